@@ -1,9 +1,7 @@
-"""The block of shared memory by which the processes of one cell tell each other what they want.
+"""The block of shared memory through which the processes of one cell exchange requests and state.
 
 Fields of eight bytes, each with one writer, read without locks: a store of eight aligned bytes
-is seen whole or not at all. Times are those of CLOCK_MONOTONIC, the same in every process.
-
-Percentiles of the latencies counted in it, and `HeartbeatMonitor`, which finds dead processes.
+is atomic. Times are those of CLOCK_MONOTONIC, the same in every process.
 """
 
 from __future__ import annotations
@@ -15,26 +13,28 @@ from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any, ClassVar, Final, Self, TypeAlias
 
+from drivers.events import Outcome
 from drivers.record import attach_memory, create_memory
 
-STALE: Final = 0.5
-"""s after which a heartbeat counts as that of a dead process."""
-PATIENCE: Final = 5.0
-"""The same where no motion was requested: a busy computer may keep a supervisor waiting, and the
-death of one is shown by its end of the pipe at once."""
+HEARTBEAT_TIMEOUT: Final = 0.5
+"""Age of a heartbeat at which its process counts as dead while a motion is requested, s."""
+IDLE_HEARTBEAT_TIMEOUT: Final = 5.0
+"""The same without a motion, s: a busy computer may delay a supervisor, whose death is detected at
+once by the end of its pipe."""
 
-
-# How long answers take is counted in bins, so that other processes can tell percentiles: that costs
-# a logarithm and a store per packet, whatever the number of packets.
+# Latencies are counted in bins: percentiles for other processes at the cost of a logarithm and a
+# store per packet.
 BINS: Final = 48
 PER_OCTAVE: Final = 4
 SHORTEST: Final = 2e-6
-"""s; the first bin holds everything up to it, each next one 2 ** (1 / `PER_OCTAVE`) times more.
-The last holds all that took longer than 5.8 ms."""
+"""Upper edge of the first bin, s; each next one is 2 ** (1 / `PER_OCTAVE`) times longer. The last
+contains everything above 5.8 ms."""
+OUTCOMES: Final[tuple[Outcome, ...]] = ("lost", "completed", "stopped", "refused")
+"""Outcome of a motion by its number in a control block; "lost" before the first."""
 
 
 def bin_of(seconds: float) -> int:
-    """Index of the bin that a latency falls into."""
+    """Return the index of the bin of a latency."""
     if not seconds > SHORTEST:
         return 0
     if math.isinf(seconds):
@@ -43,42 +43,32 @@ def bin_of(seconds: float) -> int:
 
 
 def upper_edge(index: int) -> float:
-    """Longest latency of a bin, s; that of the last is infinite."""
+    """Return the longest latency of a bin, s; infinite for the last."""
     return math.inf if index >= BINS - 1 else SHORTEST * 2.0 ** (index / PER_OCTAVE)
 
 
 def quantile(counts: Sequence[int], share: float) -> float | None:
-    """Latency not exceeded by this share of the answers, s; None without any.
+    """Return the latency not exceeded by this share of the replies, s; None without replies.
 
     It is the upper edge of a bin: never too short, and at most 19 % too long.
     """
     total = sum(counts)
     if total <= 0:
         return None
-    needed, seen = share * total, 0
+    cumulated = 0
     for index, count in enumerate(counts):
-        seen += count
-        if seen >= needed and seen > 0:
+        cumulated += count
+        if cumulated >= share * total and cumulated > 0:
             return upper_edge(index)
     return upper_edge(BINS - 1)
 
 
 class ArchiveState(IntEnum):
-    """What the archive process says of the archive."""
+    """State of the archive."""
 
     NONE = 0
     READY = 1
     FAILED = 2
-
-
-class Ended(IntEnum):
-    """How the last motion ended; the names are those of `drivers.events.Outcome`."""
-
-    NONE = 0
-    COMPLETED = 1
-    STOPPED = 2
-    REFUSED = 3
-    LOST = 4
 
 
 Gap: TypeAlias = ctypes.Array[ctypes.c_int64]
@@ -93,52 +83,43 @@ _KINDS: Final[dict[str, Any]] = {
 
 
 class ControlBlock(ctypes.Structure):
-    """The fields, for whoever reads or writes them. Those of different writers lie apart.
+    """The fields of supervisor, exchange and archive, for readers and writers.
+
+    Counts of packets are those of `drivers.events.Counters`.
 
     Args:
         fd: descriptor of the memory.
 
     Attributes:
-        latencies: (`BINS`,) answers by how long they took, counted by the exchange.
-        supervisor_heartbeat: s.
-        stop_count: raised by one for each stop asked for.
-        override: fraction of the speed asked for.
-        override_count: raised by one for each override asked for, after it was written.
-        finish: 1 when the exchange is to leave open mode and end.
-        program_offered: id of the program to be read, raised for each.
-        program_id: of the program that may begin once it was read; negative to withdraw it.
-        held: 1 if the motion going on is to rest on its path, 0 if it is to go on; an order, not
-            a state: it says nothing of a later motion.
-        hold_count: raised by one each time, after `held` was written.
-        exchange_heartbeat: s.
+        supervisor_heartbeat, exchange_heartbeat, archive_heartbeat: s.
+        stop_count: incremented for each requested stop.
+        override: requested fraction of the speed.
+        override_count: incremented after `override` was written.
+        finish: 1 if the exchange has to leave open mode and end.
+        program_offered: id of the motion to be read, incremented for each.
+        program_id: id of the motion that may begin once it was read; negative to withdraw it.
+        held: 1 to hold the present motion on its path, 0 to resume it; a command, not a state.
+        hold_count: incremented after `held` was written.
         state: `drivers.states.State` of the session.
         cycle: the controller's cycle.
         interval: in open mode, -1 before the first.
-        program_accepted: id of the program accepted last.
-        program_refused: id of the program refused last.
-        pickup_us: microseconds the last program took to be read.
-        ended_count: motions that have ended, raised after the two that follow were written; a
-            second witness, should the event get lost.
-        ended_outcome: of the last of them, an `Ended`.
-        ended_interval: of its records, -1 if it never saw open mode.
-        overflow: records overwritten before the archive had them.
-        answered: packets, as `drivers.events.Counters` has it; so are the ones that follow.
-        missed: packets that never arrived.
-        duplicates: packets that came twice.
-        stale: packets that came too late.
-        malformed: packets that were none.
-        foreign: packets from elsewhere.
-        late: packets whose answer did not leave within a cycle of their arrival: left out for a
-            newer one, or answered late.
-        answered_late: those of them that were answered all the same.
-        unanswered: answers of ours that the controller did not take.
-        refused: set-points refused.
-        worst_turnaround_us: microseconds from a packet's arrival (in the kernel, where the link
-            can say) to the departure of its answer.
+        program_accepted, program_refused: id of the motion accepted or refused last.
+        pickup_us: time to read the last motion, µs.
+        ended_count: motions that have ended, written after the two fields that follow; valid also
+            if the event was lost.
+        ended_outcome: of the last of them, an index of `OUTCOMES`.
+        ended_interval: of its records, -1 if open mode was not reached.
+        overflow: records overwritten before they were archived.
+        late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
+            answered late.
+        answered_late: those of them that were answered.
+        unanswered: replies not accepted by the controller.
+        worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
+            to the departure of the reply, µs.
         finished: 1 when the exchange has ended properly.
-        motion_time: s of the motion taken last that were gone through; NaN if it does not tell.
-        rate: how fast its motion time runs, 1 as planned; NaN likewise.
-        archive_heartbeat: s.
+        motion_time: elapsed time of the last motion at its planned speed, s; NaN if unknown.
+        rate: motion time per time, 1 at planned speed; NaN if unknown.
+        latencies: (`BINS`,) replies by their latency.
         archive_state: an `ArchiveState`.
 
     Raises:
@@ -188,56 +169,53 @@ class ControlBlock(ctypes.Structure):
     _fields_: ClassVar = [(name, _KINDS[kind]) for name, kind in __annotations__.items()]
 
     def __new__(cls, fd: int) -> Self:
-        """Return the block that lies in shared memory."""
+        """Return the block in shared memory."""
         mapped = attach_memory(fd)
         if len(mapped) != ctypes.sizeof(cls):
             raise ValueError("this memory is not a control block")
         return cls.from_buffer(mapped)
 
     def __init__(self, fd: int) -> None:
-        """Leave the fields as they are."""
+        """Leave the fields unchanged."""
 
     @property
-    def outcome(self) -> str:
-        """How the last motion ended, a `drivers.events.Outcome`, or "none"."""
-        return Ended(self.ended_outcome).name.lower()
-
-    def copied(self) -> Self:
-        """Return the fields as they are at this moment."""
-        copy: Self = type(self).from_buffer_copy(self)
-        return copy
+    def outcome(self) -> Outcome:
+        """Outcome of the last motion."""
+        return OUTCOMES[self.ended_outcome]
 
 
 def create() -> int:
-    """Descriptor of memory for a block; every field is 0."""
+    """Return the descriptor of memory for a block; every field is 0."""
     return create_memory("hil-control", ctypes.sizeof(ControlBlock))
 
 
 MAX_INTERVAL: Final = 0.5
-"""s between two looks that count at most; in a longer time this process was held up itself."""
+"""Longest time between two calls that counts as silence, s; otherwise this process was held up."""
 
 
 class HeartbeatMonitor:
-    """How long a heartbeat has stood still while somebody was awake to see it.
+    """Measures how long a heartbeat has not changed while this process was running.
 
-    Its age would not do: a machine that was suspended wakes with every heartbeat old.
+    The age of a heartbeat is not enough: after a suspension of the computer all of them are old.
 
     Args:
-        beat: the heartbeat, any number; 0 before the first.
-        max_interval: s; `MAX_INTERVAL` for somebody who looks more often.
+        heartbeat: reads the heartbeat, any number; 0 before the first.
+        max_interval: largest part of the time between two calls that counts, s.
     """
 
-    def __init__(self, beat: Callable[[], float], *, max_interval: float = MAX_INTERVAL) -> None:
-        self._beat, self._longest = beat, max_interval
-        self._last, self._seen = beat(), time.monotonic()
-        self._quiet = 0.0
+    def __init__(
+        self, heartbeat: Callable[[], float], *, max_interval: float = MAX_INTERVAL
+    ) -> None:
+        self._read, self._max_interval = heartbeat, max_interval
+        self._last, self._read_at = heartbeat(), time.monotonic()
+        self._silence = 0.0
 
     def silence(self) -> float:
-        """Seconds since the last beat; 0 before the first. To be called often."""
-        now, beat = time.monotonic(), self._beat()
-        if beat != self._last or beat == 0.0:
-            self._last, self._quiet = beat, 0.0
+        """Return the seconds since the last change, 0 before the first; to be called often."""
+        now, heartbeat = time.monotonic(), self._read()
+        if heartbeat != self._last or heartbeat == 0.0:
+            self._last, self._silence = heartbeat, 0.0
         else:
-            self._quiet += min(now - self._seen, self._longest)
-        self._seen = now
-        return self._quiet
+            self._silence += min(now - self._read_at, self._max_interval)
+        self._read_at = now
+        return self._silence

@@ -1,8 +1,8 @@
 """Events in shared memory: a ring of bytes that one process writes and others read.
 
-Each frame is length, checksum and index, then one pickled event. The writer first says which
-frames it is about to overwrite, then writes, then says how far it got; a reader copies, then
-looks which of the frames it copied were given up meanwhile. Order of stores as in `drivers.record`.
+A frame is length, checksum, index and one pickled event. The writer stores the new tail, the frame,
+then the new head; a reader copies the frames, then drops those behind the tail valid by then.
+Order of stores as in `drivers.record`.
 """
 
 from __future__ import annotations
@@ -17,10 +17,8 @@ from drivers.events import Event
 from drivers.exchange.realtime import RealTimeReport
 from drivers.record import attach_memory, create_memory
 
-NO_SUPERVISOR: Final = "the supervisor gives no sign of life"
-"""Why the exchange leaves that missed the heartbeats of the process that started it."""
-NO_ARCHIVE: Final = "the archive process gives no sign of life"
-"""Why a motion is stopped during which that process did not get on."""
+NO_SUPERVISOR: Final = "the supervisor sends no heartbeat"
+NO_ARCHIVE: Final = "the archive process sends no heartbeat"
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,8 @@ class ExchangeStarted:
 
     Attributes:
         pid: of the process.
-        realtime: what the system granted.
-        notes: options of the link that the system refused, in words.
+        realtime: permissions granted by the system.
+        notes: options of the link that the system refused.
     """
 
     pid: int
@@ -40,7 +38,7 @@ class ExchangeStarted:
 
 @dataclass(frozen=True)
 class OverrideRefused:
-    """The motion going on cannot change its speed, for the reason given."""
+    """The present motion cannot change its speed."""
 
     fraction: float
     reason: str
@@ -48,45 +46,42 @@ class OverrideRefused:
 
 @dataclass(frozen=True)
 class HoldRefused:
-    """Nothing is held, for the reason given; a motion requested later begins as usual."""
+    """There is no motion to hold; one requested later begins as usual."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class ResumeRefused:
-    """The motion cannot be resumed, for the reason given."""
+    """The motion cannot be resumed."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class EventsLost:
-    """So many events were overwritten before this reader had them; the reader itself says so."""
+    """Events were overwritten before they were read; inserted by the reader."""
 
     count: int
 
 
 @dataclass(frozen=True)
 class Leaving:
-    """No motion is accepted any more; what goes on is brought to rest and open mode left."""
+    """Motions are no longer accepted; the present one is stopped and open mode left."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class ExchangeEnded:
-    """The last thing a process says that ends properly."""
+    """Last event of a process that ends properly."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class ExchangeFailed:
-    """The last thing a process says that ends because of an error in itself.
-
-    The controller's own watch has to act.
-    """
+    """Last event of a process that ends by an internal error; the controller stops the arm."""
 
     trace: str
 
@@ -102,22 +97,23 @@ ExchangeEvent = (
     | ExchangeEnded
     | ExchangeFailed
 )
-"""Everything in an event log."""
 
 
 CAPACITY: Final = 4 << 20
-"""Bytes: some hundred refusals with their flight recorders, or 50 000 small events."""
+"""Bytes, for some hundred refusals with their flight recorders, or 50 000 small events."""
 _HEADER_BYTES: Final = 256
 _FRAME: Final = struct.Struct("<IIQ")
 _HEAD, _TAIL = 8, 16
 
 
 def create(capacity: int = CAPACITY) -> int:
-    """Descriptor of memory for a log of `capacity` bytes."""
+    """Return the descriptor of memory for a log of `capacity` bytes."""
     return create_memory("hil-events", _HEADER_BYTES + capacity)
 
 
 class _Log:
+    """The memory: two words of positions, then a ring of bytes."""
+
     def __init__(self, fd: int) -> None:
         whole = memoryview(attach_memory(fd))
         self._words = whole[:_HEADER_BYTES].cast("Q")
@@ -140,10 +136,10 @@ class EventWriter(_Log):
         self._count = 0
 
     def write(self, event: ExchangeEvent) -> None:
-        """Append one event, over the oldest where there is no room.
+        """Append one event, over the oldest if the log is full.
 
         Raises:
-            ValueError: longer than the whole log.
+            ValueError: it is longer than the log.
         """
         body = pickle.dumps(event, protocol=5)
         frame = _FRAME.pack(len(body), zlib.crc32(body), self._count) + body
@@ -164,30 +160,28 @@ class EventWriter(_Log):
 
 
 class EventReader(_Log):
-    """A reader's end, from the oldest event still there.
-
-    Where events are missing, `EventsLost` stands in their place.
+    """A reader's end, from the oldest event available; lost events appear as `EventsLost`.
 
     Attributes:
-        lost: events overwritten before this reader had them.
+        lost: events overwritten before they were read.
     """
 
     def __init__(self, fd: int) -> None:
         super().__init__(fd)
         self._position: int = self._words[_TAIL]
-        # Index of the next event; unknown to who comes when the first are gone.
+        # Index of the next event; unknown if the first ones are overwritten already.
         self._expected: int | None = None if self._position else 0
         self.lost = 0
 
     def drain(self) -> list[ExchangeEvent]:
-        """The events not read yet, in order."""
+        """Return the events not read yet, in order."""
         head = self._words[_HEAD]
         begin = max(self._position, self._words[_TAIL])
         copy = self._get(begin, head - begin)
         valid = self._words[_TAIL]
         self._position = head
         events: list[ExchangeEvent] = []
-        # Where the writer lapped all that was copied, its oldest frame begins beyond the copy.
+        # If the writer lapped all that was copied, its oldest frame begins beyond the copy.
         at = max(begin, valid)
         while at < head:
             length, checksum, index = _FRAME.unpack_from(copy, at - begin)
@@ -197,14 +191,14 @@ class EventReader(_Log):
             missing = index - (index if self._expected is None else self._expected)
             self._expected = index + 1
             if missing:
-                self._miss(missing, events)
+                self._add_lost(missing, events)
             if zlib.crc32(body) == checksum:
                 events.append(pickle.loads(body))
             else:
-                self._miss(1, events)
+                self._add_lost(1, events)
         return events
 
-    def _miss(self, count: int, events: list[ExchangeEvent]) -> None:
+    def _add_lost(self, count: int, events: list[ExchangeEvent]) -> None:
         self.lost += count
         last = events[-1] if events else None
         if isinstance(last, EventsLost):

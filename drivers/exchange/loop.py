@@ -1,4 +1,4 @@
-"""The one loop between a link and a session."""
+"""The loop between a link and a session."""
 
 from __future__ import annotations
 
@@ -23,85 +23,84 @@ from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
 from drivers.transports.base import Transport
 
-FALLEN_SILENT: Final = 1.0
-"""s without a packet that gets an answer, after which another sender may begin the session."""
+POLL: Final = 0.1
+"""Longest wait for a packet, s."""
+PEER_TIMEOUT: Final = 1.0
+"""Silence of a sender before the init packet after which another may start the session, s."""
+MAX_LATE: Final = 2
+"""Consecutive late replies that do not stop a motion in open mode."""
+MAX_KINDS: Final = 64
+"""Most packets of one backlog that are answered."""
+_MAX_BACKLOG: Final = 100_000
+"""Most packets read in search of the newest, more than any kernel queue holds."""
+_COUNT_EVERY: Final = 100
+"""Packets between two readings of the link's counters."""
+_LATE_READ: Final = 1.5
+"""Cycles between two packets read above which more than one may be queued."""
+_LONG_QUEUED: Final = 0.5
+"""Cycles that a packet was queued above which the next may be queued too."""
+_BUNCHED: Final = 0.5
+"""Cycles between two arrivals below which these and others were delayed on their way."""
+_IMMEDIATE: Final = 0.1
+"""Cycles that the reception of a packet takes at most if it was queued."""
+_OLD_BACKLOG: Final = 3.0
+_OLD_BACKLOG_SECONDS: Final = 0.005
+"""Age of the newest packet of a backlog, in cycles and at least in s, above which the queue must
+have been full when newer ones arrived."""
+_NUMBER_WINDOW: Final = 1000
+"""Largest difference of two packet numbers that is one of age."""
+
+Ages = NDArray[np.uint16]
+_Kind = tuple[int, int, bytes]
+"""Session within the backlog, length, status and modes."""
 
 
-def listens_to_all(session: Session) -> bool:
-    """Whether there is no session that a change of port could break.
+def _accepts_any_peer(session: Session) -> bool:
+    """Whether there is no session that a change of the controller's port would break.
 
-    Before the init packet there is none, and a lost one goes on with the first packet that gets
-    an answer: a stray datagram must not decide who is listened to.
+    There is none before the init packet, and a lost one is resumed by the first packet that gets a
+    reply.
     """
     return session.state is State.SYNC or session.deadline == math.inf
 
 
-class Listening:
-    """Lets the link forget its peer where that one does not lead to a session.
+class _PeerSelection:
+    """Makes the link forget a peer whose packets do not lead to a session.
 
-    Before the init packet, whoever gets answers is listened to alone until it sends something
-    that gets none, or falls silent: another host cannot take over a start that is going on, and one
-    that does not go on cannot keep the controller out.
+    Before the init packet, a peer whose packets get replies is retained until one gets none or
+    none comes for `PEER_TIMEOUT`: another host cannot take over a start in progress, and an
+    abandoned start does not exclude the controller.
     """
 
     def __init__(self, transport: Transport, session: Session) -> None:
         self._transport = transport
         self._session = session
-        self._answered_at = -math.inf
+        self._replied_at = -math.inf
 
-    def heard(self, answered: bool) -> None:
-        """A packet came and was answered, or was not."""
-        if not listens_to_all(self._session):
+    def after_packet(self, replied: bool) -> None:
+        if not _accepts_any_peer(self._session):
             return
-        if answered:
-            self._answered_at = self._transport.now
+        if replied:
+            self._replied_at = self._transport.now
         else:
             self._transport.forget_peer()
 
-    def heard_nothing(self) -> None:
-        """Nothing came for a while."""
+    def after_silence(self) -> None:
         session, transport = self._session, self._transport
-        if not listens_to_all(session):
-            return
-        starting = session.state is State.SYNC
-        if not starting or transport.now - self._answered_at >= FALLEN_SILENT:
+        if _accepts_any_peer(session) and (
+            session.state is not State.SYNC or transport.now - self._replied_at >= PEER_TIMEOUT
+        ):
             transport.forget_peer()
 
 
-POLL: Final = 0.1
-"""s, longest wait for a packet."""
-HELD_UP: Final = 1.5
-"""Cycles between two packets from which on more of them may be waiting than one."""
-WAITED_HERE: Final = 0.5
-"""Cycles a packet has waited from which on the next may be there too."""
-TOO_SOON: Final = 0.5
-"""Cycles between two arrivals below which they, and others, were held up on their way."""
-MOST_WAITING: Final = 100_000
-"""Packets looked at for the newest, more than any queue of a kernel holds."""
-MOST_KINDS: Final = 64
-"""Packets left of a pile at most."""
-TOO_OLD: Final = 3.0
-"""Cycles since the newest of a pile came, from which on newer ones must have found no room."""
-_TOO_OLD_AT_LEAST: Final = 0.005
-"""s; the same, where cycles are short against what the system may be busy for."""
-_A_LITTLE: Final = 1000
-"""Packet numbers within which one is a little later than another, or a little earlier."""
-_SLEPT: Final = 0.1
-"""Cycles that receiving a packet takes at most if it was there already."""
-
-Ages = NDArray[np.uint16]
-_Kind = tuple[int, int, bytes]
-"""Session within the pile, length, status and modes."""
-
-
 class Arrival(NamedTuple):
-    """A packet taken from the link.
+    """A packet received.
 
     Attributes:
         packet: its bytes.
-        arrived: when, on the link's clock; where the link cannot say, when it was received.
+        arrived: time of arrival on the link's clock, of reception if the link has no time stamps.
         ages: of its values, see `Transport.ages`.
-        stamped: whether the link could say.
+        stamped: whether the link has time stamps.
     """
 
     packet: bytes
@@ -111,34 +110,32 @@ class Arrival(NamedTuple):
 
 
 class ReceiveQueue:
-    """Takes packets from a link that may have queued some while this process was held up.
+    """Receives packets; of a backlog that formed while this process did not run, the newest.
 
-    The answer to any but the newest comes too late, and a motion would run ahead of the arm by a
-    step for each. So of each kind (length, status, modes) only the newest stays. The others are
-    left unanswered as if the link had lost them, and counted as "late". Where axes opened or
-    closed meanwhile the session sees it, and packets before an init packet are not mixed with
-    those after it.
+    A reply to any other comes too late, and a motion would run ahead of the arm by one step for
+    each. Of each kind (length, status, modes) only the newest packet is answered, so that the
+    session sees axes open and close; packets before and after an init packet are of different
+    kinds. The others are counted as "late".
 
-    A queue that was full holds the oldest packets. Where the newest one found is so old that
-    others must have been turned away since, it is left unanswered too while axes are open: the
-    controller's next packet comes within a cycle.
+    A full queue contains the oldest packets. If the newest packet found is so old that later ones
+    were dropped, it gets no reply either while axes are open: the next one comes within a cycle.
 
-    On a link that cannot say when a packet arrived, that is guessed for finding piles, and for
-    nothing else.
+    Where the link has no time stamps, arrivals are estimated to detect a backlog, and for nothing
+    else.
     """
 
     def __init__(self, transport: Transport, session: Session) -> None:
         self._transport = transport
         self._session = session
-        self._heard = self._arrived = math.inf
-        self._due = -math.inf
+        self._read_at = self._estimated = math.inf
+        self._earliest_next = -math.inf
         self._number = 0
 
-    def take(self) -> tuple[Arrival, ...]:
-        """What is to be answered, in order; nothing if nothing came before the deadline.
+    def receive(self) -> tuple[Arrival, ...]:
+        """Return the packets to be answered, in order; none if none came before the deadline.
 
         Raises:
-            TransportClosed: the link is gone.
+            TransportClosed: the link is closed.
         """
         transport, session = self._transport, self._session
         before = transport.now
@@ -148,65 +145,64 @@ class ReceiveQueue:
         now = transport.now
         period = session.period
         stamp = self._stamp()
-        arrived = self._guess(packet, before, now, period) if stamp is None else stamp
-        heard, self._heard = self._heard, now
-        due, self._due = self._due, arrived + TOO_SOON * period
-        late = now - arrived > WAITED_HERE * period
-        held_up = late or now - heard > HELD_UP * period or arrived < due
-        # Where nobody in particular is listened to, packets of several may wait.
-        if held_up and not listens_to_all(session):
-            return self._newest(self._arrival(packet, stamp, now, self._copied_ages()), period)
-        return (self._arrival(packet, stamp, now, transport.ages),)
+        arrived = self._estimate(packet, before, now, period) if stamp is None else stamp
+        read_at, self._read_at = self._read_at, now
+        earliest, self._earliest_next = self._earliest_next, arrived + _BUNCHED * period
+        queued = now - arrived > _LONG_QUEUED * period
+        delayed = queued or now - read_at > _LATE_READ * period or arrived < earliest
+        # While any peer is accepted, the queue may hold packets of several.
+        if delayed and not _accepts_any_peer(session):
+            return self._newest(self._arrival(packet, stamp, now, copy=True), period)
+        return (self._arrival(packet, stamp, now),)
 
     def _stamp(self) -> float | None:
         arrived: float | None = getattr(self._transport, "arrived", None)
         return arrived
 
     def _arrival(
-        self, packet: bytes, stamp: float | None, now: float, ages: Ages | None
+        self, packet: bytes, stamp: float | None, now: float, *, copy: bool = False
     ) -> Arrival:
-        if stamp is None:
-            return Arrival(packet, now, ages, False)
-        return Arrival(packet, stamp, ages, True)
+        ages = self._transport.ages
+        if copy and ages is not None:  # the link may reuse its array for the next packet
+            ages = ages.copy()
+        return Arrival(packet, now if stamp is None else stamp, ages, stamp is not None)
 
-    def _guess(self, packet: bytes, before: float, now: float, period: float) -> float:
-        """When a packet presumably arrived that was received between `before` and `now`."""
-        # If there was no wait for it, it came earlier: when it was due.
+    def _estimate(self, packet: bytes, before: float, now: float, period: float) -> float:
+        """Estimate the arrival of a packet received between `before` and `now`."""
         number = _number(packet)
         cycles, self._number = _ahead(number, self._number), number
-        if now - before > _SLEPT * period:
-            self._arrived = now
-        else:
-            steps = cycles if cycles <= _A_LITTLE else 1
-            self._arrived = min(now, self._arrived + steps * period)
-        return self._arrived
+        if now - before > _IMMEDIATE * period:
+            self._estimated = now
+        else:  # it was queued: it arrived when it was due
+            steps = cycles if cycles <= _NUMBER_WINDOW else 1
+            self._estimated = min(now, self._estimated + steps * period)
+        return self._estimated
 
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
-        """Of a packet and those that wait behind it, the newest of each kind."""
+        """Return the newest of each kind among a packet and those queued behind it."""
         transport = self._transport
         init = self._session.init
-        pile = _Pile(MAX_AXES if init is None else init.n_axes)
-        pile.add(first)
-        for _ in range(MOST_WAITING):
+        backlog = _Backlog(MAX_AXES if init is None else init.n_axes)
+        backlog.add(first)
+        for _ in range(_MAX_BACKLOG):
             before = transport.now
-            following = transport.receive(0.0)
-            if following is None:
+            packet = transport.receive(0.0)
+            if packet is None:
                 break
             stamp, now = self._stamp(), transport.now
             if stamp is None:
-                self._guess(following, before, now, period)
-            pile.add(self._arrival(following, stamp, now, self._copied_ages()))
-        arrivals, left_out = pile.arrivals, pile.left_out
-        if left_out and self._too_old(arrivals, period):
-            arrivals, left_out = (), left_out + 1
-        self._session.discarded("late", left_out)
+                self._estimate(packet, before, now, period)
+            backlog.add(self._arrival(packet, stamp, now, copy=True))
+        arrivals, dropped = tuple(arrival for _, arrival in backlog.newest), backlog.dropped
+        if dropped and self._too_old(arrivals, period):
+            arrivals, dropped = (), dropped + 1
+        self._session.discarded("late", dropped)
         return arrivals
 
     def _too_old(self, arrivals: tuple[Arrival, ...], period: float) -> bool:
-        """Whether a pile, of one kind, is that of a queue that had no room for the newest.
+        """Whether newer packets than these, all of one kind, must have been dropped.
 
-        One packet alone is none: its controller may be waiting for the answer. Packets of several
-        kinds tell the session something, however old they are.
+        Packets of several kinds carry changes that the session needs, however old they are.
         """
         if (
             len(arrivals) != 1
@@ -215,65 +211,55 @@ class ReceiveQueue:
         ):
             return False
         age = self._transport.now - arrivals[0].arrived
-        return age > max(TOO_OLD * period, _TOO_OLD_AT_LEAST)
-
-    def _copied_ages(self) -> Ages | None:
-        """Ages of the packet received last; the link may reuse its array for the next."""
-        ages = self._transport.ages
-        return None if ages is None else ages.copy()
+        return age > max(_OLD_BACKLOG * period, _OLD_BACKLOG_SECONDS)
 
 
-class _Pile:
-    """The newest packet of each kind, in the order of their arrival.
+class _Backlog:
+    """The newest packet of each kind, in the order of arrival.
 
-    Numbers that are far apart are no matter of age: one of two such packets is of another session,
-    or its number was garbled, and which one the session knows.
+    Two packets whose numbers are far apart are both retained: one is of another session, or its
+    number is corrupt, which the session can decide.
 
     Args:
-        n_axes: slots of a packet that mean something. Some controllers send more bytes, and what
-            stands in those makes no kind.
+        n_axes: axes in use; what some controllers send behind them makes no kind.
 
     Attributes:
-        left_out: packets that were not stored; repetitions of one that was do not count.
+        newest: kind and packet.
+        dropped: packets not retained, without repetitions of one that was.
     """
 
     def __init__(self, n_axes: int) -> None:
-        self.left_out = 0
+        self.dropped = 0
+        self.newest: list[tuple[_Kind, Arrival]] = []
         self._modes = slice(HEADER_LENGTH, cyclic_length(n_axes), AXIS_LENGTH)
-        self._newest: list[tuple[_Kind, Arrival]] = []
         self._sessions = 0
 
-    @property
-    def arrivals(self) -> tuple[Arrival, ...]:
-        """In order."""
-        return tuple(arrival for _, arrival in self._newest)
-
     def add(self, arrival: Arrival) -> None:
-        """Take one that came after the others."""
+        """Add a packet that came after the others."""
         packet = arrival.packet
         if is_init(packet):
             self._sessions += 1
         status = packet[4 : 4 + N_ARMS]
-        # The lowest byte tells the modes there are from each other.
+        # The lowest byte of a mode identifies it.
         kind = (self._sessions, len(packet), status + packet[self._modes])
-        for place, (other, earlier) in enumerate(self._newest):
+        for place, (other, earlier) in enumerate(self.newest):
             if other != kind:
                 continue
             if packet == earlier.packet:
                 return
-            if _ahead(_number(earlier.packet), _number(packet)) <= _A_LITTLE:
-                self.left_out += 1  # overtaken on the way
+            if _ahead(_number(earlier.packet), _number(packet)) <= _NUMBER_WINDOW:
+                self.dropped += 1  # it was overtaken on its way
                 return
-            if _ahead(_number(packet), _number(earlier.packet)) <= _A_LITTLE:
-                self._leave_out(place)
+            if _ahead(_number(packet), _number(earlier.packet)) <= _NUMBER_WINDOW:
+                self._drop(place)
                 break
-        if len(self._newest) >= MOST_KINDS:
-            self._leave_out(0)
-        self._newest.append((kind, arrival))
+        if len(self.newest) >= MAX_KINDS:
+            self._drop(0)
+        self.newest.append((kind, arrival))
 
-    def _leave_out(self, place: int) -> None:
-        del self._newest[place]
-        self.left_out += 1
+    def _drop(self, place: int) -> None:
+        del self.newest[place]
+        self.dropped += 1
 
 
 def _number(packet: bytes) -> int:
@@ -281,53 +267,42 @@ def _number(packet: bytes) -> int:
 
 
 def _ahead(later: int, earlier: int) -> int:
-    """How far one packet number is ahead of another, modulo their range."""
+    """Difference of two packet numbers, modulo their range."""
     return (later - earlier) % LAST_NUMBER
 
 
-MAX_LATE: Final = 2
-"""Answers in a row that may come too late in open mode."""
+class _LatenessMonitor:
+    """Counts replies that leave more than a cycle after their packet arrived.
 
-
-class Punctuality:
-    """Counts the answers that leave more than a cycle after their packet arrived.
-
-    Each is counted as "answered late", in every state. More than `max_late` in a row, each of them
-    overtaken by the controller's next packet, bring a motion to rest on its path: the controller
-    has been taking no answer, or each in a later cycle than it was meant for. A controller that
-    was seen to wait for its answer is not overtaken by anything.
+    Each is counted as "answered late", in every state. More than `max_late` in a row, each
+    overtaken by the controller's next packet, stop a motion on its path: the controller has
+    accepted none of them, or each in a later cycle than intended. A controller that waits for its
+    reply is never overtaken.
     """
 
     def __init__(self, session: Session, max_late: int) -> None:
         self._session = session
         self._max_late = max_late
-        self._left = -math.inf  # when the last answer left, if it was late
-        self._in_a_row = 0
+        self._late_reply_at = -math.inf
+        self._consecutive = 0
 
-    def heard(self, arrived: float) -> None:
-        """A packet arrived at that time and is to be answered next.
-
-        Infinite if the time is not known: a guess must not stop a motion.
-        """
-        if arrived > self._left:
-            self._in_a_row = 0
+    def before_reply(self, arrived: float) -> None:
+        """Record the arrival of a packet; infinite if it is not known."""
+        if arrived > self._late_reply_at:
+            self._consecutive = 0
             return
-        self._left = -math.inf
-        self._in_a_row += 1
-        if self._in_a_row > self._max_late and self._session.state is State.OPEN:
-            self._session.stop(f"{self._in_a_row} answers in a row left too late")
+        self._late_reply_at = -math.inf
+        self._consecutive += 1
+        if self._consecutive > self._max_late and self._session.state is State.OPEN:
+            self._session.stop(f"{self._consecutive} consecutive replies left too late")
 
-    def answered(self, arrived: float, left: float) -> None:
-        """The answer to that packet left at that time."""
-        if left - arrived > self._session.period:
+    def after_reply(self, arrived: float, sent: float) -> None:
+        """Record the time at which its reply left."""
+        if sent - arrived > self._session.period:
             self._session.discarded("answered late", 1)
-            self._left = left
+            self._late_reply_at = sent
         else:
-            self._left = -math.inf
-
-
-COUNT_EVERY: Final = 100
-"""Packets between two looks at what the link discarded."""
+            self._late_reply_at = -math.inf
 
 
 def exchange(
@@ -337,46 +312,47 @@ def exchange(
     until: Callable[[], bool],
     max_late: int = MAX_LATE,
 ) -> None:
-    """Answer packets until `until()`, the controller ends the session, or the link is closed.
+    """Answer packets until `until()` is true, the controller ends the session or the link closes.
 
-    `until` is asked once per packet, after its answer was sent, and at least each 0.1 s. What
-    can wait until then is done there.
+    `until` is called once per packet, after the reply was sent, and at least every 0.1 s; it is the
+    place for work that can wait. Of a backlog only the newest packets are answered
+    (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion.
 
-    Where packets have piled up, only the newest are answered, see `ReceiveQueue`. Answers that
-    leave later than the controller's next packet are counted, and end a motion, see
-    `Punctuality`. Before the init packet and after a loss, any port of the controller's host may
-    begin, see `Listening`.
-
-    A closed link is silence for good: the session is informed, and ends what was going on.
+    Args:
+        transport: the link.
+        session: decides on the replies.
+        until: end condition.
+        max_late: consecutive late replies, each overtaken by the next packet, that do not stop a
+            motion.
     """
-    intake = ReceiveQueue(transport, session)
-    listening = Listening(transport, session)
-    punctuality = Punctuality(session, max_late)
+    queue = ReceiveQueue(transport, session)
+    peers = _PeerSelection(transport, session)
+    lateness = _LatenessMonitor(session, max_late)
     handled = 0
     send, reply = transport.send, session.reply
     while session.state is not State.ENDED and not until():
         try:
-            arrivals = intake.take()
+            arrivals = queue.receive()
             if not arrivals:
                 session.tick(transport.now)
-                listening.heard_nothing()
+                peers.after_silence()
                 _count_rejected(transport, session)
                 continue
             for packet, arrived, ages, stamped in arrivals:
-                punctuality.heard(arrived if stamped else math.inf)
+                lateness.before_reply(arrived if stamped else math.inf)
                 deadline = session.deadline
                 answer = reply(packet, arrived, ages)
                 if answer is not None:
                     now = transport.now
-                    # Silence is counted from the answer: the packet may have waited long for it.
+                    # Silence is counted from the reply: the packet may have been queued for long.
                     if session.deadline != deadline:
                         session.sent(now)
-                    # Before it leaves: a controller that waits for it may be faster than we are.
-                    punctuality.answered(arrived, now)
+                    # Before it leaves: the controller's next packet may come at once.
+                    lateness.after_reply(arrived, now)
                     send(answer)
-                listening.heard(answer is not None)
+                peers.after_packet(answer is not None)
             handled += 1
-            if handled % COUNT_EVERY == 0:
+            if handled % _COUNT_EVERY == 0:
                 _count_rejected(transport, session)
         except TransportClosed:
             if math.isfinite(session.deadline):

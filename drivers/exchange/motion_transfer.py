@@ -1,8 +1,7 @@
-"""A motion source on its way from one process to another.
+"""Transfer of a motion source from the supervisor to the exchange process.
 
-It is pickled into sealed memory: what it holds in large arrays is not copied when it is read, but
-mapped, read-only, where it lies. Its descriptor goes over the socket between supervisor and
-exchange, answers come back (`Inbox`).
+It is pickled into sealed memory, whose descriptor is sent over a socket; the exchange maps large
+arrays read-only instead of copying them, and answers over the same socket (`Inbox`).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from drivers.errors import RequestError
 from drivers.motion_source import MotionSource
 
 SMALLEST_MAPPED: Final = 4096
-"""Bytes from which on an array is mapped; a smaller one is copied, and can be written to."""
+"""Bytes from which on an array is mapped; smaller ones are copied and writeable."""
 _ALIGNMENT: Final = 64
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SEAL
 _COUNT: Final = struct.Struct("<Q")
@@ -28,21 +27,21 @@ _SPAN: Final = struct.Struct("<QQ")
 
 
 def pack(source: MotionSource) -> int:
-    """Descriptor of sealed memory that holds the source; whoever gets it closes it.
+    """Return the descriptor of sealed memory with the source; the caller closes it.
 
     Raises:
-        Exception: whatever pickling this source raises.
+        Exception: the source cannot be pickled.
     """
     arrays: list[memoryview] = []
 
-    def keep(buffer: pickle.PickleBuffer) -> bool:
+    def copied(buffer: pickle.PickleBuffer) -> bool:
         raw = buffer.raw()
         if raw.nbytes < SMALLEST_MAPPED:
             return True
         arrays.append(raw)
         return False
 
-    blocks = [memoryview(pickle.dumps(source, protocol=5, buffer_callback=keep)), *arrays]
+    blocks = [memoryview(pickle.dumps(source, protocol=5, buffer_callback=copied)), *arrays]
     at = _COUNT.size + len(blocks) * _SPAN.size
     spans = []
     for block in blocks:
@@ -70,16 +69,16 @@ def _write(fd: int, block: memoryview, begin: int) -> None:
 
 
 def unpack(fd: int) -> MotionSource:
-    """The source that lies there.
+    """Return the source in the memory of `pack`.
 
     Raises:
-        ValueError: memory that could still change.
-        Exception: whatever unpickling raises.
+        ValueError: the memory is not sealed.
+        Exception: the source cannot be unpickled.
     """
     if fcntl.fcntl(fd, fcntl.F_GET_SEALS) & _SEALS != _SEALS:
-        raise ValueError("the memory of a program is not sealed")
+        raise ValueError("the memory of a motion is not sealed")
     size = os.fstat(fd).st_size
-    # Populated at once: a page fault in some later cycle would delay an answer.
+    # Populated at once: a page fault in a later cycle would delay a reply.
     flags = mmap.MAP_SHARED | mmap.MAP_POPULATE
     whole = memoryview(mmap.mmap(fd, size, flags=flags, prot=mmap.PROT_READ))
     (count,) = _COUNT.unpack_from(whole)
@@ -90,27 +89,28 @@ def unpack(fd: int) -> MotionSource:
 
 
 LONGEST_MESSAGE: Final = 1 << 16
+"""Bytes."""
 WITHDRAWN: Final = "it was withdrawn"
-"""Why a program is refused that nobody wants any more."""
+"""Reason of a refusal at the request of the supervisor."""
 READ: Final = "read"
-"""Said of a program that can be requested."""
+"""Message about a motion that was read and waits for `ControlBlock.program_id`."""
 _IDENTITY: Final = struct.Struct("<Q")
 _DESCRIPTOR: Final = struct.Struct("@i")
 
 
 class Inbox:
-    """The exchange's end; never waits.
+    """The exchange's end of the socket; never waits.
 
     Attributes:
-        identity: id of the program received last.
+        identity: id of the motion received last.
     """
 
     def __init__(self, channel: socket.socket) -> None:
         self.identity = 0
         self._channel = channel
 
-    def hung_up(self) -> bool:
-        """Whether the other end was closed."""
+    def closed(self) -> bool:
+        """Whether the supervisor closed its end."""
         try:
             return not self._channel.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -118,10 +118,10 @@ class Inbox:
         except OSError:
             return True
 
-    def take(self) -> int | None:
-        """Descriptor of the next program, if one has arrived; whoever asks closes it."""
+    def receive(self) -> int | None:
+        """Return the descriptor of the next motion, None without one; the caller closes it."""
         try:
-            # Not `socket.recv_fds`, which waits whatever flags it is given.
+            # Not `socket.recv_fds`, which ignores MSG_DONTWAIT.
             message, ancillary, _, _ = self._channel.recvmsg(
                 _IDENTITY.size, socket.CMSG_LEN(_DESCRIPTOR.size), socket.MSG_DONTWAIT
             )
@@ -133,22 +133,15 @@ class Inbox:
         self.identity = _IDENTITY.unpack(message)[0]
         return int(fd)
 
-    def read(self) -> None:
-        """Say that the program received last was read."""
-        self._say(READ)
-
-    def answer(self, refusal: RequestError | None) -> None:
-        """Say what became of the program received last."""
-        self._say(None if refusal is None else (refusal.state, refusal.reason))
-
-    def _say(self, message: str | tuple[str, str] | None) -> None:
-        # Without a supervisor nobody wants to know.
-        with contextlib.suppress(OSError):
-            self._channel.send(pickle.dumps((self.identity, message)), socket.MSG_DONTWAIT)
+    def answer(self, message: str | RequestError | None) -> None:
+        """Report the motion received last as `READ`, refused, or (None) accepted."""
+        content = (message.state, message.reason) if isinstance(message, RequestError) else message
+        with contextlib.suppress(OSError):  # without a supervisor there is no recipient
+            self._channel.send(pickle.dumps((self.identity, content)), socket.MSG_DONTWAIT)
 
 
 def hand_over(channel: socket.socket, identity: int, source: MotionSource) -> None:
-    """Send a program, from the supervisor's end."""
+    """Send a motion from the supervisor's end."""
     fd = pack(source)
     try:
         socket.send_fds(channel, [_IDENTITY.pack(identity)], [fd])

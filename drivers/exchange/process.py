@@ -30,23 +30,22 @@ from drivers.transports.base import TransportSpec
 
 @dataclass(frozen=True, eq=False)
 class ExchangeSettings:
-    """Everything the exchange needs; pickles.
+    """Settings of an exchange process; pickles.
 
     Attributes:
         transport: the link.
         drive_train: of the arm.
-        guard_limits: bounds of every set-point.
+        guard_limits: limits of every set-point.
         period: the controller's cycle, s.
         session: further keyword arguments of `Session`.
-        realtime: what to ask the system for.
-        ring_capacity: cycle records stored for whoever archives them.
-        packets: raw packets stored for whoever archives them; 0: none, and the link is as it is.
-        preload: modules imported before the link opens, so that programs made of their classes
-            are read quickly.
-        needs_archive: whether a motion is accepted and goes on only while the archive process
-            lives and has an archive ready.
-        max_late: answers in a row that may leave too late in open mode without stopping a motion;
-            None takes the session's `max_gap`.
+        realtime: requested permissions.
+        ring_capacity: cycle records buffered for the archive.
+        packets: raw packets buffered for the archive; 0 for none.
+        preload: modules imported before the link opens, so that motions of their classes are read
+            quickly.
+        needs_archive: whether motions require an archive process that is ready.
+        max_late: consecutive late replies that do not stop a motion; None for the session's
+            `max_gap`.
     """
 
     transport: TransportSpec
@@ -63,7 +62,7 @@ class ExchangeSettings:
 
     @property
     def late_allowed(self) -> int:
-        """`max_late`, or what stands for it."""
+        """`max_late`, or its default."""
         if self.max_late is not None:
             return self.max_late
         allowed: int = self.session.get("max_gap", MAX_LATE)
@@ -71,38 +70,31 @@ class ExchangeSettings:
 
 
 class ExchangeError(DriverError):
-    """The exchange process could not be started, does not answer, or is gone."""
+    """The exchange process could not be started, does not answer, or has ended."""
 
 
 class WithdrawnError(RequestError):
-    """A motion was handed over, and not wanted any more before it could begin."""
+    """A motion was withdrawn before it could begin."""
 
 
 START_TIMEOUT: Final = 60.0
-"""s until a process that was started has opened its link; imports may be slow on a cold disk."""
+"""Time until the process has opened its link, s; imports may be slow on a cold disk."""
 ANSWER_TIMEOUT: Final = 5.0
-"""s until a program has been read, and again until it has been accepted or refused."""
-_BEAT: Final = 0.1
-
-
-def _always() -> bool:
-    return True
-
-
-def _nothing() -> None: ...
+"""Time until a motion has been read, and again until it is accepted or refused, s."""
+_POLL: Final = 0.1
 
 
 class ExchangeProcess:
-    """An exchange that runs in a process, and a process session, of its own.
+    """An exchange in its own process and process session; see `start`.
 
-    It outlives this process for as long as it takes to stop the arm on its path and to leave
-    open mode; it does so when `send_heartbeat` was not called for half a second while a motion is
-    requested, five seconds otherwise. Use `start`.
+    Without `send_heartbeat` for half a second while a motion is requested, five seconds
+    otherwise, and after the death of this process, it stops the arm on its path, leaves open mode
+    and ends.
 
     Attributes:
         pid: of the process.
-        realtime: what the system granted it.
-        notes: options of the link that the system refused, in words.
+        realtime: permissions granted by the system.
+        notes: options of the link that the system refused.
         ring_fd: memory of the cycle records, for a `RingReader`.
         packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not stored.
         event_fd: memory of the events, for an `EventReader`.
@@ -144,12 +136,11 @@ class ExchangeProcess:
 
         Raises:
             TransportError: the link cannot be opened.
-            ExchangeError: it could not be started, or did not get that far; the message has its
-                last words.
+            ExchangeError: the process could not be started, or ended; with its error output.
         """
         exchange = cls(settings)
         try:
-            ready = exchange._answer(START_TIMEOUT)
+            ready = exchange._receive(START_TIMEOUT)
             if isinstance(ready, BaseException):
                 raise ready
         except BaseException:
@@ -160,30 +151,30 @@ class ExchangeProcess:
         return exchange
 
     def send_heartbeat(self) -> None:
-        """Sign of life; to be given at least every 0.2 s, from any thread."""
+        """Update the heartbeat; to be called at least every 0.2 s, from any thread."""
         self._control.supervisor_heartbeat = time.monotonic()
 
-    def submit(self, source: MotionSource, wanted: Callable[[], bool] = _always) -> int:
-        """Hand a motion over, to be run as soon as every wanted axis is open.
+    def submit(self, source: MotionSource, confirm: Callable[[], bool] = lambda: True) -> int:
+        """Hand a motion over, to be run as soon as all its axes are open.
 
         Its arrays of 4 KiB and more arrive read-only. Reading it takes the exchange about 0.2 ms
-        per MB, so that answers may come late meanwhile; axes should be closed. Gives signs of
-        life while it waits; a motion that is not accepted in time is withdrawn.
+        per MB, so that replies may be late; axes should be closed. Sends heartbeats while it
+        waits. A motion that is not accepted in time is withdrawn.
 
         Args:
             source: the motion.
-            wanted: asked once the exchange has read the motion, which may be long after this call,
-                and again until it has begun with it; if not, the motion is withdrawn.
+            confirm: called when the exchange has read the motion, which may take long, and then
+                until it has requested it; False withdraws the motion.
 
         Returns:
-            The program's id.
+            The id of the motion.
 
         Raises:
-            WithdrawnError: it is not wanted any more; nothing has begun.
+            WithdrawnError: `confirm` returned False; nothing has begun.
             RequestError: the session refuses it.
             ExchangeError: the exchange does not answer.
         """
-        # Counted before anything is sent: no two programs may ever have the same id.
+        # Incremented before anything is sent, so that no two motions have the same id.
         self._offers = identity = self._offers + 1
         try:
             hand_over(self._channel, identity, source)
@@ -193,10 +184,10 @@ class ExchangeProcess:
         try:
             reply = self._answer_to(identity)
             if reply == READ:
-                self._permit(identity, wanted)
-                reply = self._answer_to(identity, lambda: self._permit(identity, wanted))
+                self._permit(identity, confirm)
+                reply = self._answer_to(identity, lambda: self._permit(identity, confirm))
         except BaseException:
-            # Nobody waits for this motion any more: it must not begin after all, nor go on.
+            # The caller does not wait for this motion: it must not begin later, nor continue.
             self._control.program_id = -identity
             self.stop()
             raise
@@ -205,36 +196,32 @@ class ExchangeProcess:
             raise (WithdrawnError if reason == WITHDRAWN else RequestError)(state, reason)
         return identity
 
-    def _permit(self, identity: int, wanted: Callable[[], bool]) -> None:
-        """Let the program that was read begin, or withdraw it for good."""
-        if self._control.program_id != -identity and wanted():
-            self.send_heartbeat()  # the next cycle may start it
+    def _permit(self, identity: int, confirm: Callable[[], bool]) -> None:
+        """Permit the motion that was read, or withdraw it."""
+        if self._control.program_id != -identity and confirm():
+            self.send_heartbeat()  # the cycle that requests it needs a recent one
             self._control.program_id = identity
         else:
             self._control.program_id = -identity
 
     def stop(self) -> None:
-        """Ask for a stop on the path and for the end of open mode."""
+        """Request a stop on the path and the end of open mode."""
         self._control.stop_count += 1
 
     def override(self, fraction: float) -> None:
-        """Ask the motion going on for another fraction of its speed.
-
-        Where it cannot, `OverrideRefused` is among the events.
-        """
+        """Change the speed of the present motion; `OverrideRefused` if it cannot be changed."""
         self._control.override = fraction
         self._control.override_count += 1
 
     def hold(self) -> None:
-        """Ask the motion going on to rest on its path until `resume`; one that cannot is stopped.
+        """Hold the present motion on its path until `resume`; one that cannot be held is stopped.
 
-        One that has not begun begins at rest; where there is none, `HoldRefused` is among the
-        events, and one handed over later begins as usual.
+        A motion that has not begun begins at rest. Without a motion there is a `HoldRefused` event.
         """
         self._hold(1)
 
     def resume(self) -> None:
-        """Ask it to go on; where it cannot, `ResumeRefused` is among the events."""
+        """Resume the motion held; `ResumeRefused` if that is impossible."""
         self._hold(0)
 
     def _hold(self, held: int) -> None:
@@ -242,16 +229,16 @@ class ExchangeProcess:
         self._control.hold_count += 1
 
     def finish(self) -> None:
-        """Ask it to leave open mode and to end when the axes have been closed for a second."""
+        """Request the end of open mode, and of the process when the axes were closed for 1 s."""
         self._control.finish = 1
 
     def events(self) -> list[ExchangeEvent]:
-        """What happened since the last call, in order."""
+        """Return the events since the last call, in order."""
         return self._events.drain()
 
     def status(self) -> ControlBlock:
-        """Where it stands: what the control block says at this moment."""
-        return self._control.copied()
+        """Return a copy of the control block."""
+        return ControlBlock.from_buffer_copy(self._control)
 
     @property
     def alive(self) -> bool:
@@ -260,34 +247,34 @@ class ExchangeProcess:
 
     @property
     def log(self) -> str:
-        """What it wrote to its standard error: nothing, unless something is wrong."""
+        """Its standard error; empty unless something failed."""
         size = os.fstat(self._log_fd).st_size
         return os.pread(self._log_fd, size, 0).decode(errors="replace")
 
     def wait(self, timeout: float) -> int | None:
-        """Its exit status, or None if it still runs after `timeout` s; gives signs of life."""
+        """Return its exit status, None if it still runs after `timeout` s; sends heartbeats."""
         end = time.monotonic() + timeout
         while True:
             self.send_heartbeat()
             left = end - time.monotonic()
             try:
-                return self._process.wait(max(0.0, min(left, _BEAT)))
+                return self._process.wait(max(0.0, min(left, _POLL)))
             except subprocess.TimeoutExpired:
-                if left <= _BEAT:
+                if left <= _POLL:
                     return None
 
     def terminate(self) -> None:
-        """Ask for a stop on the path and for the end of the process, by signal."""
+        """Request a stop on the path and the end of the process, by signal."""
         if self.alive:
             self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """End it at once: an arm in motion is left to the controller's own watch."""
+        """Kill it: the controller's own monitoring has to stop an arm in motion."""
         self._process.kill()
         self._process.wait()
 
     def close(self) -> None:
-        """Give up this end, and the memory; a process that still runs stops the arm and ends."""
+        """Close socket and memory; a process that still runs stops the arm and ends."""
         self._channel.close()
         for name in ("ring_fd", "packets_fd", "event_fd", "control_fd", "_log_fd"):
             fd, closed = getattr(self, name), -1
@@ -295,32 +282,34 @@ class ExchangeProcess:
                 os.close(fd)
                 setattr(self, name, closed)
 
-    def _answer_to(self, identity: int, meanwhile: Callable[[], None] = _nothing) -> Any:
-        """What is said of this program next; the answer to one given up may still come before."""
+    def _answer_to(self, identity: int, poll: Callable[[], None] = lambda: None) -> Any:
+        """Receive the next message about this motion; those about earlier ones are dropped."""
         while True:
-            answered, reply = self._answer(ANSWER_TIMEOUT, meanwhile)
+            answered, reply = self._receive(ANSWER_TIMEOUT, poll)
             if answered == identity:
                 return reply
 
-    def _answer(self, timeout: float, meanwhile: Callable[[], None] = _nothing) -> Any:
-        """The next message of the exchange; `meanwhile` is called ten times a second."""
+    def _receive(self, timeout: float, poll: Callable[[], None] = lambda: None) -> Any:
+        """Receive the next message of the exchange; `poll` is called ten times a second."""
         end = time.monotonic() + timeout
-        self._channel.settimeout(_BEAT)
+        self._channel.settimeout(_POLL)
         while True:
             self.send_heartbeat()
             try:
                 message = self._channel.recv(LONGEST_MESSAGE)
             except TimeoutError:
                 if time.monotonic() < end:
-                    meanwhile()
+                    poll()
                     continue
-                raise ExchangeError(f"the exchange process was silent for {timeout:g} s") from None
+                raise ExchangeError(
+                    f"the exchange process did not answer within {timeout:g} s"
+                ) from None
             except OSError:
                 message = b""
             if not message:
                 status = self._process.wait()
-                words = self.log.strip() or "it said nothing"
-                raise ExchangeError(f"the exchange process ended with status {status}: {words}")
+                output = self.log.strip() or "no error output"
+                raise ExchangeError(f"the exchange process ended with status {status}: {output}")
             return pickle.loads(message)
 
 
@@ -330,9 +319,9 @@ _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def _spawn(fds: Sequence[int], log: int) -> subprocess.Popen[bytes]:
     environment = {
         **os.environ,
-        # What this process can import, that one can: programs are made of classes.
+        # The same import path: motions are objects of imported classes.
         "PYTHONPATH": os.pathsep.join(path or str(Path.cwd()) for path in sys.path),
-        # A pool of threads would be locked into memory and never used.
+        # Thread pools would be locked into memory and never used.
         **dict.fromkeys(_THREADS, "1"),
     }
     return subprocess.Popen(

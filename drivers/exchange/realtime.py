@@ -1,4 +1,4 @@
-"""What the operating system can do for a process that has to answer within a millisecond."""
+"""Real-time settings of a process: scheduling, locked memory, idle states, garbage collection."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from pathlib import Path
 from typing import Final
 
 CPU_LATENCY: Final = Path("/dev/cpu_dma_latency")
-"""Holding this file open at 0 keeps the processors out of their slow idle states."""
+"""Open with value 0 it excludes the slow idle states of the processors."""
 LIMITS_FILE: Final = "/etc/security/limits.d/90-hil.conf"
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _HEAP: Final = 32 << 20
-"""Bytes of heap asked for, and so locked, before the cycle begins."""
-_held: list[int] = []
+"""Bytes of heap allocated, and so locked, before the first cycle."""
+_open_files: list[int] = []
 
 
 @dataclass(frozen=True)
 class RealTimeSettings:
-    """What to ask for; each refusal is reported and none is fatal.
+    """Requested settings; a refusal is reported and never fatal.
 
     Attributes:
-        priority: of SCHED_FIFO, 1..99; 0 stays with ordinary scheduling.
-        cpu: the only processor to run on; None leaves it to the system.
-        lock_memory: keep every page in memory.
-        hold_cpu_awake: hold `/dev/cpu_dma_latency` at 0 for as long as the process lives.
+        priority: of SCHED_FIFO, 1..99; 0 for ordinary scheduling.
+        cpu: the only processor to run on; None for all.
+        lock_memory: lock all pages in memory.
+        hold_cpu_awake: hold `/dev/cpu_dma_latency` at 0 until the process ends.
     """
 
     priority: int = 50
@@ -40,12 +40,12 @@ class RealTimeSettings:
 
 @dataclass(frozen=True)
 class RealTimeReport:
-    """What was granted.
+    """Settings granted by the system.
 
     Attributes:
-        scheduling: in words.
-        memory_locked: whether every page, also of memory asked for later, stays in memory.
-        cpu_awake: whether the processors are held out of slow idle states.
+        scheduling: "SCHED_FIFO" with its priority, or "ordinary".
+        memory_locked: whether all pages, also of later allocations, are locked in memory.
+        cpu_awake: whether slow idle states of the processors are excluded.
         refused: one sentence per refusal, with its remedy.
     """
 
@@ -56,10 +56,9 @@ class RealTimeReport:
 
 
 def enter(settings: RealTimeSettings) -> RealTimeReport:
-    """Make this process as punctual as the system lets it be.
+    """Apply the settings to this process, and switch the garbage collector off.
 
-    Also freezes what exists so far for the garbage collector and switches it off: from here on
-    the process must not make reference cycles.
+    From here on the process must not create reference cycles.
     """
     refused: list[str] = []
     gc.collect()
@@ -75,7 +74,7 @@ def enter(settings: RealTimeSettings) -> RealTimeReport:
 def _schedule(priority: int, refused: list[str]) -> str:
     if priority > 0:
         try:
-            # A program started from here must not inherit the class.
+            # Child processes must not inherit the class.
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
         except (OSError, ValueError) as error:
@@ -99,10 +98,10 @@ def _lock_memory(refused: list[str]) -> bool:
     if soft != hard:
         resource.setrlimit(resource.RLIMIT_MEMLOCK, (hard, hard))
     libc = ctypes.CDLL(None, use_errno=True)
-    # Memory given back to the system would have to be asked for, page by page, in some cycle.
+    # Memory returned to the system would cost page faults in later cycles.
     libc.mallopt(_M_TRIM_THRESHOLD, -1)
     libc.mallopt(_M_MMAP_MAX, 0)
-    # Under a finite limit a locked future would make some later allocation fail, at any moment.
+    # With a finite limit MCL_FUTURE would make a later allocation fail.
     finite = hard != resource.RLIM_INFINITY and not privileged
     flags = _MCL_CURRENT if finite else _MCL_CURRENT | _MCL_FUTURE
     if libc.mlockall(flags) != 0:
@@ -126,7 +125,7 @@ def _hold_cpu_awake(refused: list[str]) -> bool:
             'rule \'KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"\''
         )
         return False
-    _held.append(fd)  # closing it would end the request
+    _open_files.append(fd)  # closing it would end the request
     return True
 
 

@@ -1,4 +1,4 @@
-"""What the exchange process does between two packets: orders in, state and events out."""
+"""What the exchange process does between two packets: run commands, publish state and events."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pickle
 import socket
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,11 +16,11 @@ import numpy as np
 from drivers.errors import DriverError, RequestError
 from drivers.events import AnswersLost, Event, GapSeen, LinkLost, MotionEnded, PacketRejected
 from drivers.exchange.control import (
-    PATIENCE,
-    STALE,
+    HEARTBEAT_TIMEOUT,
+    IDLE_HEARTBEAT_TIMEOUT,
+    OUTCOMES,
     ArchiveState,
     ControlBlock,
-    Ended,
     HeartbeatMonitor,
     bin_of,
 )
@@ -34,7 +35,7 @@ from drivers.exchange.event_log import (
     ResumeRefused,
 )
 from drivers.exchange.loop import POLL
-from drivers.exchange.motion_transfer import WITHDRAWN, Inbox, unpack
+from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
 from drivers.motion_source import MotionSource, progress_of
 from drivers.packets import InitPacket
 from drivers.record import MEASURED, CycleRing
@@ -42,94 +43,95 @@ from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
 
-EVERY: Final = 0.1
-"""s between two events of the same sort."""
-_Mergeable = PacketRejected | GapSeen | AnswersLost
-
-
-class Digest:
-    """Lets one rejection of each kind, one gap and one loss of answers through each 0.1 s.
-
-    Those that follow sooner are added up; their sum, with the cycle of the last, comes when the
-    time is over. Everything else passes at once. Before the end of a motion or of the link comes
-    what was held back till then.
-    """
-
-    def __init__(self) -> None:
-        self._held: dict[str, _Mergeable] = {}
-        self._quiet_until: dict[str, float] = {}
-
-    def take(self, events: Iterable[Event], now: float) -> list[Event]:
-        """What is to be reported at this moment, in order."""
-        released: list[Event] = []
-        for event in events:
-            if isinstance(event, PacketRejected | GapSeen | AnswersLost):
-                sort = _sort(event)
-                held = self._held.get(sort)
-                self._held[sort] = event if held is None else _sum(held, event)
-                self._release(sort, now, released)
-            else:
-                if isinstance(event, MotionEnded | LinkLost):
-                    released += self.rest()
-                released.append(event)
-        for sort in tuple(self._held):
-            self._release(sort, now, released)
-        return released
-
-    def rest(self) -> list[Event]:
-        """All that is held back."""
-        held: list[Event] = list(self._held.values())
-        self._held.clear()
-        return held
-
-    def _release(self, sort: str, now: float, released: list[Event]) -> None:
-        if now >= self._quiet_until.get(sort, -math.inf):
-            released.append(self._held.pop(sort))
-            self._quiet_until[sort] = now + EVERY
-
-
-def _sort(event: _Mergeable) -> str:
-    return f"rejected: {event.kind}" if isinstance(event, PacketRejected) else type(event).__name__
-
-
-def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
-    """Of two of the same sort."""
-    if isinstance(earlier, PacketRejected) and isinstance(later, PacketRejected):
-        return PacketRejected(later.kind, earlier.count + later.count, later.reason)
-    if isinstance(earlier, GapSeen) and isinstance(later, GapSeen):
-        return GapSeen(earlier.missed + later.missed, later.cycle)
-    assert isinstance(earlier, AnswersLost) and isinstance(later, AnswersLost)
-    return AnswersLost(earlier.count + later.count, later.cycle)
-
-
-STOPPED: Final = "the supervisor asked for a stop"
-ORPHAN_LINGER: Final = 2.0
-"""s that packets are answered, after the axes were closed, for nobody."""
+EVENT_PERIOD: Final = 0.1
+"""Shortest time between two events of one sort, s."""
+DETACHED_LINGER: Final = 2.0
+"""Time that packets are answered after the axes closed, without a supervisor, s."""
 FINISH_LINGER: Final = 1.0
-"""s that packets are answered, after the axes were closed, when the supervisor wants to end."""
+"""The same when the supervisor requested the end, s; without packets for so long, open axes are
+assumed to have closed."""
+MAX_LINGER: Final = 10.0
+"""Time after the axes closed first from which on axes that open again do not delay the end, s."""
 ARM_MOVED: Final = 5e-4
-"""rad; more than an encoder's noise, less than any motion makes in `ARM_RESTS`."""
+"""Change of a joint position that counts as motion of the arm, rad."""
 ARM_RESTS: Final = 1.0
-"""s without motion after which an arm is assumed to be at rest."""
-_POSITION: Final = MEASURED.index("position")
+"""Time without motion after which the arm is at rest, s."""
 _SLOW_EVERY: Final = 32
-"""Packets between two looks at what need not be looked at in each cycle."""
-LONGEST_LINGER: Final = 10.0
-"""s after the axes were closed first, from which on a controller that opens them again and again
-does not put off the end any more."""
+"""Packets between two updates of what need not be updated in each cycle."""
+_POSITION: Final = MEASURED.index("position")
 _MAY_BE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
+_COUNTERS: Final = ("answered", "missed", "duplicates", "stale", "unanswered", "refused")
+"""Counters of a session with their own field in the control block."""
+STOPPED: Final = "the supervisor requested a stop"
+_Mergeable = PacketRejected | GapSeen | AnswersLost
+
+
+class EventLimiter:
+    """Limits rejections of each kind, gaps and lost replies to one event per `EVENT_PERIOD`.
+
+    Those in between are summed up; the sum, with the cycle of the last, follows at the end of the
+    period, and before the end of a motion or of the link. Other events pass at once.
+    """
+
+    def __init__(self) -> None:
+        self._pending: dict[str, _Mergeable] = {}
+        self._next_at: dict[str, float] = {}
+
+    def filter(self, events: Iterable[Event], now: float) -> list[Event]:
+        """Return the events to be reported at this moment, in order."""
+        released: list[Event] = []
+        for event in events:
+            if isinstance(event, PacketRejected | GapSeen | AnswersLost):
+                sort = type(event).__name__
+                if isinstance(event, PacketRejected):
+                    sort += event.kind
+                pending = self._pending.get(sort)
+                self._pending[sort] = event if pending is None else _sum(pending, event)
+                self._release(sort, now, released)
+            else:
+                if isinstance(event, MotionEnded | LinkLost):
+                    released += self.flush()
+                released.append(event)
+        for sort in tuple(self._pending):
+            self._release(sort, now, released)
+        return released
+
+    def flush(self) -> list[Event]:
+        """Return all pending sums."""
+        pending: list[Event] = list(self._pending.values())
+        self._pending.clear()
+        return pending
+
+    def _release(self, sort: str, now: float, released: list[Event]) -> None:
+        if now >= self._next_at.get(sort, -math.inf):
+            released.append(self._pending.pop(sort))
+            self._next_at[sort] = now + EVENT_PERIOD
+
+
+def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
+    """Return the sum of two events of one sort."""
+    if isinstance(earlier, GapSeen):
+        assert isinstance(later, GapSeen)
+        return GapSeen(earlier.missed + later.missed, later.cycle)
+    assert not isinstance(later, GapSeen)
+    return replace(later, count=earlier.count + later.count)
 
 
 class ControlServer:
-    """The `until` of `exchange` in a process of its own; called after each answer.
+    """The end condition of `exchange` in its own process; called after each reply.
+
+    Runs the commands of the supervisor and publishes state and events.
 
     Args:
+        session, transport, ring, events, control: of this process.
+        channel: socket to the supervisor.
         terminated: whether the process was asked to end: stop on the path, leave open mode, end.
+        needs_archive: whether motions are stopped and refused while the archive is not written.
 
     Attributes:
-        reason: why it ended or is about to, in words.
+        reason: why the process ends or is about to; empty otherwise.
     """
 
     def __init__(
@@ -158,55 +160,55 @@ class ControlServer:
         self._overrides = control.override_count
         self._holds = control.hold_count
         self._stops = control.stop_count
-        self._linger = ORPHAN_LINGER
+        self._linger = DETACHED_LINGER
         self._calls = 0
         self._answered = 0
-        self._heard = began = time.monotonic()
-        # Of time in which the whole machine stood still nothing is to be concluded.
+        self._answered_at = began = time.monotonic()
+        # Time in which the whole computer stood still must not count as silence.
         self._supervisor = HeartbeatMonitor(
             lambda: control.supervisor_heartbeat or began, max_interval=POLL
         )
         self._archive = HeartbeatMonitor(lambda: control.archive_heartbeat, max_interval=POLL)
-        self._archive_silent = 0.0
+        self._archive_silence = 0.0
         self._closed_since = math.inf
         self._closed_first = math.inf
         self._open = False
-        self._orphaned = False
+        self._detached = False
         self._arm = ring.measured[0, _POSITION].copy()
         self._arm_moved_at = -math.inf
-        self._digest = Digest()
+        self._limiter = EventLimiter()
         self._offered: MotionSource | None = None
         self._offered_to: InitPacket | None = None
         self._source: object = None
 
     def __call__(self) -> bool:
-        """Whether the exchange is to end."""
+        """Whether the exchange has to end."""
         now = time.monotonic()
-        self._measure()
-        self._orders(now)
-        self._report(now)
-        return bool(self.reason) and self._over(now)
+        self._measure_latency()
+        self._run_commands(now)
+        self._publish(now)
+        return bool(self.reason) and self._may_end(now)
 
-    def say(self, event: ExchangeEvent) -> None:
-        """Put something into the event log."""
+    def log(self, event: ExchangeEvent) -> None:
+        """Write an event to the event log."""
         self._events.write(event)
 
-    def _measure(self) -> None:
-        """How long the packet just answered took, from `now` of its record to this moment."""
+    def _measure_latency(self) -> None:
+        """Count the time from the arrival of the packet just answered to this moment."""
         rows = self._ring.written
         if rows == self._rows:
             return
         self._rows = rows
         arrival = float(self._ring.arrival[(rows - 1) % self._ring.capacity])
-        took = self._transport.now - arrival
-        self._worst = max(self._worst, took)
-        self._control.latencies[bin_of(took)] += 1
+        latency = self._transport.now - arrival
+        self._worst = max(self._worst, latency)
+        self._control.latencies[bin_of(latency)] += 1
 
-    def _orders(self, now: float) -> None:
+    def _run_commands(self, now: float) -> None:
         control, session = self._control, self._session
         self._calls += 1
-        self._archive_silent = self._archive.silence()
-        if self._calls % _SLOW_EVERY == 0 and self._inbox.hung_up():
+        self._archive_silence = self._archive.silence()
+        if self._calls % _SLOW_EVERY == 0 and self._inbox.closed():
             self._detach("the supervisor closed its end")
         if control.stop_count != self._stops:
             self._stops = control.stop_count
@@ -219,42 +221,42 @@ class ControlServer:
         if control.hold_count != self._holds:
             self._holds = control.hold_count
             self._change_hold(bool(control.held))
-        # In a later call than it was read, so that a stop in between is seen first.
+        # Not in the call that read it, so that a stop in between comes first.
         if self._offered is not None:
-            self._take_program(self._offered)
+            self._request(self._offered)
         if control.program_offered != self._inbox.identity:
-            self._read_program(now)
+            self._read_motion(now)
         if session.requested and self._needs_archive:
-            trouble = self._archive_trouble()
-            if trouble:
-                session.stop(trouble)
-        self._reasons_to_leave()
+            fault = self._archive_fault()
+            if fault:
+                session.stop(fault)
+        self._check_supervisor()
         if self.reason:
             session.stop(self.reason)
 
-    def _reasons_to_leave(self) -> None:
-        # Read after `program_id`, which the supervisor writes after a beat: this is never older.
-        silent = self._supervisor.silence()
+    def _check_supervisor(self) -> None:
+        # Read after `program_id`, which the supervisor writes after a heartbeat.
+        silence = self._supervisor.silence()
         if self._terminated():
-            self._leave("the exchange process was asked to terminate", ORPHAN_LINGER)
-        elif silent > (STALE if self._session.requested else PATIENCE):
+            self._leave("the exchange process was asked to terminate", DETACHED_LINGER)
+        elif silence > (HEARTBEAT_TIMEOUT if self._session.requested else IDLE_HEARTBEAT_TIMEOUT):
             self._detach(NO_SUPERVISOR)
         elif self._control.finish:
-            self._leave("the supervisor wants to end", FINISH_LINGER)
+            self._leave("the supervisor requested the end", FINISH_LINGER)
 
     def _detach(self, reason: str) -> None:
-        self._orphaned = True
-        self._leave(reason, ORPHAN_LINGER)
+        self._detached = True
+        self._leave(reason, DETACHED_LINGER)
 
     def _leave(self, reason: str, linger: float) -> None:
         if not self.reason:
             self.reason, self._linger = reason, linger
-            self.say(Leaving(reason))
+            self.log(Leaving(reason))
 
-    def _archive_trouble(self) -> str:
+    def _archive_fault(self) -> str:
         if self._control.archive_state != ArchiveState.READY:
             return "the archive cannot be written"
-        if not self._control.archive_heartbeat or self._archive_silent > STALE:
+        if not self._control.archive_heartbeat or self._archive_silence > HEARTBEAT_TIMEOUT:
             return NO_ARCHIVE
         return ""
 
@@ -262,7 +264,7 @@ class ControlServer:
         try:
             self._session.override(fraction)
         except DriverError as error:
-            self.say(OverrideRefused(fraction, str(error)))
+            self.log(OverrideRefused(fraction, str(error)))
 
     def _change_hold(self, held: bool) -> None:
         try:
@@ -271,13 +273,13 @@ class ControlServer:
             else:
                 self._session.resume()
         except DriverError as error:
-            self.say((HoldRefused if held else ResumeRefused)(str(error)))
+            self.log((HoldRefused if held else ResumeRefused)(str(error)))
 
-    def _read_program(self, now: float) -> None:
-        """Read the program that was handed over. That takes time, in which it may be withdrawn."""
-        fd = self._inbox.take()
+    def _read_motion(self, now: float) -> None:
+        """Read the motion that was handed over; it may be withdrawn meanwhile."""
+        fd = self._inbox.receive()
         if fd is None:
-            return  # it is still on the way
+            return  # it has not arrived yet
         self._offered = None
         try:
             if self._withdrawn(self._inbox.identity):
@@ -286,23 +288,23 @@ class ControlServer:
             self._offered_to = self._session.init
         except RequestError as error:
             self._answer(error)
-        except Exception as error:  # whatever the classes of a foreign program raise
-            self._answer(RequestError(self._state, f"the program cannot be read: {error!r}"))
+        except Exception as error:  # raised by classes of the motion
+            self._answer(RequestError(self._state, f"the motion cannot be read: {error!r}"))
         else:
-            self._inbox.read()
+            self._inbox.answer(READ)
         finally:
             os.close(fd)
         self._control.pickup_us = 1e6 * (time.monotonic() - now)
 
-    def _take_program(self, source: MotionSource) -> None:
-        """Request the program that was read, once it may begin, and say what became of it."""
+    def _request(self, source: MotionSource) -> None:
+        """Request the motion that was read, once it may begin, and report the outcome."""
         control, identity = self._control, self._inbox.identity
         try:
             if self._withdrawn(identity):
                 raise RequestError(self._state, WITHDRAWN)
             if control.program_id != identity:
-                return  # the supervisor has not said yet
-            self._require_time_for_motions()
+                return  # not permitted yet
+            self._check_ready()
             self._session.request(source)
             self._source = source
             control.motion_time, control.rate = progress_of(source)
@@ -315,22 +317,22 @@ class ControlServer:
         control = self._control
         return control.program_id == -identity or control.program_offered != identity
 
-    def _require_time_for_motions(self) -> None:
-        """Raise RequestError if no motion may begin now, whatever the session says."""
-        trouble = self.reason
-        if not trouble and self._needs_archive:
-            trouble = self._archive_trouble()
-        if not trouble and self._session.init is not self._offered_to:
-            trouble = "the controller began a new session since this motion was handed over"
-        if trouble:
-            raise RequestError(self._state, trouble)
+    def _check_ready(self) -> None:
+        """Raise RequestError if no motion may begin for a reason outside the session."""
+        fault = self.reason
+        if not fault and self._needs_archive:
+            fault = self._archive_fault()
+        if not fault and self._session.init is not self._offered_to:
+            fault = "the controller began a new session since this motion was handed over"
+        if fault:
+            raise RequestError(self._state, fault)
 
     @property
     def _state(self) -> str:
         return self._session.state.name.lower()
 
     def _answer(self, refusal: RequestError | None) -> None:
-        """Say what became of the program taken last."""
+        """Report whether the motion received last was accepted."""
         self._offered = None
         if refusal is None:
             self._control.program_accepted = self._inbox.identity
@@ -338,21 +340,21 @@ class ControlServer:
             self._control.program_refused = self._inbox.identity
         self._inbox.answer(refusal)
 
-    def _report(self, now: float) -> None:
+    def _publish(self, now: float) -> None:
         control, session = self._control, self._session
         control.exchange_heartbeat = now
-        for event in self._digest.take(session.events(), now):
-            self._put(event)
+        for event in self._limiter.filter(session.events(), now):
+            self._log_event(event)
         control.state = session.state
         control.cycle = int(self._ring.cycle[(self._rows - 1) % self._ring.capacity])
         control.interval = session.interval
         if self._calls % _SLOW_EVERY == 0 or session.counters.answered == self._answered:
-            self._report_counters()
+            self._publish_counters()
             self._watch_arm(now)
         if session.counters.answered != self._answered:
             self._answered = session.counters.answered
-            self._heard = now
-        self._open = session.state in _MAY_BE_OPEN and now - self._heard < FINISH_LINGER
+            self._answered_at = now
+        self._open = session.state in _MAY_BE_OPEN and now - self._answered_at < FINISH_LINGER
         if self._open:
             self._closed_since = math.inf
         else:
@@ -361,58 +363,54 @@ class ControlServer:
                 self._closed_first = min(self._closed_first, now)
 
     def _watch_arm(self, now: float) -> None:
-        """With its axes closed the arm may still move, by the controller's own program."""
+        """Record motion of the arm: with closed axes the controller's own program may move it."""
         position = self._ring.measured[(self._rows - 1) % self._ring.capacity, _POSITION]
         if (np.abs(position - self._arm) > ARM_MOVED).any():
             self._arm_moved_at = now
             np.copyto(self._arm, position)
 
-    def _put(self, event: Event) -> None:
+    def _log_event(self, event: Event) -> None:
         self._events.write(event)
         if isinstance(event, MotionEnded):
-            # The count comes last: who sees it can read the others.
-            self._control.ended_outcome = Ended[event.outcome.upper()]
+            # The count comes last: it makes the others valid.
+            self._control.ended_outcome = OUTCOMES.index(event.outcome)
             self._control.ended_interval = event.interval
             self._control.ended_count += 1
 
-    def _report_counters(self) -> None:
+    def _publish_counters(self) -> None:
         control, counters = self._control, self._session.counters
         discarded = counters.discarded
+        for name in _COUNTERS:
+            setattr(control, name, getattr(counters, name))
         control.overflow = self._ring.overflow
-        control.answered = counters.answered
-        control.missed = counters.missed
-        control.duplicates = counters.duplicates
-        control.stale = counters.stale
         control.malformed = counters.malformed + discarded.get("malformed", 0)
         control.foreign = discarded.get("foreign", 0)
         control.answered_late = discarded.get("answered late", 0)
         control.late = discarded.get("late", 0) + control.answered_late
-        control.unanswered = counters.unanswered
-        control.refused = counters.refused
         control.worst_turnaround_us = 1e6 * self._worst
         control.motion_time, control.rate = progress_of(self._source)
 
-    def _over(self, now: float) -> bool:
-        """Whether nobody needs answers any more, once there is a reason to end.
+    def _may_end(self, now: float) -> bool:
+        """Whether replies are no longer needed, once there is a reason to end.
 
-        Without a supervisor it answers as long as the arm moves, whoever moves it, without limit:
-        nobody is left to see what the controller does when answers end.
+        Without a supervisor packets are answered as long as the arm moves, without limit: nobody
+        could react to what the controller does without replies.
         """
-        if self._open or (self._orphaned and now - self._arm_moved_at < ARM_RESTS):
+        if self._open or (self._detached and now - self._arm_moved_at < ARM_RESTS):
             return False
         lingered = now - self._closed_since >= self._linger
-        return lingered or now - self._closed_first >= LONGEST_LINGER
+        return lingered or now - self._closed_first >= MAX_LINGER
 
     def conclude(self) -> None:
-        """Put out what happened last."""
-        self._report(time.monotonic())
-        for event in self._digest.rest():
-            self._put(event)
-        self._report_counters()
+        """Publish what is pending."""
+        self._publish(time.monotonic())
+        for event in self._limiter.flush():
+            self._log_event(event)
+        self._publish_counters()
 
 
 def portable(error: BaseException) -> bytes:
-    """An error as bytes that another process can read, whatever it holds."""
+    """Return a pickle of the error, or of a `DriverError` with its text if it has none."""
     try:
         body = pickle.dumps(error)
         pickle.loads(body)

@@ -24,8 +24,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.events import InitReceived, Outcome
-from drivers.exchange.control import ArchiveState, ControlBlock, Ended, HeartbeatMonitor
+from drivers.events import InitReceived
+from drivers.exchange.control import ArchiveState, ControlBlock, HeartbeatMonitor
 from drivers.exchange.event_log import EventReader, ExchangeEvent
 from drivers.record import PACKET_DTYPE, PacketReader, RingReader
 from hil.archive.live import LivePublisher, Serve
@@ -293,8 +293,7 @@ class ArchiveProcess:
             job.recorder.record(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
                 # The motion has ended, and the event that says so was overwritten.
-                outcome = _OUTCOMES[Ended(self._control.ended_outcome)]
-                job.recorder.motion_ended(outcome, self._control.ended_interval)
+                job.recorder.motion_ended(self._control.outcome, self._control.ended_interval)
             if len(records):
                 job.heard, job.flushed = now, False
             elif not job.flushed and now - job.heard > SILENCE:
@@ -409,15 +408,6 @@ class ArchiveProcess:
     def _exchange_gone(self) -> bool:
         gone = self._control.finished or select.select([self._exchange], [], [], 0.0)[0]
         return bool(gone)
-
-
-_OUTCOMES: dict[Ended, Outcome] = {
-    Ended.NONE: "lost",
-    Ended.COMPLETED: "completed",
-    Ended.STOPPED: "stopped",
-    Ended.REFUSED: "refused",
-    Ended.LOST: "lost",
-}
 
 
 def main() -> None:

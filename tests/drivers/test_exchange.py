@@ -20,7 +20,7 @@ from drivers import (
     TransportClosed,
     exchange,
 )
-from drivers.exchange.loop import MOST_KINDS
+from drivers.exchange.loop import MAX_KINDS
 from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, moving, smooth_move
 
 
@@ -310,7 +310,7 @@ class TestHeldUp:
         session = Mute()
         link = Piled([packets])
         exchange(link, session, until=lambda: False)
-        assert len(link.sent) <= MOST_KINDS
+        assert len(link.sent) <= MAX_KINDS
         if packets:
             assert link.sent[-1] == packets[-1]
         assert len(link.sent) + session.counted.get("late", 0) == len(packets)
@@ -478,7 +478,7 @@ class TestLateness:
         link, session = self.run([cost] * 50, stamped=stamped)
         assert session.counted["answered late"] >= 49
         if stamped:
-            assert session.stops[0] == "3 answers in a row left too late"
+            assert session.stops[0] == "3 consecutive replies left too late"
         else:
             assert session.stops == [], "when a packet arrived was only guessed"
         # And the answers do not fall behind: each is to what came within the last cycle.

@@ -262,7 +262,7 @@ def test_a_whole_motion_is_run_recorded_and_told():
         events = run_to_the_end(exchange, controller)
         assert exchange.wait(30.0) == 0
         assert exchange.status().finished
-        assert the(ExchangeEnded, events).reason == "the supervisor wants to end"
+        assert the(ExchangeEnded, events).reason == "the supervisor requested the end"
         assert exchange.log == ""
 
 
@@ -318,7 +318,7 @@ class TestRefusedPrograms:
                 exchange.submit(still(10))
             control = ControlBlock(exchange.control_fd)
             control.archive_state = ArchiveState.READY
-            with pytest.raises(RequestError, match="archive process gives no sign of life"):
+            with pytest.raises(RequestError, match="archive process sends no heartbeat"):
                 exchange.submit(still(10))
 
             def wanted():
@@ -331,7 +331,7 @@ class TestRefusedPrograms:
         with running() as (exchange, controller):
             exchange.finish()
             controller.cycle(5)
-            with pytest.raises(RequestError, match="the supervisor wants to end"):
+            with pytest.raises(RequestError, match="the supervisor requested the end"):
                 exchange.submit(still(10))
 
 
@@ -340,7 +340,7 @@ def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
         os.kill(exchange.pid, signal.SIGSTOP)
         with monkeypatch.context() as impatient:
             impatient.setattr(process, "ANSWER_TIMEOUT", 0.3)
-            with pytest.raises(ExchangeError, match=r"silent for 0\.3 s"):
+            with pytest.raises(ExchangeError, match=r"not answer within 0\.3 s"):
                 exchange.submit(smooth_move(MOVE, 300))
         os.kill(exchange.pid, signal.SIGCONT)
         controller.open = True
@@ -380,7 +380,7 @@ class TestBetweenReadingAndBeginning:
     def test_a_stop(self):
         with running() as (exchange, controller):
             controller.open = True
-            with pytest.raises(RequestError, match="asked for a stop"):
+            with pytest.raises(RequestError, match="requested a stop"):
                 exchange.submit(Cruise(), lambda: exchange.stop() is None)
             self.assert_nothing_moves(controller)
 
@@ -481,7 +481,7 @@ class TestHeldUp:
                 events = exchange.events()
                 ended = [event for event in events if isinstance(event, MotionEnded)]
             assert ended[0].outcome == "stopped"
-            assert "answers in a row left too late" in ended[0].reason
+            assert "consecutive replies left too late" in ended[0].reason
             assert exchange.status().worst_turnaround_us > 1e6 * Slow.COST
 
 
@@ -521,9 +521,9 @@ class TestStops:
     @pytest.mark.parametrize(
         ("ask", "reason", "ends"),
         [
-            (ExchangeProcess.stop, "the supervisor asked for a stop", False),
+            (ExchangeProcess.stop, "the supervisor requested a stop", False),
             (ExchangeProcess.terminate, "asked to terminate", True),
-            (ExchangeProcess.finish, "the supervisor wants to end", True),
+            (ExchangeProcess.finish, "the supervisor requested the end", True),
         ],
     )
     def test_asked_for(self, ask, reason, ends):
@@ -548,7 +548,7 @@ class TestStops:
             controller.cycle_time = PERIOD
             if end == "silent":
                 controller.beat = exchange.send_heartbeat
-                reason = "the archive process gives no sign of life"
+                reason = "the archive process sends no heartbeat"
             else:
                 control.archive_state = ArchiveState.FAILED
                 reason = "the archive cannot be written"
@@ -562,7 +562,7 @@ class TestStops:
             silent_from = time.monotonic()
             controller.until(lambda: not controller.open)
             assert time.monotonic() - silent_from > 0.4
-            self.stopped(exchange, controller, by="no sign of life", ends=True)
+            self.stopped(exchange, controller, by="no heartbeat", ends=True)
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
     def test_not_by_an_interrupt_or_a_hang_up(self, number):

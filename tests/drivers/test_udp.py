@@ -466,7 +466,7 @@ class TestSession:
     def test_one_that_began_a_start_and_did_not_go_on_does_not_keep_it_out(
         self, near, controller, another, session, monkeypatch
     ):
-        monkeypatch.setattr(loop, "FALLEN_SILENT", 0.2)
+        monkeypatch.setattr(loop, "PEER_TIMEOUT", 0.2)
         end = time.monotonic() + 5.0
         another.send(self.SYNC)
 

@@ -23,7 +23,7 @@ from drivers.drive_train import DriveTrain
 from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketRejected
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
-from drivers.exchange.control import ArchiveState, ControlBlock, Ended
+from drivers.exchange.control import OUTCOMES, ArchiveState, ControlBlock
 from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.record import CycleRing, PacketReader, PacketRing, RingReader, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
@@ -154,7 +154,7 @@ def test_an_end_whose_event_was_overwritten_is_known_from_the_count(rig: Rig) ->
     memory.cycles(20)
     memory.events.write(MotionStarted(4, 5))
     wait(lambda: open_archive(path).n_samples >= 0)
-    memory.control.ended_outcome, memory.control.ended_interval = Ended.STOPPED, 4
+    memory.control.ended_outcome, memory.control.ended_interval = OUTCOMES.index("stopped"), 4
     memory.control.ended_count += 1
     done = rig.closed(1)
     assert (done.outcome, done.interval) == ("stopped", 4)
