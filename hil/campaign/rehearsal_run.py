@@ -42,7 +42,7 @@ from hil.version import software
 from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
-from identification.validation.prediction import over_all, prediction_error
+from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures import ServoSettings, SimulatedDrive, SimulationError, UnmodelledEffects
 
 from .campaign import Campaign
@@ -321,7 +321,7 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
     far = [found.names[k] for k in np.argsort(-distance) if distance[k] > MOST_SIGMA]
     sigma, asked = float(distance.max()) if known else None, f"{MOST_SIGMA:g} standard deviations"
     ours, theirs = (
-        over_all(prediction_error(model, values, prepared.held_out)).rms
+        pooled_error(prediction_error(model, values, prepared.held_out)).rms
         for values in (found.values, twin.truth)
     )
     ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)

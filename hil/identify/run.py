@@ -213,7 +213,7 @@ def identify_archives(
             prepared.held_out,
             same_motion=sources.same_motion,
             nominal=None if nominal is None else nominal.values,
-            surroundings=surroundings_of(prepared, result.pooled),
+            context=surroundings_of(prepared, result.pooled),
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
         )

@@ -32,7 +32,7 @@ from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
 from identification.validation.prediction import (
     PredictionError,
-    over_all,
+    pooled_error,
     prediction_error,
 )
 from identification.validation.residuals import BLOCK, Profile
@@ -349,7 +349,7 @@ def _fitted(prepared: Prepared, values: Array) -> results.FittedResult:
 
     def error(samples: Sequence[Samples], *, all_rows: bool = True) -> PredictionError:
         model = prepared.sources.cell.model
-        return over_all(prediction_error(model, values, samples, all_rows=all_rows))
+        return pooled_error(prediction_error(model, values, samples, all_rows=all_rows))
 
     moving = error(prepared.training, all_rows=False)
     everywhere = error(prepared.training)
@@ -394,10 +394,10 @@ def _judgement(
         bins = one.bins
         return results.ProfileResult.rows(centre=one.centres, mean=bins.mean, std=bins.std)
 
-    checks, around, error = evidence.residuals, evidence.surroundings, evidence.held_out
+    checks, context, error = evidence.residuals, evidence.context, evidence.held_out
     assert checks is not None
-    colour, drift, inertia = checks.colour, checks.drift, around.controller_inertia
-    step = max(1, -(-len(colour.lag) // _LAGS))
+    correlation, drift, inertia = checks.autocorrelation, checks.drift, context.controller_inertia
+    step = max(1, -(-len(correlation.lag) // _LAGS))
     joints = results.JointJudgement.rows(
         joint=joint_names,
         unit=["N·m" if evidence.revolute(j) else "N" for j in range(len(joint_names))],
@@ -405,11 +405,11 @@ def _judgement(
         relative=error.relative,
         fitted_relative=evidence.training.relative,
         explained=error.explained,
-        limit=around.torque_limit,
+        limit=context.torque_limit,
         share_of_limit=evidence.share_of_limit,
         nominal_relative=None if evidence.nominal is None else evidence.nominal.relative,
-        controller_relative=None if around.controller is None else around.controller.relative,
-        nominal_scale=None if around.nominal_scale is None else around.nominal_scale.scale,
+        controller_relative=None if context.controller is None else context.controller.relative,
+        nominal_scale=None if context.nominal_scale is None else context.nominal_scale.scale,
         controller_inertia=None if inertia is None else inertia.ratio,
         controller_inertia_spread=None if inertia is None else inertia.spread,
     )
@@ -421,8 +421,8 @@ def _judgement(
         joints=joints,
         speed=profile(checks.speed),
         position=profile(checks.position),
-        lag=colour.lag[::step],
-        autocorrelation=colour.correlation[::step].T,
-        effective_rows=np.nan_to_num(colour.effective_rows),
+        lag=correlation.lag[::step],
+        autocorrelation=correlation.correlation[::step].T,
+        effective_rows=np.nan_to_num(correlation.effective_rows),
         friction_over_time=None if drift is None else drift.share.T,
     )

@@ -17,11 +17,11 @@ from identification.factor.factor import Estimate
 from identification.selection.inner_prediction import LOW_PASS
 from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
-from identification.validation.evidence import Surroundings
+from identification.validation.evidence import CellContext
 from identification.validation.finding import Finding, joined
 from identification.validation.nominal_scale import InertiaRatio, inertia_ratio, nominal_scale
 from identification.validation.position_jumps import position_jumps
-from identification.validation.prediction import PredictionError, over_all
+from identification.validation.prediction import PredictionError, pooled_error
 
 from .prepared import Prepared
 from .sources import Source
@@ -48,7 +48,7 @@ def controller_error(
             return None
         torque = cell.drive_train.joint_torque(current)
         errors.append(PredictionError.between(prepared.torque, torque, prepared.usable))
-    return over_all(errors) if errors else None
+    return pooled_error(errors) if errors else None
 
 
 def controller_inertia(
@@ -100,13 +100,13 @@ _MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
 _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
 
-def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
+def surroundings_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     """Collect the facts about the cell and the recordings that a verdict needs."""
     cell, sources = prepared.sources.cell, prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
     driven = cell.file.drive_train is not None
     saturated, nominal = prepared.masked.get(SATURATED), nominal_of(cell)
-    return Surroundings(
+    return CellContext(
         torque_limit=torque_limits(cell),
         saturated=None if saturated is None else saturated / max(prepared.rows, 1),
         motor_from_joint=cell.drive_train.motor_from_joint if driven else None,
@@ -126,7 +126,7 @@ def surroundings_of(prepared: Prepared, estimate: Estimate) -> Surroundings:
         ),
         delays=prepared.delays,
         assumed_delay=prepared.assumed_delay,
-        mended=(*_clock(prepared), *_torque_channel(prepared), *_resolution(prepared)),
+        corrections=(*_clock(prepared), *_torque_channel(prepared), *_resolution(prepared)),
     )
 
 

@@ -1,10 +1,10 @@
-r"""Whether intervals of predicted torque hold what is measured on motion that was not fitted.
+r"""Coverage of intervals of predicted torque on held-out motion.
 
-A half second's mean of the torque of joint j differs from its prediction with variance
-:math:`\bar w_j C \bar w_j^T + s_j^2`: mean row of the regressor, covariance C of the estimate, and
-the mean square s² of the same error where the fitted part is predicted by inner folds
-(:mod:`identification.selection.inner_prediction`), as residuals are coloured and hold the errors of
-the model. Rows at rest and at reversals count; nothing held out is read to make an interval.
+The mean torque of joint j over half a second differs from its prediction with variance :math:`\bar
+w_j C \bar w_j^T + s_j^2`: mean row of the regressor, covariance C of the estimate, and mean square
+s² of the same error between inner folds of the fitted part
+(:mod:`identification.selection.inner_prediction`), which includes coloured residuals and model
+errors. Rows at rest and at reversals are included.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_inde
 Array = NDArray[np.float64]
 
 Refit = Callable[[Factor], Array]
-"""An estimator: a factor to parameters (p,)."""
+"""Estimator: factor to parameters (p,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class TorqueMeans:
-    """Means of [W | y] over B blocks of time of `BLOCK` seconds, rows at rest included."""
+    """Means of [W | y] over B blocks of `BLOCK` seconds, rows at rest included."""
 
-    # (B, n, p + 1), last the torque; NaN where less than half of the block is known of the joint
+    # (B, n, p + 1), torque last; NaN where less than half of the block is known
     rows: Array
-    block: NDArray[np.intp]  # place of each block since the origin of its motion (B,)
-    count: NDArray[np.intp]  # samples that were averaged (B, n)
+    block: NDArray[np.intp]  # index since the origin of the motion (B,)
+    count: NDArray[np.intp]  # averaged samples (B, n)
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> TorqueMeans:
-        """Blocks of recordings one after the other."""
+        """Average recordings in blocks, one after the other."""
         n, p = model.n_joints, model.n_parameters
         empty = (
             np.zeros((0, n, p + 1)),
@@ -59,36 +59,35 @@ class TorqueMeans:
         return cls(*map(np.concatenate, zip(empty, *parts, strict=True)))
 
     def errors(self, values: Array) -> Array:
-        """Mean torque measured less predicted by parameters (p,), (B, n) [N·m or N]."""
+        """Return measured minus predicted mean torque of parameters (p,), (B, n) [N·m or N]."""
         return np.asarray(self.rows @ np.append(-values, 1.0))
 
     def variance(self, covariance: Array) -> Array:
-        """What a covariance of the parameters (p, p) does to the predicted means (B, n)."""
+        """Return the variance of predicted means (B, n) by a covariance of parameters (p, p)."""
         rows = self.rows[:, :, :-1]
         return np.asarray(((rows @ covariance) * rows).sum(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Held-out means of torque and their 95 % intervals, per joint (n,).
+    """Coverage of 95 % intervals by held-out mean torques, per joint (n,).
 
-    NaN stands for a joint without any, and for one whose intervals are not known: it moved in one
-    stretch of time only.
+    NaN for a joint without mean or interval.
     """
 
-    blocks: NDArray[np.intp]  # held-out means that were compared with their interval
-    inside: Array  # share of them that lie inside
+    blocks: NDArray[np.intp]  # number of held-out means
+    inside: Array  # share inside the interval
     half_width: Array  # median of half the interval [N·m or N]
-    white_inside: Array  # share inside the intervals that white residuals would have
+    white_inside: Array  # share inside the intervals of white residuals
 
     @property
     def overall(self) -> float:
-        """Share inside of all joints; NaN where no interval is known."""
+        """Share inside over all joints; NaN without intervals."""
         return self._pooled(self.inside)
 
     @property
     def white_overall(self) -> float:
-        """Share inside with white residuals, of the same means."""
+        """Share inside with white residuals."""
         return self._pooled(self.white_inside)
 
     def _pooled(self, shares: Array) -> float:
@@ -103,18 +102,17 @@ def calibrate(
     held_out: TorqueMeans,
     refit: Refit,
 ) -> Calibration:
-    """Compare held-out means of torque with 95 % intervals, made from `phase` and `fitted` means.
+    """Compare held-out mean torques with 95 % intervals from `phase` and `fitted` means.
 
-    A parameter that the data do not determine adds nothing to an interval.
+    Undetermined parameters are ignored.
 
     Raises:
-        IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks of the fitted motion,
-            or a fold cannot be fitted.
+        IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.
     """
     inner = inner_errors(phase, fitted, refit)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.nansum(inner**2, axis=0) / np.count_nonzero(~np.isnan(inner), axis=0))
-    # Repetitions of one motion share their blocks: an error that repeats is no new error.
+    # Repetitions share blocks: repeated errors are not independent.
     limit = float(student_limit(0.025, len(np.unique(fitted.block))))
     known = np.where(np.isfinite(estimate.covariance), estimate.covariance, 0.0)
     errors = np.abs(held_out.errors(estimate.values))
@@ -138,23 +136,22 @@ def calibrate(
 
 
 def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
-    """Errors of mean torques (B, n), each stretch of time predicted from the others.
+    """Return errors of mean torques (B, n), each fold predicted from the others.
 
-    Stretches have equally many rows, and are cut at equal times of all recordings. NaN where the
-    mean is not known, infinite where the other stretches have no row of the joint.
+    Folds have equally many rows and are cut at equal times of all recordings. NaN where a mean is
+    unknown, infinite where the other folds have no row of the joint.
 
     Raises:
-        IdentificationError: there are fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be
-            fitted.
+        IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.
     """
     fine = round(BLOCK / FINE_BLOCK)
     rows = merged(phase.samples, fine).sum(axis=1)
     if np.count_nonzero(rows) < FEWEST_BLOCKS:
         raise IdentificationError(
-            f"the fitted motion is too short to be predicted in parts: {BLOCK * len(rows):g} s"
+            f"the fitted motion of {BLOCK * len(rows):g} s is too short for inner prediction"
         )
     before = np.cumsum(rows) - 0.5 * rows
-    # Blocks at rest behind the last row belong to the last stretch.
+    # Blocks at rest after the last row belong to the last fold.
     fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
     found = np.full((len(means.block), phase.n_joints), np.nan)
     for k in range(FOLDS):
@@ -167,7 +164,7 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
 
 
 def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-    """Fields of :class:`TorqueMeans` of one recording, which has rows."""
+    """Return the fields of :class:`TorqueMeans` of one recording with rows."""
     known = np.ones(samples.torque.shape, dtype=np.bool_)
     if samples.mask is not None:
         for reason in (TORN, SATURATED):

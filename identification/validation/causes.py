@@ -1,9 +1,9 @@
-"""Faults that explain what a model leaves over: mended, each has to predict better.
+"""Faults of recordings whose correction predicts parts of the fitted motion better.
 
-The torque of every fifth block of the fitted recordings is predicted from the others, as measured
-and with one fault after the other mended. The one that lowers the error most, beyond chance, is
-named, and with it mended the search goes on. All but faults of the positions are linear in the
-columns of one table per joint, whose Gram matrices are made once.
+The torque of every fifth block is predicted from the others, as measured and with one fault after
+the other corrected. The fault whose correction reduces the error most, significantly, is named, and
+the search is repeated with it corrected. All but faults of positions are linear in the columns of
+one table per joint, whose Gram matrices are computed once.
 """
 
 from __future__ import annotations
@@ -36,73 +36,73 @@ Kind = Literal[
     "changed arm",
 ]
 
-# Standard errors over the blocks, and the share of the error, that make a mended fault better.
+# Standard errors over the blocks, and relative reduction of the error, of a significant correction.
 SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
-# What is as good as that with fewer coefficients is used in its place.
+# Error ratio up to which a fault with fewer coefficients is preferred.
 _ALIKE: Final = 1.05
-# Share of its torque that each joint of a mended sign or order may be mispredicted by: where more
-# is left, the sign explains less than what remains unexplained.
+# Largest relative error of each joint with a corrected sign or order: more error than that means
+# another cause.
 _EXPLAINED: Final = 0.5
 _MOST_CAUSES: Final = 4
-# Rows of all recordings together, and blocks of time: a fault of a whole recording shows in few.
+# Rows and blocks of all recordings together.
 _MOST_ROWS: Final = 3000
 _BLOCKS: Final = 10
 _FOLDS: Final = 5
 _FEWEST_ROWS: Final = 10
 _FEWEST_BLOCKS: Final = 2
-# Share of each column's own information: keeps what a motion hardly determines small.
+# Ridge as a share of each column's information, for columns that the motion hardly determines.
 _RIDGE: Final = 1e-6
 _LOAD: Final = len(LINK_SYMBOLS)
-_MASS: Final = LINK_SYMBOLS.index("m")  # of the coefficients of a payload the one that is its size
+_MASS: Final = LINK_SYMBOLS.index("m")
 _OF_MOTION: Final = ("axis sign", "position order", "joint order")
 _OF_TORQUE: Final = ("torque sign", "torque order")
 
 
 class Part(NamedTuple):
-    """Some of the blocks of the fitted recordings."""
+    """Part of the blocks of the fitted recordings."""
 
-    words: str  # what it is: "A.mcap", or "A.mcap from 3 s on"
-    blocks: tuple[bool, ...]  # whether each belongs to it
+    name: str  # such as "A.mcap", or "A.mcap from 3 s on"
+    blocks: tuple[bool, ...]  # mask over the blocks (B,)
 
 
 class Fault(NamedTuple):
-    """What may be wrong with recordings."""
+    """Possible fault of recordings."""
 
     kind: Kind  # of fault
-    joints: tuple[int, ...] = ()  # whose; all of them if empty
-    part: Part | None = None  # of the recordings that has it; None for all
+    joints: tuple[int, ...] = ()  # affected joints; all if empty
+    part: Part | None = None  # affected part of the recordings; None for all
 
     @property
     def discrete(self) -> bool:
-        """Whether it is there or not: a sign or an order has no size."""
+        """Whether the fault has no size, as a sign or an order."""
         return self.kind in (*_OF_MOTION, *_OF_TORQUE)
 
 
 class Cause(NamedTuple):
-    """A fault that explains errors."""
+    """Fault that explains errors."""
 
-    fault: Fault  # what seems to be wrong
-    # error of predicted blocks with it mended over that without: geometric mean over the joints
+    fault: Fault
+    # error of predicted blocks with the correction over that without: geometric mean over joints
     ratio: float
-    # how large it is, a delay [s], a factor less one or a mass [kg]; None of others
+    # delay [s], factor less one, or mass [kg]; None without size
     size: float | None
-    std: float  # standard deviation of that over the blocks
+    std: float  # standard deviation over the blocks
 
 
 class Causes(NamedTuple):
-    """Faults that were looked for in what was fitted."""
+    """Faults that were found in the fitted motion."""
 
-    found: tuple[Cause, ...]  # the one that explains most first
-    best: Cause | None  # of all faults the one with the least error where nothing was found
+    found: tuple[Cause, ...]  # in order of their effect
+    best: Cause | None  # fault of least error if nothing was found
 
 
 def find_causes(
     model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str] = ()
 ) -> Causes:
-    """Faults with which, once mended, blocks of the fitted recordings are predicted better.
+    """Find faults whose correction predicts blocks of the fitted recordings better.
 
-    `values` (p,) are the parameters estimated from them, `names` those of the recordings.
+    `values` (p,) are the parameters estimated from the recordings, `names` their names.
     """
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
     search = _Search(model, recordings, values, words)
@@ -111,29 +111,29 @@ def find_causes(
     while len(found) < _MOST_CAUSES and (trial := _best(trials)) is not None:
         found.append(trial.cause)
         if trial.cause.fault.kind == "changed arm":
-            break  # with all parameters apart, nothing is left to compare
-        search.mend(trial.cause.fault)
+            break  # with separate parameters nothing is left to compare
+        search.correct(trial.cause.fault)
         trials = search.trials()
     best = min((one.cause for one in first), key=lambda one: one.ratio)
     return Causes(tuple(found), None if found else best)
 
 
 class _Trial(NamedTuple):
-    """A fault mended."""
+    """Correction of one fault."""
 
     cause: Cause  # the fault
-    highest: float  # upper end of its ratio
-    coefficients: int  # how many it has
-    left: float  # error that remains on the worst of its joints, as a share of their torque
+    highest: float  # upper limit of its ratio
+    coefficients: int  # added coefficients
+    left: float  # remaining relative error of the worst of its joints
 
     @property
     def better(self) -> bool:
-        """Whether the fault mended predicts better, beyond chance."""
+        """Whether the correction reduces the error significantly."""
         explained = not self.cause.fault.discrete or self.left < _EXPLAINED
         return explained and self.cause.ratio < 1.0 - LEAST_GAIN and self.highest < 1.0
 
-    def rivalled_by(self, other: _Trial) -> bool:
-        """Whether another order, or an order in place of a sign, explains nearly as much."""
+    def ambiguous_with(self, other: _Trial) -> bool:
+        """Return whether another order, or order instead of sign, explains nearly as much."""
         mine, its = self.cause.fault, other.cause.fault
         return (
             mine.discrete
@@ -145,16 +145,16 @@ class _Trial(NamedTuple):
 
 
 def _best(trials: Sequence[_Trial]) -> _Trial | None:
-    """The trial of least error among those that are better beyond chance, simple ones first."""
+    """Return the significant trial of least error, with few coefficients preferred."""
     better = [trial for trial in trials if trial.better]
     least = min((trial.cause.ratio for trial in better), default=0.0)
     alike = [trial for trial in better if trial.cause.ratio <= _ALIKE * least]
     best = min(alike, key=lambda one: (one.coefficients, one.cause.ratio), default=None)
-    return best if best and not any(best.rivalled_by(trial) for trial in better) else None
+    return best if best and not any(best.ambiguous_with(trial) for trial in better) else None
 
 
 class _Search:
-    """Recordings with the faults mended that were found so far."""
+    """Recordings with the faults corrected that were found."""
 
     def __init__(
         self, model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str]
@@ -162,18 +162,18 @@ class _Search:
         self._model, self._values, self._names = model, values, names
         self._recordings = recordings
         self._known: list[Fault] = []
-        self._moved: dict[Fault, _Tables] = {}  # of faults of the motion, the same in every search
+        self._motion_tables: dict[Fault, _Tables] = {}  # cache: faults of the motion
 
-    def mend(self, fault: Fault) -> None:
-        """Go on without a fault."""
+    def correct(self, fault: Fault) -> None:
+        """Correct a fault in all following trials."""
         if fault.discrete:
-            self._recordings = [_mended(self._model, one, fault) for one in self._recordings]
-            self._moved.clear()
+            self._recordings = [_corrected(self._model, one, fault) for one in self._recordings]
+            self._motion_tables.clear()
         else:
             self._known.append(fault)
 
     def trials(self) -> list[_Trial]:
-        """Every fault mended in its turn."""
+        """Try the correction of each fault."""
         model, values, p = self._model, self._values, self._model.n_parameters
         tables = _Tables.of(model, self._recordings, values)
         target = np.eye(model.n_joints, tables.width, tables.width - model.n_joints)
@@ -185,10 +185,10 @@ class _Search:
         for fault in self._faults(tables):
             own, measured, seen, joints = none, target.copy(), tables, list(fault.joints)
             if fault.kind in _OF_MOTION:
-                if fault not in self._moved:
-                    moved = [_mended(model, one, fault) for one in self._recordings]
-                    self._moved[fault] = _Tables.of(model, moved, values)
-                seen = self._moved[fault]
+                if fault not in self._motion_tables:
+                    moved = [_corrected(model, one, fault) for one in self._recordings]
+                    self._motion_tables[fault] = _Tables.of(model, moved, values)
+                seen = self._motion_tables[fault]
             elif fault.kind == "torque sign":
                 measured[joints] *= -1.0
             elif fault.kind == "torque order":
@@ -196,9 +196,9 @@ class _Search:
             else:
                 own = _columns_of(tables, model, values, fault)
                 if not own.any():
-                    continue  # such as other friction of a joint that was found to have none
+                    continue  # such as friction of a frictionless joint
             score = _score(seen, p, np.concatenate([own, before], axis=3), measured)
-            ratio, highest = score.against(usual)
+            ratio, highest = score.ratio_to(usual)
             size, std = _size(fault, score, tables, own)
             torque = np.einsum("jq,bjqr,jr->j", measured, seen.gram, measured)
             left = np.sqrt(score.squares.sum(axis=0) / np.maximum(torque, np.finfo(float).tiny))
@@ -223,7 +223,7 @@ class _Search:
                 yield fault._replace(part=self._other_recordings(tables, fault))
 
     def _other_recordings(self, tables: _Tables, fault: Fault) -> Part:
-        """The recordings in which a fault is largest, if each has its own size of it."""
+        """Return the recordings in which a fault is largest, estimated separately in each."""
         model, alike, columns = self._model, fault, []
         if fault.kind == "changed arm":
             alike = Fault("payload")
@@ -241,7 +241,7 @@ class _Search:
         return Part(", ".join(self._names[k] for k in those), tuple(blocks.tolist()))
 
     def _later_parts(self, tables: _Tables) -> Iterator[Part]:
-        """All that comes after each moment."""
+        """Yield the blocks from each time on."""
         blocks = len(tables.recording)
         for first in range(_FEWEST_BLOCKS, blocks - _FEWEST_BLOCKS + 1):
             k, start = int(tables.recording[first]), tables.start[first]
@@ -258,9 +258,9 @@ class _Tables(NamedTuple):
     """
 
     gram: Array  # (B, n, q, q)
-    rows: NDArray[np.intp]  # that count (B, n)
-    recording: NDArray[np.intp]  # index of the one that each block is of (B,)
-    start: Array  # time at which each begins, since its recording began (B,) [s]
+    rows: NDArray[np.intp]  # usable rows (B, n)
+    recording: NDArray[np.intp]  # index of the recording of each block (B,)
+    start: Array  # start time of each since its recording began (B,) [s]
 
     @property
     def width(self) -> int:
@@ -289,7 +289,7 @@ class _Tables(NamedTuple):
 
 
 def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
-    """Columns of some rows of each joint (n, k, q)."""
+    """Return the columns of some rows of each joint (n, k, q)."""
     n, p = model.n_joints, model.n_parameters
     payload = RegressorPlan.of_bodies(model.chain, model.gravity, n - 1)
     filtered = samples.torque_bandwidth is not None or samples.whole is not None
@@ -312,7 +312,7 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
 
 
 def _rate(model: RobotModel, samples: Samples, values: Array, some: NDArray[np.intp]) -> Array:
-    """Rate of the predicted torque (k, n) in some rows, from their neighbours."""
+    """Return the rate of the predicted torque (k, n) in some rows, from their neighbours."""
     after, before = np.minimum(some + 1, len(samples.torque) - 1), np.maximum(some - 1, 0)
     now, first, last = (samples.motion.rows(rows) for rows in (some, before, after))
     direction = now.direction
@@ -329,8 +329,8 @@ class _Score(NamedTuple):
     values: Array
     added: Array
 
-    def against(self, other: _Score) -> tuple[float, float]:
-        """Error over another's: geometric mean over joints, and its upper end by the blocks."""
+    def ratio_to(self, other: _Score) -> tuple[float, float]:
+        """Return the error ratio, geometric mean over the joints, and its upper limit by blocks."""
         tested = (self.squares > 0.0) & (other.squares > 0.0)
         known = tested.any(axis=0)
         if not known.any():
@@ -348,7 +348,7 @@ class _Score(NamedTuple):
 
 
 def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
-    """Predict each fifth block from the others."""
+    """Predict every fifth block from the others."""
     blocks, n = tables.rows.shape
     column = np.broadcast_to(target[:, :, None], (blocks, n, target.shape[1], 1))
     wide = np.concatenate([added, column], axis=3)
@@ -359,7 +359,7 @@ def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
             [np.swapaxes(moved[..., :p, :], 2, 3), np.swapaxes(wide, 2, 3) @ moved],
         ]
     )
-    # Weighted by the inverse variances of an ordinary fit; rounding leaves the floor.
+    # Weighted by the inverse variances of an ordinary fit, limited by rounding.
     whole = gram.sum(axis=0)
     floor = 1e-12 * whole[:, -1, -1] + np.finfo(np.float64).tiny
     usual = np.maximum(_squares(whole, _solved(whole.sum(axis=0))), floor)
@@ -378,13 +378,13 @@ def _score(tables: _Tables, p: int, added: Array, target: Array) -> _Score:
 
 
 def _squares(gram: Array, values: Array) -> Array:
-    """Sum of squared errors of coefficients (k,) on Gram matrices (..., k + 1, k + 1)."""
+    """Return the sum of squared errors of coefficients (k,) on Grams (..., k + 1, k + 1)."""
     augmented = np.append(-values, 1.0)
     return np.asarray((gram @ augmented) @ augmented)
 
 
 def _solved(gram: Array) -> Array:
-    """Least squares (k,) of a Gram matrix of [W | y] (k + 1, k + 1), slightly regularised."""
+    """Solve a Gram matrix of [W | y] (k + 1, k + 1) for (k,), slightly regularised."""
     length = np.sqrt(np.diag(gram)[:-1])
     present = length > 0.0
     scale = np.where(present, length, 1.0)
@@ -394,13 +394,13 @@ def _solved(gram: Array) -> Array:
 
 
 def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[float | None, float]:
-    """How large a fault of columns (B, n, q, r) is, and its standard deviation by the jackknife."""
+    """Return the size of a fault of columns (B, n, q, r), and its jackknife deviation."""
     if fault.discrete or fault.kind == "changed arm":
         return None, 0.0
     p = score.values.shape[1]
     sizes = score.added[:, _MASS if fault.kind == "payload" else 0]
     if fault.kind in ("gain", "changed gain", "changed friction"):
-        # Its column has the pooled parameters; what it multiplies is what the fit finds beside it.
+        # Its column uses the pooled parameters, the fit finds others beside it.
         columns = own[..., :p, 0].reshape(-1, p)
         column = columns[np.argmax(columns.any(axis=1))]
         power = tables.gram[:, fault.joints[0], :p, :p].sum(axis=0) @ column
@@ -409,7 +409,7 @@ def _size(fault: Fault, score: _Score, tables: _Tables, own: Array) -> tuple[flo
 
 
 def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault) -> Array:
-    """Columns of a fault's size as combinations of those of a table (B, n, q, r)."""
+    """Return the columns of a fault as combinations of those of a table (B, n, q, r)."""
     blocks, n, width, _ = tables.gram.shape
     p, joints = model.n_parameters, list(fault.joints or range(model.n_joints))
     columns = np.zeros((n, width, {"payload": _LOAD, "changed arm": p}.get(fault.kind, 1)))
@@ -426,8 +426,8 @@ def _columns_of(tables: _Tables, model: RobotModel, values: Array, fault: Fault)
     return np.asarray(mask[:, None, None, None] * columns)
 
 
-def _mended(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
-    """Samples without a fault of signs or orders."""
+def _corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
+    """Return samples with a wrong sign or order corrected."""
     n = model.n_joints
     sign, order = np.ones(n), np.arange(n)
     if fault.kind.endswith("sign"):
@@ -440,8 +440,8 @@ def _mended(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
         usable = usable[:, order]
     if fault.kind != "position order":
         torque = torque[:, order] * sign
-    mended = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
+    corrected = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
     if samples.whole is not None:
         whole, part = samples.whole
-        mended = replace(mended, whole=(_mended(model, whole, fault), part))
-    return mended.directed(model)
+        corrected = replace(corrected, whole=(_corrected(model, whole, fault), part))
+    return corrected.directed(model)

@@ -1,7 +1,6 @@
-"""What physical consistency costs an estimate, and what of the machine stands in its way.
+"""Effect of physical consistency on the torque error, and the parameters that prevent it.
 
-Where the data leave parameters open, the nearest possible machine fits them as well. Where it
-predicts worse, the bound that stops it names what the data ask for in vain.
+Undetermined parameters can be made consistent at no cost. If the error rises, some bound is active.
 """
 
 from __future__ import annotations
@@ -20,17 +19,15 @@ from identification.validation.finding import joined
 
 Array = NDArray[np.float64]
 
-# Smallest second moment of a link, against the nominal body's, at which it counts as at the edge
-# of what is possible: the data push a hundred times harder than the prior of one row.
+# Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01
-# Standard deviations by which a parameter must have been moved for that to be no chance.
+# Standard deviations of a significant change.
 _MOVED: Final = 3.0
 _SHOWN_BOUNDS: Final = 4
-# Rise of the held-out torque error over all joints, as a fraction of the torque, and of one joint,
-# as a fraction of its own, above which consistency costs something; and above which no machine has
-# such parameters. Simulated NS 16 campaigns without a fault: below 0.0001 over all joints. With the
-# torque or the position of one joint turned: 0.13 and more over all joints for joints 1 and 2, on
-# a wrist joint 0.004 to 0.02 over all, but more than 0.5 of that joint's own torque.
+# Rise of the relative held-out torque error over all joints, and of one joint, that is noticeable,
+# or means that no consistent parameters exist. NS 16 campaigns without a fault: below 0.0001 over
+# all joints. With torque or position of one joint negated: at least 0.13 for joints 1 and 2; for
+# wrist joints 0.004 to 0.02, but more than 0.5 of their own torque.
 _COSTLY: Final = (0.001, 0.005)
 _IMPOSSIBLE: Final = (0.02, 0.1)
 _NEGATIVE: Final = {
@@ -42,21 +39,20 @@ _NEGATIVE: Final = {
 
 @dataclass(frozen=True, eq=False)
 class ConsistencyCheck:
-    """A consistent estimate beside the unconstrained one, on motion that neither was fitted to."""
+    """Consistent estimate compared with the unconstrained one on held-out motion."""
 
-    consistent: ConsistentEstimate  # the estimate
-    held_out: float  # its relative torque error on held-out motion
-    unconstrained_held_out: float  # that of the estimate without inequalities
-    held_out_rise: Array  # rise of the relative error of each joint (n,), NaN for one without rows
-    # smallest second moment of each link over the nominal body's in the same direction (n,): 1
-    # where it is the nominal body, 0 at the edge of what is possible
+    consistent: ConsistentEstimate
+    held_out: float  # relative torque error on held-out motion
+    unconstrained_held_out: float  # that of the unconstrained estimate
+    held_out_rise: Array  # rise per joint (n,), NaN without rows
+    # smallest second moment of each link over the nominal body's in the same direction (n,), zero
+    # at the bound
     room: Array
-    # names of the parameters that were moved by more than three standard deviations
+    # parameters changed by more than three standard deviations
     moved: tuple[str, ...]
-    # what the unconstrained estimate asks for and no machine has, in words, that of the joint
-    # with the largest rise first
+    # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
     bounds: tuple[str, ...]
-    judged_on: str = "held-out"  # "held-out", or "in-sample" where that motion was fitted after all
+    judged_on: str = "held-out"  # "held-out" or "in-sample"
 
     @property
     def cost(self) -> float:
@@ -65,12 +61,12 @@ class ConsistencyCheck:
 
     @property
     def costly(self) -> bool:
-        """Whether the possible machine predicts noticeably worse."""
+        """Whether the consistent estimate predicts noticeably worse."""
         return self._beyond(*_COSTLY)
 
     @property
     def impossible(self) -> bool:
-        """Whether no machine predicts the held-out motion about as well as the estimate does."""
+        """Whether no consistent estimate predicts the held-out motion well."""
         return self._beyond(*_IMPOSSIBLE)
 
     def _beyond(self, overall: float, axis: float) -> bool:
@@ -79,17 +75,17 @@ class ConsistencyCheck:
 
     @property
     def sentence(self) -> str:
-        """What was found, in words."""
+        """Result as a sentence."""
         points = round(100.0 * self.cost, 2) + 0.0
         error = f"{self.judged_on} torque error {points:+.2f} points"
         if not self.costly:
             better = self.cost < -_COSTLY[0]
-            return f"a possible machine predicts {'better' if better else 'as well'} ({error})"
+            return f"consistent parameters predict {'better' if better else 'as well'} ({error})"
         start = (
-            "no machine fits these parameters"
+            "no physically consistent parameters fit the data"
             if self.impossible
-            else "the parameters are not those of a possible machine, and the nearest one predicts"
-            " worse"
+            else "the parameters are not physically consistent, and the nearest consistent ones"
+            " predict worse"
         )
         return f"{start} ({error}): {joined(self.bounds, _SHOWN_BOUNDS)}".removesuffix(": ")
 
@@ -102,19 +98,18 @@ def check_consistency(
     *,
     weights: Array | None = None,
 ) -> ConsistencyCheck:
-    """Find the physically consistent estimate and what it costs beside an unconstrained one.
+    """Compare the physically consistent estimate with an unconstrained one.
 
     Weights (n,) are by default the inverse residual variances of an ordinary fit.
 
     Raises:
-        IdentificationError: see
-            :func:`identification.estimators.consistent.consistent_estimate`.
+        IdentificationError: see :func:`identification.estimators.consistent.consistent_estimate`.
     """
     found = consistent_estimate(model, training, unconstrained, weights=weights)
-    ours, free = found.estimate.values, unconstrained.values
+    values, free = found.estimate.values, unconstrained.values
     shift, links = np.abs(found.shift), model.layout.links
-    rise = held_out.relative_errors(ours) - held_out.relative_errors(free)
-    # In axes in which the pseudo-inertia of the reference is the unit matrix.
+    rise = held_out.relative_errors(values) - held_out.relative_errors(free)
+    # In axes in which the reference's pseudo-inertia is the unit matrix.
     frames = reference_bodies(model.nominal[links], model.chain.translation).frames
     inner = np.linalg.solve(frames, pseudo_inertia(found.standard[links]))
     inner = np.linalg.solve(frames, inner.transpose(0, 2, 1))
@@ -133,7 +128,7 @@ def check_consistency(
             bounds.append(f"the link of {name} would need a negative mass or moment of inertia")
     return ConsistencyCheck(
         consistent=found,
-        held_out=held_out.relative_error(ours),
+        held_out=held_out.relative_error(values),
         unconstrained_held_out=held_out.relative_error(free),
         held_out_rise=rise,
         room=room,

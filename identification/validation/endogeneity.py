@@ -1,12 +1,10 @@
-"""Was least squares biased by noise in the regressor? A Durbin-Wu-Hausman test.
+"""Durbin-Wu-Hausman test: whether noise in the regressor has biased least squares.
 
-What the instruments do not explain of W, V = W - P_Z W, is added to the equation; its coefficients
-are zero if least squares was not biased. Noise enters in the direction V pi only, so one column per
-joint is added, V_j pi with pi by instrumental variables, and the n coefficients are tested together
-with a covariance that leaves out one block of time at a time (Hotelling's F). With noise of
-measurement alone they are minus the share of that column that is noise; a disturbance that moves
-the arm may have either sign. Beside it, parameter by parameter: how far the two estimates are
-apart.
+V = W - P_Z W, the part of W that the instruments do not explain, is added to the equation; its
+coefficients are zero without bias. Noise enters in the direction V pi only, so one column V_j pi
+per joint is added, with pi by instrumental variables, and the n coefficients are tested together
+with a covariance over blocks of time (Hotelling's F). For measurement noise a coefficient is minus
+the share of noise in its column; a disturbance that moves the arm may have either sign.
 """
 
 from __future__ import annotations
@@ -29,10 +27,9 @@ from identification.validation.finding import joined
 Array = NDArray[np.float64]
 
 LEVEL: Final = 0.05
-# Share of an axis's torque, RMS on the fitted motion: what models of industrial arms leave
-# unexplained is 2 to 10 %, a bias of less does nobody harm.
+# Share of an axis's torque (RMS); models of industrial arms have errors of 2 to 10 %.
 MATTERS: Final = 0.005
-# Below this share of the torque measured and instrument motion are the same but for rounding.
+# Share of the torque below which measured and instrument motion are equal.
 _SAME: Final = 1e-9
 
 
@@ -40,43 +37,40 @@ _SAME: Final = 1e-9
 class EndogeneityTest:
     """Result of the test."""
 
-    #: F of the hypothesis that least squares is not biased; NaN if there is nothing to test
+    #: F of the hypothesis of no bias; NaN if untested
     statistic: float
-    p_value: float  #: probability of a larger one if the hypothesis is true, NaN likewise
+    p_value: float  #: probability of a larger F without bias, NaN likewise
     freedom: tuple[int, int]  #: degrees of freedom of the F
-    #: of each joint's column (n,): minus the share of it that is noise of measurement; NaN where
-    #: there is none
+    #: per joint (n,): minus the noise share of its column; NaN without
     coefficient: Array
-    #: torque V pi that stands for what the instruments do not explain of the regressor, as a
-    #: share of each joint's torque (n,), both as RMS
+    #: torque V pi as a share of each joint's torque (n,), both RMS
     noise: Array
-    shift: Array  #: least squares less instrumental variables (p,)
-    #: names of the parameters that differ by more than chance (all of them together 5 %)
+    shift: Array  #: least squares minus instrumental variables (p,)
+    #: parameters that differ significantly (5 % over all)
     shifted: tuple[str, ...]
-    #: torque that the two estimates predict differently on the fitted motion, as a share of each
-    #: joint's torque (n,)
+    #: difference of the predicted torques as a share of each joint's torque (n,)
     predicted: Array
-    words: str  #: the answer in words
+    words: str  #: result as sentences
 
     @property
     def biased(self) -> bool:
-        """Whether least squares was biased, beyond what chance does one time in twenty."""
+        """Whether least squares was biased significantly (5 %)."""
         return bool(self.p_value < LEVEL)
 
     @property
     def matters(self) -> bool:
-        """Whether it was biased, and the torques of some axis are predicted differently for it."""
+        """Whether the bias changes the predicted torque of some axis noticeably."""
         return self.biased and bool(np.max(self.predicted, initial=0.0) >= MATTERS)
 
 
 def endogeneity_test(
     model: RobotModel, factor: PhaseFactor, result: InstrumentalEstimate
 ) -> EndogeneityTest:
-    """Test whether noise in the regressor has biased least squares, by the factor of a result."""
+    """Test by the factor of an instrumental estimate whether least squares was biased."""
     used = np.asarray(factor.samples.any(axis=1))
     blocks, values = factor.weighted(result.weights)[used], result.estimate.values
     p, total = len(values), blocks.sum(axis=0)
-    # V pi, what the instruments leave of W pi, as a combination of [Z | W | y].
+    # V pi as a combination of [Z | W | y].
     explained = solve(NormalEquations(total[:p, :p], total[:p, p : 2 * p] @ values, 0.0, 0)).values
     left_over = np.concatenate([-explained, values, [0.0]])
     noise = _share(factor, left_over)
@@ -116,7 +110,7 @@ def endogeneity_test(
 
 
 def _share(factor: PhaseFactor, combination: Array) -> Array:
-    """RMS of a combination (2 p + 1,) of [Z | W | y] as a share of each joint's torque (n,)."""
+    """Return the RMS of combinations (2 p + 1,) of [Z | W | y] per torque RMS of joints (n,)."""
     shares = np.zeros(factor.n_joints)
     for joint, gram in enumerate(factor.gram):
         own, total = combination[factor.places(joint)], gram.sum(axis=0)
@@ -127,10 +121,10 @@ def _share(factor: PhaseFactor, combination: Array) -> Array:
 def _wald(
     information: Array, moments: Array, k: int
 ) -> tuple[float, tuple[int, int], Array, Array]:
-    """F of the hypothesis that the last k coefficients are zero, and its degrees of freedom."""
+    """Return F of the hypothesis that the last k coefficients are zero, its degrees of freedom."""
     p = information.shape[1] - k
     solution = solve(NormalEquations(information.sum(axis=0), moments.sum(axis=0), 0.0, 0))
-    # Merged until the scores of neighbours hardly correlate.
+    # Merged until neighbouring scores are nearly uncorrelated.
     length = block_length(moments - information @ solution.values)
     information, moments = merged(information, length), merged(moments, length)
     moved = spread(information, moments - information @ solution.values, solution.root)[:, p:]
@@ -145,7 +139,7 @@ def _wald(
 
 
 def _shift(blocks: Array) -> tuple[Array, Array, int]:
-    """Least squares less instrumental variables (p,), its standard deviation, and the blocks."""
+    """Return least squares minus instrumental variables (p,), its deviation, and the blocks."""
     p = blocks.shape[-1] // 2
     least, cross = blocks[:, p : 2 * p, p:], blocks[:, :p, p:]
     total = blocks.sum(axis=0)
@@ -166,33 +160,33 @@ def _shift(blocks: Array) -> tuple[Array, Array, int]:
 
 
 def _words(test: EndogeneityTest, significance: Array, joints: Sequence[str]) -> str:
-    """Put the answer in words, the columns' coefficients given in their standard deviations."""
+    """Describe the result; the significance is coefficients over standard deviations."""
     if np.isnan(test.p_value):
         return (
-            "There is nothing to test: the instruments are the measured motion itself, or the"
-            " recording is too short."
+            "The bias of least squares was not tested: the instruments equal the measured motion,"
+            " or the recording is too short."
         )
-    answer = "Nothing says that noise in the regressor has biased least squares"
+    answer = "Noise in the regressor does not bias least squares significantly"
     if test.matters:
         answer = "Least squares is biased by noise in the regressor"
     elif test.biased:
         answer = (
-            "Noise in the regressor biases least squares measurably, but moves no axis's torque by"
-            f" {MATTERS:.1%} or more: too small to matter"
+            "Noise in the regressor biases least squares, but changes no axis's torque by"
+            f" {MATTERS:.1%} or more: negligible"
         )
     worst = int(np.argmax(test.noise))
     text = (
         f"{answer} (F({test.freedom[0]}, {test.freedom[1]}) = {test.statistic:.2f},"
-        f" p = {test.p_value:.2g}). What the instruments do not explain of it amounts to"
+        f" p = {test.p_value:.2g}). The part of it that the instruments do not explain is"
         f" {test.noise[worst]:.1%} of the torque of {joints[worst]}; the two estimates differ by up"
         f" to {float(np.max(test.predicted)):.1%} of an axis's torque"
     )
     if test.biased and test.shifted:
-        text += f", beyond chance in {', '.join(test.shifted)}"
+        text += f", significantly in {', '.join(test.shifted)}"
     if test.biased and significance[np.argmax(np.abs(significance))] > 0.0:
         text += (
-            ". It does not act as noise of measurement does: a disturbance or error of the model"
-            " that moves the arm is the likelier cause"
+            ". Its sign is not that of measurement noise: a disturbance or model error that moves"
+            " the arm is more likely"
         )
     advice = " Use the instrumental variables, or less noisy positions." if test.matters else ""
     return f"{text}.{advice}"

@@ -1,4 +1,4 @@
-"""What a verdict on an estimate is given on: its errors, where they come from, and its signs."""
+"""Evidence for a verdict: errors of an estimate, their possible causes, and its signs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from identification.validation.plausibility import Implausible, implausibilities
 from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
     PredictionError,
-    over_all,
+    pooled_error,
     prediction_error,
     residual,
     slow_error,
@@ -41,39 +41,38 @@ from identification.validation.residuals import ResidualChecks, check_residuals
 
 Array = NDArray[np.float64]
 
-# Bandwidth in which a rigid arm makes its torque [Hz]; ripple and current noise lie above it,
-# every error of sign, coupling or constant below.
+# Hz. The torque of a rigid arm lies below, torque ripple and current noise above.
 SLOW: Final = 10.0
 SIGMAS: Final = 3.0
 _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
-# Combinations of standard parameters that hardly act are worse conditioned than this.
+# Condition beyond which combinations of standard parameters count as undetermined.
 _WORST_CONDITION: Final = 10.0**4.5
-# A joint's error is beyond that of the fit if its power is this many times larger.
+# Power ratio beyond which a joint's error exceeds that of the fit.
 _GROWN: Final = 4.0
 _POSTURES: Final = 40
-# A few recordings of each kind decide on gravity and load as well as all.
+# Enough recordings to determine gravity and load.
 _MOST_RECORDINGS: Final = 3
 _PLAUSIBLE: Final = Implausible((), ())
 
 
 @dataclass(frozen=True, eq=False)
 class GravityDirection:
-    """The direction of gravity that fits the recordings best.
+    """Direction of gravity that fits the recordings best.
 
-    An arm on a wall or a tilted base, described as upright, spoils every axis that gravity loads,
-    and looks like many wrong torque constants at once.
+    A wrong mounting direction increases the error of every axis that gravity loads, like several
+    wrong torque constants.
     """
 
     declared: Array  # gravity of the model (3,) [m/s²]
     best: Array  # gravity that fits the training motion best, of the same size (3,) [m/s²]
-    # squared error on unseen motion under `best` over that under `declared`: the geometric mean
-    # over the joints that moved
+    # squared error on unseen motion under `best` over `declared`, geometric mean over the joints
+    # that moved
     ratio: float
 
     @property
     def angle(self) -> float:
-        """Between the two [rad]; zero where none is declared."""
+        """Angle between the two [rad], zero if none is declared."""
         size = float(np.linalg.norm(self.declared) * np.linalg.norm(self.best))
         if size == 0.0:
             return 0.0
@@ -81,7 +80,7 @@ class GravityDirection:
 
 
 def _solved(factor: Factor, weights: Array) -> Array:
-    """Standard parameters, of least norm where the data leave a choice."""
+    """Return standard parameters, of least norm where they are undetermined."""
     return solve(factor.weighted(weights), _WORST_CONDITION).values
 
 
@@ -90,11 +89,11 @@ def find_gravity(
 ) -> GravityDirection:
     """Fit the training motion under all directions of gravity, and predict the held-out one.
 
-    The best of six directions along the base's axes and the declared one is refined.
+    Starts at the best of the declared direction and six along the axes of the base.
     """
 
     def fitted(gravity: Array) -> tuple[Array, Array]:
-        """Parameters, each joint weighted by its own residual, and the squared errors (n,)."""
+        """Return parameters, joints weighted by their residuals, and the squared errors (n,)."""
         factor = training.under(gravity)
         errors, values = factor.gram[:, -1, -1], np.empty(0)
         floor = 1e-12 * errors + 1e-300
@@ -104,7 +103,7 @@ def find_gravity(
         return values, np.maximum(errors, floor)
 
     def misfit(gravity: Array) -> float:
-        """Twice the negative logarithm of the likelihood, noise variances concentrated out."""
+        """Return twice the negative log likelihood, maximised over the noise variances."""
         return float(training.rows @ np.log(fitted(gravity)[1]))
 
     def unseen(gravity: Array) -> Array:
@@ -139,10 +138,10 @@ def find_gravity(
 def repetition_noise(
     model: RobotModel, values: Array, recordings: Iterable[Samples], bandwidth: float | None = None
 ) -> Array:
-    """Standard deviation of the residual between repetitions at equal times (n,) [N·m or N].
+    """Return the standard deviation of the residual between repetitions (n,) [N·m or N].
 
-    Of parameters (p,), through a low-pass [Hz] if there is one; no model can predict it. NaN for a
-    joint that never moves twice at the same time, to the nearest sampling interval.
+    The residual of parameters (p,), through a low-pass [Hz] if given, is compared at equal times,
+    rounded to the sampling interval. NaN for a joint that never moves twice at the same time.
 
     Raises:
         IdentificationError: fewer than two repetitions, or no row that two of them share.
@@ -162,8 +161,8 @@ def repetition_noise(
     shared = count >= 2
     if not shared.any():
         raise IdentificationError(
-            "what repeats cannot be distinguished from noise: it takes two repetitions in which"
-            f" joints move at the same times, here are {len(parts)}"
+            "noise is measured on two or more repetitions in which joints move at the same times;"
+            f" {len(parts)} recordings given"
         )
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)
     spread = np.where(shared, np.nansum((table - mean) ** 2, axis=0), 0.0).sum(axis=0)
@@ -172,13 +171,13 @@ def repetition_noise(
 
 
 class CarriedLoad(NamedTuple):
-    """A body on the last link that the unseen motion asks for and the fitted one does not."""
+    """Body on the last link that explains errors on unseen motion only."""
 
-    mass: float  # how much more the arm carried there [kg]
-    # share of the error on unseen motion, beyond that of the fit, that it explains
+    mass: float  # mass difference to the fitted motion [kg]
+    # share of the additional error on unseen motion that it explains
     explained: float
-    axes: int  # number of joints whose error is far beyond that of the fit
-    # of the mass, 95 % [kg]; infinite where the body explains little, or nothing determines it
+    axes: int  # number of joints whose error is far above that of the fit
+    # of the mass, 95 % [kg]; infinite if unknown
     half_interval: float = np.inf
 
 
@@ -189,20 +188,20 @@ def find_load(
     fitted: StandardGram,
     predicted: StandardGram,
 ) -> CarriedLoad:
-    """Fit the training motion, and then ten more parameters of the last link to the unseen one.
+    """Fit the training motion, then ten parameters of the last link to the unseen motion.
 
-    Where these explain the error, the load is fitted again with friction that drifts between
+    If they explain the error, the mass is estimated again with friction that drifts between
     recordings, for its interval.
     """
     seen, unseen = fitted.under(model.gravity), predicted.under(model.gravity)
     values = _solved(seen, fitted.rows / np.maximum(seen.gram[:, -1, -1], 1e-300))
-    # The error of the fit in as many rows as were predicted.
+    # Squared error of the fit, scaled to as many rows.
     floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
     usual = seen.squared_errors(values) * predicted.rows / np.maximum(fitted.rows, 1.0)
     weights = predicted.rows / np.maximum(usual, floor)
     before = unseen.squared_errors(values)
     last = model.layout.links[-1]
-    # Of [last link | what the fit leaves over].
+    # Columns [last link | residual].
     change = np.zeros((unseen.n_parameters + 1, len(last) + 1))
     change[last, range(len(last))] = 1.0
     change[:, -1] = np.append(-values, 1.0)
@@ -230,66 +229,63 @@ def find_load(
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """What is known of the cell beside its model; None throughout where nothing is."""
+class CellContext:
+    """Data on the cell beside its model; None where unknown."""
 
     torque_limit: Array | None = None  # of each joint (n,) [N·m or N], NaN where unknown
     saturated: Array | None = None  # share of samples at the limit of torque or current (n,)
     motor_from_joint: Array | None = None  # motor angle per joint angle (n, n)
-    controller: PredictionError | None = None  # of its own dynamic model on the unseen motion
-    delays: DelayEstimate | None = None  # of the torque behind the position, as recorded
-    assumed_delay: float | Array = 0.0  # that the fit assumed, of all axes or of each (n,) [s]
+    controller: PredictionError | None = None  # error of its dynamic model on the unseen motion
+    delays: DelayEstimate | None = None  # of the recorded torque relative to the position
+    assumed_delay: float | Array = 0.0  # in the fit, of all axes or each (n,) [s]
     nominal_scale: NominalScale | None = None  # measured torque over that of nominal inertias
-    jumps: tuple[PositionJump, ...] = ()  # steps of the measured positions that no arm makes
-    controller_inertia: InertiaRatio | None = None  # its own diagonal inertia over the model's
-    mended: tuple[Finding, ...] = ()  # what was wrong with recordings and is made good in the fit
+    jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
+    controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one
+    corrections: tuple[Finding, ...] = ()  # faults of recordings that were corrected
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a verdict is given on; None is what was not measured or looked for."""
+    """Input of a verdict; None is what was not measured or tested."""
 
     estimate: Estimate  #: the result
-    held_out: PredictionError  #: its error on motion that was not used for fitting
-    training: PredictionError  #: its error on the motion it was fitted to
-    #: error on unseen motion below 10 Hz that neither noise nor what warm gears excuse explains,
-    #: as a share of the torque (n,); NaN for a joint that was not tested, None without
-    #: repetitions, which tell noise from error
+    held_out: PredictionError  #: error on motion that was not fitted
+    training: PredictionError  #: error on the fitted motion
+    #: error on unseen motion below 10 Hz beyond noise and temperature-dependent friction, as a
+    #: share of the torque (n,); NaN for a joint that was not tested, None without repetitions
     systematic: Array | None = None
-    systematic_apart: Array | None = None  #: the same apart from all change of friction
-    #: share by which friction was higher on an unseen motion than estimated, of all motions the
-    #: one with the largest change, per joint (n,); None likewise
+    systematic_without_friction: Array | None = None  #: the same without any change of friction
+    #: largest relative change of friction on an unseen motion (n,); None likewise
     friction_change: Array | None = None
-    #: what no model can predict of the torque (n,) [N·m or N]: the residual above the band of the
-    #: motion, and what differs between repetitions
+    #: torque noise (n,) [N·m or N]: residual above the bandwidth of the motion, and differences
+    #: between repetitions
     noise_floor: Array | None = None
-    #: of the repetitions' own estimates with the pooled one, the worst of them, as a share of
-    #: each axis's torque (n,); None without repetitions
+    #: largest torque difference of a repetition's estimate to the pooled one, as a share of the
+    #: torque (n,); None without repetitions
     disagreement: Array | None = None
-    causes: Causes | None = None  #: faults that explain errors of the fit
+    causes: Causes | None = None  #: faults whose correction reduces errors
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
-    load: CarriedLoad | None = None  #: a body that the arm seems to carry on unseen motion only
+    load: CarriedLoad | None = None  #: body carried on unseen motion only
     loaded: NDArray[np.bool_] | None = None  #: joints that gravity can load (n,)
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
-    implausible: Implausible = _PLAUSIBLE  #: what is physically impossible about the estimate
-    residuals: ResidualChecks | None = None  #: what is left over, and what it follows
-    #: index I_c of how far the parameters' estimates move together (paper, eq. 5), infinite where
-    #: a parameter is undetermined, and I_c,max of as many parameters
+    implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
+    residuals: ResidualChecks | None = None  #: patterns of the residual
+    #: coupling index I_c (paper, eq. 5), infinite with undetermined parameters, and I_c,max
     coupling: tuple[float, float] | None = None
-    #: limits, saturation and the controller's own model
-    surroundings: Surroundings = Surroundings()
+    #: data on the cell
+    context: CellContext = CellContext()
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     #: whether nothing was held out, so that all errors are those of the fit
     in_sample: bool = False
 
     def revolute(self, joint: int) -> bool:
-        """Whether a joint turns; its torque is in N·m then, else in N."""
+        """Return whether a joint is revolute, with torque in N·m, else N."""
         return joint not in self.prismatic
 
     @property
     def floor(self) -> float | None:
-        """Noise floor over all axes, as a share of the held-out torque; None if not measured."""
+        """Noise floor over all axes as a share of the held-out torque; None if not measured."""
         if self.noise_floor is None:
             return None
         power = float(self.held_out.torque_squared.sum())
@@ -298,8 +294,8 @@ class Evidence:
 
     @property
     def share_of_limit(self) -> Array | None:
-        """RMS error on unseen motion over the joint's torque limit (n,); None without limits."""
-        limit = self.surroundings.torque_limit
+        """RMS error on unseen motion over the torque limit (n,); None without limits."""
+        limit = self.context.torque_limit
         return None if limit is None else np.asarray(self.held_out.rms / limit)
 
 
@@ -311,7 +307,7 @@ def gather(
     *,
     same_motion: bool = True,
     nominal: Array | None = None,
-    surroundings: Surroundings = Surroundings(),
+    context: CellContext = CellContext(),
     in_sample: bool = False,
     names: Sequence[str] = (),
 ) -> Evidence:
@@ -319,27 +315,26 @@ def gather(
 
     Args:
         model: the robot.
-        result: from the training recordings.
+        result: estimate from the training recordings.
         training: as many recordings as the result has.
-        held_out: motions that were not used for fitting.
-        same_motion: whether these are repetitions of one motion; only then can what repeats be
-            distinguished from noise.
+        held_out: motions that were not fitted.
+        same_motion: whether the training recordings repeat one motion, so that noise is measured.
         nominal: parameters (p,) of the nominal model.
-        surroundings: what is known of the cell beside its model.
-        in_sample: whether the held-out motions are those of the training after all.
+        context: data on the cell.
+        in_sample: whether the held-out motions are those of the training.
         names: of the training recordings.
 
     Raises:
         IdentificationError: nothing was held out.
     """
     if not held_out:
-        raise IdentificationError("there is no motion left that was not used for fitting")
+        raise IdentificationError("there is no held-out motion")
     values = result.pooled.values
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])
     postures = position[:: max(1, len(position) // _POSTURES)]
     unseen = sum((Factor.of(model, run) for run in held_out), Factor.zero(model))
-    error = over_all(prediction_error(model, values, held_out))
+    error = pooled_error(prediction_error(model, values, held_out))
     few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
     grams = StandardGram.of(model, few), StandardGram.of(model, unseen_few)
     repeated = same_motion and len(result.repetitions) > 1
@@ -348,13 +343,15 @@ def gather(
     evidence = Evidence(
         estimate=result.pooled,
         held_out=error,
-        training=over_all(prediction_error(model, values, training)),
+        training=pooled_error(prediction_error(model, values, training)),
         noise_floor=_noise_floor(model, values, few, noise),
         causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
         load=find_load(model, few, unseen_few, *grams),
         loaded=gravity_loads(model, postures),
-        nominal=None if nominal is None else over_all(prediction_error(model, nominal, held_out)),
+        nominal=None
+        if nominal is None
+        else pooled_error(prediction_error(model, nominal, held_out)),
         implausible=implausibilities(
             model,
             result.pooled,
@@ -369,10 +366,10 @@ def gather(
             training,
             () if in_sample else held_out,
             same_motion=same_motion,
-            motor_from_joint=surroundings.motor_from_joint,
+            motor_from_joint=context.motor_from_joint,
         ),
         coupling=(float(coupling_index(gram)), coupling_index_max(len(gram))),
-        surroundings=surroundings,
+        context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),
     )
@@ -381,18 +378,18 @@ def gather(
     slow = [slow_error(model, values, run, SLOW) for run in held_out]
     changes = np.array([one.friction_change for one in slow])
     largest = np.abs(changes).argmax(axis=0)[None]
-    # Up to two deviations of what torque noise has done to the parameters are no error.
+    # Two standard deviations of the estimate are no error.
     explained = noise**2 + (2.0 * _estimation_noise(result, unseen)) ** 2
     tested = error.rows > 0
 
     def beyond_noise(errors: Iterable[PredictionError]) -> Array:
-        excess = np.sqrt(np.maximum(over_all(errors).rms ** 2 - explained, 0.0))
+        excess = np.sqrt(np.maximum(pooled_error(errors).rms ** 2 - explained, 0.0))
         return np.where(tested, excess / np.where(tested, error.torque_rms, 1.0), np.nan)
 
     return replace(
         evidence,
         systematic=beyond_noise(one.error for one in slow),
-        systematic_apart=beyond_noise(one.apart for one in slow),
+        systematic_without_friction=beyond_noise(one.apart for one in slow),
         friction_change=np.take_along_axis(changes, largest, axis=0)[0],
         disagreement=_disagreement(result),
     )
@@ -401,7 +398,7 @@ def gather(
 def _noise_floor(
     model: RobotModel, values: Array, recordings: Sequence[Samples], repeated: Array | None
 ) -> Array | None:
-    """Standard deviation of the noise of each joint's torque (n,), NaN of one without rows."""
+    """Return the standard deviation of torque noise per joint (n,), NaN without rows."""
     first = recordings[0]
     if repeated is None and noiseless_above(first.motion.time, first.torque, first.segments):
         return None
@@ -409,7 +406,7 @@ def _noise_floor(
     for samples in recordings:
         fast = residual(model, values, samples) - residual(model, values, samples, SLOW)
         nyquist = 0.5 / float(np.median(np.diff(samples.motion.time)))
-        share = max(1.0 - SLOW / nyquist, 0.5)  # of white noise that is above
+        share = max(1.0 - SLOW / nyquist, 0.5)  # share of white noise above the bandwidth
         squares += np.where(samples.usable, fast**2, 0.0).sum(axis=0) / share
         rows += np.count_nonzero(samples.usable, axis=0)
     white = squares / np.where(rows > 0.0, rows, np.nan)
@@ -417,6 +414,7 @@ def _noise_floor(
 
 
 def _disagreement(result: RepeatedEstimate) -> Array:
+    """Return the largest torque difference of repetitions to the pooled estimate (n,)."""
     gram = result.factor.gram
     differences = np.array([one.values for one in result.repetitions]) - result.pooled.values
     torque = np.einsum("ri,jik,rk->rj", differences, gram[:, :-1, :-1], differences)
@@ -425,7 +423,7 @@ def _disagreement(result: RepeatedEstimate) -> Array:
 
 
 def _estimation_noise(result: RepeatedEstimate, held_out: Factor) -> Array:
-    """Standard deviation (n,) of the pooled estimate's predictions, by the scatter of estimates."""
+    """Return the standard deviation (n,) of predicted torque by scatter of the estimates."""
     values = np.array([one.values for one in result.repetitions])
     differences, count = values - values.mean(axis=0), len(values)
     torque = np.einsum("ri,jik,rk->j", differences, held_out.gram[:, :-1, :-1], differences)

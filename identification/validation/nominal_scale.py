@@ -1,7 +1,7 @@
-"""How large each axis's torque is beside what the nominal inertias ask for.
+"""Ratio of each axis's measured torque to that of the nominal inertias.
 
-A torque constant or gear ratio that is wrong by a factor fits as well as ever; only knowledge from
-elsewhere can tell. Friction is free in the comparison, and so are unknown rotor inertias.
+A torque constant or gear ratio wrong by a factor fits equally well; only independent knowledge
+shows it. Friction is free in the comparison, and so are unknown rotor inertias.
 """
 
 from __future__ import annotations
@@ -21,40 +21,36 @@ from identification.validation.plausibility import inertia_matrices
 
 Array = NDArray[np.float64]
 
-_BLOCKS: Final = 20  # stretches of the recordings whose scatter gives the standard deviation
-# What a friction law does not describe, as a share of the friction (Bittencourt and Gunnarsson
-# 2012: some per cent with speed, load and position).
+_BLOCKS: Final = 20  # parts of the recordings whose scatter gives the standard deviation
+# Model error of friction laws relative to the friction (Bittencourt and Gunnarsson 2012).
 _FRICTION_SHARE: Final = 0.03
-_WIDEST: Final = 0.5  # a tolerance, as a share of the scale, above which an axis says nothing
-# Links are wrong each in its own way, which counts where friction takes most of the torque. On a
-# simulated UR5 whose links were off by up to 10 % each no scale was off by more than 7 %.
+_WIDEST: Final = 0.5  # relative tolerance above which a scale is unknown
+# Weight of independent errors of links, where friction dominates the torque. On a simulated UR5
+# with link errors up to 10 % all scales were within 7 %.
 _LINKS_APART: Final = 0.05
 _SURE: Final = 2.0  # standard deviations
 _OTHER_UNIT: Final = 3.0
 
 
 class NominalScale(NamedTuple):
-    """Measured over nominal torque, n axes."""
+    """Ratio of measured to nominal torque of n axes."""
 
-    scale: Array  # (n,), NaN for an axis on which the nominal torque carries too little
-    # what is no wonder in it (n,): half a 95 % interval, and what a wrong nominal torque and a
-    # friction that its law does not describe may do; infinite likewise
+    scale: Array  # (n,), NaN where the nominal torque is too small
+    # half a 95 % interval with errors of nominal torque and friction law (n,); infinite likewise
     tolerance: Array
 
     @property
     def off(self) -> NDArray[np.bool_]:
-        """Whether the scale of each axis is a wonder (n,)."""
-        # Of a factor that may as well be zero, the nominal torque is not part of what was measured.
+        """Whether the scale of each axis differs significantly from 1 (n,)."""
+        # A factor that may be zero says nothing on the nominal torque.
         known = (self.tolerance < _WIDEST) & (np.abs(self.scale) > self.tolerance)
         return known & (np.abs(self.scale - 1.0) > self.tolerance)
 
     @property
     def common(self) -> float:
-        """Factor by which most axes are off alike: 1 where they are not.
+        """Factor common to most axes, such as a wrong unit or motor torques; 1 if there is none.
 
-        Of a single axis a factor this large may be a nominal torque that is next to nothing beside
-        friction; of most axes it is a unit, or torques of the motors mistaken for those of the
-        joints.
+        The factor of a single axis may come from a nominal torque far smaller than friction.
         """
         known = np.isfinite(self.scale) & (self.scale > 0.0)
         if np.count_nonzero(known) < 2:
@@ -67,13 +63,13 @@ class NominalScale(NamedTuple):
 
     @property
     def negated(self) -> bool:
-        """Whether the torque of every axis that says something has the other sign."""
+        """Whether all known scales are significantly negative."""
         known = np.isfinite(self.scale)
         enough = np.count_nonzero(known) >= min(2, len(known))
         return bool(enough and np.all(self.scale[known] + self.tolerance[known] < 0.0))
 
     def without(self, joints: Iterable[int]) -> NominalScale:
-        """The same with nothing said of some axes."""
+        """Return the scales with those of some axes unknown."""
         scale = self.scale.copy()
         scale[sorted(set(joints))] = np.nan
         return self._replace(scale=scale)
@@ -87,21 +83,21 @@ def nominal_scale(
     rotors_known: bool = False,
     share: float = NOMINAL_SHARE,
 ) -> NominalScale:
-    """Compare measured torque with that of nominal parameters (p,), axis by axis, without friction.
+    """Compare measured torque with that of nominal parameters (p,) per axis, without friction.
 
-    `rotors_known`: the nominal parameters hold the rotors' inertias; `share`: standard deviation of
-    the nominal torque, as a share of it.
+    `rotors_known`: the nominal parameters include rotor inertias; `share`: relative standard
+    deviation of the nominal torque.
 
     Raises:
         IdentificationError: no recording.
     """
     if not runs:
-        raise IdentificationError("there is no recording to compare with the nominal model")
+        raise IdentificationError("no recording to compare with the nominal model")
     found, regressors = [], [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
         columns, turning = regressors[0].columns[joint], [joint]
         inertial = columns < model.base.rank
-        if model.coupling is not None:  # coupled motors feel other joints' accelerations, too
+        if model.coupling is not None:
             turns = model.coupling.motor_from_joint
             turning = sorted({joint, *np.flatnonzero((turns.T @ turns)[joint]).tolist()})
         tables, torques = [], []
@@ -117,13 +113,13 @@ def nominal_scale(
 
 
 def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
-    """Coefficient of the first column and what is no wonder in it; NaN if it says little."""
+    """Return the coefficient of the first column and its tolerance; NaN if uncertain."""
     rigid, others = table[:, 0], table[:, 1:]
     if len(torque) < 10 * _BLOCKS or not rigid.any():
         return np.nan, np.inf
     size = np.linalg.norm(others, axis=0)
     basis, _ = np.linalg.qr(others[:, size > 0.0] / size[size > 0.0])
-    # What friction does not explain of the nominal torque as well.
+    # Part of the nominal torque that friction does not explain.
     alone = rigid - basis @ (basis.T @ rigid)
     power = float(alone @ alone)
     if not power > 1e-12 * float(rigid @ rigid):
@@ -135,20 +131,19 @@ def _scale(table: Array, torque: Array, share: float) -> tuple[float, float]:
     std = np.sqrt(scatter * _BLOCKS / (_BLOCKS - 1)) / power
     lost = float(rigid @ rigid) / power - 1.0
     misfit = _FRICTION_SHARE * np.linalg.norm(friction) / np.sqrt(power)
-    wonder = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
-    tolerance = student_limit(0.025, _BLOCKS - 1) * std + wonder
-    # Friction and noise have the unit of the torque, so a tolerance is large where the scale is.
+    model_error = _SURE * float(np.sqrt(share**2 * (1.0 + _LINKS_APART * lost) + misfit**2))
+    tolerance = student_limit(0.025, _BLOCKS - 1) * std + model_error
+    # Tolerances scale with the unit of the torque.
     known = tolerance < _WIDEST * max(1.0, abs(scale))
     return (scale, float(tolerance)) if known else (np.nan, np.inf)
 
 
 class InertiaRatio(NamedTuple):
-    """Controller's over identified inertia of each joint, rotors included, on the joint side."""
+    """Ratio of the controller's to the identified inertia per joint, with rotors, joint side."""
 
-    # median over the postures (n,); NaN where the controller sends zero, or where the data leave
-    # the model's own inertia open
+    # median over postures (n,); NaN where the controller sends zero or the inertia is undetermined
     ratio: Array
-    spread: Array  # standard deviation over the postures of the ratio (n,), NaN likewise
+    spread: Array  # standard deviation over postures (n,), NaN likewise
 
 
 def inertia_ratio(
@@ -156,8 +151,8 @@ def inertia_ratio(
 ) -> InertiaRatio | None:
     """Compare a diagonal inertia (m, n) at positions (m, n) [rad or m] with that of values (p,).
 
-    The controller's, `theirs`, is on the joint side [kg·m² or kg], zero where it sends nothing;
-    None where there is nothing to compare.
+    `theirs`, of the controller, is on the joint side [kg·m² or kg], zero where not sent. None if
+    there is nothing to compare.
     """
     if not np.any(theirs):
         return None

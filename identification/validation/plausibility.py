@@ -1,6 +1,6 @@
-"""Whether estimated parameters can belong to a machine at all, by signs that nature does not make.
+"""Signs of estimated parameters that are physically impossible.
 
-Each is judged with the estimate's own uncertainty: what is merely not known is no offence.
+A wrong sign counts only if it is significant.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
-_SIGMAS: Final = 3.0  # standard deviations beyond which a wrong sign counts
-# More of them for what was searched for among many directions and postures.
+_SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign
+# Added where the worst of many directions and postures is tested.
 _SEARCHED: Final = 2.0
-# Never negative, whatever the axes: masses, rotor inertias, moments of inertia about an axis.
+# Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
 
 class Implausible(NamedTuple):
-    """What is wrong with the signs of an estimate, in words."""
+    """Messages on wrong signs of an estimate."""
 
-    impossible: tuple[str, ...]  # a wrong sign that the predictions rest on
-    # a wrong sign whose whole torque is less than the error of the prediction
+    impossible: tuple[str, ...]  # wrong signs with a torque above the prediction error
+    # wrong signs with a smaller torque
     doubtful: tuple[str, ...]
 
 
@@ -42,14 +42,14 @@ def implausibilities(
     position: Array,
     speed: Array,
 ) -> Implausible:
-    """Say in words what about an estimate is physically impossible.
+    """Return messages on what is physically impossible in an estimate.
 
-    Offences are weighed by their torque on a `motion`, against the error of its prediction (n,).
-    The inertia matrix is looked at in positions (k, n), friction up to the highest speeds (n,).
+    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,). The
+    inertia matrix is evaluated at positions (k, n), friction up to the highest speeds (n,).
     """
     impossible: list[str] = []
     doubtful: list[str] = []
-    for words, part in _offences(model, estimate, speed):
+    for words, part in _wrong_signs(model, estimate, speed):
         own = np.where(part, estimate.values, 0.0)
         squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
@@ -59,7 +59,7 @@ def implausibilities(
 
 
 def _is_negative(estimate: Estimate, direction: Array, sigmas: float = _SIGMAS) -> bool:
-    """Whether direction · parameters is below zero significantly."""
+    """Return whether direction · parameters is significantly below zero."""
     known = np.isfinite(np.diag(estimate.covariance))
     if np.any(direction[~known]):
         return False
@@ -68,10 +68,10 @@ def _is_negative(estimate: Estimate, direction: Array, sigmas: float = _SIGMAS) 
     return float(direction @ estimate.values) < -sigmas * float(np.sqrt(variance))
 
 
-def _offences(
+def _wrong_signs(
     model: RobotModel, estimate: Estimate, speed: Array
 ) -> Iterator[tuple[str, NDArray[np.bool_]]]:
-    """Wrong signs in words, and the parameters (p,) whose torque they are."""
+    """Yield messages on wrong signs, with the parameters (p,) that cause them."""
     values, first, count = estimate.values, model.base.rank, len(estimate.values)
     for joint, (name, law) in enumerate(zip(model.joint_names, model.friction.laws, strict=True)):
         one = speed[joint : joint + 1]
@@ -92,7 +92,7 @@ def _offences(
                 f" less than half of its Coulomb friction {coulomb @ values:.3g}"
             )
             yield words, top != 0.0
-    alone = {  # what a single parameter stands for
+    alone = {  # names of single parameters, and a hint
         k: (
             f"friction {term.name} of motor {term.owner + 1}",
             "; a coupling ratio or a direction may have the wrong sign",
@@ -111,7 +111,7 @@ def _offences(
 
 
 def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> list[str]:
-    """A posture in which the inertia matrix has a negative direction."""
+    """Return a message on a posture with a negative direction of the inertia matrix."""
     matrices = inertia_matrices(model, estimate.values, position)
     eigenvalues, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
     worst = int(np.argmin(eigenvalues[:, 0]))
@@ -134,10 +134,9 @@ def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> l
 
 
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
-    """Inertia matrices (k, n, n), rotors included, of parameters (p,) at positions (k, n).
+    """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n).
 
-    From the torque that one joint's acceleration alone takes, which is the same for all standard
-    parameters behind the base parameters.
+    Computed from the torque of one joint's acceleration at a time.
     """
     still = np.zeros_like(position)
     rest = model.torque(values, position, still, still)

@@ -1,4 +1,4 @@
-"""How well a model predicts torque on motion it was not fitted to."""
+"""Torque prediction errors of a model."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 class PredictionError:
     """Sums over the rows of a prediction error e = measured - predicted, per joint (n,).
 
-    They are sums, so that runs add up: the error over all runs is the sum of theirs.
+    The sums of several recordings add up.
     """
 
-    rows: NDArray[np.intp]  #: rows that counted
+    rows: NDArray[np.intp]  #: usable rows
     absolute: Array  #: sum of |e|
     signed: Array  #: sum of e
     squared: Array  #: sum of e²
@@ -35,7 +35,7 @@ class PredictionError:
     torque_squared: Array  #: sum of measured torque²
 
     def __str__(self) -> str:
-        """As a person reads it: relative errors over all joints and of each, and of what."""
+        """Relative errors over all joints and of each, with the number of rows."""
         each = ", ".join(f"{100.0 * one:.1f}" for one in self.relative)
         rows = "no rows" if not self.rows.size else f"{self.rows.min()} to {self.rows.max()} rows"
         return f"{100.0 * self.overall:.1f} % of the torque ({each} % by joint; {rows} of a joint)"
@@ -44,7 +44,7 @@ class PredictionError:
     def between(
         cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None = None
     ) -> PredictionError:
-        """Error of predicted (m, n) against measured torque (m, n), over usable rows (m, n)."""
+        """Compare predicted with measured torque (m, n) over usable rows (m, n)."""
         if measured.shape != predicted.shape:
             raise ShapeError("predicted", predicted.shape, f"{measured.shape}, as measured")
         counts = np.ones(measured.shape, dtype=np.bool_) if usable is None else usable
@@ -53,7 +53,7 @@ class PredictionError:
         return cls(np.count_nonzero(counts, axis=0), *(one.sum(axis=0) for one in sums))
 
     def __add__(self, other: PredictionError) -> PredictionError:
-        """Error over both sets of rows."""
+        """Return the error over both sets of rows."""
         names = [field.name for field in fields(self)]
         return PredictionError(*(getattr(self, name) + getattr(other, name) for name in names))
 
@@ -64,7 +64,7 @@ class PredictionError:
 
     @property
     def mean(self) -> Array:
-        """Mean e (n,) [N·m or N]: what the prediction is off by on average."""
+        """Mean e (n,) [N·m or N]."""
         return self.signed / np.maximum(self.rows, 1)
 
     @property
@@ -88,8 +88,7 @@ class PredictionError:
     def explained(self) -> Array:
         """Share of each joint's torque variance that the prediction explains (n,), R².
 
-        Zero or less is no better than a constant, the mean torque of these very rows. NaN for a
-        joint without rows or whose torque does not vary.
+        NaN for a joint without rows or torque variance.
         """
         varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
         known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
@@ -105,9 +104,9 @@ class PredictionError:
 def residual(
     model: RobotModel, values: Array, samples: Samples, bandwidth: float | None = None
 ) -> Array:
-    """Torque measured less predicted (m, n) by parameters (p,), zero in rows that do not count.
+    """Return measured minus predicted torque (m, n) of parameters (p,), zero in unusable rows.
 
-    Then through a zero-phase low-pass of a bandwidth [Hz], if there is one.
+    Filtered by a zero-phase low-pass of a bandwidth [Hz] if given.
     """
     return _usable_part(
         samples, samples.torque - samples.predicted_torque(model, values), bandwidth
@@ -126,21 +125,19 @@ def _usable_part(samples: Samples, torque: Array, bandwidth: float | None) -> Ar
 
 
 class SlowError(NamedTuple):
-    """Slow error of a prediction, and what a change of friction explains of it."""
+    """Low-frequency error of a prediction, with the part that a change of friction explains."""
 
     error: PredictionError  # what is left
-    # share by which each joint's friction torque would have to be larger than predicted (n,), of
-    # any size
+    # relative change of each joint's friction (n,), not limited
     friction_change: Array
-    apart: PredictionError  # what would be left if all of that change were subtracted
+    apart: PredictionError  # error without this change
 
 
 def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: float) -> SlowError:
-    """Error of parameters (p,) below a bandwidth [Hz], apart from a change of friction.
+    """Return the error of parameters (p,) below a bandwidth [Hz], apart from changed friction.
 
-    Friction follows the temperature of the gears: between training and validation it may differ
-    by some per cent without anything being wrong with the model. Each joint's whole friction
-    torque may therefore be scaled, by one number within `FRICTION_CHANGE`.
+    Friction varies with gear temperature, so the friction torque of each joint may be scaled by one
+    factor within `FRICTION_CHANGE`.
     """
     error = residual(model, values, samples, bandwidth)
     friction = samples.predicted_torque(model, np.where(model.friction_columns, values, 0.0))
@@ -160,10 +157,9 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
 def prediction_error(
     model: RobotModel, values: Array, runs: Iterable[Samples], *, all_rows: bool = False
 ) -> tuple[PredictionError, ...]:
-    """Prediction error of parameters (p,) on each of several runs.
+    """Return the prediction error of parameters (p,) on each recording.
 
-    `all_rows` counts rows at standstill and near ends as well, where no model of sliding friction
-    can be right.
+    `all_rows` includes rows at standstill and near ends.
     """
     return tuple(
         PredictionError.between(
@@ -173,18 +169,18 @@ def prediction_error(
     )
 
 
-def over_all(runs: Iterable[PredictionError]) -> PredictionError:
-    """Error over all runs together.
+def pooled_error(runs: Iterable[PredictionError]) -> PredictionError:
+    """Return the error over all recordings together.
 
     Raises:
-        IdentificationError: no runs.
+        IdentificationError: no recordings.
     """
     errors = list(runs)
     if not errors:
-        raise IdentificationError("there is no run to validate on")
+        raise IdentificationError("no recording to validate on")
     return sum(errors[1:], errors[0])
 
 
 def for_figure(time: Array, torque: Array) -> Array:
-    """Torque (m, n) through a zero-phase low-pass, as the paper shows it (Fig. 4)."""
+    """Filter torque (m, n) by a zero-phase low-pass, as in the paper (Fig. 4)."""
     return low_pass(time, torque, FIGURE_BANDWIDTH)

@@ -1,11 +1,11 @@
-r"""Recorded torques through a model forwards in time: how far the arm would have gone astray.
+r"""Forward simulation of a model under recorded torques: divergence from the recorded motion.
 
 .. math:: (M(q) + R)\,\ddot q = \tau + \tau_f - h(q, \dot q) - f(\dot q)
 
-with the rotors' inertia R and a feedback :math:`\tau_f` on the recorded motion, a spring and damper
-of `FEEDBACK` on each joint: without one any two models part, the farther the longer the motion. In
-steps of at most `STEP`. Dry friction is an impulse that at most stops its joint, and so can hold.
-All arms are simulated at once: to pinocchio they are branches of one robot.
+with rotor inertias R and a feedback :math:`\tau_f` on the recorded motion, a spring and damper of
+`FEEDBACK` on each joint that limits the divergence. Steps are at most `STEP`. Dry friction is an
+impulse that at most stops its joint. All arms are branches of one pinocchio model and simulated at
+once.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 STEP: Final = 1e-3
-"""s; longer steps between two samples are divided."""
+"""Longest integration step, s."""
 FEEDBACK: Final = 1.0
-"""Hz, of each joint at its inertia in the first posture, critically damped."""
-# Of impulses of dry friction, joint after joint; one that changes by so small a share is found.
+"""Hz; critically damped at the inertia of the first posture."""
+# Iterations for impulses of dry friction, and relative change at which they end.
 _ROUNDS: Final = 200
 _FOUND: Final = 1e-9
 
 
 class Simulated(NamedTuple):
-    """A model with parameters of V arms."""
+    """Model with parameters of V arms."""
 
-    model: RobotModel  # the robot
-    standard: Array  # standard parameters (V, s); every link with a mass, or held by rotors
-    values: Array  # parameters (V, p), of which friction, springs and balancers are read
+    model: RobotModel
+    standard: Array  # standard parameters (V, s); every joint moves inertia
+    values: Array  # parameters (V, p), for friction, springs and balancers
 
 
 def replay(arms: Simulated, samples: Samples) -> Array:
-    """Return simulated less recorded positions (V, m, n) [rad or m]; NaN between stretches.
+    """Return simulated minus recorded positions (V, m, n) [rad or m]; NaN between segments.
 
-    From the first recorded state of each stretch on, under the torque without that of a payload and
-    known elements; the feedback is that of the first arm's inertia for all.
+    Starts at the first recorded state of each segment, under the torque without payload and known
+    elements. The feedback uses the inertia of the first arm for all.
 
     Raises:
-        numpy.linalg.LinAlgError: a joint moves nothing that has inertia.
+        numpy.linalg.LinAlgError: a joint without inertia.
     """
     dynamics = _Dynamics(arms)
     found = np.full((len(arms.standard), *samples.motion.position.shape), np.nan)
@@ -75,25 +75,23 @@ def replay(arms: Simulated, samples: Samples) -> Array:
             sample + 1, (duration / steps)[sample].tolist(), *between, strict=True
         ):
             pull = inertia * (rate**2 * (aim - q) + 2.0 * rate * (speed - v))
-            q, v = dynamics.advanced(q, v, given + pull, period)
+            q, v = dynamics.step(q, v, given + pull, period)
             path[:, k] = q
     return found - samples.motion.position
 
 
 class SlowResidual(NamedTuple):
-    """Torque that a model leaves out, averaged over a period of the feedback, joint by joint."""
+    """Torque residual averaged over a period of the feedback, per joint."""
 
     rms: Array  # (n,) [N·m or N]
-    constant: Array  # (n,) share of its square that a constant torque explains
-    friction: Array  # (n,) what one in the direction of motion explains beyond that
+    constant: Array  # (n,) share of its square that a constant explains
+    friction: Array  # (n,) additional share that a torque in the direction of motion explains
 
 
 def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual:
-    """Return what makes a replay drift: faster residuals average out.
+    """Return the slow torque residual, which makes a simulation diverge.
 
-    Args:
-        arm: the model; the first arm counts.
-        recordings: motion and torque.
+    `arm`: model, first arm only; `recordings`: motion and torque.
     """
     slow: list[Array] = []
     turns: list[Array] = []
@@ -126,7 +124,7 @@ class _Dynamics:
         self._rotors = np.array([arms.model.layout.rotor_matrix(one) for one in arms.standard])
         friction = arms.model.friction
         tables = [friction.table(one[arms.model.friction_part]) for one in arms.values]
-        self._turns = np.vstack([np.eye(n), friction.motor_speeds()])  # of joints, then motors
+        self._turns = np.vstack([np.eye(n), friction.motor_speeds()])  # joints, then motors
         owners: dict[FrictionTerm, list[int]] = {}
         for owner, law in enumerate(friction.all_laws):
             for term in law.terms:
@@ -145,7 +143,7 @@ class _Dynamics:
         )
         return np.asarray(upper + np.triu(upper, 1).swapaxes(1, 2) + self._rotors)
 
-    def advanced(self, q: Array, v: Array, torque: Array, duration: float) -> tuple[Array, Array]:
+    def step(self, q: Array, v: Array, torque: Array, duration: float) -> tuple[Array, Array]:
         """Return position and velocity (V, n) after a duration [s] under torques (V, n)."""
         smooth, slope, dry = self._friction(v)
         bias = pin.nonLinearEffects(self._arms, self._data, q.ravel(), v.ravel())
@@ -156,11 +154,11 @@ class _Dynamics:
         held = self.inertia(q) + duration * slope
         response = np.asarray(np.linalg.inv(held), dtype=np.float64)
         free = v + duration * np.einsum("anm,am->an", response, rest)
-        moved = self._slowed(v, free, response, duration * dry)
+        moved = self._with_dry_friction(v, free, response, duration * dry)
         return q + duration * moved, moved
 
-    def _slowed(self, before: Array, free: Array, response: Array, most: Array) -> Array:
-        """Return what dry friction leaves of the speeds `free` (V, n) after a step."""
+    def _with_dry_friction(self, before: Array, free: Array, response: Array, most: Array) -> Array:
+        """Apply dry friction to the speeds `free` (V, n) after a step."""
         turns = self._turns
         directions = np.sign(before @ turns.T)
         columns = response @ turns.T
@@ -169,7 +167,7 @@ class _Dynamics:
         turned = np.any(np.sign(moved @ turns.T) != directions, axis=1)
         if not turned.any():
             return np.asarray(moved)
-        # Some change direction or rest: each as much as stops it, at most what it has.
+        # Joints that reverse or rest: the impulse that stops them, within its limit.
         columns, impulse, most, speeds = (one[turned] for one in (columns, impulse, most, moved))
         own = np.einsum("kn,ank->ak", turns, columns)
         for _ in range(_ROUNDS):
@@ -188,7 +186,7 @@ class _Dynamics:
         return np.asarray(moved)
 
     def _friction(self, v: Array) -> tuple[Array, Array, Array]:
-        """Return friction of speed alone (V, n), its slope (V, n, n), and dry one (V, n + k)."""
+        """Return viscous friction (V, n), its slope (V, n, n), and dry friction (V, n + k)."""
         turns, zero = self._turns, np.zeros(())
         speeds = v @ turns.T
         smooth, slope, dry = np.zeros((3, *speeds.shape))

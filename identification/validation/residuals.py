@@ -1,8 +1,7 @@
-"""What is left over, looked at from all sides: is it noise, and if not, what does it follow?
+"""Statistical checks of the torque residual: outliers, correlation, patterns and drift.
 
-Means are judged by how much they differ from block to block of time (cluster-robust, Liang and
-Zeger 1986); repetitions of one motion share their blocks, for an error that repeats with the motion
-is not confirmed by being repeated.
+Means are tested by their scatter over blocks of time (cluster-robust, Liang and Zeger 1986);
+repetitions of one motion share blocks, since errors that repeat are not independent.
 """
 
 from __future__ import annotations
@@ -25,31 +24,30 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Rows = NDArray[np.bool_]
 
-# Errors of a model come and go with the moves of the arm.
+# Model errors are correlated over tenths of a second.
 BLOCK: Final = 0.5  # s
-# A mean over fewer blocks has no standard error worth the name.
+# Fewer blocks give no standard error.
 FEWEST_BLOCKS: Final = 5
 BINS: Final = 12
-# Chance that a joint without any such error is mistaken for one with it, over all its bins.
+# Probability of a false finding per joint, over all its bins.
 CHANCE: Final = 0.001
-# Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors beyond.
+# Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
 HARMONICS: Final = (1, 2, 3, 4, 6)
-# Of the worst of five: about one chance in a thousand, with an amplitude of two components.
+# Largest of five harmonics: probability of about 0.001.
 _SIGMAS: Final = 4.1
-_FEWEST_PIECES: Final = 4  # of a trend of friction
-# Pieces in all: fewer leave the trend's own scatter too uncertain.
+_FEWEST_PIECES: Final = 4  # parts for a trend of friction
+# Parts of all recordings together.
 _PIECES: Final = 12
-# Median absolute deviations, as standard deviations of a normal distribution: beyond six lies one
-# sample of 500 million.
+# Robust standard deviations; one normal sample in 500 million is beyond six.
 _BEYOND: Final = 6.0
 _NORMAL: Final = 1.4826
-# Longer than any move of an arm takes to forget the one before.
+# Longer than the settling of a move.
 LONGEST_LAG: Final = 0.5  # s
 _MOST_LAGS: Final = 1000
 
 
 class BlockMean(NamedTuple):
-    """Means over blocks of time; every array has the shape of what was averaged."""
+    """Means over blocks of time; every array has the shape of the averaged values."""
 
     mean: Array  # NaN with fewer than `FEWEST_BLOCKS` blocks
     std: Array  # standard error, likewise
@@ -58,10 +56,10 @@ class BlockMean(NamedTuple):
 
 
 def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
-    """Sum of values over sum of weights of all blocks, and its standard error.
+    """Return sum of values over sum of weights, with standard error by blocks.
 
-    Of each recording by blocks the sums of a quantity, and of what it is divided by (2, B, ...).
-    The first `repeated` recordings are of one motion and share their blocks.
+    Each part holds the sums of values and of weights by blocks (2, B, ...). The first `repeated`
+    parts repeat one motion and share blocks.
     """
     shared = np.zeros((2, max(p.shape[1] for p in parts[:repeated]), *parts[0].shape[2:]))
     for part in parts[:repeated]:
@@ -77,7 +75,7 @@ def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
 
 
 def block_index(samples: Samples) -> Indices:
-    """Block of each row (m,), numbered from the beginning of the motion."""
+    """Return the block of each row (m,), numbered from the start of the motion."""
     since = samples.motion.time - samples.origin
     return np.maximum(np.floor(since / BLOCK + 1e-9).astype(np.intp), 0)
 
@@ -85,9 +83,8 @@ def block_index(samples: Samples) -> Indices:
 class Profile(NamedTuple):
     """Mean residual of n joints in K bins of their own speed or position."""
 
-    edges: Array  # of the bins, (n, K + 1) [rad/s, m/s, rad or m]
-    # mean and standard error of the residual (n, K) [N·m or N], NaN in a bin that too few blocks
-    # of time have seen
+    edges: Array  # (n, K + 1) [rad/s, m/s, rad or m]
+    # residual (n, K) [N·m or N], NaN with too few blocks
     bins: BlockMean
 
     @property
@@ -97,10 +94,7 @@ class Profile(NamedTuple):
 
     @property
     def rms(self) -> Array:
-        """Root mean square over the samples of what the bins explain (n,) [N·m or N].
-
-        The standard errors are subtracted, so that noise alone gives about zero.
-        """
+        """RMS of the residual that the bins explain (n,) [N·m or N], with noise subtracted."""
         seen = np.isfinite(self.bins.mean)
         rows = np.where(seen, self.bins.rows, 0.0)
         squares = np.where(seen, self.bins.mean**2 - self.bins.std**2, 0.0)
@@ -109,9 +103,9 @@ class Profile(NamedTuple):
 
     @property
     def significant(self) -> Rows:
-        """Whether some bin of a joint is off by more than chance explains (n,).
+        """Whether the mean of some bin differs significantly from zero (n,).
 
-        Student's t of the worst bin, at `CHANCE` shared among the bins (Bonferroni).
+        Student's t at `CHANCE` over all bins (Bonferroni).
         """
         seen = np.isfinite(self.bins.mean)
         freedom = np.maximum(self.bins.blocks - 1, 1)
@@ -119,13 +113,13 @@ class Profile(NamedTuple):
         return np.asarray((self._certainty > limit).any(axis=1))
 
     def worst(self, joint: int) -> tuple[float, float]:
-        """Middle of the bin in which a joint's mean residual is most certain, and that residual."""
+        """Return centre and mean residual of the most significant bin of a joint."""
         k = int(self._certainty[joint].argmax())
         return float(self.centres[joint, k]), float(np.nan_to_num(self.bins.mean[joint, k]))
 
     @property
     def _certainty(self) -> Array:
-        """Size of each mean in its standard errors (n, K), zero where it is not known."""
+        """Mean over standard error (n, K), zero where unknown."""
         std = np.nan_to_num(self.bins.std)
         return np.abs(np.nan_to_num(self.bins.mean)) / np.where(std > 0.0, std, np.inf)
 
@@ -133,7 +127,7 @@ class Profile(NamedTuple):
 def _profile(
     runs: Sequence[Samples], left: Sequence[Array], over: Sequence[Array], repeated: int
 ) -> Profile:
-    """Residuals (m, n) in equal bins over what each joint did, in the rows that count."""
+    """Average residuals (m, n) of usable rows in equal bins of each joint's own quantity."""
     values, rows = np.concatenate(over), np.concatenate([run.usable for run in runs])
     lowest = np.where(rows, values, np.inf).min(axis=0)
     highest = np.where(rows, values, -np.inf).max(axis=0)
@@ -156,32 +150,32 @@ def _profile(
 class Ripple(NamedTuple):
     """Residual of n joints that follows the angle of their motors."""
 
-    parts: BlockMean  # mean cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N]
+    parts: BlockMean  # cosine and sine part of each of `HARMONICS` (n, H, 2) [N·m or N]
 
     @property
     def amplitude(self) -> Array:
-        """Amplitude per joint and harmonic (n, H) [N·m or N], NaN where not seen."""
+        """Amplitude per joint and harmonic (n, H) [N·m or N], NaN where unknown."""
         return np.asarray(np.hypot(self.parts.mean[..., 0], self.parts.mean[..., 1]))
 
     @property
     def rms(self) -> Array:
-        """Root mean square of what all harmonics explain (n,) [N·m or N], noise subtracted."""
+        """RMS of all harmonics (n,) [N·m or N], with noise subtracted."""
         squares = 0.5 * (self.parts.mean**2 - self.parts.std**2).sum(axis=-1)
         return np.asarray(np.sqrt(np.maximum(np.nan_to_num(squares).sum(axis=-1), 0.0)))
 
     @property
     def significant(self) -> Rows:
-        """Whether some harmonic of a joint stands out (n,)."""
+        """Whether some harmonic of a joint is significant (n,)."""
         std = np.sqrt(np.mean(self.parts.std**2, axis=-1))
         return np.asarray((np.nan_to_num(self.amplitude) > _SIGMAS * np.nan_to_num(std)).any(-1))
 
     def strongest(self, joint: int) -> int:
-        """Periods per motor turn of a joint's largest harmonic."""
+        """Return the periods per motor turn of a joint's largest harmonic."""
         return HARMONICS[int(np.nan_to_num(self.amplitude[joint]).argmax())]
 
 
 def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> Array:
-    """Sums of a residual (m, n) times cosine and sine, and of their squares (2, B, n, H, 2)."""
+    """Sum a residual (m, n) times cosine and sine, and their squares (2, B, n, H, 2)."""
     block, motor = block_index(samples), samples.motion.position @ motor_from_joint.T
     count = int(block[-1]) + 1
     found = np.zeros((2, count, residual.shape[1], len(HARMONICS), 2))
@@ -195,22 +189,22 @@ def _ripple_sums(samples: Samples, residual: Array, motor_from_joint: Array) -> 
 
 
 class FrictionDrift(NamedTuple):
-    """By how much friction was higher than estimated, piece by piece in the order of recording."""
+    """Relative change of friction over time, in P parts of the recordings."""
 
     share: Array  # (P, n), 0.05 for friction 5 % higher; NaN where a joint did not move
-    change: Array  # of a straight line through the pieces from the first to the last (n,)
-    change_std: Array  # its standard error from the scatter about the line (n,)
-    freedom: int  # degrees of freedom of that scatter
+    change: Array  # of a straight line from the first to the last part (n,)
+    change_std: Array  # its standard error (n,)
+    freedom: int  # degrees of freedom
 
     @property
     def significant(self) -> Rows:
-        """Whether the trend stands out of the scatter (n,)."""
+        """Whether the trend is significant (n,)."""
         limit = student_limit(0.5 * CHANCE, self.freedom)
         return np.asarray(np.abs(self.change) > limit * self.change_std)
 
 
 def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
-    """Trend over all pieces in order; None where they are too few."""
+    """Fit a trend over all parts in order; None with too few."""
     if sum(one.shape[1] for one in sums) < _FEWEST_PIECES:
         return None
     product, power = np.concatenate(sums, axis=1)
@@ -223,7 +217,7 @@ def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
     weight = np.where(known, power, 0.0)
 
     def about_means(values: Array) -> Array:
-        """Values (P, n) less the weighted mean of their part over the recordings."""
+        """Subtract the weighted mean over the recordings from values (P, n), part by part."""
         table, own = values.reshape(-1, parts, n), weight.reshape(-1, parts, n)
         total = own.sum(axis=0)
         mean = (own * table).sum(axis=0) / np.where(total > 0.0, total, 1.0)
@@ -243,15 +237,15 @@ def _friction_drift(sums: Sequence[Array]) -> FrictionDrift | None:
 
 
 class Outliers(NamedTuple):
-    """Samples of which the residual is beyond six robust deviations of its joint."""
+    """Samples with a residual beyond six robust standard deviations of the joint."""
 
-    share: Array  # of the usable samples of each joint (n,)
+    share: Array  # share of usable samples (n,)
     power: Array  # their share of the squared residual (n,)
-    without: PredictionError  # prediction error of all other samples
+    without: PredictionError  # prediction error without outliers
 
 
 def find_outliers(torque: Array, residual: Array, usable: Rows) -> Outliers:
-    """Look for outliers in measured torque and residual (m, n) over the rows that count (m, n)."""
+    """Find outliers of measured torque and residual (m, n) in usable rows (m, n)."""
     far = np.zeros_like(usable)
     for joint, rows in enumerate(usable.T):
         if rows.any():
@@ -271,15 +265,15 @@ class Autocorrelation(NamedTuple):
     """Autocorrelation of the residual of n joints at L + 1 lags."""
 
     lag: Array  # (L + 1,) [s], from zero
-    correlation: Array  # (L + 1, n), one at lag zero; NaN for a joint without rows
-    rows: Indices  # samples that were correlated (n,)
+    correlation: Array  # NaN for a joint without rows
+    rows: Indices  # samples (n,)
 
     @property
     def time(self) -> Array:
         """Integrated correlation time per joint (n,) [s], half a sampling step for white noise.
 
-        The sum over lags ends where two neighbours together are no longer positive (initial
-        positive sequence, Geyer 1992): beyond that an estimated autocorrelation is noise.
+        Summed up to the first pair of lags with negative sum (initial positive sequence, Geyer
+        1992).
         """
         pairs = self.correlation[: len(self.lag) // 2 * 2].reshape(-1, 2, len(self.rows)).sum(1)
         positive = np.cumprod(pairs > 0.0, axis=0)
@@ -287,16 +281,16 @@ class Autocorrelation(NamedTuple):
 
     @property
     def effective_rows(self) -> Array:
-        """Independent samples that would say as much about a mean as these do (n,)."""
+        """Number of independent samples with the same standard error of the mean (n,)."""
         return np.asarray(self.rows / np.maximum(2.0 * self.time / self.lag[1], 1.0))
 
 
 def autocorrelation(
     residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = LONGEST_LAG
 ) -> Autocorrelation:
-    """Autocorrelation up to the longest lag [s] over several recordings with a clock step [s].
+    """Return the autocorrelation up to the longest lag [s] over recordings with a step [s].
 
-    Of each recording the residual (m, n) and which rows count (m, n): pairs count if both do.
+    Each recording is its residual (m, n) and its usable rows (m, n).
     """
     lags = max(2, min(_MOST_LAGS, round(longest / step)))
     products = sum(_products(np.where(usable, left, 0.0), lags) for left, usable in residuals)
@@ -311,11 +305,11 @@ def autocorrelation(
 
 
 def _products(values: Array, lags: int) -> Array:
-    """Sums of x(t) x(t + l) for l = 0 .. lags, per column: (lags + 1, n)."""
+    """Return sums of x(t) x(t + l) for l = 0 .. lags, per column (lags + 1, n)."""
     m, n = values.shape
     found = np.zeros((lags + 1, n))
     reach = min(lags, m - 1)
-    length = scipy.fft.next_fast_len(m + reach, real=True)  # so long that nothing wraps round
+    length = scipy.fft.next_fast_len(m + reach, real=True)  # zero-padded against wrap-around
     power = np.abs(scipy.fft.rfft(values, length, axis=0)) ** 2
     found[: reach + 1] = scipy.fft.irfft(power, length, axis=0)[: reach + 1]
     return found
@@ -323,22 +317,22 @@ def _products(values: Array, lags: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ResidualChecks:
-    """What the torque residual of all recordings follows."""
+    """Patterns of the torque residual of all recordings."""
 
-    torque_rms: Array  # measured torque of the rows that count (n,) [N·m or N]
-    rms: Array  # residual of those rows (n,) [N·m or N]
-    colour: Autocorrelation  # correlation in time, of what was fitted
-    speed: Profile  # mean residual against the joint's own speed
-    position: Profile  # against the joint's own position
-    # against the angle of the joint's motor; None where no gear ratio is known
+    torque_rms: Array  # of usable rows (n,) [N·m or N]
+    rms: Array  # (n,) [N·m or N]
+    autocorrelation: Autocorrelation  # of the fitted recordings
+    speed: Profile  # over the joint's own speed
+    position: Profile  # over the joint's own position
+    # over the motor angle; None without gear ratios
     ripple: Ripple | None
-    # change of friction over the fitted recordings; None where they are too few
+    # None with too few recordings
     drift: FrictionDrift | None
-    friction_share: Array  # friction torque of the fitted recordings over the measured one (n,)
-    outliers: Outliers  # of the unseen motion, or of the fitted one where there is no other
+    friction_share: Array  # friction over measured torque of the fitted recordings (n,)
+    outliers: Outliers  # of the unseen motion, or of the fitted one without it
 
     def share(self, size: Array) -> Array:
-        """A residual (n,) as a share of the joint's torque; zero for a joint without rows."""
+        """Return a residual (n,) as a share of the torque; zero for a joint without rows."""
         torque = self.torque_rms
         return np.where(torque > 0.0, size / np.where(torque > 0.0, torque, 1.0), 0.0)
 
@@ -352,16 +346,16 @@ def check_residuals(
     same_motion: bool = False,
     motor_from_joint: Array | None = None,
 ) -> ResidualChecks:
-    """Look at the residuals of parameters (p,) on all recordings.
+    """Check the residuals of parameters (p,) on all recordings.
 
-    Drift is looked for in the training recordings, in their order; `same_motion`: they repeat one.
+    Drift is tested on the training recordings in order; with `same_motion` they repeat one motion.
     Ripple needs motor angles per joint angle (n, n).
 
     Raises:
         IdentificationError: no recording was fitted.
     """
     if not training:
-        raise IdentificationError("there is no residual to check: no recording is given")
+        raise IdentificationError("no recording to check residuals of")
     runs, fitted = [*training, *held_out], len(training)
     left = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs
@@ -387,7 +381,7 @@ def check_residuals(
     return ResidualChecks(
         torque_rms=np.sqrt(torque.sum(axis=0) / rows),
         rms=np.sqrt(sum((own**2).sum(axis=0) for own in left) / rows),
-        colour=autocorrelation(
+        autocorrelation=autocorrelation(
             list(zip(left[:fitted], usable[:fitted], strict=True)), float(np.median(steps))
         ),
         speed=_profile(runs, left, [run.motion.velocity for run in runs], repeated),

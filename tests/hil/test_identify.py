@@ -274,7 +274,7 @@ class TestSources:
         """The end of a recording, at which the arm is held for 0.2 s, has no motion to predict."""
         found = identify_archives([paths(campaign)[0]], Silent(), Options(split=0.985))
         assert not found.verdict.good
-        assert "tests nothing" in found.verdict.line
+        assert "moved in fewer than" in found.verdict.line
 
     @pytest.mark.parametrize(
         ("spoilt", "sentence"),
@@ -570,7 +570,9 @@ class TestInSample:
         assert results.judgement.in_sample
         assert results.validation == [] and results.essential is results.calibration is None
         assert not results.verdict.good
-        assert "in-sample" in results.verdict.line and "nothing held out" in results.verdict.line
+        assert (
+            "in-sample" in results.verdict.line and "no motion was held out" in results.verdict.line
+        )
         assert "unseen motion well" not in results.verdict.line
         more, fewer = results.excitation.executed, split.results.excitation.executed
         assert more.n_samples > fewer.n_samples

@@ -20,7 +20,7 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
 from identification.signals.samples import Samples, prepare
-from identification.validation.prediction import over_all, prediction_error
+from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import ur10
 from tests.identification.two_link import URDF, as_samples, sine_motion, truth
@@ -265,7 +265,7 @@ def test_a_blind_choice_never_sees_the_held_out_motion(seed: int) -> None:
         (fitted.torque * scale).ravel(),
         rcond=None,
     )[0]
-    expected = over_all(prediction_error(arm, values, unseen)).overall
+    expected = pooled_error(prediction_error(arm, values, unseen)).overall
     assert found.blind.left == len(kept)
     assert found.blind.essential == pytest.approx(expected, rel=1e-6)
 

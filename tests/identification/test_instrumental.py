@@ -224,14 +224,14 @@ def test_a_disturbance_that_moves_the_arm_is_not_taken_for_noise() -> None:
     test = examine(replace(samples, torque=disturbed))
     assert test.biased
     assert np.all(test.coefficient > 0.0)
-    assert "does not act as noise of measurement does" in test.words
+    assert "not that of measurement noise" in test.words
 
 
 @pytest.mark.parametrize(
     ("noise", "biased", "matters", "words"),
     [
-        (0.0, False, False, "Nothing says that noise in the regressor has biased"),
-        (2e-5, True, False, "too small to matter"),
+        (0.0, False, False, "does not bias least squares significantly"),
+        (2e-5, True, False, "negligible"),
         (LARGE, True, True, "Use the instrumental variables"),
     ],
 )
@@ -250,7 +250,7 @@ def test_instruments_that_are_the_measured_motion_leave_nothing_to_test() -> Non
     test = endogeneity_test(MODEL, factor, result)
     assert np.isnan(test.p_value)
     assert not test.biased
-    assert "nothing to test" in test.words
+    assert "was not tested" in test.words
     np.testing.assert_allclose(
         result.estimate.values, result.least_squares.values, rtol=1e-7, atol=1e-8
     )

@@ -129,7 +129,7 @@ class TestConsistencyCheck:
         assert abs(found.cost) < 0.001
         assert not found.costly and not found.impossible
         assert found.bounds == () and np.all(found.room > 0.5)
-        assert "a possible machine predicts as well" in found.sentence
+        assert "consistent parameters predict as well" in found.sentence
 
     def test_costs_are_those_of_the_predictions(self) -> None:
         recordings = runs(I2m=-0.1)
@@ -163,7 +163,7 @@ class TestConsistencyCheck:
     def test_a_torque_of_the_wrong_sign_is_no_machine(self) -> None:
         found = checked([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
         assert found.impossible and "shoulder" in found.sentence
-        assert found.sentence.startswith("no machine fits these parameters")
+        assert found.sentence.startswith("no physically consistent parameters fit")
 
     def test_a_link_thinner_than_nothing_is_at_the_edge(self) -> None:
         """The second moment of the elbow's link about its own centre is made negative."""
@@ -230,11 +230,11 @@ def test_a_gap_is_no_jump() -> None:
 AXES = range(1, 4)  # of the UR5, whose weight and inertia stand out of their friction
 
 
-def findings(model: RobotModel, **surroundings: object) -> list[Finding]:
-    """What these surroundings make a verdict say."""
+def findings(model: RobotModel, **context: object) -> list[Finding]:
+    """Findings of a verdict with this context."""
     error = an_error(0.05, joints=model.n_joints)
     known = judged(model.joint_names, held_out=error, training=error).findings
-    found = judged(model.joint_names, held_out=error, training=error, **surroundings).findings
+    found = judged(model.joint_names, held_out=error, training=error, **context).findings
     return [one for one in found if one not in known]
 
 
@@ -324,7 +324,7 @@ def test_all_torques_negated_are_one_finding(model: RobotModel) -> None:
     found = nominal_scale(model, nominal(model), negated)
     (finding,) = findings(model, nominal_scale=found)
     assert (finding.check, finding.level) == ("direction of axes", "wrong")
-    assert "all torques seem to have the other sign" in finding.words
+    assert "all torques have the opposite sign" in finding.words
 
 
 @cache

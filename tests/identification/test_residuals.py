@@ -274,10 +274,10 @@ class TestPatterns:
     @pytest.mark.parametrize(
         ("change", "share", "level", "words"),
         [
-            ((1e-5, -1e-5), 1.0, "good", "no change of friction"),
-            ((0.02, 0.0), 1.0, "information", "shoulder by +2.0%; that is at most 2.0% of an axis"),
+            ((1e-5, -1e-5), 1.0, "good", "did not change"),
+            ((0.02, 0.0), 1.0, "information", "shoulder by +2.0%, at most 2.0% of an axis"),
             ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
-            ((0.02, -0.2), 1.0, "doubtful", "recordings were made: elbow by -20.0%"),
+            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: elbow by -20.0%"),
         ],
     )
     def test_drift_matters_as_far_as_it_makes_torque(

@@ -21,7 +21,7 @@ from identification.validation.calibration import Calibration, TorqueMeans, cali
 from identification.validation.evidence import repetition_noise
 from identification.validation.prediction import (
     PredictionError,
-    over_all,
+    pooled_error,
     prediction_error,
     slow_error,
 )
@@ -76,7 +76,7 @@ def test_rows_that_do_not_count_change_nothing(
 def test_the_error_over_two_runs_is_that_of_the_runs_put_together(
     m1: Array, p1: Array, m2: Array, p2: Array
 ) -> None:
-    both = over_all([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
+    both = pooled_error([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
     joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
     np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
     assert both.overall == pytest.approx(joined.overall, rel=1e-12, nan_ok=True)
@@ -118,8 +118,8 @@ def test_a_change_of_friction_is_apart_from_other_slow_errors() -> None:
 
 
 def test_no_runs_and_other_shapes_are_errors() -> None:
-    with pytest.raises(IdentificationError, match="no run"):
-        over_all([])
+    with pytest.raises(IdentificationError, match="no recording"):
+        pooled_error([])
     with pytest.raises(ShapeError):
         PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
 
@@ -133,7 +133,7 @@ def test_noise_is_what_differs_between_repetitions() -> None:
         samples_with(common + sizes * rng.standard_normal((3000, 2)), origin=k) for k in range(12)
     ]
     np.testing.assert_allclose(repetition_noise(MODEL, values, runs), sizes, rtol=0.05)
-    with pytest.raises(IdentificationError, match="two repetitions"):
+    with pytest.raises(IdentificationError, match="two or more repetitions"):
         repetition_noise(MODEL, values, runs[:1])
 
 
