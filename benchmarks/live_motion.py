@@ -78,7 +78,7 @@ def measure(plans: int, points: int, fly: float) -> dict[str, Any]:
         bounds = slowing_bounds(limits, factors.acceleration, factors.jerk, motion.extrema())
         law = ramp(1.0, 0.0, 0.0, bounds)
         stop_s.append(law.duration)
-        instants, way = travels(motion, law.gone)
+        instants, way = travels(motion, law.motion_time)
         travel = np.maximum(travel, way.max(axis=0))
         at, joint = np.unravel_index(int(np.argmax(way)), way.shape)
         if worst is None or way[at, joint] > worst.travel.max():

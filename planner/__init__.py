@@ -1,8 +1,8 @@
-"""Via points to motion, as an industrial controller's joint interpolator runs them.
+"""Motion planning through via points, as a joint interpolator of an industrial controller does it.
 
-`plan` turns via points into a `PiecewiseCubic`, `plan_moves` does it move by move with overrides,
-`Interpolator` step by step while targets arrive. `TrajectoryPlayer` gives a motion out one
-set-point per controller cycle, at an override that may change, and stops it on its path.
+`plan` turns via points into a `PiecewiseCubic`, `plan_moves` does so with settings for each move,
+`Interpolator` step by step while targets arrive. `TrajectoryPlayer` returns one set-point per
+controller cycle, at an override that may change, and stops a motion on its path.
 """
 
 from planner.errors import (

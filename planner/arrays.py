@@ -1,4 +1,4 @@
-"""The one array type of this package, and how it is made read-only."""
+"""Array type of the package."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def read_only(values: ArrayLike) -> Array:
-    """Return `values` as a read-only float64 array of its own (frozen dataclasses hold these)."""
+    """Return a read-only float64 copy of `values`."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array

@@ -1,4 +1,4 @@
-"""What data of a file hold, type by type; nothing is mistaken for what it only resembles."""
+"""Typed checks of data read from files: strict types, arrays of numbers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pydantic import Field, TypeAdapter
 
 from planner.arrays import Array, read_only
 
-# What reading damaged data can raise, whatever is wrong with them: texts in place of tables,
-# numbers too large for a float or with too many digits, lists too deep.
+# What reading damaged data can raise: a text in place of a table, numbers too large for a float or
+# with too many digits, lists nested too deep.
 DAMAGED = (
     TypeError,
     ValueError,
@@ -22,14 +22,14 @@ DAMAGED = (
 
 
 Whole = Annotated[int, Field(ge=-(2**63), lt=2**63)]
-"""A whole number that 64 bits hold."""
+"""Integer of 64 bits."""
 
 
 def strict(kind: Any, value: Any) -> Any:
-    """Return a value of this type, in which True is no number and "1" neither.
+    """Return a value checked to be of a type, without conversion (True and "1" are no numbers).
 
     Raises:
-        ValueError: it is none (pydantic's `ValidationError`).
+        ValueError: it is of another type (pydantic's `ValidationError`).
     """
     return _adapter(kind).validate_python(value, strict=True)
 

@@ -1,15 +1,12 @@
-"""Flying by a via point: leave one move early, enter the next late, join the two states.
+"""Fly-by corners: leave one move early, enter the next late, join the two states by ruckig.
 
-How far a corner is rounded. A join saves the time that it replaces minus its own. Joins found by
-a perfect solver save the more the more of both ramps they replace, because to follow the ramps and
-then a smaller join is one of the motions to choose from. The solver is not perfect: at a few
-isolated states, such as those at a knot of a ramp, it misses the fastest join by far, or takes one
-that breaks a limit. So it is asked at shares next to each other and the corner that saves most is
-used; none is used that would be slower than to stop.
+With an ideal solver, the more of both ramps a join replaces the more time it saves. ruckig misses
+the fastest join at a few isolated states, such as those at a knot of a ramp, or returns one that
+breaks a limit. So neighbouring shares of the ramps are compared and the corner that saves most is
+used; a corner slower than a stop is not used.
 
-Many corners are joined at once: a join is solved in 10 µs, all else goes over all of them together.
-Each number is made by the same operations whatever else is in the arrays, so a corner does not
-depend on its company, to the last bit.
+Many corners are computed together: a join takes 10 µs, everything else is vectorised. Results do
+not depend on what else is in the arrays, to the last bit.
 """
 
 from __future__ import annotations
@@ -27,62 +24,51 @@ from planner.limits import Allowance, jump_rounding
 from planner.piecewise_cubic import Block, Mask, PiecewiseCubic, Rows
 from planner.straight import StraightMoves
 
-# The margins against crashes of the corner solver (community ruckig) are measurements of one series
-# of versions, not properties of the algorithm. So another version is not merely warned of: no
-# corner is planned with it. Stops, playing and reading of plans work with any version.
+# Margins against crashes were measured for this series of ruckig; corners need it.
 SERIES: Final = "0.19"
 _VERSION = str(getattr(ruckig, "__version__", "unknown"))
 
-# Shares of the fly asked for that are compared, and those tried one by one if none of them will do.
+# Shares of the requested fly that are compared, and those tried one by one if none of them works.
 FIRST_SHARES: Final = (1.0, 0.9999, 0.999, 0.99, 0.97)
 LAST_SHARES: Final = (0.9, 0.5, 0.25, 0.125, 0.0625)
-# A corner that takes less of its ramps than this cannot be distinguished from a stop: its path
-# passes at some 1e-12 of the distance of a full one.
+# Smaller shares of the ramps are treated as stops.
 LEAST_SHARE: Final = 1e-4
-# A join is preferred to that at the share asked for if it saves this much more [s].
+# A join is preferred to that of the requested share if it saves this much more [s].
 BETTER: Final = 1e-9
-# ruckig is never shown a state closer than this to its limits: it can crash the process there.
+# States closer to their limits than this can crash ruckig, and are not passed to it.
 NEAREST_STATE: Final = 0.995
-# Joins use the full limits but for a little room in which the last digits are closed.
+# Joins use this share of the limits; `_closed` uses the rest.
 FULL: Final = 0.999
-# What ruckig raises where it finds no motion: now and then (1 in 200 000) it ends with an error
-# number that its own Python face does not know, which is then a ValueError.
+# Errors of ruckig where it finds no motion; one in 200 000 is an unknown error number (ValueError).
 REFUSALS: Final = (ruckig.RuckigError, ValueError)
-# Jerk limit in the units in which the solver is asked.
+# Jerk limit in the units passed to ruckig.
 SOLVER_JERK: Final = 64.0
-# Shares of a distance: what is aimed at, and from where on it is near enough; and how many corners
-# a search for it may try.
+# Search for a distance: shares of it that are aimed at and accepted, most corners tried.
 _AIM: Final = 0.95
 _NEAR_ENOUGH: Final = 0.9
 _SEARCH: Final = 12
-# A join may miss its end by this share of what counts as rounding between two pieces.
+# Largest error of a join's end, as a share of the tolerance on jumps.
 _MISS: Final = 0.1
-# Of a solution: two to brake into the limits (of no length here), seven to move.
+# Pieces of a ruckig profile: two to brake into the limits (of zero length here), seven to move.
 _PIECES: Final = 9
 
 
 class Passing(NamedTuple):
-    """Where a motion is nearest to a point.
-
-    Attributes:
-        time: When, from the beginning of the motion [s].
-        distance: Euclidean distance in joint space [rad].
-    """
+    """Time [s] and Euclidean distance [rad] at which a motion is nearest to a point."""
 
     time: float
     distance: float
 
 
-_SAMPLES = 65  # a join has one bend; its distance to the corner has one dip, now and then two
-_STEPS = 60  # of Newton's method, four or five as a rule; halving alone would need about fifty
-_RESOLUTION = 1e-15  # share of the duration: two times closer than this are one
+_SAMPLES = 65  # to find the minimum: a join has one, sometimes two
+_STEPS = 60  # of Newton's method; mostly four or five are needed, bisection alone takes fifty
+_RESOLUTION = 1e-15  # of the time, as a share of the duration
 
 
 def passing(motion: PiecewiseCubic, point: Array) -> Passing:
-    """Return where `motion` comes nearest to `point` (n,) [rad].
+    """Return where `motion` is nearest to `point` (n,) [rad].
 
-    The distance is that of a point of the path, so that the true one is never larger: what is
-    found to be within a tolerance is.
+    The distance is that of a point of the path, hence an upper bound of the true one.
     """
     times = np.linspace(0.0, motion.duration, _SAMPLES)
     apart = motion.sample(times)[0] - point
@@ -90,7 +76,7 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
     index = int(square.argmin())
     time, best = float(times[index]), float(square[index])
     low, high = float(times[max(index - 1, 0)]), float(times[min(index + 1, _SAMPLES - 1)])
-    # At its ends a motion may rest, where the slope tells nothing.
+    # At its ends a motion may rest, where the slope is zero.
     t = time if low < time < high else 0.5 * (low + high)
     for _ in range(_STEPS):
         q, qd, qdd = motion.sample_one(t)
@@ -101,7 +87,7 @@ def passing(motion: PiecewiseCubic, point: Array) -> Passing:
         low, high = (t, high) if slope < 0.0 else (low, t)
         bend = float(qd @ qd + gap @ qdd)
         closer = t - slope / bend if bend > 0.0 else high
-        if not low < closer < high:  # Newton's step is none: halve what is left
+        if not low < closer < high:  # bisect where Newton's step fails
             closer = 0.5 * (low + high)
         if abs(closer - t) <= _RESOLUTION * motion.duration:
             break
@@ -113,14 +99,14 @@ How = Literal["stopped", "flown", "reduced"]
 
 
 class Corner(NamedTuple):
-    """How a via point is passed.
+    """Passage of a via point.
 
     Attributes:
-        leave: Time cut from the end of the move before [s].
-        enter: Time cut from the beginning of the move after [s].
-        join: What replaces them; None where the arm stops.
+        leave: Time cut from the end of the previous move [s].
+        enter: Time cut from the beginning of the next move [s].
+        join: Motion in their place; None where the arm stops.
         share: Share of the ramps that the corner takes.
-        how: "flown" as asked; "reduced": rounded less than asked; or "stopped".
+        how: "flown" as requested, "reduced" (rounded less than requested), or "stopped".
     """
 
     leave: float
@@ -134,10 +120,10 @@ STOP: Final = Corner(0.0, 0.0, None)
 
 
 def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Corner:
-    """Round the corner between two moves as far as the path stays within `distance` [rad] of it.
+    """Round the corner between two moves such that the path stays within `distance` [rad] of it.
 
-    The path passes between 0.9 and 1 times the distance from the corner, or nearer where even
-    the whole ramps lead it nearer or the bounds (1, n) forbid to go farther; else it stops.
+    The path passes at 0.9 to 1 times the distance, or nearer where the ramps are too short or the
+    bounds (1, n) do not allow more; else it stops.
     """
     best, saving = STOP, 0.0
     low, share, high = 0.0, 1.0, 1.0
@@ -156,7 +142,7 @@ def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Co
             low = share
         else:
             high = share
-        # Near its point a path strays with the cube of the share, farther off with its square.
+        # The distance grows with the cube of small shares and with the square of larger ones.
         share = corner.share * (_AIM * distance / passed) ** 0.4 if passed > 0.0 else high
         if not low < share < high:
             share = 0.5 * (low + high)
@@ -166,25 +152,25 @@ def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Co
 def round_corners(
     moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
 ) -> list[Corner]:
-    """Round corners between two of the moves each as far as asked and the bounds allow.
+    """Round corners between pairs of moves as far as requested and the bounds allow.
 
-    The cut takes the share of the ramp before and of the ramp after the corner, so that no part
-    of a move goes to both of its corners. It never takes longer than to stop.
+    A corner takes the same share of the ramps before and after it, so that no part of a move
+    belongs to two corners. It never takes longer than a stop.
 
     Args:
         moves: The straight moves.
-        before: Which of them lead to the corners (c,).
-        after: Which lead on (c,).
-        bounds: What each join may use (c, n).
-        fly: Share of the ramps that each is asked to take (c,).
+        before: Index of the move before each corner (c,).
+        after: Index of the move after it (c,).
+        bounds: Limits of each join (c, n).
+        fly: Requested share of the ramps (c,).
 
     Raises:
-        UnsupportedSolver: a corner is to be rounded, and nothing is known about the solver.
+        UnsupportedSolver: a corner is to be rounded with an untested version of ruckig.
     """
     corners = [STOP] * len(before)
     slowing, speeding = moves.slowing_down[before], moves.speeding_up[after]
     asked = np.flatnonzero((slowing > 0.0) & (speeding > 0.0) & (fly >= LEAST_SHARE))
-    if len(asked) == 0:  # the solver is not even asked whether it is there
+    if len(asked) == 0:  # stops need no solver, of whatever version
         return corners
 
     def cuts(rows: Rows, shares: Array) -> tuple[Array, Array]:
@@ -232,10 +218,10 @@ def round_corners(
 
 
 def ranked(savings: Array) -> NDArray[np.intp]:
-    """Return the rows of savings (s, ...) [s] in the order in which to try corners, best first.
+    """Return the order in which to try the rows of savings (s, ...) [s], best first.
 
-    Rows are those of `FIRST_SHARES`, -inf where no corner is known; the first, as a rule that
-    asked for, comes first unless another one is clearly better. One that costs is not to be tried.
+    Rows are those of `FIRST_SHARES`, -inf where there is no corner; the first, which was
+    requested, comes first unless another one is better by `BETTER`.
     """
     preferred = savings.copy()
     preferred[0] += BETTER
@@ -243,14 +229,14 @@ def ranked(savings: Array) -> NDArray[np.intp]:
 
 
 class Solutions(NamedTuple):
-    """What the solver found for many joins, not yet checked.
+    """Unchecked solutions of ruckig for many joins.
 
     Attributes:
         starts: Position, velocity and acceleration of the joints at each start, (c, n, 3).
         ends: The same at each end, (c, n, 3); all joints arrive together.
-        times: Unit of time in which each was asked for (c,) [s].
+        times: Unit of time of each (c,) [s].
         durations: Length in time of each join (c,) [s]; infinite where there is none.
-        found: The solver's own results (c,), in its units; None where there is none.
+        found: `ruckig.Trajectory` in normalised units (c,); None where there is none.
     """
 
     starts: Array
@@ -260,27 +246,26 @@ class Solutions(NamedTuple):
     found: NDArray[np.object_]
 
     def take(self, rows: Rows) -> Solutions:
-        """Return some of the solutions, by index."""
+        """Return solutions by index."""
         fields: list[Any] = [field[rows] for field in self]
         return Solutions(*fields)
 
 
 def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Solutions:
-    """Find the fastest motions between two states (c, n, 3) each under limits (c, n).
+    """Find the fastest motions between states (c, n, 3) under limits (c, n).
 
     Args:
         starts: Position, velocity and acceleration of the joints at each start.
         ends: The same at each end; all joints arrive together.
-        times: About how long each may take (c,) [s].
-        bounds: What each may use.
+        times: Expected duration of each (c,) [s], its unit of time for the solver.
+        bounds: Limits of each.
 
     Raises:
-        UnsupportedSolver: the solver is of a version that nothing is known about.
+        UnsupportedSolver: ruckig is of another series than `SERIES`.
     """
     if _VERSION.split(".")[:2] != SERIES.split("."):
         raise UnsupportedSolver(
-            f"ruckig {_VERSION} is installed; corners are planned with {SERIES}.x only, whose "
-            "behaviour near its limits is known"
+            f"ruckig {_VERSION} is installed; corners are planned with {SERIES}.x only"
         )
     n_joints = starts.shape[1]
     problem = ruckig.InputParameter(n_joints)
@@ -310,7 +295,7 @@ def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> S
 
 
 def _askable(states: Array, bounds: Allowance) -> Mask:
-    """Return which states (c, n, 3) the solver may be shown, (c,)."""
+    """Whether states (c, n, 3) are far enough from their limits for ruckig, (c,)."""
     slow = np.abs(states[..., 1]) < NEAREST_STATE * bounds.velocity
     gentle = np.abs(states[..., 2]) < NEAREST_STATE * bounds.acceleration
     askable: Mask = np.all(slow & gentle, axis=-1)
@@ -320,9 +305,9 @@ def _askable(states: Array, bounds: Allowance) -> Mask:
 def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Sequence[list[Any]]:
     """Return starts, ends (c, 3, n) and limits (c, 2, n) in the solver's units, as lists.
 
-    Setting lists costs the solver's face a third of setting arrays.
+    ruckig reads lists three times as fast as arrays.
     """
-    # Powers as floats have them: those of arrays may differ in the last digit.
+    # Powers of floats: those of arrays may differ in the last digit.
     square, cube = np.array([(time**2, time**3) for time in times.tolist()]).reshape(-1, 2).T
     way = bounds.jerk / SOLVER_JERK * cube[:, None]
     units = np.stack((way, way / times[:, None], way / square[:, None]), axis=2)
@@ -334,7 +319,7 @@ def _in_units(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Se
 
 
 def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic | None]:
-    """Turn solutions, none of which is None, into joins; None for one that breaks its bounds."""
+    """Return the joins of solutions that exist; None for one that breaks its bounds."""
     joined: list[PiecewiseCubic | None] = [None] * len(solutions.durations)
     if not joined:
         return joined
@@ -347,7 +332,7 @@ def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic 
         groups.append((missed, _closed(tables.take(missed), starts, ends)))
     for rows, block in groups:
         own = bounds.take(rows)
-        valid = block.keeps(own) & _meets(block, solutions.ends[rows], own)
+        valid = block.satisfies(own) & _meets(block, solutions.ends[rows], own)
         for index in np.flatnonzero(valid).tolist():
             pieces = tuple(block.knots[index]), tuple(block.coefficients[index])
             joined[int(rows[index])] = PiecewiseCubic(*pieces)
@@ -355,7 +340,7 @@ def finish_many(solutions: Solutions, bounds: Allowance) -> list[PiecewiseCubic 
 
 
 def _tables(solutions: Solutions, bounds: Allowance) -> Block:
-    """Turn solutions into cubic pieces."""
+    """Return the cubic pieces of solutions."""
     profiles = np.array(
         [
             [[*p.brake.t, *p.t, *p.brake.j, *p.j] for p in result.profiles[0]]
@@ -372,24 +357,23 @@ def _tables(solutions: Solutions, bounds: Allowance) -> Block:
 
 
 def _closed(block: Block, start: Array, end: Array) -> Block:
-    """Change the jerks of tables from `start` as little as it takes to end in `end`.
+    """Change the jerks of motions from `start` by least squares such that they end in `end`.
 
-    The solver is content with 1e-8 rad. Sampled each millisecond, such a jump is a jerk of
-    10 rad/s³ and more. Knots at the quarters keep the change small: the fastest way to shift
-    a joint a little, all else equal, changes its jerk there.
+    ruckig is exact to 1e-8 rad: sampled each millisecond, a jump by that is a jerk of 10 rad/s³
+    and more. Additional knots at the quarters keep the changes of jerk small.
     """
     duration = block.durations[:, None, None]
     quarters = np.broadcast_to(duration * np.array([0.25, 0.5, 0.75]), (*start.shape[:2], 3))
     finer = np.sort(np.concatenate((block.knots, quarters), axis=-1), axis=-1)
     piece = np.sum(finer[..., :-1, None] >= block.knots[..., None, 1:-1], axis=-1)
     jerks = np.take_along_axis(block.coefficients[..., 3], piece, axis=-1)
-    # What each jerk does to the end state, by the time that is left at its two knots.
+    # Effect of each jerk on the end state, from the time left at its two knots.
     left = duration - finer
     effect = -np.diff(np.stack((left**3 / 6.0, left**2 / 2.0, left), axis=-2), axis=-1)
     # Makes the three rows comparable.
     scale = np.concatenate((np.ones_like(duration), duration, duration**2), axis=-1)
     closing = np.linalg.pinv(effect * scale[..., None])
-    for _ in range(2):  # the second time for what rounding left of the first
+    for _ in range(2):  # the second removes rounding errors of the first
         gap = (end - block.end) * scale
         jerks = jerks + np.einsum("cjik,cjk->cji", closing, gap)
         block = Block.from_jerks(start, finer, jerks)
@@ -397,7 +381,7 @@ def _closed(block: Block, start: Array, end: Array) -> Block:
 
 
 def _meets(block: Block, end: Array, bounds: Allowance) -> Mask:
-    """Whether tables end in their state `end` (c, n, 3) but for rounding, (c,)."""
+    """Whether motions end in the states `end` (c, n, 3) within rounding, (c,)."""
     rounding = _MISS * jump_rounding(bounds, block.durations)
     met: Mask = np.all(np.abs(end - block.end) <= rounding, axis=(1, 2))
     return met

@@ -1,26 +1,4 @@
-"""What planning and playing a motion can refuse.
-
-::
-
-    PlannerError
-     ├─ InvalidLimits           limits of the wrong shape, not finite, empty or reversed
-     ├─ InvalidSetting          speed, fly, period or a stop factor outside its range
-     ├─ InvalidTrajectory       a stored trajectory that is not one
-     ├─ InvalidViaPoints        of the wrong shape, too few, not finite, or out of limits
-     ├─ InvalidPlanFile         a plan file or motion table that cannot be what it says
-     ├─ PlanningError
-     │   ├─ LimitExceeded       the finished plan would break a limit
-     │   └─ NotSmooth           the finished plan would jump
-     ├─ UnsupportedSolver       the installed ruckig is not of the series measured
-     ├─ PlannerCrashed          the process that planned died on this input
-     ├─ PlannerNotStarted       it died before it could be asked
-     ├─ PlanningTimedOut        it did not end in time
-     ├─ NoCallPending        its result is not that of what was asked
-     ├─ StartMismatch           the arm is not where the motion begins
-     └─ NotBegun                a player was asked to advance before it was begun
-
-Joints are counted from 0, as arrays are.
-"""
+"""Errors of planning and playing motions; all derive from `PlannerError`. Joints count from 0."""
 
 # ruff: noqa: N818  the leaves are named for what is wrong; their root ends in Error
 
@@ -32,7 +10,7 @@ class PlannerError(Exception):
 
 
 class InvalidLimits(PlannerError, ValueError):
-    """Joint limits that describe no robot; `name` is the field."""
+    """Joint limits of the wrong shape, not finite, empty or reversed; `name` is the field."""
 
     def __init__(self, name: str, reason: str) -> None:
         self.name = name
@@ -40,7 +18,7 @@ class InvalidLimits(PlannerError, ValueError):
 
 
 class InvalidSetting(PlannerError, ValueError):
-    """A number that steers planning or playing lies outside its range."""
+    """Setting of a plan or a player (speed, fly, period, bound) outside its range."""
 
     def __init__(self, name: str, value: object, valid: str) -> None:
         self.name, self.value, self.valid = name, value, valid
@@ -52,15 +30,15 @@ class InvalidTrajectory(PlannerError, ValueError):
 
 
 class InvalidViaPoints(PlannerError, ValueError):
-    """Via points that no motion can be planned through."""
+    """Via points of the wrong shape, too few, not finite, or out of limits."""
 
 
 class InvalidPlanFile(PlannerError, ValueError):
-    """A stored plan that cannot be read, or is not the plan of the moves it lists."""
+    """Stored plan that cannot be read, or whose motion does not belong to its moves."""
 
 
 class PlanningError(PlannerError):
-    """A motion was planned but does not keep what a plan promises; it is not returned."""
+    """The planned motion breaks a limit or is not smooth; it is not returned."""
 
 
 class LimitExceeded(PlanningError):
@@ -85,26 +63,26 @@ class NotSmooth(PlanningError):
 
 
 class UnsupportedSolver(PlannerError, RuntimeError):
-    """The installed corner solver is not of the series whose margins were measured."""
+    """The installed ruckig is not of the series whose margins were measured."""
 
 
 class StartMismatch(PlannerError):
-    """The arm is too far from where the motion begins, or goes on [rad]."""
+    """A joint is farther from the start or resume point of a motion than the tolerance [rad]."""
 
     def __init__(self, joint: int, value: float, expected: float, tolerance: float) -> None:
         self.joint, self.value, self.expected, self.tolerance = joint, value, expected, tolerance
         super().__init__(
             f"joint {joint} is at {value:.6g} rad, the motion at {expected:.6g} rad; "
-            f"at most {tolerance:.3g} rad of difference is carried along"
+            f"the tolerance is {tolerance:.3g} rad"
         )
 
 
 class NotBegun(PlannerError, RuntimeError):
-    """A player gives set-points only after `begin` was given where the arm is."""
+    """`TrajectoryPlayer.advance` was called before `begin`."""
 
 
 class PlannerCrashed(PlannerError, RuntimeError):
-    """The process that planned died; nothing was planned, and this process lives on."""
+    """The planning process died during the call."""
 
     def __init__(self, status: int) -> None:
         self.status = status
@@ -115,7 +93,7 @@ class PlannerCrashed(PlannerError, RuntimeError):
 
 
 class PlannerNotStarted(PlannerError, RuntimeError):
-    """A planning process died before it could be asked anything; it writes why to stderr."""
+    """A planning process died before its first call; the reason is on stderr."""
 
     def __init__(self, status: int) -> None:
         super().__init__(f"a planning process could not be started (status {status})")
@@ -129,4 +107,4 @@ class PlanningTimedOut(PlannerError, TimeoutError):
 
 
 class NoCallPending(PlannerError, RuntimeError):
-    """The result of the planning process is that of another call, or none was begun here."""
+    """`WorkerProcess.receive` was called in a process that sent no call."""

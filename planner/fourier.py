@@ -2,10 +2,9 @@ r"""Sums of sines, the excitation of the paper's method A (eq. 8), bare or broug
 
 .. math:: q_j(t) = q_{0,j} + w(t) \sum_{k=1}^{W} a_{jk} \sin(\omega_{jk} t)
 
-The paper has w = 1 throughout, which starts at full speed: no controller can execute that. With a
-ramp, w rises from 0 to 1 at the beginning and falls back at the end, in fifth order, so that the
-motion starts and ends at rest in `offset`, is C2, never reaches farther than without, and is
-eq. 8 to the letter in between.
+The paper has w = 1 throughout, which starts at full speed and cannot be executed. With a ramp, w is
+a quintic from 0 to 1 at the beginning and back at the end: the motion starts and ends at rest in
+`offset`, is C2, stays within the range of the bare series, and is eq. 8 in between.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema
 
-# The result may exceed the truth by this share of `largest`; some 1e4 times what rounding does.
+# Tolerance of the bound, as a share of `largest`.
 _RESOLUTION = 1e-10
-# At first the function is known to this share; each division tells _PARTS² times more.
+# Resolution of the first samples; each division into _PARTS improves it by _PARTS².
 _FIRST = 1e-3
 _PARTS = 8
-# Below this, quotients of bounds lose their digits; no motion is so small.
+# Below this, quotients of bounds lose digits.
 _TINY = 1e-290
-# A function that needs more samples than this is bounded by `largest` alone.
+# A function that needs more samples is bounded by `largest`.
 _MOST_SAMPLES = 400_000
 
 
@@ -46,17 +45,16 @@ def supremum(
     """Return an upper bound, tight to 1e-10 of `largest`, of a function on [start, stop].
 
     Args:
-        function: Values at times (m,): what has a continuous second derivative between the ends,
-            or the magnitude of that.
-        start: Where to begin.
-        stop: Where to end, above `start`.
-        largest: A bound of the function's magnitude, known beforehand.
-        curvature: A bound of the magnitude of its second derivative.
+        function: Values at times (m,) of a C2 function, or of its magnitude.
+        start: Start of the interval.
+        stop: Its end, above `start`.
+        largest: Known bound of the function's magnitude.
+        curvature: Known bound of the magnitude of its second derivative.
     """
     if largest < _TINY:
         return largest
     pieces = (stop - start) * sqrt(curvature / (8.0 * _FIRST * largest))
-    if not pieces <= _MOST_SAMPLES:  # written so that an infinite bound ends here
+    if not pieces <= _MOST_SAMPLES:  # true also for NaN
         return largest
     knots = np.linspace(start, stop, 1 + max(1, ceil(pieces)))
     left, right = knots[:-1], knots[1:]
@@ -106,9 +104,9 @@ class HarmonicBounds(NamedTuple):
 def harmonic_bounds(limits: JointLimits, offset: ArrayLike, harmonics: int) -> HarmonicBounds:
     """Return the constraints of the paper's appendix for `harmonics` sines about `offset` (n,).
 
-    The paper's q_max belongs to a range that is symmetric about the offset; here it is the room
-    on the narrower side. Bare series inside these bounds keep the limits of position and
-    acceleration; velocity and jerk are not bounded by them and have to be checked.
+    The paper's q_max, for a range symmetric about the offset, is the room on the narrower side
+    here. The bounds imply the limits of position and acceleration of bare series, not those of
+    velocity and jerk.
 
     Raises:
         InvalidSetting: an offset not strictly inside the limits, or no harmonic.
@@ -128,20 +126,19 @@ def harmonic_bounds(limits: JointLimits, offset: ArrayLike, harmonics: int) -> H
 class FourierSeries:
     """A sum of sines per joint (eq. 8), at rest at both ends if it has a ramp.
 
-    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
-    ends. Without a ramp that is a jump of velocity: such a series can be looked at and designed
-    with, not executed.
+    Before time 0 and after `duration` the joints rest at the first and last position. Without a
+    ramp the velocity jumps there: such a series can be designed, not executed.
 
     Attributes:
-        offset: Position about which each joint swings, (n,) [rad].
-        amplitude: Of each sine, (n, W) [rad].
-        frequency: Of each sine, angular, (n, W) [rad/s].
-        length: Time from beginning to end, ramps included [s].
-        ramp: Time over which the sines grow at the beginning and fade at the end [s]; 0 for none.
+        offset: Position about which each joint moves, (n,) [rad].
+        amplitude: Amplitudes of the sines, (n, W) [rad].
+        frequency: Angular frequencies, (n, W) [rad/s].
+        length: Duration, ramps included [s].
+        ramp: Duration of each of the two ramps [s]; 0 for none.
 
     Raises:
-        InvalidTrajectory: shapes that do not belong together, values that are not finite, a
-            length of 0 or less, ramps longer than the whole.
+        InvalidTrajectory: shapes that do not match, values that are not finite, a length of 0 or
+            less, ramps longer than the motion.
     """
 
     offset: Array
@@ -162,16 +159,16 @@ class FourierSeries:
             or len(self.amplitude) != n
         ):
             raise InvalidTrajectory(
-                f"offset {self.offset.shape}, amplitude {self.amplitude.shape} and frequency "
-                f"{self.frequency.shape} do not belong together; expected (n,), (n, W), (n, W)"
+                f"offset {self.offset.shape}, amplitude {self.amplitude.shape}, frequency "
+                f"{self.frequency.shape}; expected (n,), (n, W), (n, W)"
             )
         for field in fields(self):
             if not np.all(np.isfinite(getattr(self, field.name))):
                 raise InvalidTrajectory(f"{field.name} of a series of sines must be finite")
         if not (self.length > 0.0 and 0.0 <= 2.0 * self.ramp <= self.length):
             raise InvalidTrajectory(
-                f"a series of sines of {self.length} s with ramps of {self.ramp} s; "
-                "both ramps together must fit into it"
+                f"a series of sines of {self.length} s with two ramps of {self.ramp} s each; "
+                "they must fit into it"
             )
 
     @property
@@ -202,11 +199,10 @@ class FourierSeries:
         return q[0], qd[0], qdd[0]
 
     def extrema(self) -> Extrema:
-        """Return bounds of the extremes over all time, per joint.
+        """Return rigorous bounds of the extremes over all time, per joint.
 
-        They are never inside the truth, and outside it by 1e-10 at most of what the sum of
-        amplitudes, each at the worst time, would give. The jump that a bare series makes at its
-        ends is not in them.
+        They are tight to 1e-10 of the sum of amplitudes. The jump of a bare series at its ends is
+        not included.
         """
         lower, upper, velocity, acceleration, jerk = np.empty((5, self.n_joints))
         for joint in range(self.n_joints):
@@ -219,15 +215,14 @@ class FourierSeries:
         return Extrema(lower, upper, velocity, acceleration, jerk)
 
     def derivative_bound(self, order: int, *, ramps: bool = True) -> Array:
-        """Bound a derivative's magnitude over all time, order 1 to 5, (n,); far cheaper than tight.
+        """Return a coarse bound of a derivative's magnitude, order 1 to 5, (n,), from amplitudes.
 
-        It is what all sines and ramps of a joint would make, each at its worst at once. Without
-        `ramps` it holds between them only, where it may be far lower.
+        Without `ramps` it is true only between them, where it may be far lower.
         """
         return self._bounds(order, ramps and self.ramp > 0.0)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return lists; `from_dict` restores every bit, through JSON too."""
+        """Return lists, from which `from_dict` restores the same bits, also through JSON."""
         return {
             "type": "fourier_series",
             "offset": self.offset.tolist(),
@@ -242,11 +237,11 @@ class FourierSeries:
         """Restore a series from `to_dict`.
 
         Raises:
-            InvalidTrajectory: a field is missing, or is not what it should be.
+            InvalidTrajectory: a field is missing or invalid.
         """
-        if data.get("type") != "fourier_series":
-            raise InvalidTrajectory(f"type is {data.get('type')!r}; expected 'fourier_series'")
         try:
+            if data["type"] != "fourier_series":
+                raise InvalidTrajectory("the type is not 'fourier_series'")
             return cls(
                 offset=numbers(data["offset"], 1),
                 amplitude=numbers(data["amplitude"], 2),
@@ -266,7 +261,7 @@ class FourierSeries:
         )
 
     def _largest(self, order: int, side: np.ufunc) -> float:
-        """Bound from above one side of the derivative `order` of joint 0, less its offset."""
+        """Return an upper bound of one side of derivative `order` of joint 0, less its offset."""
         return max(
             supremum(
                 lambda t, stage=stage: side(self._inside(t, order, stage)),  # type: ignore[misc]
@@ -279,7 +274,7 @@ class FourierSeries:
         )
 
     def _stages(self) -> list[tuple[int, float, float]]:
-        """Return the stages that take any time: which (see `_stage`), its start and stop [s]."""
+        """Return the stages of nonzero duration: number (see `_stage`), start and stop [s]."""
         stages = [(0, self.ramp, self.length - self.ramp)]
         if self.ramp > 0.0:
             stages += [(1, 0.0, self.ramp), (-1, self.length - self.ramp, self.length)]
@@ -291,9 +286,9 @@ class FourierSeries:
         return _product(window, self._sines(t, order), order)[:, 0]
 
     def _bounds(self, order: int, ramped: bool) -> Array:
-        """Bound the magnitude of a derivative, less offset, by the sum of amplitudes, (n,)."""
+        """Return a bound of a derivative's magnitude, less offset, from the amplitudes, (n,)."""
         size, rate = np.abs(self.amplitude), np.abs(self.frequency)
-        with np.errstate(all="ignore"):  # what overflows becomes inf, which any limit refuses
+        with np.errstate(all="ignore"):  # an overflow is inf, which exceeds every limit
             sums = [
                 np.sum(np.where(size > 0.0, size * rate**k, 0.0), axis=1) for k in range(order + 1)
             ]
@@ -310,14 +305,14 @@ class FourierSeries:
         return np.where(np.isnan(bound), inf, bound)
 
     def _stage(self, t: Array) -> NDArray[np.int_]:
-        """Return where in the motion times (m,) are: 1 growing, 0 between, -1 fading."""
-        growing, fading = t < self.ramp, t > self.length - self.ramp
-        return growing.astype(np.int_) - (fading & ~growing).astype(np.int_)
+        """Return the stage at times (m,): 1 in the first ramp, 0 between, -1 in the last ramp."""
+        first, last = t < self.ramp, t > self.length - self.ramp
+        return first.astype(np.int_) - (last & ~first).astype(np.int_)
 
     def _window(self, t: Array, order: int, stage: NDArray[np.int_]) -> list[Array]:
-        """Return w and its derivatives up to `order` at times (m,) in these stages (m,).
+        """Return w and its derivatives up to `order` at times (m,) in stages (m,).
 
-        The third derivative jumps between stages, so a time alone does not say which one is meant.
+        The third derivative jumps between stages, so at their common time the stage is needed.
         """
         if self.ramp == 0.0:
             return [np.ones_like(t), *(np.zeros_like(t) for _ in range(order))]

@@ -1,4 +1,4 @@
-"""The interpolator as a controller offers it: targets in, one set-point per step out."""
+"""Online interpolator with the services of RRS-1: targets in, one set-point per step out."""
 
 from __future__ import annotations
 
@@ -47,26 +47,26 @@ from planner.rrs import (
 from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 from planner.worker import in_child, in_child_now
 
-# A motion time [s], and a share of a period, shorter than this is rounding.
+# Tolerance on motion times [s], and on times as a share of a period.
 _ROUNDING: Final = 1e-9
-# No joint space is wider than this [rad].
+# Largest fly-by distance [rad].
 _WIDEST: Final = 1e9
-# COMAU's default is 100 %; its distance of 5 mm says nothing of joints, so here it is 5 mrad.
+# COMAU's defaults are 100 % and 5 mm; the distance in joint space is 5 mrad here.
 _FLYBY = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: 5e-3}
 
 
 def corner(legs: Legs, fly: Fly) -> Corner:
-    """Plan how the target of the first of two legs is passed on the way to that of the second."""
+    """Plan the corner between two legs."""
     first, second = np.arange(2)[:, None]
     return legs.corners(first, second, [fly])[0]
 
 
 def _isolated_corner(legs: Legs, fly: Fly) -> Corner:
-    return in_child_now(corner, legs, fly)  # the arm may move
+    return in_child_now(corner, legs, fly)
 
 
 class _Stretch(NamedTuple):
-    """A part of the motion: its motion times [s] and how it is read."""
+    """A leg or corner of the motion between two motion times [s]."""
 
     begin: float
     end: float
@@ -74,24 +74,23 @@ class _Stretch(NamedTuple):
 
 
 class _Passage(NamedTuple):
-    """A target that is still ahead, and the motion time at which it is passed or reached [s]."""
+    """A target ahead, and the motion time at which it is passed or reached [s]."""
 
     target_id: int
     time: float
 
 
 class MotionQueue:
-    """Targets queued for one motion from rest to rest, planned while it may already run.
+    """Targets of one motion from rest to rest, planned while it runs.
 
-    A corner takes at most the slowing down of the leg before it and the speeding up of the one
-    after it, so corners never meet, and a new target changes nothing but the end of what was the
-    last leg: from a stop there to a corner. That is possible until the arm has come to where the
-    corner would begin.
+    Corners use the deceleration before and the acceleration after a target, so they never overlap:
+    a new target only replaces the stop at the last one by a corner, as long as the arm has not
+    reached the start of that corner.
 
     Args:
-        start: Where the arm is at rest (n,) [rad].
-        limits: Limits that the motion keeps.
-        corner: What plans a corner, `corner` or the same in another process.
+        start: Start position of the arm, at rest (n,) [rad].
+        limits: Limits of the motion.
+        corner: `corner`, or the same in another process.
 
     Attributes:
         ahead: Targets not passed yet, the next one first.
@@ -109,11 +108,11 @@ class MotionQueue:
 
     @property
     def end(self) -> float:
-        """Motion time at which the arm rests at the last target [s]."""
+        """Motion time at which the motion ends at the last target [s]."""
         return self._stretches[-1].end if self._stretches else 0.0
 
     def position(self, time: float) -> Array:
-        """Return the position (n,) [rad] at a motion time [s], not before the one read last."""
+        """Return the position (n,) [rad] at a motion time [s], not before that of the last call."""
         stretches = self._stretches
         if not stretches or time >= stretches[-1].end:
             return self._point
@@ -123,19 +122,19 @@ class MotionQueue:
         return path.read(time - begin)[0]
 
     def leg_to(self, move: Move, overrides: Overrides) -> Legs:
-        """Return the leg to a further target, as it would be from rest to rest.
+        """Return the leg to a further target, from rest to rest.
 
         Raises:
-            InvalidSetting: the move does not fit the arm.
+            InvalidSetting: the move has another number of joints.
         """
         points = np.stack((self._point, move.target))
         return legs_through(points, [move], self._limits, overrides)
 
     def append(self, target_id: int, move: Move, overrides: Overrides, now: float) -> None:
-        """Go on to a further target; `now` is the motion time [s] read last.
+        """Add a target; `now` is the present motion time [s].
 
         Raises:
-            PlannerError: no motion to it was found; what was planned before stays.
+            PlannerError: no motion to it was found; the motion planned before is unchanged.
         """
         new = legs = self.leg_to(move, overrides)
         turn, turns = STOP, list[Corner]()
@@ -144,14 +143,12 @@ class MotionQueue:
             found = self._corner(both, self._last[1])
             if found.join is not None and self.end - found.leave >= now:
                 turn, turns, legs = found, [found], both
-        # From rest to rest: what is new, and of what was there the leg that it joins.
-        legs.motions(turns, 1)
+        legs.motions(turns, 1)  # checked from rest to rest, with the leg before the corner
         del self._stretches[: self._reading]
         self._reading = 0
         if turn.join is not None:
             begin = self.end - turn.leave
             passed = passage(0, self._point, turn, begin)
-            # The last part ends where the corner begins, which was not read past yet.
             self._stretches[-1] = self._stretches[-1]._replace(end=begin)
             self._extend(turn.join)
             self.ahead[-1] = self.ahead[-1]._replace(time=passed.time)
@@ -169,17 +166,17 @@ class MotionQueue:
 
 @dataclass(frozen=True, eq=False)
 class MoveSettings:
-    """What holds for every target until it is set again; shares in (0, 1].
+    """Settings of the next targets.
 
     Attributes:
-        speed, acceleration, jerk: Shares of each joint's limits (n,).
+        speed, acceleration, jerk: Shares of the limits of each joint (n,), in (0, 1].
         flying: Whether via points are flown by.
-        criterion: What rules the size of a corner.
-        flyby: Its value by each criterion: a percentage, a distance [rad].
-        accuracy: Termination kind; those of joints differ from the others for Cartesian motion.
-        overrides: Of the program, own quantity only.
-        motion_time: What the next move has to take [s]; 0 for as short as possible.
-        advance: How many targets should be known beyond the one that the arm moves to.
+        criterion: Criterion of the size of a corner.
+        flyby: Values of the criteria: a percentage, a distance [rad].
+        accuracy: Termination kind.
+        overrides: Overrides of the program.
+        motion_time: Duration of the next move [s]; 0 for the shortest.
+        advance: Number of targets that should be known beyond the next one.
     """
 
     speed: Array
@@ -194,7 +191,7 @@ class MoveSettings:
     advance: int = 1
 
     def move_to(self, target: Array, speed: float = 1.0) -> Move:
-        """Return a move to a target (n,) [rad] as set; `motion_time` is not in it."""
+        """Return a move to a target (n,) [rad] without `motion_time`."""
         value = self.flyby[self.criterion]
         percent = self.criterion is FlybyCriterion.PERCENT
         fly = FlyPercent(value) if percent else FlyDistance(value)
@@ -222,7 +219,7 @@ E = TypeVar("E", bound=IntEnum)
 def _service(
     method: Callable[Concatenate[Interpolator, P], Status | None],
 ) -> Callable[Concatenate[Interpolator, P], Status]:
-    """Make a service of what raises where it refuses, before it has changed anything."""
+    """Return a service that returns the status of the errors which the method raises."""
 
     @wraps(method)
     def service(self: Interpolator, /, *args: P.args, **kwargs: P.kwargs) -> Status:
@@ -240,34 +237,33 @@ def _service(
 
 
 class Interpolator:
-    """Plan and interpolate joint moves while they run, by the services of RRS-1.
+    """Plans and interpolates joint moves while they run, with the services of RRS-1.
 
-    Targets are planned as they are set, never in a step: `set_next_target` may be called before
-    and during the motion. A target set before the arm comes to where the corner before it would
-    begin is flown to if fly-by is on; one set later finds the arm stopping at the point before.
-    Where nothing else is set, the motion ends at rest at the last target. Targets set at once
-    give the motion that `planner.plan_moves` gives. The same calls give the same steps, bit by
-    bit.
+    Targets are planned by `set_next_target`, before or during the motion. A target set before the
+    arm reaches the start of the corner before it is reached by a fly-by, if that is selected; with
+    a later one the arm stops at the point before. The motion ends at rest at the last target.
+    Targets set before the motion give the motion of `planner.plan_moves`. The same calls return
+    the same steps bit by bit.
 
-    Every service returns a `Status` (but `get_next_step`, which returns a `Step`, and
-    `get_current_target_id`); a refused service changed nothing. The order of calls is
+    Services return a `Status` (`get_next_step` a `Step`); a refused service changed nothing. The
+    order of calls is
 
         initialize, set_initial_position, {set_next_target | get_next_step}..., terminate
 
-    with settings anywhere after `initialize`; they hold for targets set from then on, except
-    GEN_OVR (`set_override_speed`), which acts at once and leaves the path as it is.
+    with settings anywhere after `initialize`. Settings apply to later targets, except GEN_OVR
+    (`set_override_speed`), which acts at once without changing the path.
 
     Args:
-        limits: Limits of the arm; planned motion keeps them.
-        period: Time from step to step [s].
+        limits: Limits of the arm.
+        period: Time of a step [s].
         override_bounds: Largest acceleration and jerk while GEN_OVR changes, as multiples (> 1)
             of the limits.
         stop_bounds: The same while the motion is stopped or continued; not below the others.
-        isolated: Plan corners in a child process, whose crash is a FATAL status here and no more;
-            False saves half a millisecond per corner.
+        isolated: Plan corners in a child process, whose crash is a FATAL status; without it, a
+            corner takes half a millisecond less.
 
     Attributes:
-        refusal: Why the last refused service was refused, in words.
+        refusal: Reason of the last refusal.
 
     Raises:
         InvalidSetting: a period or a bound outside its range.
@@ -296,19 +292,17 @@ class Interpolator:
         self._first_period = period
         self._stopping: RateBounds = slowing_bounds(limits, *stop_bounds)
         self._overriding = within(slowing_bounds(limits, *override_bounds), self._stopping)
-        # A joint closer than rounding to an end of its range stands on it.
         rounding = position_rounding(limits)
         self._inside = (limits.lower + rounding, limits.upper - rounding)
-        self._forget()
+        self._clear()
 
     # -- session ---------------------------------------------------------------------------
 
     def initialize(self) -> Status:
-        """Begin, or begin anew: every setting at its default, no position, no target.
+        """Start with default settings and without position and targets.
 
-        Refused while the arm moves, as `reset` and `terminate` are: the set-points would end in
-        mid-motion. `stop_motion` or `cancel_motion` bring it to rest first. FATAL if the process
-        that plans corners does not start.
+        Refused while the arm moves, as `reset` and `terminate` are: call `stop_motion` or
+        `cancel_motion` first. FATAL if the process that plans corners does not start.
         """
         before, self._initialized = self._initialized, True
         status = self.reset()
@@ -318,25 +312,25 @@ class Interpolator:
 
     @_service
     def reset(self) -> None:
-        """Set everything back as `initialize` does; refused while the arm moves."""
+        """Reset all settings as `initialize` does; refused while the arm moves."""
         self._require_rest()
         if self._isolated:
             try:
-                in_child(float)  # to start it takes a third of a second, which no motion has
+                in_child(float)  # starts the child, before a motion runs
             except PlannerError as error:
                 raise _RefusedError(str(error), Status.FATAL) from error
-        self._forget()
+        self._clear()
         self._initialized = True
 
     @_service
     def terminate(self) -> None:
-        """End; only `initialize` is accepted from then on. Refused while the arm moves."""
+        """End; only `initialize` is accepted afterwards. Refused while the arm moves."""
         self._require_rest()
-        self._forget()
+        self._clear()
 
     @_service
     def set_initial_position(self, position: ArrayLike) -> None:
-        """Set where the arm is at rest (n,) [rad]; refused while targets are queued."""
+        """Set the position of the arm at rest (n,) [rad]; refused while targets are queued."""
         queued = self._queue is not None and self._queue.ahead
         self._require(not queued, "targets are queued; cancel the motion first")
         point = self._position_of(position)
@@ -345,7 +339,7 @@ class Interpolator:
 
     @_service
     def set_interpolation_time(self, period: float) -> None:
-        """Set the time from step to step [s]; refused while the arm moves."""
+        """Set the time of a step [s]; refused while the arm moves."""
         self._require_rest()
         seconds = _real(period)
         self._require(0.0 < seconds < inf, f"interpolation time of {period} s")
@@ -358,13 +352,13 @@ class Interpolator:
 
     @_service
     def select_motion_type(self, motion_type: int) -> None:
-        """Select how the arm gets to targets: `MotionType.JOINT`, nothing else is offered."""
+        """Select the kind of path; only `MotionType.JOINT` is implemented."""
         joint = _member(MotionType, motion_type) is MotionType.JOINT
         self._require(joint, f"motion type {motion_type} is not JOINT (1)")
 
     @_service
     def set_advance_motion(self, count: int) -> None:
-        """Set how many targets beyond the present one are asked for (NEED_MORE_DATA), from 0."""
+        """Set the number of targets beyond the next one below which NEED_MORE_DATA is returned."""
         targets = _whole(count)
         self._require(targets is not None and targets >= 0, f"advance of {count} targets")
         self._set(advance=targets)
@@ -390,9 +384,9 @@ class Interpolator:
     def set_override_acceleration(
         self, percent: float, kind: AccelerationKind = AccelerationKind.BOTH
     ) -> None:
-        """Scale the ramps of targets set from now on (PROG_ACC_OVR, PROG_DEC_OVR), (0, 100] %.
+        """Scale the ramps of later targets (PROG_ACC_OVR, PROG_DEC_OVR), in (0, 100] %.
 
-        Nothing but the ramps is scaled, so the path at fly-by corners can change.
+        The path at fly-by corners can change.
         """
         share, overrides = _real(percent) / 100.0, self._settings.overrides
         scaled = _member(AccelerationKind, kind)
@@ -405,52 +399,45 @@ class Interpolator:
 
     @_service
     def select_flyby_mode(self, on: bool) -> None:
-        """Select whether the arm flies by the targets set from now on or stops there."""
+        """Select whether the arm flies by later targets or stops there."""
         known = isinstance(on, bool | np.bool_) or _whole(on) in (0, 1)
         self._require(known, f"fly-by {on!r} is neither on nor off")
         self._set(flying=bool(on))
 
     @_service
     def select_flyby_criteria(self, criterion: int) -> None:
-        """Select what rules the size of a corner, a `FlybyCriterion`."""
+        """Select the `FlybyCriterion` of the size of corners."""
         self._set(criterion=_member(FlybyCriterion, criterion))
 
     @_service
     def set_flyby_criteria_parameter(self, criterion: int, value: float) -> None:
-        """Set the size of a corner: FLY_PER in 0..100 %, or the distance from the via point.
-
-        The distance is the Euclidean one in joint space [rad], and is not exceeded.
-        """
+        """Set the size of corners: FLY_PER in 0..100 %, or a distance in joint space [rad]."""
         self._set_flyby(_member(FlybyCriterion, criterion), value)
 
     @_service
     def set_point_accuracy_parameter(self, criterion: int, value: float) -> None:
-        """Set the size of a corner and select its criterion in one, as COMAU maps this service."""
+        """Set the size of corners and select its criterion, as COMAU maps this service."""
         named = _member(FlybyCriterion, criterion)
         self._set_flyby(named, value)
         self._set(criterion=named)
 
     @_service
     def cancel_flyby_criteria(self, criterion: int) -> None:
-        """Forget the value of a criterion; if it is selected, the percentage is from now on."""
+        """Reset the value of a criterion; if it is selected, select the percentage."""
         cancelled, selected = _member(FlybyCriterion, criterion), self._settings.criterion
         self._set_flyby(cancelled, _FLYBY[cancelled])
         self._set(criterion=FlybyCriterion.PERCENT if selected is cancelled else selected)
 
     @_service
     def select_point_accuracy(self, accuracy: int) -> None:
-        """Select the termination kind of the targets set from now on, a `PointAccuracy`.
-
-        Set-points are exact whatever it is; it says what a servo has to do behind them.
-        """
+        """Select the `PointAccuracy` of later targets; it does not change set-points."""
         self._set(accuracy=_member(PointAccuracy, accuracy))
 
     @_service
     def set_motion_time(self, seconds: float) -> None:
-        """Set what the move to the next target takes from rest to rest [s]; 0 takes that back.
+        """Set the time of the move to the next target, from rest to rest [s]; 0 for the shortest.
 
-        Its speed is lowered accordingly; `set_next_target` returns TIME_TOO_SHORT where the time
-        is too short. Flying by either end of the move shortens it.
+        `set_next_target` returns TIME_TOO_SHORT if it is too short. Fly-bys shorten the move.
         """
         self._require(0.0 <= _real(seconds) < inf, f"motion time of {seconds} s")
         self._set(motion_time=_real(seconds))
@@ -459,25 +446,25 @@ class Interpolator:
 
     @_service
     def set_next_target(self, target_id: int, position: ArrayLike) -> Status:
-        """Queue a target (n,) [rad], to be reached as the settings say now.
+        """Add a target (n,) [rad] with the present settings.
 
         Returns OK, or NEED_MORE_DATA while fewer targets are known than `set_advance_motion`
-        asks for. Refusals: INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where
-        no motion was found; the motion to the targets before goes on and stops at the last.
+        requests. Refusals: INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where
+        no motion was found; the motion to the targets before it continues.
         """
         queue, number = self._queue, _whole(target_id)
         if queue is None:
             raise _RefusedError("no initial position is set")
         self._require(not self._cancelling, "the cancelled motion still comes to rest")
         if number is None:
-            raise _RefusedError(f"target id {target_id!r} is no whole number")
+            raise _RefusedError(f"target id {target_id!r} is not an integer")
         move = _timed(queue, self._settings, self._position_of(position))
         queue.append(number, move, self._settings.overrides, self._law.motion_time)
         self._set(motion_time=0.0)
         return self._wanted(queue)
 
     def get_current_target_id(self) -> int | None:
-        """Return the identifier of the target that the arm moves to; None where there is none."""
+        """Return the identifier of the next target, or None."""
         ahead = self._queue.ahead if self._queue is not None else None
         return ahead[0].target_id if ahead else None
 
@@ -486,19 +473,18 @@ class Interpolator:
     def get_next_step(self, output_format: int = OutputFormat.JOINT) -> Step:
         """Return the next step of the motion.
 
-        Its status is OK; NEED_MORE_DATA while fewer targets are known than asked for (without
-        another the motion goes on and ends at the last one); FINAL_STEP with the end of the
-        motion, and for as long as it is stopped; NO_TARGET where there is nothing to move to;
-        OUTPUT_FORMAT for any format but joint positions.
+        Its status is OK; NEED_MORE_DATA while fewer targets are known than requested (the motion
+        continues to the last one); FINAL_STEP at the end of the motion and while it is stopped;
+        NO_TARGET without targets; OUTPUT_FORMAT for any format but joint positions.
         """
         queue, law = self._queue, self._law
         if _whole(output_format) != OutputFormat.JOINT:
-            return self._no_step(Status.OUTPUT_FORMAT, "only joint positions are offered")
+            return self._no_step(Status.OUTPUT_FORMAT, "only joint positions are available")
         if queue is None:
             return self._no_step(Status.INCONSISTENT, "no initial position is set")
         ahead = queue.ahead
         if not ahead:
-            return self._no_step(Status.NO_TARGET, "no target is set; the arm stands")
+            return self._no_step(Status.NO_TARGET, "no target is set")
         braking = self._held or self._cancelling
         if braking and law.settled:
             return self._stand(())
@@ -521,7 +507,7 @@ class Interpolator:
     def set_override_speed(
         self, percent: float, correction: SpeedCorrection = SpeedCorrection.GENERAL
     ) -> None:
-        """Set GEN_OVR, in 0..100 %, at once and on the path; or PROG_SPD_OVR, in (0, 100] %."""
+        """Set GEN_OVR, in 0..100 %, which acts at once; or PROG_SPD_OVR, in (0, 100] %."""
         general = _member(SpeedCorrection, correction) is SpeedCorrection.GENERAL
         share = _real(percent) / 100.0
         valid = 0.0 <= share <= 1.0 and (general or share > 0.0)
@@ -534,7 +520,7 @@ class Interpolator:
 
     @_service
     def stop_motion(self) -> None:
-        """Come to rest on the path, and stay, with unchanged targets, until asked otherwise."""
+        """Stop on the path until `continue_motion`; the targets are unchanged."""
         if not self._held:
             self._held = True
             self._stop_reported = self.get_current_target_id() is None
@@ -542,14 +528,14 @@ class Interpolator:
 
     @_service
     def continue_motion(self) -> None:
-        """Go on along the path after `stop_motion`, also while the arm still comes to rest."""
+        """Continue after `stop_motion`, also while the arm still slows down."""
         if self._held:
             self._held = False
             self._run(self._stopping)
 
     @_service
     def cancel_motion(self) -> None:
-        """Come to rest on the path and drop all targets; the arm waits for a new one there."""
+        """Stop on the path and drop all targets."""
         if self.get_current_target_id() is None:
             self._held = False
         elif self._moving:
@@ -558,9 +544,7 @@ class Interpolator:
         else:
             self._drop()
 
-    # -- within ----------------------------------------------------------------------------
-
-    def _forget(self) -> None:
+    def _clear(self) -> None:
         n = self._limits.n_joints
         full = read_only(np.ones(n))
         self._settings = MoveSettings(full, full, full)
@@ -575,7 +559,7 @@ class Interpolator:
         self._stop_reported = True
 
     def _rest_at(self, position: Array) -> None:
-        """Begin to wait for targets, at rest."""
+        """Wait for targets at a position."""
         self._queue = MotionQueue(position, self._limits, self._corner)
         self._position = position
         self._elapsed = 0.0
@@ -593,10 +577,10 @@ class Interpolator:
         return self.get_current_target_id() is not None and not at_rest
 
     def _run(self, bounds: RateBounds) -> None:
-        """Bring motion time to the rate it should have, within bounds if they suffice."""
+        """Change the rate to its target within bounds, or within those of a stop if needed."""
         law = self._law
         rate = 0.0 if self._held or self._cancelling else self._override
-        if law.motion_time == 0.0:  # at rest where the motion begins every rate is the same
+        if law.motion_time == 0.0:  # at rest at the start
             law.restart(0.0, rate)
         else:
             admitted = admits(bounds, law.rate, law.slope)
@@ -634,7 +618,7 @@ class Interpolator:
         self._set(**{name: read_only(shares)})
 
     def _position_of(self, position: ArrayLike) -> Array:
-        """Return a position (n,) that the arm can be at."""
+        """Return a position (n,) checked to be inside the limits."""
         point, lower, upper = _reals(position), self._limits.lower, self._limits.upper
         inside = point.shape == lower.shape and np.all((point >= lower) & (point <= upper))
         self._require(bool(inside), f"position {position!r:.200} is not in the limits")
@@ -656,7 +640,7 @@ class Interpolator:
         return self._step(status, ())
 
     def _stand(self, events: tuple[Event, ...]) -> Step:
-        """Return the step of an arm that was asked to stop and is at rest."""
+        """Return the step of a stopped arm at rest."""
         target = self.get_current_target_id()
         if not self._stop_reported and target is not None:
             self._stop_reported = True
@@ -667,7 +651,7 @@ class Interpolator:
         return step
 
     def _finish(self, queue: MotionQueue, before: float, now: float) -> Step:
-        """Return the step in which the motion ends, somewhere between two motion times."""
+        """Return the step in which the motion ends, between two motion times."""
         share = (queue.end - before) / (now - before) if now > before else 0.0
         self._elapsed += self._period * min(share, 1.0)
         *passed, last = queue.ahead
@@ -683,10 +667,10 @@ class Interpolator:
 
 
 def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move:
-    """Return the move to a target, slow enough for its motion time.
+    """Return the move to a target with its motion time.
 
     Raises:
-        InvalidSetting: a move that goes nowhere was given a time.
+        InvalidSetting: a motion time for a target that is the point before.
     """
     seconds = settings.motion_time
     if seconds == 0.0:
@@ -711,7 +695,7 @@ def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move:
 
 
 def _real(value: Any) -> float:
-    """Return a number as a float; NaN, which no range holds, for what is none, as True or "1"."""
+    """Return a number as a float; NaN, which fails every check of a range, if it is none."""
     try:
         return float(value) if isinstance(value, Real) and not isinstance(value, bool) else nan
     except OverflowError:
@@ -719,13 +703,13 @@ def _real(value: Any) -> float:
 
 
 def _reals(values: Any) -> Array:
-    """Return numbers, one or rows of them, as a read-only array, NaN for what are none."""
+    """Return numbers as a read-only array, NaN for entries that are none."""
     raw = np.asarray(values, dtype=object)
     return read_only(np.array([_real(value) for value in raw.flat]).reshape(raw.shape))
 
 
 def _whole(value: Any) -> int | None:
-    """Return a whole number, of Python's or numpy's types; None for what is none."""
+    """Return an integer of Python or numpy; None if it is none."""
     return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
 
 
@@ -733,5 +717,5 @@ def _member(kind: type[E], value: Any) -> E:
     """Return the member of an enumeration with this number."""
     number = _whole(value)
     if number is None or number not in kind._value2member_map_:
-        raise _RefusedError(f"{value!r:.80} is no {kind.__name__}")
+        raise _RefusedError(f"{value!r:.80} is not a {kind.__name__}")
     return kind(number)

@@ -1,4 +1,4 @@
-"""How far, how fast and how abruptly each joint may move."""
+"""Limits of position, velocity, acceleration and jerk of each joint."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 from planner.arrays import Array, read_only
 from planner.errors import InvalidLimits
 
-# No arm comes near; far beyond, the corners' solver has been seen to take its process with it.
+# Far beyond what any arm does; with larger numbers ruckig has crashed its process.
 SMALLEST_RATE: Final = 1e-10
 LARGEST_RATE: Final = 1e10
-# Rounding, not licence: a position may leave its range by this share of the range's size, and
-# neighbouring pieces may differ by this share of the limit of the quantity.
+# Tolerances for rounding: of a position beyond its range, relative to its largest magnitude, and of
+# a jump between two pieces, relative to the limit of the quantity.
 POSITION_ROUNDING: Final = 1e-12
 RATE_ROUNDING: Final = 1e-9
 
 
 class Allowance(NamedTuple):
-    """Limits made of others that were checked before, of one motion (n,) or of many (c, n)."""
+    """Limits computed from checked ones, of one motion (n,) or of many (c, n)."""
 
     lower: Array
     upper: Array
@@ -30,13 +30,13 @@ class Allowance(NamedTuple):
     jerk: Array
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> Allowance:
-        """Return some of the rows, by index or mask."""
+        """Return rows by index or mask."""
         return Allowance(*(bound[rows] for bound in self))
 
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Position range and largest rates of every joint, each (n,) and read-only.
+    """Limits of every joint, each (n,) and read-only.
 
     Attributes:
         lower: Smallest position [rad].
@@ -96,16 +96,16 @@ Bounds: TypeAlias = JointLimits | Allowance
 
 
 def position_rounding(limits: Bounds) -> Array:
-    """Return by how much a position may leave its range, which counts as rounding, (..., n)."""
+    """Return the tolerance on positions beyond their range (..., n) [rad]."""
     return POSITION_ROUNDING * np.maximum(np.abs(limits.lower), np.abs(limits.upper))
 
 
 def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
-    """Return the jumps of position, velocity, acceleration that count as rounding, (..., n, 3).
+    """Return the tolerances on jumps of position, velocity, acceleration, (..., n, 3).
 
     Durations (...) [s] and limits (..., n) are of one motion or of many.
     """
-    # A knot is reported no finer than the clock allows: late in a long motion that shows.
+    # Times of knots are rounded in proportion to the duration.
     tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
     return np.stack(
         (

@@ -1,8 +1,8 @@
-"""Moves to motion, as an industrial controller's joint interpolator runs them.
+"""Moves with settings, and the motion planned through their targets.
 
-A plan is made of legs, each a move by itself, and of the corners between two. Each looks at two
-neighbours at most, so that a motion can also be planned while it runs, one move after the other,
-and comes out the same; and many motions can be planned together, as a search does.
+A plan consists of legs (single moves) and of corners between two legs. A corner depends on its two
+legs only, so a motion planned move by move while it runs is the same, and many motions can be
+planned together.
 """
 
 from __future__ import annotations
@@ -26,19 +26,17 @@ from planner.straight import StraightMoves
 from planner.verify import check_limits, check_smooth
 
 Termination = Literal["fine", "coarse", "nosettle"]
-"""How exactly the arm has to have arrived before a stop at the target counts as made.
+"""Accuracy with which the arm has to reach a target at which it stops.
 
-It changes no set-point: the interpolated motion is at rest on the target in all three cases. It
-is carried along for whoever executes the motion and decides how long to wait for the real arm.
+It changes no set-point; whoever executes the motion may wait for the arm accordingly.
 """
 
 
 @dataclass(frozen=True)
 class FlyPercent:
-    """Fly by: the next move begins during the last `percent` of the deceleration (0..100).
+    """Fly-by in which the next move begins during the last `percent` of the deceleration (0..100).
 
-    0 is a stop; at 100 the corner begins as soon as the deceleration does. The path is rounder
-    at a higher speed.
+    0 is a stop; at 100 the corner begins with the deceleration. It is rounder at higher speed.
     """
 
     percent: float
@@ -50,10 +48,9 @@ class FlyPercent:
 
 @dataclass(frozen=True)
 class FlyDistance:
-    """Fly by as widely as the path stays within `distance` [rad] of the target.
+    """Widest fly-by whose path stays within `distance` [rad] of the target.
 
-    The distance is Euclidean in joint space, between the target and the point of the path that
-    is nearest to it.
+    The distance is Euclidean in joint space, from the target to the nearest point of the path.
     """
 
     distance: float
@@ -65,7 +62,7 @@ class FlyDistance:
 
 @dataclass(frozen=True)
 class Stop:
-    """Come to rest on the target."""
+    """Stop at the target."""
 
 
 Fly: TypeAlias = FlyPercent | FlyDistance | Stop
@@ -73,20 +70,20 @@ Fly: TypeAlias = FlyPercent | FlyDistance | Stop
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """One straight joint-space move to a target, all joints in phase.
+    """Straight joint-space move to a target, all joints in phase.
 
-    Shares multiply, with each other and with the overrides; what they limit is one joint's
-    velocity, acceleration or jerk, and the joint that needs longest rules the others.
+    Shares of limits multiply, with each other and with the overrides; the slowest joint determines
+    the time.
 
     Attributes:
-        target: Where it leads (n,) [rad].
+        target: Target position (n,) [rad].
         speed: Share of all velocity limits, in (0, 1].
         acceleration: Share of all acceleration limits, in (0, 1], for both ramps.
-        joint_speed: Share of each velocity limit (n,), or None for all.
-        joint_acceleration: Share of each acceleration limit (n,), or None for all.
-        fly: How the target is passed; the last target of a motion is always a stop.
+        joint_speed: Share of each velocity limit (n,); None for 1.
+        joint_acceleration: Share of each acceleration limit (n,); None for 1.
+        fly: Passage of the target; the last target of a motion is always a stop.
         termination: See `Termination`.
-        joint_jerk: Share of each jerk limit (n,), or None for all.
+        joint_jerk: Share of each jerk limit (n,); None for 1.
 
     Raises:
         InvalidSetting: a value is outside its range or of the wrong shape.
@@ -119,9 +116,9 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Overrides:
-    """Overrides that change only their own quantity, so that a flown path may change with them.
+    """Overrides at planning time, each of one quantity; fly-by paths may change with them.
 
-    (The override that leaves the path unchanged acts while the motion is played.)
+    The override that does not change the path is `TrajectoryPlayer.override`.
 
     Attributes:
         speed: Share of all velocity limits, in (0, 1].
@@ -147,10 +144,10 @@ class Overrides:
 
 
 def checked_shares(name: str, values: ArrayLike, n_joints: int | None = None) -> Array:
-    """Return a share in (0, 1], or as many as joints where their number is given, read-only.
+    """Return shares in (0, 1], one or one per joint, read-only.
 
     Raises:
-        InvalidSetting: a value is outside its range, or there are not as many as joints.
+        InvalidSetting: a value is outside its range, or their number is wrong.
     """
     shares = _array(values)
     if shares.shape not in ((), (n_joints,)) or not np.all((shares > 0.0) & (shares <= 1.0)):
@@ -160,15 +157,15 @@ def checked_shares(name: str, values: ArrayLike, n_joints: int | None = None) ->
 
 
 def _array(values: ArrayLike) -> Array:
-    """Return numbers as a read-only array, NaN for what are none."""
+    """Return numbers as a read-only array; NaN if they are not numbers."""
     try:
         return read_only(values)
     except (TypeError, ValueError):
         return read_only(np.nan)
 
 
-# Segments keep this distance from the limits, so that the states at which corners cut them lie
-# clear of where the corner's solver is known to fail; corners then use the full limits.
+# Shares of the limits that legs use, so that the states at which corners cut them are far from
+# those at which ruckig fails; corners use the full limits.
 SEGMENT_VELOCITY: Final = 0.99
 SEGMENT_ACCELERATION: Final = 0.98
 SEGMENT_JERK: Final = 0.98
@@ -179,8 +176,8 @@ class Legs(NamedTuple):
 
     Attributes:
         moves: The straight motions.
-        bounds: What each may use (s, n), its deceleration apart.
-        deceleration: What each may use while slowing down (s, n) [rad/s²].
+        bounds: Limits of each (s, n).
+        deceleration: Acceleration limits while slowing down (s, n) [rad/s²].
     """
 
     moves: StraightMoves
@@ -199,19 +196,19 @@ class Legs(NamedTuple):
         return cls(StraightMoves.between(starts, ends, cautious, slowing), bounds, deceleration)
 
     def followed_by(self, other: Legs) -> Legs:
-        """Return these and other legs in one."""
+        """Return these legs and others."""
         moves, bounds = (
-            [np.concatenate(pair) for pair in zip(ours, theirs, strict=True)]
-            for ours, theirs in zip(self[:2], other[:2], strict=True)
+            [np.concatenate(pair) for pair in zip(first, second, strict=True)]
+            for first, second in zip(self[:2], other[:2], strict=True)
         )
         deceleration = np.concatenate((self.deceleration, other.deceleration))
         return Legs(StraightMoves(*moves), Allowance(*bounds), deceleration)
 
     def corners(self, before: Rows, after: Rows, flies: Sequence[Fly]) -> list[Corner]:
-        """Plan how the targets of legs `before` (c,) are passed on the way to those of `after`.
+        """Plan the corners at the targets of legs `before` (c,), towards those of `after`.
 
-        Within a corner each joint may use what the more generous of the two moves grants: the
-        deceleration of the one before or the acceleration of the one after.
+        Limits within a corner are the larger ones of the two moves; those of acceleration are the
+        deceleration before and the acceleration after it.
         """
         first, second = self.bounds.take(before), self.bounds.take(after)
         bounds = first._replace(
@@ -229,10 +226,10 @@ class Legs(NamedTuple):
         return corners
 
     def motions(self, corners: Sequence[Corner], count: int) -> list[PiecewiseCubic]:
-        """Cut the legs of so many motions where the corners ask for it and put all in a row.
+        """Assemble legs and corners to `count` motions.
 
         Raises:
-            PlanningError: a motion breaks what its legs may use, or is not smooth.
+            PlanningError: a motion breaks a limit of its legs, or is not smooth.
         """
         found = self.checked_motions(corners, count)
         for motion in found:
@@ -243,21 +240,21 @@ class Legs(NamedTuple):
     def checked_motions(
         self, corners: Sequence[Corner], count: int
     ) -> list[PiecewiseCubic | PlanningError]:
-        """Return the same, each motion as the table that it is or why there is none."""
+        """Return each motion, or the error for which it is refused."""
         block = _assembled(self.moves, corners, count)
         rates = self.bounds._replace(
             acceleration=np.maximum(self.bounds.acceleration, self.deceleration)
         )
         n = self.deceleration.shape[1]
         widest = Allowance(*(bound.reshape(count, -1, n).max(axis=1) for bound in rates))
-        good = (block.keeps(widest) & block.smooth(widest)).tolist()
+        good = (block.satisfies(widest) & block.smooth(widest)).tolist()
         return [
-            motion if ok else _refused(motion, Allowance(*(bound[row] for bound in widest)))
+            motion if ok else _checked(motion, Allowance(*(bound[row] for bound in widest)))
             for row, (motion, ok) in enumerate(zip(block.tables(), good, strict=True))
         ]
 
 
-def _refused(motion: PiecewiseCubic, bounds: Allowance) -> PiecewiseCubic | PlanningError:
+def _checked(motion: PiecewiseCubic, bounds: Allowance) -> PiecewiseCubic | PlanningError:
     try:
         check_limits(motion, bounds)
         check_smooth(motion, bounds)
@@ -267,20 +264,20 @@ def _refused(motion: PiecewiseCubic, bounds: Allowance) -> PiecewiseCubic | Plan
 
 
 def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> Block:
-    """Return motions of as many legs each, corners between them."""
+    """Return `count` motions of equal numbers of legs, with corners between them."""
     legs, n = len(moves.start) // count, moves.start.shape[1]
     leave, enter = np.zeros((2, count, legs))
     leave[:, :-1] = np.array([corner.leave for corner in corners]).reshape(count, -1)
     enter[:, 1:] = np.array([corner.enter for corner in corners]).reshape(count, -1)
-    # Two full fly-bys may use up a move without cruise; nothing is left but rounding.
+    # Two full fly-bys may use up a move without cruise: then `end` is `begin` within rounding.
     begin, end = enter.ravel(), moves.durations - leave.ravel()
     times, pieces = moves.cut(begin, np.maximum(begin, end))
     times = times.reshape(count, legs, 1, -1)
     pieces = pieces.reshape(count, legs, n, -1, 4)
 
     width = max([1, *(len(c.join.knots[0]) - 1 for c in corners if c.join is not None)])
-    # Where the arm stops, and behind the last piece of a join, pieces of no length hold the state
-    # in which the next move is entered.
+    # At a stop, and after the last piece of a join, pieces of zero length have the state at which
+    # the next move is entered.
     rounds = np.repeat(pieces[:, 1:, :, :1], width, axis=3)
     rounds[..., 3] = 0.0
     knots = np.zeros((count, legs - 1, n, width + 1))
@@ -307,10 +304,10 @@ def _assembled(moves: StraightMoves, corners: Sequence[Corner], count: int) -> B
 def legs_through(
     points: Array, moves: Sequence[Move], limits: JointLimits, overrides: Overrides
 ) -> Legs:
-    """Plan the moves from each of the points (s + 1, n) [rad] to the next by themselves.
+    """Plan the moves from each of the points (s + 1, n) [rad] to the next, from rest to rest.
 
     Raises:
-        InvalidSetting: a move, or the overrides, are those of another number of joints.
+        InvalidSetting: the overrides have another number of joints.
     """
     n = limits.n_joints
     joint = np.asarray(overrides.joint)
@@ -338,13 +335,13 @@ def legs_through(
 
 @dataclass(frozen=True)
 class TargetPassage:
-    """How the target of one move is passed.
+    """Passage of the target of one move.
 
     Attributes:
-        index: Of the move, from 0.
-        time: When the path is nearest to the target, or reaches it, from the beginning [s].
+        index: Number of the move, from 0.
+        time: Time at which the path is nearest to the target [s].
         distance: Euclidean distance between path and target in joint space [rad].
-        how: "flown" as asked, "reduced" (rounded less than asked), or "stopped".
+        how: "flown" as requested, "reduced" (rounded less than requested), or "stopped".
         fly: Share of the ramps before and after the target that the corner takes, 0 for a stop.
     """
 
@@ -360,13 +357,13 @@ class MotionPlan:
     """A motion through the targets of moves, from rest to rest.
 
     Attributes:
-        start: Where it begins (n,) [rad].
-        moves: What was asked.
-        limits: What it keeps at every instant.
-        overrides: What applied when it was planned.
+        start: Start position (n,) [rad].
+        moves: Moves as requested.
+        limits: Limits satisfied at every instant.
+        overrides: Overrides of the plan.
         trajectory: The motion.
-        durations: Of each move by itself, from rest to rest [s].
-        corners: How each target but the last is passed.
+        durations: Duration of each move from rest to rest [s].
+        corners: Corner at each target but the last.
     """
 
     start: Array
@@ -384,17 +381,17 @@ class MotionPlan:
 
     @property
     def duration_with_stops(self) -> float:
-        """Length in time of the same moves with a stop at every target [s]; never shorter."""
+        """Length in time with a stop at every target [s]; never shorter."""
         return sum(self.durations)
 
     @property
     def reduced_corners(self) -> int:
-        """Number of targets flown by less widely than asked."""
+        """Number of targets with a smaller corner than requested."""
         return sum(corner.how == "reduced" for corner in self.corners)
 
     @property
     def stopped_corners(self) -> int:
-        """Number of targets to be flown by between two real moves at which the motion stops."""
+        """Number of targets at which the motion stops although a fly-by was requested."""
         return sum(
             corner.how == "stopped"
             and move.fly not in (Stop(), FlyPercent(0.0), FlyDistance(0.0))
@@ -406,7 +403,7 @@ class MotionPlan:
 
     @cached_property
     def targets(self) -> tuple[TargetPassage, ...]:
-        """How the target of each move is passed."""
+        """Passage of the target of each move."""
         time, entered, passages = 0.0, 0.0, []
         for index, (move, duration, corner) in enumerate(
             zip(self.moves, self.durations, (*self.corners, STOP), strict=True)
@@ -419,7 +416,7 @@ class MotionPlan:
 
 
 def passage(index: int, target: Array, corner: Corner, time: float) -> TargetPassage:
-    """Return how a target (n,) [rad] is passed by a corner that begins at `time` [s]."""
+    """Return the passage of a target (n,) [rad] by a corner that begins at `time` [s]."""
     if corner.join is None:
         return TargetPassage(index, time, 0.0, "stopped", 0.0)
     passed = passing(corner.join, target)
@@ -427,7 +424,7 @@ def passage(index: int, target: Array, corner: Corner, time: float) -> TargetPas
 
 
 def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
-    """Return via points (n_points, n_joints) [rad] that a motion can be planned through.
+    """Return checked via points (n_points, n_joints) [rad].
 
     Raises:
         InvalidViaPoints: wrong shape, fewer than two, not finite, or out of limits.
@@ -442,7 +439,7 @@ def checked_via_points(via_points: ArrayLike, limits: JointLimits) -> Array:
     if len(points) < 2:
         raise InvalidViaPoints(f"{len(points)} via point(s) given; a motion needs at least 2")
     inside = (points >= limits.lower) & (points <= limits.upper)
-    for index, joint in np.argwhere(~inside).tolist():  # NaN is inside of nothing
+    for index, joint in np.argwhere(~inside).tolist():  # the first; NaN is never inside
         value, lower, upper = points[index, joint], limits.lower[joint], limits.upper[joint]
         raise InvalidViaPoints(
             f"via point {index}, joint {joint}: {value:.6g} rad is outside "
@@ -462,26 +459,26 @@ def plan_moves(
     limits: JointLimits,
     overrides: Overrides = _NO_OVERRIDES,
 ) -> MotionPlan:
-    """Plan a motion through the targets of moves that starts and ends at rest.
+    """Plan a motion through the targets of moves, from rest to rest.
 
     Between targets the arm moves on straight joint-space lines, all joints in phase. A target
-    that repeats its predecessor is a stop. A corner that cannot be rounded as asked, or is
-    faster if it is rounded less, is rounded less, in the end not at all; see
-    `MotionPlan.targets`. The motion never takes longer than one with a stop at every target.
+    that repeats its predecessor is a stop. A corner that cannot be rounded as requested, or is
+    faster if rounded less, is rounded less or becomes a stop; see `MotionPlan.targets`. The motion
+    never takes longer than one with a stop at every target.
 
     Args:
-        start: Where the arm rests (n,) [rad].
+        start: Start position (n,) [rad].
         moves: At least one, targets inside the limits.
-        limits: Limits, respected exactly (but for rounding) at every instant.
-        overrides: Shares that apply to all moves.
+        limits: Limits, satisfied at every instant within rounding.
+        overrides: Shares for all moves.
 
     Raises:
-        InvalidViaPoints: start or a target is of the wrong shape, not finite, or out of limits;
-            via point 0 is the start, via point i the target of the i-th move.
+        InvalidViaPoints: start (via point 0) or a target (via point i of the i-th move) is of the
+            wrong shape, not finite, or out of limits.
         InvalidSetting: overrides of another number of joints.
-        PlanningError: the finished plan breaks a limit or jumps by more than rounding, and is not
-            returned; seen only with limits that lie many powers of ten (1e8) apart.
-        UnsupportedSolver: a corner is to be rounded, and the installed ruckig is not known.
+        PlanningError: the plan breaks a limit or is not smooth; seen only with limits that differ
+            by 1e8.
+        UnsupportedSolver: a corner is to be rounded with an untested version of ruckig.
     """
     points = checked_via_points([start, *(move.target for move in moves)], limits)
     legs = legs_through(points, moves, limits, overrides)
@@ -502,16 +499,14 @@ def plan_moves(
 def plan(
     via_points: ArrayLike, limits: JointLimits, *, speed: ArrayLike = 1.0, fly: float = 0.5
 ) -> PiecewiseCubic:
-    """Plan a motion through via points that starts and ends at rest and keeps all limits.
-
-    The same as `plan_moves` with moves that are all alike; see there.
+    """Plan a motion through via points, from rest to rest: `plan_moves` with equal settings.
 
     Args:
         via_points: Positions (n_points, n_joints) [rad], at least two, inside the limits.
-        limits: Limits, respected exactly (but for rounding) at every instant.
-        speed: Share of each joint's velocity limit to use, in (0, 1], a number or (n,).
+        limits: Limits, satisfied at every instant within rounding.
+        speed: Share of each joint's velocity limit, in (0, 1], a number or (n,).
         fly: Share of each deceleration that the next acceleration overlaps, from 0 (stop at
-            every via point) to 1 (the corner begins where the deceleration would).
+            every via point) to 1 (the corner begins with the deceleration).
 
     Raises:
         InvalidSetting: speed or fly outside its range.
@@ -530,19 +525,18 @@ def plan(
 def plan_chunk(
     individuals: Sequence[ArrayLike], speed: Array, limits: JointLimits, fly: float
 ) -> list[PiecewiseCubic | PlannerError]:
-    """Plan a motion through the via points of each individual of a search, all together.
+    """Plan the motions of many individuals of a search together.
 
-    A corner can crash the solver and this process with it, so that this is a worker's
-    (`planner.worker`).
+    ruckig can crash the process, so searches call this in `planner.worker` processes.
 
     Args:
         individuals: Via points (n_points, n_joints) [rad] of each; their number may differ.
         speed: Share of each joint's velocity limit, in (0, 1], one row (n,) for each.
-        limits: Limits that every motion keeps.
+        limits: Limits of all motions.
         fly: Share of each deceleration that the next acceleration overlaps, 0 to 1.
 
     Returns:
-        For each individual, in their order, its motion or the error that `plan` would raise for it.
+        For each individual its motion, or the error that `plan` would raise.
     """
     planned: dict[int, PiecewiseCubic | PlannerError] = {}
     alike: dict[int, list[tuple[int, Array]]] = {}

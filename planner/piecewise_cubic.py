@@ -1,4 +1,4 @@
-"""The table every interpolated motion becomes: cubic pieces per joint, exactly integrable."""
+"""Motions as cubic pieces of each joint: the form of every interpolated motion."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Trajectory(Protocol):
 
 
 class Extrema(NamedTuple):
-    """The farthest a trajectory goes, per joint (n,), SI units; rates are magnitudes."""
+    """Extremes of a trajectory per joint (n,), SI units; rates are magnitudes."""
 
     lower: Array
     upper: Array
@@ -53,15 +53,14 @@ class Extrema(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PiecewiseCubic:
-    """A motion of constant jerks: per joint its own knots and cubic pieces between them.
+    """A motion of piecewise constant jerk, with separate knots for each joint.
 
-    Before time 0 and after `duration` the joints are assumed to rest where the motion begins and
-    ends: sampled there, the position is held and velocity and acceleration are zero.
+    Before time 0 and after `duration` the joints rest at the first and last position.
 
     Attributes:
-        knots: Per joint (m_j + 1,) times [s], from 0 to the common duration, never falling.
+        knots: Times (m_j + 1,) [s] per joint, from 0 to the common duration, not decreasing.
         coefficients: Per joint (m_j, 4): position [rad], velocity [rad/s], acceleration
-            [rad/s²] at the start of each piece, and its constant jerk [rad/s³].
+            [rad/s²] at the start of each piece, and its jerk [rad/s³].
     """
 
     knots: tuple[Array, ...]
@@ -91,7 +90,7 @@ class PiecewiseCubic:
         ):
             piece = np.searchsorted(knots[1:-1], within, side="right")
             p, v, a, j, start = np.vstack((coefficients.T, knots[:-1])).take(piece, axis=1)
-            # In place throughout: fresh temporaries of this size cost more than the arithmetic.
+            # In place: temporaries of this size cost more than the arithmetic.
             x = np.subtract(within, start, out=start)
             half = np.multiply(j, x, out=j)
             half *= 0.5
@@ -126,7 +125,7 @@ class PiecewiseCubic:
 
     @cached_property
     def _rows(self) -> list[tuple[list[float], list[list[float]]]]:
-        """Knots and coefficients as floats, which a single look-up reads fastest."""
+        """Knots and coefficients as floats, the fastest for a single look-up."""
         return [
             (knots.tolist(), coefficients.tolist())
             for knots, coefficients in zip(self.knots, self.coefficients, strict=True)
@@ -140,7 +139,7 @@ class PiecewiseCubic:
         )
 
     def extrema(self) -> Extrema:
-        """Return the extremes over all time, from the roots of each piece, not from samples."""
+        """Return the extremes over all time, from the roots of each piece."""
         first = np.cumsum([0, *(len(c) for c in self.coefficients[:-1])])
         pieces = np.concatenate(self.coefficients)
         reach = _reach(pieces, np.concatenate([np.diff(knots) for knots in self.knots]))
@@ -148,7 +147,7 @@ class PiecewiseCubic:
         return Extrema(np.minimum.reduceat(reach.lower, first), *largest)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return lists; `from_dict` restores every bit, through JSON too."""
+        """Return lists, from which `from_dict` restores the same bits, also through JSON."""
         return {
             "type": "piecewise_cubic",
             "knots": [knots.tolist() for knots in self.knots],
@@ -160,12 +159,11 @@ class PiecewiseCubic:
         """Restore a trajectory from `to_dict`.
 
         Raises:
-            InvalidTrajectory: a field is missing, or is not the table that it should be.
+            InvalidTrajectory: a field is missing or invalid.
         """
         try:
-            kind = data.get("type")
-            if kind != "piecewise_cubic":
-                raise InvalidTrajectory(f"type is {kind!r:.80}; expected 'piecewise_cubic'")
+            if data["type"] != "piecewise_cubic":
+                raise InvalidTrajectory("the type is not 'piecewise_cubic'")
             knots = tuple(numbers(row, 1) for row in data["knots"])
             coefficients = tuple(numbers(row, 2) for row in data["coefficients"])
             _check_table(knots, coefficients)
@@ -184,10 +182,8 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
         )
     for joint, (times, pieces) in enumerate(zip(knots, coefficients, strict=True)):
         if len(times) < 2 or pieces.shape != (len(times) - 1, 4):
-            raise InvalidTrajectory(
-                f"joint {joint}: knots {times.shape} and coefficients {pieces.shape}; "
-                "expected (m + 1,) and (m, 4) with m >= 1"
-            )
+            shapes = f"knots {times.shape} and coefficients {pieces.shape}"
+            raise InvalidTrajectory(f"joint {joint}: {shapes}; expected (m + 1,) and (m, 4)")
         if not (np.all(np.isfinite(times)) and np.all(np.isfinite(pieces))):
             raise InvalidTrajectory(f"joint {joint}: knots and coefficients must be finite")
         if times[0] != 0.0 or np.any(np.diff(times) < 0.0) or times[-1] != knots[0][-1]:
@@ -197,12 +193,11 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
 
 
 class Block(NamedTuple):
-    """Cubic pieces of many motions, the same number m for every joint of every one.
+    """Cubic pieces of many motions, the same number m for every joint of each.
 
     Attributes:
         knots: Times from 0 to the duration of each motion, (c, n, m + 1) [s].
-        coefficients: Position, velocity, acceleration at the start of each piece, and its jerk,
-            (c, n, m, 4).
+        coefficients: As of a `PiecewiseCubic`, (c, n, m, 4).
         end: Position, velocity, acceleration at the end, (c, n, 3).
     """
 
@@ -216,7 +211,7 @@ class Block(NamedTuple):
         x = knots[..., 1:] - knots[..., :-1]
         states = np.empty((*knots.shape, 3))
         states[..., 0, :] = start
-        # In the order of operations in which a table is evaluated: so pieces meet to the last bit.
+        # In the order of operations of `after`, so that pieces meet to the last bit.
         jx = jerks * x
         states[..., 1:, 2] = jx
         p, v, a = (states[..., i] for i in range(3))
@@ -230,7 +225,7 @@ class Block(NamedTuple):
 
     @classmethod
     def of_pieces(cls, knots: Array, coefficients: Array) -> Self:
-        """Make a block of its pieces, which tell where it ends."""
+        """Return a block of pieces, with its end computed."""
         last = np.moveaxis(coefficients[..., -1, :], -1, 0)
         end = np.stack(after(last, knots[..., -1] - knots[..., -2]), axis=-1)
         return cls(knots, coefficients, end)
@@ -242,11 +237,11 @@ class Block(NamedTuple):
         return last
 
     def take(self, rows: Rows | Mask) -> Block:
-        """Return some of the motions, by index or mask."""
+        """Return motions by index or mask."""
         return Block(*(field[rows] for field in self))
 
-    def keeps(self, bounds: Allowance) -> Mask:
-        """Whether each motion keeps its bounds (c, n) at every instant (c,)."""
+    def satisfies(self, bounds: Allowance) -> Mask:
+        """Whether each motion satisfies its bounds (c, n) at every instant, (c,)."""
         reach = _reach(self.coefficients, np.diff(self.knots, axis=-1))
         slack = position_rounding(bounds)
         within = reach.lower.min(axis=-1) >= bounds.lower - slack
@@ -257,7 +252,7 @@ class Block(NamedTuple):
         return respected
 
     def smooth(self, bounds: Allowance) -> Mask:
-        """Whether each motion is C2 and at rest at both ends, but for rounding, (c,)."""
+        """Whether each motion is C2 and at rest at both ends within rounding, (c,)."""
         pieces = np.moveaxis(self.coefficients, -1, 0)
         ends = np.stack(after(pieces, np.diff(self.knots, axis=-1)), axis=-1)
         starts = self.coefficients[..., :3]
@@ -268,7 +263,7 @@ class Block(NamedTuple):
         return smooth
 
     def tables(self) -> list[PiecewiseCubic]:
-        """Return each motion as a table of its own, without pieces of no length."""
+        """Return each motion, without pieces of zero length."""
         real = np.diff(self.knots, axis=-1) > 0.0
         real[..., 0] |= ~real.any(axis=-1)
         ends = np.cumsum(real.sum(axis=-1), axis=None).tolist()
@@ -285,7 +280,7 @@ class Block(NamedTuple):
 
 
 def after(piece: Any, x: Any) -> tuple[Any, Any, Any]:
-    """Return position, velocity, acceleration a time `x` into pieces (4, ...), or into one."""
+    """Return position, velocity, acceleration a time `x` into one piece or pieces (4, ...)."""
     p, v, a, j = piece
     return (
         p + x * (v + x * (a * 0.5 + x * j * (1.0 / 6.0))),
@@ -295,7 +290,7 @@ def after(piece: Any, x: Any) -> tuple[Any, Any, Any]:
 
 
 def pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
-    """Return coefficients (m, 4) of one joint that go on from times (m,) [s] within a motion."""
+    """Return coefficients (m, 4) of one joint as of pieces that start at times (m,) [s]."""
     knots = motion.knots[joint]
     piece = np.searchsorted(knots[1:-1], times, side="right")
     pieces = motion.coefficients[joint][piece].T
@@ -303,14 +298,14 @@ def pieces_from(motion: PiecewiseCubic, joint: int, times: Array) -> Array:
 
 
 def _reach(pieces: Array, length: Array) -> Extrema:
-    """Return how far pieces (..., 4) of lengths (...) [s] go, from their roots, (...) each."""
+    """Return the extremes of pieces (..., 4) of lengths (...) [s], from their roots, (...) each."""
     p, v, a, j = parts = np.moveaxis(pieces, -1, 0)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         fastest = -a / j
         # Roots of v + a x + j x²/2 in the form that loses no digits when j is small.
         root = -(a + np.copysign(np.sqrt(a * a - 2.0 * j * v), a))
         times = np.stack((root / j, 2.0 * v / root, fastest, length))
-    # Any time inside its piece is a fair sample, so a root that does not exist may be that.
+    # A root that does not exist is replaced by a time inside the piece, which changes no extreme.
     times = np.fmax(np.fmin(times, length), 0.0)
     position, velocity, acceleration = after(parts, times)
     return Extrema(

@@ -1,7 +1,7 @@
-"""A plan as data: the moves that were asked for, and the motion that came of them.
+"""Plan files: moves and the motion planned through them, as JSON (SI units), TOML and CSV.
 
-`PlanFile.to_dict` is what an archive carries (JSON, SI units); `to_toml` is the same for people,
-with angles in degrees, and restores the same bits. `to_csv` is the motion alone, for others.
+The JSON of `PlanFile.to_dict` is part of archives. The TOML has angles in degrees, from which the
+same bits are read again. `to_csv` writes the motion alone.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _ANGLES: Mapping[str, frozenset[str]] = {
     "limits": frozenset({"lower", "upper", "velocity", "acceleration", "jerk"}),
     "moves": frozenset({"target", "fly_distance"}),
 }
-"""Which fields of each table are angles or their rates."""
+"""Fields of each table that are angles or their rates."""
 
 
 def to_toml(data: Mapping[str, Any]) -> str:
@@ -68,7 +68,7 @@ def _with_angles(table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def from_toml(text: str) -> dict[str, Any]:
-    """Return the data of a plan file, in SI units, from TOML.
+    """Return the data of a plan file in SI units from TOML.
 
     Raises:
         InvalidPlanFile: the text is not TOML, or an angle is not a number.
@@ -83,8 +83,8 @@ def from_toml(text: str) -> dict[str, Any]:
 
 FORMAT: Final = "joint motion plan"
 VERSION: Final = 1
-# Planned again on another machine a motion may differ in its last digits [rad, s], and in its
-# rates by as small a share of their limits; no more, at any instant.
+# Tolerances between a stored motion and the same one planned on another machine: of positions
+# [rad] and duration [s], and of rates as a share of their limits.
 _SAME = 1e-9
 _SAME_RATES = 1e-6
 
@@ -125,7 +125,7 @@ class _MoveData(_Data):
         fields = self.model_dump(exclude_none=True)
         percent, distance = fields.pop("fly_percent", None), fields.pop("fly_distance", None)
         if None not in (percent, distance):
-            raise InvalidPlanFile("a move flies by percentage or by distance, not both")
+            raise InvalidPlanFile("a move has fly_percent or fly_distance, not both")
         if percent is not None:
             return Move(fly=FlyPercent(percent), **fields)
         return Move(fly=Stop() if distance is None else FlyDistance(distance), **fields)
@@ -159,15 +159,15 @@ class _FileData(_Data):
 
 @dataclass(frozen=True, eq=False)
 class PlanFile:
-    """What a file of a plan says.
+    """Content of a plan file.
 
     Attributes:
         joint_names: Names of the joints, in their order.
-        start: Where the motion begins (n,) [rad].
-        moves: What follows, in order; percentages of fly and shares of speed as they were asked.
-        overrides: Those in force when it was planned.
-        limits: Those it was planned for; a file written by hand may leave them out.
-        trajectory: The motion itself, to the bit; a file written by hand has none.
+        start: Start position (n,) [rad].
+        moves: Moves in order.
+        overrides: Overrides of the plan.
+        limits: Limits of the plan; None in some files written by hand.
+        trajectory: The motion; None in files written by hand.
     """
 
     joint_names: tuple[str, ...]
@@ -184,13 +184,13 @@ class PlanFile:
         if len(set(self.joint_names)) < n:
             raise InvalidPlanFile(f"a joint is named twice in {', '.join(self.joint_names)}")
         if n == 0 or any(size != n for size in sizes):
-            raise InvalidPlanFile(f"{n} joints are named, but positions or limits are for {sizes}")
+            raise InvalidPlanFile(f"{n} joints are named; positions and limits have {sizes}")
         if not all(np.all(np.isfinite(q)) for q in (self.start, *(m.target for m in self.moves))):
             raise InvalidPlanFile("start and targets must be finite positions")
 
     @classmethod
     def of(cls, plan: MotionPlan, joint_names: Sequence[str]) -> PlanFile:
-        """Return a plan as a file, with its limits and its motion."""
+        """Return the file of a plan, with limits and motion."""
         return cls(
             joint_names=tuple(joint_names),
             start=plan.start,
@@ -201,28 +201,28 @@ class PlanFile:
         )
 
     def plan(self, limits: JointLimits | None = None) -> MotionPlan:
-        """Return the plan: the stored motion if there is one, checked, else a new one.
+        """Return the plan with the checked stored motion, or a new one.
 
         Args:
-            limits: Plan for these instead, whatever limits and motion are stored.
+            limits: Plan the moves for these, in place of the stored limits and motion.
 
         Raises:
-            InvalidPlanFile: no limits anywhere, or a stored motion that breaks its limits or is
-                not what its moves plan to.
+            InvalidPlanFile: no limits are given or stored, or the stored motion breaks its limits
+                or is not that of its moves.
             PlannerError: the moves cannot be planned.
         """
-        own = limits is None
+        use_stored = limits is None
         limits = limits or self.limits
         if limits is None:
-            raise InvalidPlanFile("the plan has no limits; name some to plan it for")
+            raise InvalidPlanFile("the plan has no limits; give the limits to plan it for")
         planned = plan_moves(self.start, self.moves, limits, self.overrides)
-        if not own or self.trajectory is None:
+        if not use_stored or self.trajectory is None:
             return planned
         _check_motion(self.trajectory, planned)
         return replace(planned, trajectory=self.trajectory)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return lists in SI units; `from_dict` restores every bit, through JSON too."""
+        """Return lists in SI units, from which `from_dict` restores the same bits."""
         overrides = {
             name: np.asarray(getattr(self.overrides, name)).tolist()
             for name in _OverridesData.model_fields
@@ -248,7 +248,7 @@ class PlanFile:
         """Restore a file from `to_dict`.
 
         Raises:
-            InvalidPlanFile: a field is missing, unknown, or not what it should be.
+            InvalidPlanFile: a field is missing, unknown or invalid.
         """
         try:
             read = _FileData.model_validate(data)
@@ -265,18 +265,18 @@ class PlanFile:
             raise
         except ValidationError as error:
             first = error.errors(include_url=False, include_input=False)[0]
-            place = ".".join(map(str, first["loc"])) or "it"
+            place = ".".join(map(str, first["loc"]))
             raise InvalidPlanFile(f"not a plan: {place}: {first['msg']}") from error
         except (PlannerError, *DAMAGED) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
 
     def to_toml(self) -> str:
-        """Return the file as text for people, angles in degrees."""
+        """Return the file as TOML, angles in degrees."""
         return to_toml(self.to_dict())
 
     @classmethod
     def from_toml(cls, text: str) -> PlanFile:
-        """Read the text of a file, written by `to_toml` or by hand.
+        """Read a TOML file written by `to_toml` or by hand.
 
         Raises:
             InvalidPlanFile: the text is not TOML, or not a plan.
@@ -285,32 +285,29 @@ class PlanFile:
 
 
 def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
-    again, limits = planned.trajectory, planned.limits
+    other, limits = planned.trajectory, planned.limits
     try:
         check_limits(stored, limits)
         check_smooth(stored, limits)
     except PlannerError as error:
         raise InvalidPlanFile(f"the stored motion: {error}") from error
-    extrema = _apart(stored, again).extrema()
+    extrema = _difference(stored, other).extrema()
     apart = float(max(np.max(-extrema.lower), np.max(extrema.upper)))
     rates = max(
         float(np.max(extrema.velocity / limits.velocity)),
         float(np.max(extrema.acceleration / limits.acceleration)),
     )
-    late = abs(stored.duration - again.duration)
+    late = abs(stored.duration - other.duration)
     if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
         raise InvalidPlanFile(
-            f"the stored motion of {stored.duration:.6f} s is not what the moves plan to "
-            f"({again.duration:.6f} s, up to {apart:.3g} rad away): they were edited, or "
-            "planned by another version; take the motion out to plan them anew"
+            f"the stored motion of {stored.duration:.6f} s differs from the one planned through "
+            f"the moves ({other.duration:.6f} s) by up to {apart:.3g} rad: the moves were edited, "
+            "or planned by another version; delete the motion to plan again"
         )
 
 
-def _apart(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
-    """Return the difference of two motions: between the knots of both it is cubic as well.
-
-    The longer one is compared up to where the other ends.
-    """
+def _difference(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
+    """Return the difference of two motions, up to the end of the shorter one."""
     end = min(one.duration, other.duration)
     knots, coefficients = [], []
     for joint in range(one.n_joints):
@@ -324,21 +321,20 @@ def _apart(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
 
 
 _QUANTITIES: Final = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]")
-# A last period this much shorter than the others is rounding, not motion.
+# Shortest last period, as a share of the others.
 _LAST_PERIOD: Final = 1e-9
-# More rows a second than any controller has cycles.
-_HIGHEST_RATE: Final = 1e5
+_HIGHEST_RATE: Final = 1e5  # Hz
 
 
 def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> str:
-    """Return a motion as comma-separated values, `rate` rows a second [Hz] and one for its end.
+    """Return a motion as comma-separated values with `rate` rows per second [Hz] and its end.
 
-    The first row names the columns: ``time [s]``, then for each joint ``NAME.position [rad]``,
-    ``NAME.velocity [rad/s]`` and ``NAME.acceleration [rad/s^2]``. Every bit of a number is written.
+    The columns are ``time [s]``, then for each joint ``NAME.position [rad]``,
+    ``NAME.velocity [rad/s]`` and ``NAME.acceleration [rad/s^2]``. Numbers are exact.
 
     Raises:
-        InvalidSetting: a rate not above 0 or above 100 kHz, not one name per joint, each another,
-            or a motion of no duration, which no rows can tell.
+        InvalidSetting: a rate outside (0, 100 kHz], names that are not different or not one per
+            joint, or a motion of zero duration.
     """
     if not 0.0 < rate <= _HIGHEST_RATE:
         raise InvalidSetting("rate", rate, f"above 0 Hz, at most {_HIGHEST_RATE:g} Hz")

@@ -1,4 +1,4 @@
-"""Turning a trajectory into one set-point per controller cycle."""
+"""Playing a trajectory: one set-point per controller cycle, with override, hold and stop."""
 
 from __future__ import annotations
 
@@ -17,14 +17,10 @@ from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
 
 
 class PathReader:
-    """Read position and velocity at one motion time, in a few microseconds.
+    """Evaluates position and velocity at one motion time in a few microseconds.
 
-    The knots of all joints are merged, so that one look-up finds the cubics of all of them. Sums
-    of sines are summed here, without the accelerations that nobody asks for. A trajectory of
-    another kind is asked for each state itself, at its own speed.
-
-    Args:
-        trajectory: The path as a function of motion time.
+    The knots of all joints of a `PiecewiseCubic` are merged for a single look-up; sums of sines
+    are evaluated without accelerations; other trajectories are sampled.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -41,10 +37,7 @@ class PathReader:
             self._trajectory = trajectory
 
     def read(self, s: float) -> tuple[Array, Array]:
-        """Return position (n,) [rad] and velocity (n,) [rad/s] at motion time `s` [s].
-
-        It lies within the trajectory, which lasts longer than 0 s.
-        """
+        """Return position (n,) [rad] and velocity (n,) [rad/s] at a motion time `s` of it [s]."""
         if isinstance(self._trajectory, _Sines):
             return self._trajectory.read(s)
         if self._trajectory is not None:
@@ -63,7 +56,7 @@ class PathReader:
 
 
 class _Sines:
-    """Reads a sum of sines, to rounding what the series itself says."""
+    """Evaluates a `FourierSeries`, equal to its `sample` within rounding."""
 
     def __init__(self, series: FourierSeries) -> None:
         self._offset, self._frequency = series.offset, series.frequency
@@ -84,25 +77,25 @@ class _Sines:
 
     @staticmethod
     def _window(u: float) -> tuple[float, float]:
-        """w(u) of the ramp, 0 <= u < 1, and its derivative in u."""
+        """Return w(u) of the ramp, 0 <= u < 1, and its derivative in u."""
         return u * u * u * (10.0 + u * (6.0 * u - 15.0)), 30.0 * (u * (1.0 - u)) ** 2
 
 
 def _merged(trajectory: PiecewiseCubic) -> tuple[list[float], Array]:
-    """Return the times at which the cubic of any joint changes, and the cubics (m, 4, n)."""
+    """Return the knots of all joints, and the polynomials between them (m, 4, n)."""
     begins = np.unique(np.concatenate(trajectory.knots))[:-1]
     joints = range(trajectory.n_joints)
     merged = np.stack([pieces_from(trajectory, joint, begins) for joint in joints], axis=2)
     return begins.tolist(), merged * np.array([1.0, 1.0, 0.5, 1.0 / 6.0])[:, None]
 
 
-# A last period this much shorter than the others is rounding, not motion.
+# Tolerance on times, as a share of the period.
 _ROUNDING = 1e-9
-# Share of half a joint's range by which a set-point rounded on the wire may lie outside it.
-_CARRIED = 9e-7
-# Steps of Newton towards the nearest point of a path, from a few cycles away.
-_TRIES = 8
-# s; no gap of which a motion goes on is longer, and no nearest point is farther away in time.
+# Tolerance on the range of a joint for set-points rounded to float32, as a share of half the range.
+_RANGE_ROUNDING = 9e-7
+# Newton steps to the nearest point of the path.
+_NEWTON_STEPS = 8
+# Largest change of motion time in `resume_from` [s].
 _FARTHEST = 1.0
 
 
@@ -114,42 +107,47 @@ class _SetPoints(NamedTuple):
 
 
 class TrajectoryPlayer:
-    """Play a trajectory one period per call, whatever the clock says.
+    """Returns the set-points of a trajectory, one period per call of `advance`.
 
-    Motion time advances only in `advance`, so a late or missing call delays the motion and
-    never makes it jump. At full rate the set-points come from a table made before the motion
-    begins. Once the rate was changed, the same path is read at the motion time that has come,
-    for the table's rows lie elsewhere. At the end the last set-point is the last position with
-    zero velocity, however often it is asked for.
+    Motion time advances only in `advance`, so a late or missing call delays the motion and never
+    makes it jump. At full rate the set-points come from a table; after a change of rate the path
+    is evaluated. After the end, `advance` returns the last position with zero velocity.
 
-    =============  ===========================================  ==============================
-    asked for      the rate goes                                within the bounds
-    =============  ===========================================  ==============================
-    `override`     to this fraction                             of an override
-    `hold`         to 0, until `resume`                         of a stop
-    `resume`       to the fraction of the override              of a stop
-    `stop`         to 0, where the motion ends; so `cancel`     of a stop
-    =============  ===========================================  ==============================
+    =============  =======================================  ==============
+    call           target of the rate                       bounds
+    =============  =======================================  ==============
+    `override`     the fraction                             of an override
+    `hold`         0, until `resume`                        of a stop
+    `resume`       the fraction of the override             of a stop
+    `stop`         0, where the motion ends; so `cancel`    of a stop
+    =============  =======================================  ==============
 
-    Each may be asked for between any two cycles, also while the rate still changes. An override
-    asked for during a hold takes effect with `resume`. One asked for while a resumed motion is
-    still gathering speed changes the target at once; it goes on within the bounds of a stop if
-    those of an override no longer suffice. As long as the arm is at rest at the start of the
-    motion, every rate applies at once.
+    Each may be called between any two cycles, also while the rate changes. An override during a
+    hold takes effect with `resume`. An override while a resumed motion accelerates changes the
+    target at once, within the bounds of a stop if those of an override do not suffice. While the
+    arm is at rest at the start of the motion, every rate applies at once.
 
     Args:
-        trajectory: What to play, keeping `limits`.
+        trajectory: Motion within `limits`.
         period: Time between two set-points [s].
-        limits: The limits the trajectory was planned for; the bounds are their multiples.
+        limits: Limits of the trajectory, to which the factors refer.
         override_acceleration: Largest acceleration while an override changes, as a multiple (> 1)
             of the limits.
-        override_jerk: Largest jerk while an override changes, likewise.
-        stop_acceleration: Largest acceleration during a stop, likewise; not below the override's.
-        stop_jerk: Largest jerk during a stop, likewise; not below the override's.
-        start_tolerance: How far [rad] each joint may be from where the trajectory begins.
+        override_jerk: Largest jerk while an override changes, as a multiple.
+        stop_acceleration: Largest acceleration during a stop, as a multiple; not below the
+            override's.
+        stop_jerk: Largest jerk during a stop, as a multiple; not below the override's.
+        start_tolerance: Largest distance of a joint from the start of the trajectory [rad].
+
+    Attributes:
+        start: First position of the trajectory (n,) [rad].
+        duration: Duration of the trajectory at full rate [s].
+        finished: Whether the last set-point of the motion, or of its stop, was returned.
+        bounds: Bounds that the last set-point satisfies, or the next one if those are wider: "plan"
+            at a constant rate, "override" or "stop" while the rate changes, "stop" after `stop`.
 
     Raises:
-        InvalidSetting: a period or tolerance or factor outside its range, or limits of another
+        InvalidSetting: a period, tolerance or factor outside its range, or limits of another
             number of joints.
     """
 
@@ -183,7 +181,7 @@ class TrajectoryPlayer:
         self._tolerance = start_tolerance
         extrema = trajectory.extrema() if isinstance(trajectory, PiecewiseCubic) else None
         stopping = slowing_bounds(limits, stop_acceleration, stop_jerk, extrema)
-        # At this rate the path's own accelerations are those of a stop.
+        # Rate at which the accelerations of the path are those of a stop.
         self._fastest = sqrt(stop_acceleration)
         overriding = slowing_bounds(limits, override_acceleration, override_jerk, extrema)
         self._allowed: dict[Literal["override", "stop"], RateBounds] = {
@@ -195,87 +193,63 @@ class TrajectoryPlayer:
         reach = self._table.position
         self._lower = reach.min(axis=0) if extrema is None else extrema.lower
         self._upper = reach.max(axis=0) if extrema is None else extrema.upper
-        self._duration = trajectory.duration
-        # The end of the motion, but for a last period that is no more than rounding.
+        self.duration = trajectory.duration
         self._end = trajectory.duration - _ROUNDING * period
         self._path = PathReader(trajectory)
-        self._start: Array = trajectory.sample(np.zeros(1))[0][0]
-        self._rest: Array = np.zeros_like(self._start)
+        self.start: Array = trajectory.sample(np.zeros(1))[0][0]
+        self._rest: Array = np.zeros_like(self.start)
         self._offset = self._rest
         self._law = TimeLaw(period)
         self._tabled = True
         self._override = 1.0
         self._begun = False
+        self.finished: bool
+        self.bounds: Literal["plan", "override", "stop"]
         self._rewind()
 
     def _rewind(self) -> None:
-        self._last = self._start + self._offset
+        self._last = self.start + self._offset
         self._given = 0
         self._across: list[Array] = []
-        self._finished = self._held = self._stopping = False
-        self._bounds: Literal["plan", "override", "stop"] = "plan"
+        self.finished = self._held = self._stopping = False
+        self.bounds = "plan"
         self._ramp: Literal["override", "stop"] = "override"
-        self._take_up(self._override)
-
-    @property
-    def start(self) -> Array:
-        """Position (n,) [rad] where the trajectory begins."""
-        return self._start
-
-    @property
-    def duration(self) -> float:
-        """Duration [s] of the trajectory at full rate."""
-        return self._duration
-
-    @property
-    def finished(self) -> bool:
-        """Whether the last set-point was given: the motion, or its stop, is over."""
-        return self._finished
-
-    @property
-    def bounds(self) -> Literal["plan", "override", "stop"]:
-        """Which bounds the set-point given last keeps, or the next one if that is more.
-
-        Those of the plan at any constant rate, those of what was asked for while the rate
-        changes, and from `stop` on those of a stop for good.
-        """
-        return self._bounds
+        self._start_at(self._override)
 
     @property
     def rate(self) -> float:
-        """How fast motion time runs, from 0 (at rest) to 1 (as planned)."""
+        """Rate of motion time, from 0 (at rest) to 1 (as planned)."""
         return self._law.rate
 
     @property
     def motion_time(self) -> float:
-        """Time in the trajectory [s] of the set-point given last."""
+        """Time in the trajectory [s] of the last set-point."""
         return self._given * self._period if self._tabled else self._law.motion_time
 
     def begin(self, position: Array) -> None:
-        """Take up the motion, from its beginning, at the set-point the arm really starts from.
+        """Start the motion from its beginning, at the present set-point of the arm.
 
-        The small difference to the planned start stays for the whole motion: a set-point that
-        was rounded on its way must not become a jerk. What was held or stopped before is not
-        any more; an override stays as it was asked for.
+        The small difference to the planned start is added to the whole motion, so that a rounded
+        set-point does not become a jerk. A hold or stop is cleared, an override is not.
 
         Args:
             position: First set-point (n,) [rad], at rest.
 
         Raises:
             StartMismatch: a joint is farther from the planned start than the tolerance.
-            LimitExceeded: with the difference carried along, a joint would leave its range.
+            LimitExceeded: with the difference added, a joint would leave its range.
         """
-        offset = self._near(position, self._start, self._tolerance)
+        offset = self._offset_from(self.start, position, self._tolerance)
         self._check_range(offset)
-        # The table stays as it is: to copy it would cost the cycle of the first set-point.
+        # Not added to the table, which would take longer than the cycle of the first set-point.
         self._offset = offset
         self._begun = True
         self._rewind()
 
-    def _near(self, position: Array, point: Array, tolerance: float) -> Array:
-        """Return how far (n,) [rad] a position is from a point of the path, if that is near."""
+    def _offset_from(self, point: Array, position: Array, tolerance: float) -> Array:
+        """Return the difference (n,) [rad] of a position from a point; StartMismatch if larger."""
         offset = np.asarray(position, dtype=np.float64) - point
-        off = ~(np.abs(offset) <= tolerance)  # written so that NaN is off
+        off = ~(np.abs(offset) <= tolerance)  # true also for NaN
         if np.any(off):
             joint = int(np.argmax(off))
             raise StartMismatch(joint, float(position[joint]), float(point[joint]), tolerance)
@@ -283,7 +257,7 @@ class TrajectoryPlayer:
 
     def _check_range(self, offset: Array) -> None:
         limits, rounding = self._limits, position_rounding(self._limits)
-        slack = np.maximum(rounding, 0.5 * _CARRIED * (limits.upper - limits.lower))
+        slack = np.maximum(rounding, 0.5 * _RANGE_ROUNDING * (limits.upper - limits.lower))
         for reach, bound, sign in (
             (self._lower + offset, limits.lower, -1.0),
             (self._upper + offset, limits.upper, 1.0),
@@ -294,29 +268,30 @@ class TrajectoryPlayer:
                 raise LimitExceeded("position", joint, float(reach[joint]), float(bound[joint]))
 
     def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
-        """Go on where a controller carried the motion by itself, with what was asked for.
+        """Continue from a set-point to which the controller extrapolated the motion in a gap.
 
-        That is at the nearest point of the path, and as fast along it; the velocity across dies
-        away in `cycles`. The distance stays for the rest of the motion, like that at the start.
+        The motion continues at the nearest point of the path, with the velocity along it; the
+        velocity across it decays linearly in `cycles`. The distance from the path remains for the
+        rest of the motion, like that at the start.
 
         Args:
-            position: The controller's set-point (n,) [rad].
+            position: Set-point of the controller (n,) [rad].
             velocity: Its velocity (n,) [rad/s].
-            cycles: How many set-points have a part of the velocity across.
+            cycles: Number of set-points with a part of the velocity across the path.
 
         Raises:
             StartMismatch: a joint is farther from the path than the tolerance.
         """
-        way = self._offset + (position - self._last)
-        if velocity.any() and np.max(np.abs(way)) <= self._tolerance:
-            self._offset, self._last = way, position
+        offset = self._offset + (position - self._last)
+        if velocity.any() and np.max(np.abs(offset)) <= self._tolerance:
+            self._offset, self._last = offset, position
             return
         s, here = self.motion_time, position - self._offset
-        # Where the path hardly moves its direction says nothing.
+        # Below this squared speed the path has no usable direction.
         slowest = float(velocity @ velocity) * _ROUNDING
-        least, most = max(s - _FARTHEST, 0.0), min(s + _FARTHEST, self._duration)
+        least, most = max(s - _FARTHEST, 0.0), min(s + _FARTHEST, self.duration)
         point, speed = self._path.read(s)
-        for _ in range(_TRIES):
+        for _ in range(_NEWTON_STEPS):
             square = float(speed @ speed)
             if square <= slowest:
                 break
@@ -325,111 +300,111 @@ class TrajectoryPlayer:
             if abs(s - before) <= _ROUNDING * self._period:
                 break
         square = float(speed @ speed) or 1.0
-        self._near(here, point, self._tolerance)
-        # However many gaps there are: once the tolerance for the start, once for all of them.
-        self._offset = self._near(position, point, 2.0 * self._tolerance)
+        self._offset_from(point, here, self._tolerance)
+        # One tolerance for the start, one for all gaps together.
+        self._offset = self._offset_from(point, position, 2.0 * self._tolerance)
         self._last = position
         self._tabled = False
         rate = min(max(0.0, float(velocity @ speed) / square), self._fastest)
         stopping = self._allowed["stop"]
-        # What slows down goes on so: begun anew after each of many gaps, it would never be at rest.
+        # A deceleration continues: restarted after each of many gaps, it would never end.
         slope = max(min(self._law.slope, 0.0), -sqrt(2.0 * stopping.change * rate))
         self._law.restart(s, rate, slope)
         shares = np.arange(1.0, cycles + 1.0)[:, None] / (cycles + 1.0)
         self._across = list(shares * (velocity - rate * speed)) if velocity.any() else []
         self._law.aim(0.0 if self._held or self._stopping else self._override, stopping)
-        self._ramp = self._bounds = "stop"
-        self._finished = self._stopping and self._settled
+        self._ramp = self.bounds = "stop"
+        self.finished = self._stopping and self._settled
 
     @property
     def _settled(self) -> bool:
-        """Whether the rate has come to its target and no velocity across the path is left."""
+        """Whether the rate has reached its target and the velocity across the path is zero."""
         return self._law.settled and not self._across
 
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""
         if not self._begun:
             raise NotBegun
-        if self._finished:
+        if self.finished:
             return self._last, self._rest
         if not self._tabled:
-            return self._advance_beside_the_table()
+            return self._advance_on_path()
         row = self._given
         self._given = row + 1
-        self._finished = self._given >= len(self._table.position)
+        self.finished = self._given >= len(self._table.position)
         self._last = self._table.position[row] + self._offset
         return self._last, self._table.velocity[row]
 
-    def _advance_beside_the_table(self) -> tuple[Array, Array]:
+    def _advance_on_path(self) -> tuple[Array, Array]:
         law = self._law
         if self._settled:
-            self._bounds = "plan"
+            self.bounds = "plan"
             if law.rate == 0.0:
                 return self._last, self._rest
         law.advance()
         if law.motion_time >= self._end and not self._across:
-            self._finished = True
+            self.finished = True
             self._last = self._table.position[-1] + self._offset
             return self._last, self._rest
-        position, velocity = self._path.read(min(law.motion_time, self._duration))
+        position, velocity = self._path.read(min(law.motion_time, self.duration))
         velocity = velocity * law.rate
         if self._across:
             across = self._across.pop()
             velocity += across
             self._offset = self._offset + self._period * across
-        self._finished = self._stopping and self._settled
+        self.finished = self._stopping and self._settled
         self._last = position + self._offset
         return self._last, velocity
 
     def override(self, fraction: float) -> None:
-        """Go on at this fraction, 0 to 1, of the planned speed.
+        """Change the speed to this fraction, 0 to 1, of the planned one.
 
         Raises:
-            InvalidSetting: any other number.
+            InvalidSetting: the fraction is out of range.
         """
         _check("override", fraction, "a number from 0 to 1", 0.0 <= fraction <= 1.0)
         self._override = float(fraction)
-        if self._finished or self._stopping or self._held:
+        if self.finished or self._stopping or self._held:
             return
         law = self._law
-        # Only what wider bounds began can be too abrupt; asked in a ramp of the same bounds,
-        # rounding alone would decide.
+        # Checked only within ramps of wider bounds: within those of an override, the result would
+        # depend on rounding.
         abrupt = self._ramp == "stop" and not (
             law.settled or admits(self._allowed["override"], law.rate, law.slope)
         )
         self._aim(self._override, "stop" if abrupt else "override")
 
     def hold(self) -> None:
-        """Come to rest on the path and wait there, starting now."""
-        if self._finished or self._stopping or self._held:
+        """Stop on the path until `resume`."""
+        if self.finished or self._stopping or self._held:
             return
         self._held = True
         self._aim(0.0, "stop")
 
     def resume(self) -> None:
-        """Go on after a hold, or in the middle of it."""
-        if self._finished or not self._held:
+        """Continue after `hold`, also while the motion still slows down."""
+        if self.finished or not self._held:
             return
         self._held = False
         self._aim(self._override, "stop")
 
     def stop(self) -> None:
-        """Come to rest on the path, starting now; once stopping or finished, do nothing."""
-        if self._finished or self._stopping:
+        """Stop on the path and end the motion; without effect if stopping or finished."""
+        if self.finished or self._stopping:
             return
         self._held, self._stopping = False, True
         self._aim(0.0, "stop")
-        self._bounds = "stop"
-        self._finished = self._settled
+        self.bounds = "stop"
+        self.finished = self._settled
 
     def cancel(self) -> None:
-        """Give the motion up: come to rest on the path, from where it cannot be resumed."""
+        """Stop the motion for good, as `stop` does."""
         self.stop()
 
     def _aim(self, target: float, ramp: Literal["override", "stop"]) -> None:
-        """Let the rate go to a target within the bounds of an override or a stop."""
+        """Change the rate to a target within the bounds of an override or a stop."""
         if self.motion_time == 0.0:
-            self._take_up(target)
+            self._start_at(target)
             return
         if self._tabled:
             if target == 1.0:
@@ -439,10 +414,10 @@ class TrajectoryPlayer:
         self._law.aim(target, self._allowed[ramp])
         self._ramp = ramp
         if not self._law.settled:
-            self._bounds = ramp
+            self.bounds = ramp
 
-    def _take_up(self, rate: float) -> None:
-        """Run at a rate from the start: nothing moves there yet that could move abruptly."""
+    def _start_at(self, rate: float) -> None:
+        """Set the rate at the start, where the arm is at rest."""
         self._law.restart(0.0, rate)
         self._tabled = rate == 1.0
 
@@ -457,5 +432,5 @@ def _tabulate(trajectory: Trajectory, period: float) -> _SetPoints:
     cycles = max(1, ceil(trajectory.duration / period - _ROUNDING))
     position, velocity, _ = trajectory.sample(period * np.arange(1, 1 + cycles, dtype=np.float64))
     velocity = np.ascontiguousarray(velocity)
-    velocity[-1] = 0.0  # the last one is rest by definition, not to the last digit
+    velocity[-1] = 0.0  # exactly at rest at the end
     return _SetPoints(np.ascontiguousarray(position), velocity)

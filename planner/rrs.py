@@ -1,8 +1,8 @@
-"""Words of the RRS-1 robot controller interface, with the status codes of COMAU's ORL.
+"""Codes of the RRS-1 robot controller interface, with the status codes of COMAU's ORL.
 
-RRS-1 (Realistic Robot Simulation, 1993) is how simulators call a controller's own motion
-software; `planner.Interpolator` offers its services. Codes and numbers are those that public
-clients of ORL and RRS-1 use. Speeds, accelerations and jerks are percentages here, and only here.
+RRS-1 (Realistic Robot Simulation, 1993) is the interface by which simulators call the motion
+software of a controller; `planner.Interpolator` implements its services. The numbers are those of
+public clients of ORL and RRS-1. In RRS-1, speeds, accelerations and jerks are percentages.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from planner.arrays import Array
 
 
 class Status(IntEnum):
-    """What a service returns: 0 or more is success, less is a refusal that changed nothing."""
+    """Return code of a service: success if not negative; a refused service changed nothing."""
 
     OK = 0
     NEED_MORE_DATA = 1
@@ -27,7 +27,7 @@ class Status(IntEnum):
 
 
 class MotionType(IntEnum):
-    """How the arm gets to a target."""
+    """Kind of path to a target."""
 
     JOINT = 1
     LINEAR = 2
@@ -35,7 +35,7 @@ class MotionType(IntEnum):
 
 
 class OutputFormat(IntEnum):
-    """What a step reports."""
+    """Format of the positions of a step."""
 
     JOINT = 0
     CARTESIAN = 1
@@ -52,14 +52,14 @@ class PointAccuracy(IntEnum):
 
 
 class FlybyCriterion(IntEnum):
-    """What rules the size of a fly-by corner (the numbers are ours; ORL only names them)."""
+    """Criterion for the size of a fly-by corner (the numbers are not from ORL)."""
 
     PERCENT = 1
     DISTANCE = 2
 
 
 class AccelerationKind(IntEnum):
-    """Which of its ramps an acceleration override scales."""
+    """Ramps that an acceleration override scales."""
 
     BOTH = 0
     ACCELERATION = 1
@@ -67,10 +67,10 @@ class AccelerationKind(IntEnum):
 
 
 class SpeedCorrection(IntEnum):
-    """Which of the controller's speed overrides is meant.
+    """Speed override of the controller.
 
-    GENERAL (GEN_OVR) acts at once and leaves the path as it is; PROGRAM (PROG_SPD_OVR) scales the
-    speed of the targets set from then on, whose corners may change with it.
+    GENERAL (GEN_OVR) acts at once and does not change the path; PROGRAM (PROG_SPD_OVR) scales the
+    speed of later targets, whose corners may change with it.
     """
 
     GENERAL = 0
@@ -78,7 +78,7 @@ class SpeedCorrection(IntEnum):
 
 
 class EventKind(Enum):
-    """What can happen during a step."""
+    """Kind of an `Event`."""
 
     VIA_POINT_PASSED = "via point passed"
     MOTION_ENDED = "motion ended"
@@ -86,10 +86,10 @@ class EventKind(Enum):
 
 
 class Event(NamedTuple):
-    """Something that happened during a step, and at which target.
+    """Event during a step, with its target.
 
-    A via point counts as passed where the path is nearest to it. An end is that of the motion to
-    the last target; a stop is one asked for, on the way to the target named.
+    A via point is passed where the path is nearest to it. A motion ends at its last target;
+    a requested stop names the next target.
     """
 
     kind: EventKind
@@ -100,13 +100,12 @@ class Step(NamedTuple):
     """One interpolation step.
 
     Attributes:
-        status: OK, NEED_MORE_DATA, FINAL_STEP, or why there is no step.
-        position: Set-point (n,) [rad], read-only; the last one where there is no step, NaN where
-            there never was one.
-        elapsed_time: Time since the arm last stood at the end of a motion [s]; the end of a
-            motion is known to a fraction of a step.
-        joint_limits: Bit j is set while joint j stands at an end of its range.
-        events: What happened since the step before, in order.
+        status: OK, NEED_MORE_DATA, FINAL_STEP, or an error.
+        position: Set-point (n,) [rad], read-only; the last one after an error, NaN before the
+            first one.
+        elapsed_time: Time since the last motion ended [s], to a fraction of a step.
+        joint_limits: Bit j is set while joint j is at an end of its range.
+        events: Events since the previous step, in order.
     """
 
     status: Status

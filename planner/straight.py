@@ -1,10 +1,8 @@
 """Straight joint-space moves between two positions, from rest to rest, many at once.
 
-One scalar profile of seven pieces runs along each line, so the line is straight for any ratio
-between the joints' limits. (A general planner asked for phase synchronisation leaves the line where
-the joint that is slowest overall is not the one that is slowest to build up acceleration.)
-
-Each number is made by the same operations whatever else is in the arrays.
+One scalar profile of seven pieces along each line keeps it straight for any ratio between the
+limits of the joints; ruckig's phase synchronisation does not. Results do not depend on what else is
+in the arrays.
 """
 
 from __future__ import annotations
@@ -20,15 +18,15 @@ from planner.piecewise_cubic import Block, PiecewiseCubic, Rows, after
 
 
 class StraightMoves(NamedTuple):
-    """Straight lines that all joints run in phase, ruled by the slowest of them.
+    """Straight moves of all joints in phase; the slowest joint determines the time.
 
     Attributes:
-        start: Where each begins (s, n) [rad].
+        start: Start of each (s, n) [rad].
         direction: Change of the joints per unit of path, largest entry 1, (s, n).
         knots: Times of the profile (s, 8) [s].
-        pieces: Path, its rates at the start of each piece, and its constant jerk, (s, 7, 4).
-        speeding_up: Time from rest to the fastest (s,) [s].
-        slowing_down: Time from the fastest to rest (s,) [s].
+        pieces: Path and its two rates at the start of each piece, and its jerk, (s, 7, 4).
+        speeding_up: Time from rest to the highest speed (s,) [s].
+        slowing_down: Time from the highest speed to rest (s,) [s].
     """
 
     start: Array
@@ -61,7 +59,7 @@ class StraightMoves(NamedTuple):
         return cls(starts, direction, knots, pieces, ramps[0] * moves, ramps[1] * moves)
 
     def take(self, rows: Rows) -> StraightMoves:
-        """Return some of the moves, by index."""
+        """Return moves by index."""
         return StraightMoves(*(field[rows] for field in self))
 
     @property
@@ -71,19 +69,16 @@ class StraightMoves(NamedTuple):
         return last
 
     def states(self, t: Array) -> Array:
-        """Return position, velocity, acceleration (s, n, 3) at one time `t` (s,) [s] in each."""
+        """Return position, velocity, acceleration (s, n, 3) of each at its time `t` (s,) [s]."""
         along = self._along(t)
         states = self.direction[:, :, None] * along[:, None, :3]
         states[..., 0] += self.start
         return states
 
     def cut(self, begin: Array, end: Array) -> tuple[Array, Array]:
-        """Return the parts between two times (s,) [s], with pieces outside them of no length.
+        """Return knots from 0 (s, 8) [s] and pieces (s, n, 7, 4) between two times (s,) [s].
 
-        Those hold the state at the cut, so that the table stays continuous.
-
-        Returns:
-            Times from 0 (s, 8) [s] and pieces (s, n, 7, 4).
+        Pieces outside have zero length and the state at the cut.
         """
         begin, end = begin[:, None], end[:, None]
         knots = np.clip(self.knots, begin, end)
@@ -100,13 +95,13 @@ class StraightMoves(NamedTuple):
         return knots - begin, table
 
     def tables(self, begin: Array, end: Array) -> list[PiecewiseCubic]:
-        """Return the parts between two times (s,) [s], each beginning at its own time 0."""
+        """Return the parts between two times (s,) [s], each starting at time 0."""
         knots, pieces = self.cut(begin, end)
         each = np.broadcast_to(knots[:, None], (*pieces.shape[:2], knots.shape[1]))
         return Block.of_pieces(each, pieces).tables()
 
     def _along(self, t: Array) -> Array:
-        """Return path, its two rates and its jerk at a time in each move, (s, 4)."""
+        """Return path, its two rates and its jerk at one time in each move, (s, 4)."""
         index = np.sum(self.knots[:, 1:-1] <= t[:, None], axis=1)
         rows = np.arange(len(t))
         pieces = self.pieces[rows, index].T
@@ -136,8 +131,8 @@ def rest_to_rest(
             for rate, ramp in zip(rates, ramps, strict=True)
         ]
 
-    # The second ramp mirrors one from rest, so that nothing that rounding leaves behind, such as
-    # a trace of acceleration, is integrated over a long cruise.
+    # The second ramp is computed backwards from rest, so that no rounding error of the acceleration
+    # is integrated over a long cruise.
     (p1, v1, a1, p2, v2, p3, v3), (p4, v4, a4, p5, v5, p6, v6) = (_ramp(*r, jerk) for r in ramps)
     cruise = np.where(cruises, (distance - p3 - p6) / v3, 0.0)
     zero = np.zeros_like(distance)
@@ -158,23 +153,23 @@ def rest_to_rest(
 
 
 _Pulse = tuple[Array, Array]
-"""Acceleration pulses: jerk up and down for the first time (s,) [s], none between for the other."""
+"""Acceleration pulses: rise time, equal to the fall time, and flat time (s,) [s]."""
 
 
 def _pulse(velocity_change: Array, acceleration: Array, jerk: Array) -> _Pulse:
-    """Return the shortest pulses that change the velocity so much."""
+    """Return the shortest pulses with this change of velocity."""
     rise = np.minimum(acceleration / jerk, np.sqrt(velocity_change / jerk))
     return rise, np.maximum(velocity_change / (jerk * rise) - rise, 0.0)
 
 
 def _half_pulse(distance: Array, acceleration: Array, jerk: Array) -> _Pulse:
-    """Return the pulses that, with their mirror images, cover distances without a cruise."""
+    """Return the pulses that cover a distance with their mirror images, without a cruise."""
     rise = acceleration / jerk
     # peak velocity a (rise + flat), held on average for 2 rise + flat
     flat = (np.sqrt(rise * rise + 4.0 * distance / acceleration) - 3.0 * rise) / 2.0
     holds = distance >= 2.0 * acceleration * rise * rise
-    # The shortest do not even reach full acceleration. The root is that of floats: an array's may
-    # differ in the last digit.
+    # The shortest do not reach full acceleration. Roots of floats: those of arrays may differ in
+    # the last digit.
     rise[~holds] = [cbrt(cube) for cube in (distance / (2.0 * jerk))[~holds].tolist()]
     return rise, np.where(holds, np.maximum(flat, 0.0), 0.0)
 
@@ -184,7 +179,7 @@ def _where(which: Any, pulses: _Pulse, others: _Pulse) -> _Pulse:
 
 
 def _ramp(rise: Array, flat: Array, jerk: Array) -> tuple[Array, ...]:
-    """Return path and rates at the ends of the three pieces of ramps from rest."""
+    """Return path and rates at the ends of the three pieces of a ramp from rest."""
     a1 = jerk * rise
     v1 = a1 * rise / 2.0
     p1 = v1 * rise / 3.0
@@ -194,9 +189,9 @@ def _ramp(rise: Array, flat: Array, jerk: Array) -> tuple[Array, ...]:
 
 
 def _peak(distance: Array, above: Array, rates: tuple[Array, Array], jerk: Array) -> Array:
-    """Return the peak velocity, at most `above`, of two unlike ramps that cover a distance.
+    """Return the peak velocity, at most `above`, of two different ramps that cover a distance.
 
-    The distance is a convex function of the peak, so Newton's steps from above never pass it.
+    The distance is convex in the peak, so Newton's method from above converges monotonically.
     """
     peak = above
     for _ in range(60):

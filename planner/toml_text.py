@@ -1,7 +1,7 @@
-"""Data as TOML for people, to the last bit: angles in degrees, one line per list.
+"""TOML text from data and back, with angles in degrees that restore the same bits.
 
-A field of angles is an `Angles` in the data and a name that ends in `_deg` in the text. Numbers are
-read as `Decimal`, which keeps angles exact.
+A field of `Angles` has a name that ends in `_deg` in the text. (The standard library reads TOML and
+does not write it.)
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ _SUFFIX = "_deg"
 
 @dataclass(frozen=True)
 class Angles:
-    """Angles or their rates in rad (s), a number or nested lists, which the text has in degrees."""
+    """Angles or their rates in rad: a number or nested lists, written in degrees."""
 
     values: Any
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Lists of lists of numbers, which the text has one row a line."""
+    """Nested lists of numbers, written one row per line."""
 
     values: Sequence[Any]
 
@@ -42,32 +42,32 @@ def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
 
     Args:
         data: tables, lists of tables, lists, numbers, texts; None is left out.
-        comments: lines that are to stand before the table of that (dotted) name, "" the first.
+        comments: lines before the table of each (dotted) name; "" for the first table.
     """
     return "\n".join(_table("", data, comments))
 
 
 def from_text(text: str, angles: Mapping[str, Collection[str]] | None = None) -> dict[str, Any]:
-    """Return the data of a TOML text, angles in rad under their name without `_deg`.
+    """Return the data of a TOML text, angles in rad with names without `_deg`.
 
     Args:
         text: of the file.
-        angles: fields of each table (by its name, "" of the first) that are angles; any that ends
-            in `_deg` if left out.
+        angles: fields of each table (by its name, "" for the first) that are angles; None for all
+            whose names end in `_deg`.
 
     Raises:
-        ValueError: the text is not TOML, or an angle is no number, or given twice.
+        ValueError: the text is not TOML, or an angle is not a number or given twice.
     """
     try:
         return _read(tomllib.loads(text, parse_float=Decimal), angles)
     except RecursionError as error:
-        raise ValueError("it is nested too deep") from error
+        raise ValueError("nested too deep") from error
     except InvalidOperation as error:
-        raise ValueError("it has a number beyond all bounds") from error
+        raise ValueError("a number is out of range") from error
 
 
 def _table(path: str, data: Mapping[str, Any], comments: Mapping[str, str]) -> list[str]:
-    """Return the blocks of a table: its own fields first, then those of the tables in it."""
+    """Return the blocks of a table: its fields, then the tables in it."""
     own = {name: value for name, value in data.items() if not _is_table(value)}
     head = "".join(f"# {line}\n" for line in comments.get(path, "").splitlines())
     fields = "".join(_field(name, value) for name, value in own.items() if value is not None)
@@ -94,14 +94,14 @@ def _is_table(value: Any) -> bool:
 def _field(name: str, value: Any) -> str:
     if isinstance(value, Angles):
         return f"{toml_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
-    text = _laid_out(value.values) if isinstance(value, Rows) else toml_value(value)
+    text = _row_lines(value.values) if isinstance(value, Rows) else toml_value(value)
     return f"{toml_key(name)} = {text}\n"
 
 
-def _laid_out(values: Sequence[Any], indent: str = "") -> str:
+def _row_lines(values: Sequence[Any], indent: str = "") -> str:
     inner = indent + "  "
     rows = (
-        _laid_out(row, inner) if row and isinstance(row[0], Sequence) else toml_value(row)
+        _row_lines(row, inner) if row and isinstance(row[0], Sequence) else toml_value(row)
         for row in values
     )
     return f"[\n{''.join(f'{inner}{row},' + chr(10) for row in rows)}{indent}]"
@@ -120,7 +120,7 @@ def _read(
     for name, value in table.items():
         stem = name.removesuffix(_SUFFIX)
         if stem == name or (angles is not None and stem not in angles.get(path, ())):
-            found[name] = _below(value, angles, name)
+            found[name] = _read_value(value, angles, name)
         elif stem in table:
             raise ValueError(f"both {stem!r} and {name!r} are given")
         else:
@@ -128,32 +128,31 @@ def _read(
     return found
 
 
-def _below(value: Any, angles: Mapping[str, Collection[str]] | None, path: str) -> Any:
-    """Return a value in which tables may be, and in them angles."""
+def _read_value(value: Any, angles: Mapping[str, Collection[str]] | None, path: str) -> Any:
     if isinstance(value, Mapping):
         return _read(value, angles, path)
     if isinstance(value, list):
-        return [_below(entry, angles, path) for entry in value]
+        return [_read_value(entry, angles, path) for entry in value]
     return float(value) if isinstance(value, Decimal) else value
 
 
 def toml_key(name: str) -> str:
-    """Return a key, quoted where it has to be."""
+    """Return a key, quoted if necessary."""
     bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
     return name if bare else toml_text(name)
 
 
 def toml_text(value: str) -> str:
-    """Return a text in quotes."""
-    # JSON's quoting, but for what TOML wants otherwise: no pairs of surrogates, no bare DEL.
+    """Return a quoted string."""
+    # As in JSON, but without surrogate pairs and with DEL escaped.
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def toml_value(value: Any) -> str:
-    """Return a number, text, truth value, date, time, list or table (inline) of these.
+    """Return a number, string, boolean, date, time, list or (inline) table of these.
 
     Raises:
-        TypeError: it is something else.
+        TypeError: it is of another type.
     """
     if isinstance(value, float):
         return repr(float(value)) if math.isfinite(value) else str(float(value))  # inf, -inf, nan
@@ -166,13 +165,13 @@ def toml_value(value: Any) -> str:
         return f"[{', '.join(toml_value(entry) for entry in value)}]"
     if isinstance(value, date | time):
         return value.isoformat()
-    if isinstance(value, int):  # truth values are numbers, too
+    if isinstance(value, int):  # also bool
         return json.dumps(value)
-    raise TypeError(f"TOML has no value like {value!r}")
+    raise TypeError(f"TOML has no type for {value!r}")
 
 
 def radians_of(angle: Decimal | int) -> float:
-    """Return an angle in rad from one in degrees, as it was written."""
+    """Return an angle in rad from degrees as written."""
     angle = Decimal(angle)
     if len(angle.as_tuple().digits) <= _SHORT_DIGITS or not angle.is_finite():
         return float(angle) * (pi / 180.0)
@@ -181,7 +180,7 @@ def radians_of(angle: Decimal | int) -> float:
 
 
 def degrees_text(angle: float) -> str:
-    """Return the shortest degrees that `radians_of` turns into this angle [rad], to the bit."""
+    """Return the shortest degrees from which `radians_of` restores this angle [rad]."""
     rounded = repr(float(f"{degrees(angle):.{_SHORT_DIGITS}g}"))
     if _same(radians_of(Decimal(rounded)), angle):
         return rounded
@@ -191,19 +190,15 @@ def degrees_text(angle: float) -> str:
         text = f"{exact:.{digits - 1}e}"
         if _same(radians_of(Decimal(text)), angle):
             return f"{Decimal(text):f}" if 1e-4 < abs(exact) < 1e15 else text
-    raise AssertionError(f"{angle!r} rad has no degrees")  # 18 digits tell any two floats apart
+    raise AssertionError(f"{angle!r} rad has no degrees")  # 18 digits suffice for any float
 
 
 def _same(a: float, b: float) -> bool:
-    return a == b and str(a) == str(b)  # the latter tells -0.0 from 0.0
+    return a == b and str(a) == str(b)  # str distinguishes -0.0 from 0.0
 
 
 def radians_in(name: str, value: Any) -> Any:
-    """Return degrees, one number or nested lists of them, in rad.
-
-    Args:
-        name: of the field, for the error.
-        value: as read.
+    """Return a number or nested lists of degrees of the field `name` in rad.
 
     Raises:
         ValueError: an entry is not a number.

@@ -1,4 +1,4 @@
-"""The promise of a plan, checked on its finished table."""
+"""Checks of a finished motion: limits, smoothness, rest at both ends."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
 
 
 class Bounded(Protocol):
-    """A motion that knows how far it goes."""
+    """A motion with rigorous bounds of its extremes."""
 
     def extrema(self) -> Extrema:
-        """Return bounds of its extremes over all time, rigorous ones."""
+        """Return bounds of the extremes over all time."""
         ...
 
 
 def check_limits(trajectory: Bounded, limits: Bounds) -> None:
-    """Refuse a trajectory that breaks a limit anywhere, analytically.
+    """Check analytically that a trajectory satisfies its limits at every instant.
 
     Raises:
-        LimitExceeded: naming the first offending quantity, its worst joint, value and bound.
+        LimitExceeded: of the first quantity that breaks its limit, with its worst joint.
     """
     extrema = trajectory.extrema()
     slack = position_rounding(limits)
@@ -40,10 +40,10 @@ def check_limits(trajectory: Bounded, limits: Bounds) -> None:
 
 
 def check_smooth(trajectory: PiecewiseCubic, limits: Bounds) -> None:
-    """Refuse a trajectory that is not C2, or not at rest at both ends.
+    """Check that a trajectory is C2 and at rest at both ends.
 
     Raises:
-        NotSmooth: naming the quantity, joint, time and jump.
+        NotSmooth: it is not.
     """
     scale = jump_rounding(limits, trajectory.duration)
     for joint, ends in enumerate(trajectory.ends()):
@@ -62,10 +62,10 @@ def check_smooth(trajectory: PiecewiseCubic, limits: Bounds) -> None:
 
 
 def check_rest(trajectory: Trajectory, limits: Bounds) -> None:
-    """Refuse a trajectory of any kind that is not at rest at both ends.
+    """Check that a trajectory of any kind is at rest at both ends.
 
     Raises:
-        NotSmooth: naming the quantity, joint, time and what is left of velocity or acceleration.
+        NotSmooth: it has a velocity or acceleration there.
     """
     scale = jump_rounding(limits, trajectory.duration)[:, 1:]
     times = np.array([0.0, trajectory.duration])

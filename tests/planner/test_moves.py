@@ -564,7 +564,7 @@ def test_limits_are_kept_where_the_check_of_one_motion_says_so(block, factors):
         each.append(JointLimits(lower, upper, *rates))
     rows = rows_of(*each)
     expected = [holds(check_limits, table(block, row), each[row]) for row in range(COUNT)]
-    assert block.keeps(rows).tolist() == expected
+    assert block.satisfies(rows).tolist() == expected
 
 
 @given(

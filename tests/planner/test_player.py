@@ -289,7 +289,7 @@ class TestCarriedOn:
         aside = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-4])
         played = [player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))]
         before, last = played[-2:]
-        with pytest.raises(StartMismatch, match=r"at most 0\.002 rad"):
+        with pytest.raises(StartMismatch, match=r"tolerance is 0\.002 rad"):
             for _ in range(30):
                 player.resume_from(last + aside, (last - before) / PERIOD, 2)
                 before, last = last + aside, player.advance()[0]

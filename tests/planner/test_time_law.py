@@ -57,11 +57,11 @@ def test_a_ramp_is_smooth_keeps_its_bounds_and_ends_at_the_target(state, target)
         )
         # A cubic is integrated exactly from its ends and middle.
         middle = piece.rate + x * piece.slope / 2.0 + x * x * piece.change / 8.0
-        assert after[0] - piece.gone == pytest.approx(
+        assert after[0] - piece.motion_time == pytest.approx(
             x / 6.0 * (piece.rate + 4.0 * middle + after[1]), abs=1e-9 * max(1.0, x)
         )
-    assert way.sample(way.duration) == (way.gone, target, 0.0)
-    assert way.sample(way.duration + 2.0)[0] == pytest.approx(way.gone + 2.0 * target)
+    assert way.sample(way.duration) == (way.motion_time, target, 0.0)
+    assert way.sample(way.duration + 2.0)[0] == pytest.approx(way.motion_time + 2.0 * target)
 
 
 @given(states(), fractions)
