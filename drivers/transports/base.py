@@ -1,4 +1,4 @@
-"""What every link offers."""
+"""The interface of a link."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ class TransportError(DriverError):
     """A link that cannot be opened.
 
     Attributes:
-        link: the address it was to have, in words.
-        reason: what is in the way.
-        remedy: what to do about it.
+        link: kind and address.
+        reason: of the failure.
+        remedy: for the operator.
     """
 
     def __init__(self, link: str, reason: str, remedy: str) -> None:
@@ -27,61 +27,59 @@ class TransportError(DriverError):
 
 
 class Transport(Protocol):
-    """The PC's end of a link that carries whole packets of up to 1200 bytes, in order.
+    """The PC's end of a link that carries packets of up to 1200 bytes, in order.
 
-    Packets may be lost or come twice; one that arrives is one that was sent (or was corrupted
-    beyond what the link can see).
+    Packets may be lost or duplicated; what arrives is complete, and intact as far as the link can
+    check.
 
-    One that knows how long a packet lay in a queue has `arrived` besides: when the packet received
-    last arrived, s on the clock of `now`, or None if unknown; never in the future, nor before the
-    packet that came before it. One whose options the system can refuse has `notes`, in words.
+    Optional attributes: `arrived`, the time at which the packet received last arrived, s on the
+    clock of `now`, None if unknown, never in the future nor before that of the previous packet;
+    `notes`, options refused by the system.
     """
 
     @property
     def now(self) -> float:
-        """Monotonic time in s, on the link's own clock."""
+        """Monotonic time of the link, s."""
 
     @property
     def ages(self) -> NDArray[np.uint16] | None:
-        """How old the values of the packet received last are, in cycles since they were sent.
+        """Ages of the values of the packet received last, in cycles.
 
-        (n_axes, 8) for D1..D5, extra1..3 of each axis; None where a packet carries all of them
-        at once, so that all are fresh.
+        (n_axes, 8) for D1..D5, extra1..3 of each axis; None if each packet carries all of them.
         """
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet, or None after `timeout` s without one.
+        """Return the next packet, or None after `timeout` s without one.
 
         Raises:
-            TransportClosed: the link was closed, or its far end is gone for good.
+            TransportClosed: the link was closed here or by the peer.
         """
 
     def send(self, packet: bytes) -> None:
-        """Send one packet to where the last one received came from.
+        """Send one packet to the sender of the packet received last.
 
         Raises:
             TransportClosed: the link was closed.
         """
 
     def rejected(self) -> dict[str, int]:
-        """Packets discarded below the session since the last call, by kind.
+        """Return the number of packets discarded by the link since the last call, by kind.
 
-        Kinds are words such as "foreign", "malformed", "torn", "corrupt", "overrun", "unsent".
+        Kinds are "foreign", "malformed", "torn", "corrupt", "overrun", "unsent" and others.
         """
 
     def forget_peer(self) -> None:
-        """There is no session: its next packet may come from elsewhere at the same address.
+        """Accept the next packet from any port of the controller's host.
 
-        Called, for as long as that is so, after each packet that got no answer, and when there
-        was none with an answer for a while.
+        Called without a session, after each packet that got no reply and after a silence.
         """
 
     def close(self) -> None:
-        """Give the link up. Closing twice changes nothing."""
+        """Close the link; may be called again."""
 
 
 class TransportSpec(Protocol):
-    """What is needed to open a link; pickles, so that another process can open it."""
+    """Settings of a link; pickles, so that another process can open it."""
 
     def open(self) -> Transport:
         """Open the link.

@@ -1,7 +1,6 @@
-"""Faults of a link, as a script that says what happens in which cycle.
+"""Scripted faults of a link, by cycle of the controller; 0 is the first packet that it sends.
 
-Cycles are those of the controller: 0 is the first packet it sends. `FaultyLink` turns a script into
-what arrives and when, for a link in virtual time and for a real one alike.
+`FaultyLink` applies them to packets, in virtual time and on real links.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Final, Literal
 Direction = Literal["to_pc", "to_controller"]
 
 OVERTAKEN_BY: Final = 1.25
-"""Cycles by which a packet is held up that the next one is to overtake."""
+"""Delay of a packet that is overtaken by the next, in cycles."""
 
 
 MOST_CYCLES: Final = 1_000_000_000
@@ -70,7 +69,7 @@ class Delay(_Packets):
 
 @dataclass(frozen=True)
 class Corrupt(_Packets):
-    """One byte of the packets of some cycles is changed: exclusive-or of `mask` at `offset`."""
+    """One byte of the packets is changed: exclusive-or of `mask` at `offset`."""
 
     offset: int = field(kw_only=True)
     mask: int = field(default=0xFF, kw_only=True)
@@ -83,7 +82,7 @@ class Corrupt(_Packets):
             raise ValueError(f"Corrupt: offset {self.offset} is negative")
 
     def apply(self, packet: bytes) -> bytes:
-        """The packet with that byte changed; unchanged if it is shorter."""
+        """Return the packet with that byte changed; unchanged if it is shorter."""
         if self.offset >= len(packet):
             return packet
         changed = bytearray(packet)
@@ -95,10 +94,10 @@ Fault = Lose | Delay | Duplicate | Reorder | Corrupt
 
 
 class FaultyLink:
-    """What arrives of each packet, and when. Pure: the same question has the same answer.
+    """Deliveries of each packet under scripted faults, without state.
 
     Args:
-        faults: the script.
+        faults: in any order.
         period: the controller's cycle, s.
     """
 
@@ -113,9 +112,9 @@ class FaultyLink:
             self._planned[fault.direction].append((cycles, fault))
 
     def carry(self, cycle: int, direction: Direction, packet: bytes) -> list[tuple[float, bytes]]:
-        """The deliveries of the packet sent in `cycle`: delay in s, and bytes.
+        """Return the deliveries of the packet sent in `cycle`: delay in s, and bytes.
 
-        An empty packet stands for none: a controller that is silent in this cycle.
+        An empty packet means that nothing is sent in this cycle.
         """
         if not packet:
             return []

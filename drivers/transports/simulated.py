@@ -1,4 +1,4 @@
-"""A link in virtual time, to a controller that is an object in the same process."""
+"""A link in virtual time to a simulated controller in the same process."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from drivers.transports.faults import Fault, FaultyLink
 
 
 class Peer(Protocol):
-    """The controller's end. Each cycle: one `next_packet`, then one `accept`."""
+    """A simulated controller. Each cycle: one `next_packet`, then one `accept`."""
 
     @property
     def period(self) -> float:
-        """Cycle in s."""
+        """Cycle, s."""
 
     def next_packet(self) -> bytes | None:
-        """The packet of the next cycle, empty for none; None when there will be no more."""
+        """Return the packet of the next cycle, empty for none; None at the end of the session."""
 
     def accept(self, reply: bytes | None) -> None:
-        """The answer to it; None if none arrived within the cycle."""
+        """Receive the reply to it; None if none arrived within the cycle."""
 
 
 class _Delayed(NamedTuple):
-    """Something under way: when it arrives, the cycle it was sent in, what it is."""
+    """A delayed packet: time of arrival, cycle in which it was sent, content."""
 
     due: float
     cycle: int
@@ -39,20 +39,18 @@ class _Delayed(NamedTuple):
 class SimulatedTransport:
     """Carries packets between a session and a peer, one cycle of virtual time per packet.
 
-    Deterministic: the same peer, session and faults give the same bytes at the same times. Time
-    is a count of cycles, so that it does not drift.
+    Deterministic: the same peer, session and faults give the same bytes at the same times.
 
-    The peer gets at most one answer per cycle, and none that was sent in an earlier one: an answer
-    held up past the end of its cycle came too late, and for the peer there was none.
+    The peer gets at most one reply per cycle, and none that was sent in an earlier cycle.
 
     Args:
-        peer: the controller's end.
-        faults: what goes wrong, see `drivers.transports.faults`.
+        peer: the controller.
+        faults: of the link, see `drivers.transports.faults`.
 
     Attributes:
         cycle: cycles begun so far.
-        surplus_replies: answers beyond the first of a cycle (those to duplicates).
-        late_replies: answers that arrived after the cycle in which they were sent.
+        surplus_replies: replies beyond the first of a cycle (those to duplicates).
+        late_replies: replies that arrived after the cycle in which they were sent.
     """
 
     def __init__(self, peer: Peer, faults: Sequence[Fault] = ()) -> None:
@@ -70,43 +68,43 @@ class SimulatedTransport:
 
     @property
     def now(self) -> float:
-        """Virtual time in s."""
+        """Virtual time, s; a count of cycles, so that it does not drift."""
         return self.cycle * self._peer.period + self._waiting
 
     @property
     def ages(self) -> NDArray[np.uint16] | None:
-        """None: every field of a packet is of its own cycle."""
+        """None: all values of a packet are of its own cycle."""
         return None
 
     def rejected(self) -> dict[str, int]:
-        """Nothing is discarded below the session."""
+        """Return nothing: the link discards no packets."""
         return {}
 
     def forget_peer(self) -> None:
-        """There is only one peer."""
+        """Do nothing: there is only one peer."""
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet to arrive; None if that is further off than `timeout`.
+        """Return the next packet; None after `timeout` s without one.
 
         Raises:
-            TransportClosed: closed, or the peer has no more packets.
+            TransportClosed: closed, or the session has ended.
         """
         self._require_open()
         left = timeout
         while True:
             if self._arrived:
                 return self._arrived.popleft()
-            left = self._pass_time(left)
+            left = self._advance(left)
             if left < 0.0:
                 return None
 
-    def _pass_time(self, patience: float) -> float:
-        """Go on to the next event; what is left of the patience, negative if it ran out first."""
+    def _advance(self, timeout: float) -> float:
+        """Advance to the next event; returns the time left, negative if it expired before."""
         until_cycle = self._peer.period - self._waiting
         until_arrival = self._next_due() - self.now
         until_event = min(until_cycle, max(0.0, until_arrival))
-        if patience < until_event:
-            self._waiting += max(0.0, patience)
+        if timeout < until_event:
+            self._waiting += max(0.0, timeout)
             return -1.0
         if until_arrival < until_cycle:
             self._waiting += until_event
@@ -115,22 +113,22 @@ class SimulatedTransport:
             if packet is not None:
                 self._arrived.append(packet)
         self._deliver()
-        return patience - until_event
+        return timeout - until_event
 
     def _next_due(self) -> float:
-        """When the next delayed packet arrives, either way."""
+        """Time of arrival of the next delayed packet, in either direction."""
         if not (self._to_pc or self._to_controller):
             return inf
         return min(delayed.due for delayed in (*self._to_pc, *self._to_controller))
 
     def _next_cycle(self) -> bytes | None:
-        """Begin a cycle; the packet that arrives at once, if one does."""
+        """Begin a cycle; returns the packet that arrives at once, if any."""
         if self._awaiting_reply:
             self._peer.accept(None)
         packet = self._peer.next_packet()
         if packet is None:
             self.close()
-            raise TransportClosed("the controller's end has no more packets")
+            raise TransportClosed("the simulated controller has no more packets")
         index = self.cycle
         self.cycle += 1
         self._waiting = 0.0
@@ -144,7 +142,7 @@ class SimulatedTransport:
         return at_once[0] if at_once else None
 
     def _deliver(self) -> None:
-        """Hand over what has arrived by now, in the order of its arrival."""
+        """Deliver the packets due by now, in the order of arrival."""
         if not (self._to_pc or self._to_controller):
             return
         now = self.now
@@ -155,7 +153,7 @@ class SimulatedTransport:
         self._to_controller = [d for d in self._to_controller if d.due > now]
 
     def send(self, packet: bytes) -> None:
-        """Answer the packet received last; the answer belongs to the present cycle.
+        """Send a reply in the present cycle.
 
         Raises:
             TransportClosed: closed.
@@ -169,7 +167,7 @@ class SimulatedTransport:
                 self._hand_over(content, index)
 
     def _hand_over(self, reply: bytes, sent_in: int) -> None:
-        """Give the peer an answer, if it waits for one of that cycle."""
+        """Deliver a reply if the peer waits for one of that cycle."""
         if sent_in != self.cycle - 1:
             self.late_replies.append(reply)
         elif self._awaiting_reply:
@@ -179,7 +177,7 @@ class SimulatedTransport:
             self.surplus_replies.append(reply)
 
     def close(self) -> None:
-        """Give the link up."""
+        """Close the link."""
         self._closed = True
         self._awaiting_reply = False
 

@@ -1,4 +1,4 @@
-"""A link whose packets are left as they were, both ways."""
+"""A link that copies its packets, both ways, to a ring."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from drivers.record import PacketRing
 from drivers.transports.base import Transport
 
-MOST_WAITING: Final = 256
-"""Packets that wait for their cycle; a flood is handed on in parts, with the cycle known then."""
+MAX_BUFFERED: Final = 256
+"""Packets buffered until their cycle is known."""
 
 
 class _Passed(NamedTuple):
-    """A packet that went through."""
+    """A packet received or sent."""
 
     time: float
     sent: bool
@@ -24,17 +24,16 @@ class _Passed(NamedTuple):
 
 
 class TappedTransport:
-    """Passes everything on to another link, and its packets to a sink as well.
+    """Wraps a link and copies its packets to a ring.
 
-    A packet reaches the sink when its answer is out, before the next one is waited for: nothing
-    but its place in a list is taken note of between the two. Its cycle is known by then; packets
-    that had piled up and were left out have that of the one answered, but for those of a pile of
-    more than `MOST_WAITING`: they are not delayed, and have that of the one answered before.
+    Packets are copied before the wait for the next one, so that replies are not delayed, and when
+    their cycle is known. Packets of a backlog have the cycle of the one answered; the first ones
+    of a backlog of more than `MAX_BUFFERED` that of the one answered before.
 
     Args:
         transport: the link.
-        sink: where the packets go.
-        cycle: the controller's cycle of the packet answered last.
+        sink: ring for the copies.
+        cycle: returns the controller's cycle of the packet answered last.
     """
 
     def __init__(self, transport: Transport, sink: PacketRing, cycle: Callable[[], int]) -> None:
@@ -55,19 +54,19 @@ class TappedTransport:
 
     @property
     def arrived(self) -> float | None:
-        """When the packet received last arrived, of a link that knows."""
+        """Time of arrival of the packet received last, None if unknown."""
         arrived: float | None = getattr(self._transport, "arrived", None)
         return arrived
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Options that the system refused, in words, of a link that has such."""
+        """Options refused by the system."""
         return tuple(getattr(self._transport, "notes", ()))
 
     def receive(self, timeout: float) -> bytes | None:
         """See `Transport.receive`."""
-        if self._passed and (timeout > 0.0 or len(self._passed) >= MOST_WAITING):
-            self.settle()
+        if self._passed and (timeout > 0.0 or len(self._passed) >= MAX_BUFFERED):
+            self.flush()
         packet = self._transport.receive(timeout)
         if packet is not None:
             arrived = self.arrived
@@ -89,12 +88,12 @@ class TappedTransport:
         self._transport.forget_peer()
 
     def close(self) -> None:
-        """Give the link up."""
-        self.settle()
+        """Close the link."""
+        self.flush()
         self._transport.close()
 
-    def settle(self) -> None:
-        """Hand to the sink what has passed; called between an answer and the next packet."""
+    def flush(self) -> None:
+        """Copy the buffered packets to the ring."""
         cycle = self._cycle()
         for time, sent, packet in self._passed:
             self._sink.put(cycle, time, sent, packet)

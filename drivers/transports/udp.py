@@ -1,8 +1,7 @@
-"""The link over UDP/IPv4: the PC serves, the controller sends first and sets the pace.
+"""The link over UDP/IPv4: the controller sends first, one datagram per packet.
 
-One datagram is one packet. A cycle costs two system calls, one `recvmsg` and one `sendto`: the
-kernel keeps the time-out of the first, so that nothing has to be asked before it, and says with
-each datagram when it arrived.
+A cycle costs two system calls, `recvmsg` and `sendto`: the time-out is stored in the socket, and
+the kernel attaches the time of arrival to each datagram.
 """
 
 from __future__ import annotations
@@ -23,15 +22,15 @@ from drivers.packets import HEADER_LENGTH
 from drivers.transports.base import TransportError
 
 LONGEST: Final = 1500
-"""Bytes of the longest datagram that is looked at (the buffer of the makers' library)."""
+"""Bytes of the longest datagram accepted (the buffer of the manufacturer's library)."""
 PRIORITY: Final = 6
-"""SO_PRIORITY: the highest a program without privileges may set."""
+"""SO_PRIORITY: the highest without privileges."""
 TYPE_OF_SERVICE: Final = 0x28
-"""IP_TOS of the makers' library (class AF11)."""
+"""IP_TOS of the manufacturer's library (class AF11)."""
 BUSY_POLL: Final = 50
-"""Microseconds the kernel may poll the network device before it sleeps."""
+"""Time that the kernel may poll the network device before it sleeps, µs."""
 _SHORTEST_PLAUSIBLE: Final = HEADER_LENGTH
-# Numbers of asm-generic/socket.h that the socket module does not name.
+# Constants of asm-generic/socket.h that the socket module lacks.
 _SO_TIMESTAMPNS: Final = 35
 _SO_BUSY_POLL: Final = 46
 _SO_MEMINFO: Final = 55
@@ -40,19 +39,19 @@ _TIMEVAL: Final = struct.Struct("@qq")
 _TIMESPEC: Final = struct.Struct("@qq")
 _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 _CLOCK_SET: Final = 1e-3
-"""s that the wall clock moves against the monotonic one if it was set; else they run alike."""
-MOST_PASSED_OVER: Final = 1000
-"""Datagrams of other hosts passed over once the time is up, more than a queue usually holds."""
+"""Change of the difference between wall and monotonic clock that means that one was set, s."""
+MAX_FOREIGN: Final = 1000
+"""Datagrams of other hosts skipped after the time-out, more than a queue usually holds."""
 
 
 @dataclass(frozen=True)
 class UdpSpec:
-    """A UDP link, to be opened.
+    """Settings of a UDP link.
 
     Attributes:
-        peer_host: IPv4 address (or name) of the controller; nobody else is listened to.
-        port: of the PC, 1000 in the controller's set-up; 0 takes any that is free.
-        bind: IPv4 address of the PC's network device on the link; "0.0.0.0" takes all of them.
+        peer_host: IPv4 address (or name) of the controller, the only host accepted.
+        port: of the PC, 1000 in the controller's set-up; 0 for any free port.
+        bind: IPv4 address of the PC's network device; "0.0.0.0" for all of them.
     """
 
     peer_host: str
@@ -63,34 +62,28 @@ class UdpSpec:
         """Bind the port.
 
         Raises:
-            TransportError: address unknown, port in use, or not permitted.
+            TransportError: unknown address, or the port is in use or not permitted.
         """
         return UdpTransport(self.peer_host, self.port, self.bind)
 
 
 class UdpTransport:
-    """A bound port that listens to one host.
+    """A bound UDP port that accepts datagrams of one host; arguments as for `UdpSpec`.
 
-    The first datagram of a plausible length from that host, at the beginning and after
-    `forget_peer`, decides the port that is listened to from then on; whoever finds that it was
-    none of a controller calls `forget_peer` again. Datagrams from any other
-    address are counted as "foreign" and get no answer; what is longer than 1500 bytes is counted
-    as "malformed"; what the kernel dropped because its queue was full, as "overrun".
-
-    Args:
-        peer_host: IPv4 address or name of the controller.
-        port: of the PC; 0 takes any that is free.
-        bind: IPv4 address of the PC's network device.
+    The first datagram of plausible length from that host, at the beginning and after
+    `forget_peer`, selects its port. Datagrams from other addresses are counted as "foreign",
+    those longer than 1500 bytes as "malformed", those dropped by the kernel because its queue was
+    full as "overrun".
 
     Attributes:
         address: host and port bound.
-        notes: socket options that the system refused, in words. None of them is needed.
-        arrived: when the kernel had the datagram received last, on the clock of `now`, and never
-            before the one that came before it; None where it does not say. Where the system's
-            clock was set since the last one, when it was received.
+        notes: optional socket options refused by the system.
+        arrived: time at which the kernel received the last datagram, on the clock of `now`, not
+            before the previous one; None if unknown. If the system's clock was set in between,
+            the time at which it was read.
 
     Raises:
-        TransportError: address unknown, port in use, or not permitted.
+        TransportError: unknown address, or the port is in use or not permitted.
     """
 
     def __init__(self, peer_host: str, port: int, bind: str = "0.0.0.0") -> None:
@@ -99,7 +92,7 @@ class UdpTransport:
         self.address: tuple[str, int] = self._socket.getsockname()
         self.notes = _set_options(self._socket)
         self._timeout = math.nan
-        self._earliest = time.monotonic()  # no datagram to come arrived before
+        self._earliest = time.monotonic()  # no later datagram arrived before
         self._offset = time.time() - self._earliest
         self.arrived: float | None = None
         self._receive = self._socket.recvmsg
@@ -111,49 +104,48 @@ class UdpTransport:
 
     @property
     def now(self) -> float:
-        """CLOCK_MONOTONIC in s, the same in every process of this machine."""
+        """CLOCK_MONOTONIC, s."""
         return time.monotonic()
 
     @property
     def ages(self) -> NDArray[np.uint16] | None:
-        """None: a datagram carries every value."""
+        """None: a datagram carries all values."""
         return None
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next datagram of the peer, or None after `timeout` s without one.
+        """Return the next datagram of the peer, or None after `timeout` s without one.
 
-        One that is there already is found behind any number of datagrams of other hosts up to
-        `MOST_PASSED_OVER`, also with a time-out of 0.
+        A queued one is found behind up to `MAX_FOREIGN` of other hosts, also with a time-out of 0.
 
         Raises:
             TransportClosed: closed, or the socket failed.
         """
         end = time.monotonic() + timeout
-        passed_over = 0
+        foreign = 0
         while True:
-            flags = 0 if timeout == self._timeout else self._have_patience(timeout)
+            flags = 0 if timeout == self._timeout else self._set_timeout(timeout)
             try:
                 packet, control, _, sender = self._receive(LONGEST + 1, _CONTROL_SPACE, flags)
             except BlockingIOError:
-                # The kernel counts in scheduler ticks and may have ended the wait a tick early.
+                # The kernel counts in scheduler ticks and may return a tick early.
                 timeout = end - time.monotonic()
                 if timeout <= 0.0:
                     return None
                 continue
             except OSError as error:
-                raise TransportClosed(self._trouble(error)) from error
+                raise TransportClosed(self._closed_reason(error)) from error
             if (sender == self._peer and len(packet) <= LONGEST) or self._accepts(packet, sender):
                 self.arrived = self._arrival(control)
                 return packet
-            # Strangers do not lengthen the wait, but what is behind them is not left there.
+            # Foreign datagrams do not extend the wait, but those queued behind them are read.
             timeout = max(0.0, end - time.monotonic())
             if timeout == 0.0:
-                passed_over += 1
-                if passed_over > MOST_PASSED_OVER:
+                foreign += 1
+                if foreign > MAX_FOREIGN:
                     return None
 
     def send(self, packet: bytes) -> None:
-        """Answer the peer; a datagram that the system does not take is counted as "unsent".
+        """Send to the peer; a datagram that the system does not accept is counted as "unsent".
 
         Raises:
             TransportClosed: closed.
@@ -167,12 +159,12 @@ class UdpTransport:
             self._send(packet, socket.MSG_DONTWAIT, self._peer)
         except OSError as error:
             if self._closed:
-                raise TransportClosed(self._trouble(error)) from error
-            # A full queue or a cable pulled out: to the controller it is an answer that was lost.
+                raise TransportClosed(self._closed_reason(error)) from error
+            # A full queue or an unplugged cable: for the controller the reply is lost.
             self._count("unsent")
 
     def rejected(self) -> dict[str, int]:
-        """Datagrams discarded since the last call, by kind."""
+        """Return the datagrams discarded since the last call, by kind."""
         counts, self._rejected = self._rejected, {}
         dropped = 0 if self._closed else _dropped(self._socket)
         if dropped > self._dropped:
@@ -181,22 +173,22 @@ class UdpTransport:
         return counts
 
     def forget_peer(self) -> None:
-        """Let the next datagram of the controller's host decide the port again."""
+        """Let the next datagram of the controller's host select its port."""
         self._peer = None
 
     def close(self) -> None:
-        """Give the port up. Closing twice changes nothing."""
+        """Close the port; may be called again."""
         self._closed = True
         self._socket.close()
 
-    def _trouble(self, error: Exception) -> str:
+    def _closed_reason(self, error: Exception) -> str:
         return "the UDP link was closed" if self._closed else f"the UDP socket failed: {error}"
 
-    def _have_patience(self, timeout: float) -> int:
-        """Have the kernel wait for `timeout` s; returns the flags of the call that waits."""
+    def _set_timeout(self, timeout: float) -> int:
+        """Set the time-out of the socket; returns the flags for the next call."""
         if timeout <= 0.0 or self._closed:
             return socket.MSG_DONTWAIT
-        # Rounded up: zero would mean for ever.
+        # Rounded up: zero means no time-out.
         seconds, microseconds = divmod(math.ceil(timeout * 1e6), 1_000_000)
         value = _TIMEVAL.pack(seconds, microseconds)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
@@ -205,7 +197,7 @@ class UdpTransport:
 
     def _accepts(self, packet: bytes, sender: tuple[str, int]) -> bool:
         if sender != self._peer:
-            # A stray short datagram must not decide the port for the whole session.
+            # A stray short datagram must not select the port.
             first = self._peer is None and _SHORTEST_PLAUSIBLE <= len(packet) <= LONGEST
             if sender[0] != self._host or not first:
                 known = self._peer is None and sender[0] == self._host
@@ -218,7 +210,7 @@ class UdpTransport:
         return True
 
     def _arrival(self, control: list[tuple[int, int, bytes]]) -> float | None:
-        """The kernel's time of arrival, which is that of the wall clock, on the monotonic clock."""
+        """Convert the kernel's time of arrival from the wall clock to the monotonic clock."""
         if not control:
             return None
         seconds, nanoseconds = _TIMESPEC.unpack(control[0][2])
@@ -228,9 +220,9 @@ class UdpTransport:
         if abs(self._offset - offset) > _CLOCK_SET:
             arrived = now
         else:
-            # The queue is in order, so a stamp older than the last one's is of a clock since set.
-            stayed = wall - seconds - 1e-9 * nanoseconds
-            arrived = min(now, max(now - stayed, self._earliest))
+            # The queue is in order: an older stamp means that the clock was set since.
+            queued = wall - seconds - 1e-9 * nanoseconds
+            arrived = min(now, max(now - queued, self._earliest))
         self._earliest = arrived
         return arrived
 
@@ -244,7 +236,7 @@ def _resolve(host: str) -> str:
     except OSError as error:
         raise TransportError(
             f"the UDP link to {host!r}",
-            f"the controller's address is not known ({error})",
+            f"the controller's address is unknown ({error})",
             "give its IPv4 address, such as 10.2.12.150",
         ) from error
 
@@ -267,7 +259,7 @@ def _bound(bind: str, port: int) -> socket.socket:
 
 _BIND_FAILURES: Final = {
     errno.EADDRINUSE: (
-        "another program has it",
+        "another program uses it",
         "find that program with: ss -ulnp sport = :{port}",
     ),
     errno.EACCES: (
@@ -282,7 +274,7 @@ _BIND_FAILURES: Final = {
 
 
 def _set_options(udp: socket.socket) -> tuple[str, ...]:
-    """Priority on the way out, polling and times on the way in; what was refused, in words."""
+    """Set priority, polling and time stamps; returns the refusals."""
     notes = []
     for name, level, option, value in (
         # IP_TOS comes first because it sets a priority of its own.
@@ -299,7 +291,7 @@ def _set_options(udp: socket.socket) -> tuple[str, ...]:
 
 
 def _dropped(udp: socket.socket) -> int:
-    """Datagrams the kernel dropped for want of room since the socket was made."""
+    """Return the datagrams dropped by the kernel because the queue was full."""
     try:
         return int(
             _MEMINFO.unpack(udp.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[8]

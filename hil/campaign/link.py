@@ -262,7 +262,7 @@ class Link:
         """Raw packets since the last call; None if they are not stored."""
         if self.packets is None or not isinstance(self.transport, TappedTransport):
             return None
-        self.transport.settle()
+        self.transport.flush()
         return self.packets.drain()
 
     def events(self) -> list[Event]:

@@ -398,7 +398,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_bus_that_another_program_has_is_refused_with_its_number() -> None:
     first = BusLock("socketcan", "can0")
-    with pytest.raises(TransportError, match=rf"another program has it \(process {os.getpid()}\)"):
+    with pytest.raises(TransportError, match=rf"another program uses it \(process {os.getpid()}\)"):
         BusLock("socketcan", "can0")
     BusLock("socketcan", "can1").release()
     first.release()
@@ -411,7 +411,7 @@ def test_two_names_of_one_serial_port_are_one_bus(tmp_path: Path) -> None:
     port.touch()
     name.symlink_to(port)
     held = BusLock("slcan", str(port))
-    with pytest.raises(TransportError, match="another program has it"):
+    with pytest.raises(TransportError, match="another program uses it"):
         BusLock("slcan", str(name))
     held.release()
 

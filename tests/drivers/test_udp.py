@@ -22,7 +22,7 @@ from drivers import (
 )
 from drivers.exchange import loop
 from drivers.transports.base import TransportError
-from drivers.transports.udp import MOST_PASSED_OVER, UdpSpec, UdpTransport
+from drivers.transports.udp import MAX_FOREIGN, UdpSpec, UdpTransport
 from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
 from tests.drivers.transport_contract import TransportContract
 
@@ -186,7 +186,7 @@ class TestPeer:
 
         near._receive = endless
         assert near.receive(0.0) is None
-        assert near.rejected() == {"foreign": MOST_PASSED_OVER + 1}
+        assert near.rejected() == {"foreign": MAX_FOREIGN + 1}
 
 
 class TestWaiting:
@@ -303,7 +303,7 @@ class TestArrival:
 class TestOpening:
     def test_a_port_in_use_is_named_with_the_remedy(self, near):
         port = near.address[1]
-        with pytest.raises(TransportError, match="another program has it") as caught:
+        with pytest.raises(TransportError, match="another program uses it") as caught:
             UdpTransport(HOST, port, HOST)
         assert str(port) in str(caught.value)
         assert f"ss -ulnp sport = :{port}" in caught.value.remedy
@@ -320,7 +320,7 @@ class TestOpening:
         ("address", "words"),
         [
             ((HOST, 0, "192.0.2.1"), "no network device"),
-            (("no host", 0), "controller's address is not known"),
+            (("no host", 0), "controller's address is unknown"),
             ((HOST, -1), "no such port"),
             ((HOST, 65536), "no such port"),
         ],

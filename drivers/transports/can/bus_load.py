@@ -1,8 +1,8 @@
-"""How much of the bus the frames of a cycle take.
+"""Errors, bit rates and bus load of the CAN profiles.
 
 Bits of ISO 11898-1 frames with 11-bit identifiers, interframe space included. A classic frame is
-stuffed up to its CRC; an FD frame up to its data, its CRC field has stuff bits at fixed places.
-The worst case is a stuff bit after the first five equal bits and then after every fourth.
+stuffed up to its CRC; an FD frame up to its data, and its CRC field at fixed places. The worst
+case is a stuff bit after the first five equal bits and then after every fourth.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from drivers.transports.can.layout import PAYLOADS_FD
 
 
 class CanError(TransportError):
-    """The link as described cannot carry this session: `reason`, and what to do, `remedy`."""
+    """The bus cannot carry this session."""
 
     def __init_subclass__(cls, *, remedy: str) -> None:
         cls.remedy = remedy
@@ -27,26 +27,26 @@ class CanError(TransportError):
 
 
 class CanAxesError(CanError, remedy="the profile carries one to six axes of arm 1; use UDP"):
-    """The controller opens axes that the frames have no place for."""
+    """The controller opens axes that the frames cannot carry."""
 
 
 class CanBusLoadError(CanError, remedy="use a longer cycle, a faster bus or fewer axes"):
-    """The frames of a cycle would take too large a share of it."""
+    """The frames of a cycle take too large a share of it."""
 
 
 class CanModeError(
     CanError, remedy="the profile moves axes in modes 4, 5 and 7; use UDP for others"
 ):
-    """A mode or an answer that the frames have no room for."""
+    """A mode or a reply that the frames cannot carry."""
 
 
 class CanValueError(CanError, remedy="check calibration and gear ratios"):
-    """A number that its field cannot hold."""
+    """A number outside the range of its field."""
 
 
 ProfileName = Literal["fd", "classic"]
 LOAD_LIMIT: Final = 0.70
-"""Largest share of a cycle that the frames may take, worst-case stuffing."""
+"""Largest share of a cycle for the frames, with worst-case stuffing."""
 _CLASSIC_HEAD: Final = 1 + 11 + 3 + 4  # start, identifier, RTR IDE r0, length
 _TAIL: Final = 1 + 2 + 7 + 3  # CRC delimiter, acknowledge, end of frame, interframe space
 _FD_ARBITRATION: Final = 1 + 11 + 5  # start, identifier, RRS IDE FDF res BRS
@@ -54,14 +54,14 @@ _FD_CONTROL: Final = 1 + 4  # ESI, length
 
 
 class Bits(NamedTuple):
-    """Bits of one frame, by the rate they are sent at."""
+    """Bits of one frame, by bit rate."""
 
     nominal: int
     data: int = 0
 
 
 def classic_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
-    """Bits of a classic data frame with 0..8 bytes; `stuffed` as badly as can be."""
+    """Return the bits of a classic data frame with 0..8 bytes, with worst-case stuffing."""
     if not 0 <= n_bytes <= 8:
         raise ValueError(f"a classic frame carries 0..8 bytes, not {n_bytes}")
     stuffable = _CLASSIC_HEAD + 8 * n_bytes + 15
@@ -70,7 +70,7 @@ def classic_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
 
 
 def fd_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
-    """Bits of an FD frame with bit rate switch."""
+    """Return the bits of an FD frame with bit rate switch."""
     if n_bytes not in PAYLOADS_FD:
         raise ValueError(f"an FD frame carries one of {PAYLOADS_FD} bytes, not {n_bytes}")
     crc, fixed = (17, 6) if n_bytes <= 16 else (21, 7)
@@ -101,27 +101,27 @@ class BusRates:
             raise ValueError(f"bit rates {self.bitrate}, {self.data_bitrate} are not positive")
 
     def duration(self, n_bytes: int, *, stuffed: bool = True) -> float:
-        """Seconds on the bus of one frame with this payload."""
+        """Return the time on the bus of one frame with this payload, s."""
         fd = self.profile == "fd"
         bits = (fd_bits if fd else classic_bits)(n_bytes, stuffed=stuffed)
         return bits.nominal / self.bitrate + bits.data / self.data_bitrate
 
     def cycle_payloads(self, n_axes: int) -> tuple[int, ...]:
-        """Bytes of each frame of one cycle, both ways."""
+        """Return the bytes of each frame of one cycle, both ways."""
         if self.profile == "fd":
             return 64, 48, 64
         return (8,) * (1 + n_axes + (n_axes + 1) // 2)
 
     def load(self, n_axes: int, period: float, *, stuffed: bool = True) -> float:
-        """Share of the bus that the cyclic frames take; 1 is a full bus."""
+        """Return the share of the bus used by the cyclic frames; 1 is a full bus."""
         payloads = self.cycle_payloads(n_axes)
         return sum(self.duration(size, stuffed=stuffed) for size in payloads) / period
 
     def require_load(self, n_axes: int, period: float) -> None:
-        """See that the frames of a cycle fit.
+        """Check that the frames of a cycle fit.
 
         Raises:
-            CanBusLoadError: they take more than `LOAD_LIMIT` of it with worst-case stuffing.
+            CanBusLoadError: their share exceeds `LOAD_LIMIT` with worst-case stuffing.
         """
         load = self.load(n_axes, period)
         if load > LOAD_LIMIT:

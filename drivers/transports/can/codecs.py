@@ -1,13 +1,13 @@
-"""Cyclic frames of both profiles: packets to numbers in frames, and replies to words in frames.
+"""Cyclic frames of both profiles: conversion of packets and replies.
 
-FD: two frames up, one down, numbers as they are on the C4G wire. Classic: packed integers in frames
-of eight bytes. Positions are rounded to 2^-16 motor revolutions. A number outside its field is sent
-as the most negative value of the field and read as NaN, which no guard lets pass. D4 is formed from
-consecutive D3, and the D2 of an answer from consecutive D1.
+FD: two frames up, one down, numbers as in C4G packets. Classic: packed integers in frames of eight
+bytes. Positions are rounded to 2^-16 motor revolutions. A number outside its field is sent as the
+most negative value of the field and read as NaN, which the guard refuses. D4 is computed from
+consecutive D3, and the D2 of a reply from consecutive D1.
 
-Most replies give back what the controller sent (the drive is off, the axes are closed). The PC has
-some of that only as aged or rounded values, so such an axis is not sent at all: it is *mirrored*,
-and the controller's end fills in what it sent itself, bit for bit.
+Most replies return what the controller sent (drive off, axes closed). The PC has some of these
+values only aged or rounded, so such an axis is *mirrored*: not sent, and filled in at the
+controller's end from the packet that it sent.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ Array = NDArray[np.float64]
 
 WORDS_PER_AXIS: Final = 9
 NEVER: Final = 0xFFFF
-"""Age of a value that was never received, and of one older than can be said."""
+"""Age of a value that was never received, and largest age."""
 _D1, _D2, _D3, _D4, _D5 = range(1, 6)
 _SLOW: Final = (2, 6, 7, 8)
 """Columns of D2, extra1..3 in an axis block of nine words (mode first)."""
@@ -74,13 +74,13 @@ _UNKNOWN: Final = int(np.float32(np.nan).view(np.int32))
 
 
 def slow_turns(n_axes: int) -> Iterator[int]:
-    """Indices of the slow values of `n_axes` axes, one a cycle, for ever."""
+    """Yield the index of the slow value of each cycle, for `n_axes` axes."""
     values = [MAX_AXES * field + axis for field in range(len(_SLOW)) for axis in range(n_axes)]
     return cycle([*values, FUNCTIONALITY])
 
 
 def slow_value(index: int, words: Words, functionality: bytes) -> bytes:
-    """Four bytes of the slow value of this index in a packet's words (n, 9)."""
+    """Return the four bytes of a slow value in a packet's words (n, 9)."""
     if index == FUNCTIONALITY:
         return functionality
     field, axis = divmod(index, MAX_AXES)
@@ -89,7 +89,7 @@ def slow_value(index: int, words: Words, functionality: bytes) -> bytes:
 
 
 class SlowStore:
-    """The last of each value that goes up one per cycle, in turn, and its age.
+    """Latest slow values (one is sent per cycle, in turn), and their ages.
 
     Attributes:
         ages: (n, 8) cycles since each of D1..D5, extra1..3 was sent, `NEVER` before the first.
@@ -101,7 +101,7 @@ class SlowStore:
         self.forget()
 
     def forget(self) -> None:
-        """Nothing is known."""
+        """Discard all values."""
         self.functionality = bytes(4)
         self._values: Words = np.full(self._shape, _UNKNOWN, np.int32)
         self._elapsed = np.full(self._shape, NEVER, np.int64)
@@ -109,11 +109,11 @@ class SlowStore:
         self._last: int | None = None
 
     def update(self, number: int, index: int, value: bytes, words: Words) -> int:
-        """Take the slow value of a cycle and fill all of them into its words, (n, 9).
+        """Store the slow value of a cycle and write all of them into its words, (n, 9).
 
         Returns:
-            Cycles since the last one taken, 0 for the first; negative where this cycle is older
-            than that one. Of such a cycle nothing slow is known.
+            Cycles since the previous update, 0 for the first; negative if this cycle is older,
+            whose slow values are unknown.
         """
         ahead = 0 if self._last is None else (number - self._last) % LAST_NUMBER
         if ahead > LAST_NUMBER // 2 or (ahead == 0 and self._last is not None):
@@ -139,8 +139,8 @@ class SlowStore:
         return ages
 
 
-class AxisAnswer(NamedTuple):
-    """The answer for one axis; `d1` and `d2` mean nothing where it is mirrored."""
+class AxisReply(NamedTuple):
+    """The reply for one axis; `d1` and `d2` are not used if it is mirrored."""
 
     mirrored: bool
     mode: int
@@ -148,24 +148,24 @@ class AxisAnswer(NamedTuple):
     d2: float = 0.0
 
 
-class Answer(NamedTuple):
-    """One reply. `status` is the status byte of the arm."""
+class Reply(NamedTuple):
+    """One reply; `status` is the status byte of the arm."""
 
     number: int
     status: int
-    axes: tuple[AxisAnswer, ...]
+    axes: tuple[AxisReply, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """The cyclic packet that is answered, as one end knows it.
+    """The cyclic packet that a reply belongs to, as sent or received at one end.
 
     Attributes:
         number: its number.
         status: status byte of arm 1.
         words: (n, 9) its axis blocks.
         modes: mode of each slot.
-        mask: (n, 9) all bits set in what a mirrored axis gives back; none if it cannot be.
+        mask: (n, 9) all bits set in the words that a mirrored axis returns, none if it cannot be.
     """
 
     number: int
@@ -176,7 +176,7 @@ class Sent:
 
     @classmethod
     def of(cls, packet: bytes, n_axes: int) -> Sent:
-        """Understand the packet that is answered."""
+        """Read a packet."""
         words = words_of(packet, n_axes)
         modes: list[int] = words[:, 0].tolist()
         mask = _mirrored(packet[4], tuple(modes))
@@ -184,33 +184,33 @@ class Sent:
 
 
 def words_of(packet: bytes, n_axes: int) -> Words:
-    """The axis blocks of a cyclic packet as (n, 9) words; a read-only view."""
+    """Return the axis blocks of a cyclic packet as (n, 9) words, a read-only view."""
     count = n_axes * AXIS_DTYPE.itemsize // 4
     return np.frombuffer(packet, np.int32, count, HEADER_LENGTH).reshape(n_axes, WORDS_PER_AXIS)
 
 
-_GIVEN_BACK: Final[Mapping[int, int]] = {
+_RETURNED: Final[Mapping[int, int]] = {
     Mode.CLOSED: _D2 + 1,
     Mode.DRIVING_ON: _D2 + 1,
     Mode.CLOSED_MIRRORED: _D5 + 1,
 }
-"""Words that a mirrored axis gives back with its drive on; all of them with the drive off."""
+"""Number of words that a mirrored axis returns with its drive on; all with the drive off."""
 
 
 @lru_cache(maxsize=256)
 def _mirrored(status: int, modes: tuple[int, ...]) -> Words:
     mask = np.zeros((len(modes), WORDS_PER_AXIS), np.int32)
     for slot, mode in enumerate(modes):
-        words = _GIVEN_BACK.get(mode, 0) if status == DRIVE_ON else WORDS_PER_AXIS
+        words = _RETURNED.get(mode, 0) if status == DRIVE_ON else WORDS_PER_AXIS
         mask[slot, :words] = -1
     return mask
 
 
-def read_reply(reply: bytes, sent: Sent) -> Answer:
-    """Put a reply into words.
+def read_reply(reply: bytes, sent: Sent) -> Reply:
+    """Decode a reply.
 
     Raises:
-        CanModeError: it carries what the frames have no room for.
+        CanModeError: it has values that the frames cannot carry.
         CanValueError: a target is not finite.
     """
     words = words_of(reply, len(sent.words))
@@ -221,50 +221,49 @@ def read_reply(reply: bytes, sent: Sent) -> Answer:
     if surplus.size:
         slot = int(surplus[0])
         raise CanModeError(
-            f"the answer in mode {modes[slot]} (slot {slot}) needs more than D1 and D2"
+            f"the reply in mode {modes[slot]} (slot {slot}) needs more than D1 and D2"
         )
     targets = floats[:, _D1 : _D2 + 1]
     for slot, field in np.argwhere(~np.isfinite(targets) & ~mirrored[:, None]):
-        raise _no_room(f"D{field + 1}", slot, targets[slot, field], "finite numbers")
+        raise _out_of_range(f"D{field + 1}", slot, targets[slot, field], "finite numbers")
     axes = zip(mirrored.tolist(), modes, *targets.T.tolist(), strict=True)
     number = int.from_bytes(reply[:4], "little", signed=True)
-    return Answer(number, reply[4], tuple(AxisAnswer(*axis) for axis in axes))
+    return Reply(number, reply[4], tuple(AxisReply(*axis) for axis in axes))
 
 
-def _no_room(field: str, slot: int, value: float, holds: str) -> CanValueError:
-    return CanValueError(f"{field} of slot {slot} is {value:.9g}; its field holds {holds}")
+def _out_of_range(field: str, slot: int, value: float, limits: str) -> CanValueError:
+    return CanValueError(f"{field} of slot {slot} is {value:.9g}; its field holds {limits}")
 
 
-def write_reply(answer: Answer, sent: Sent) -> bytes:
-    """The reply itself, at the controller's end: 12 + 36 n bytes."""
-    axes = CyclicPacket.zeros(answer.number, len(answer.axes)).axes
+def write_reply(reply: Reply, sent: Sent) -> bytes:
+    """Encode a reply at the controller's end: 12 + 36 n bytes."""
+    axes = CyclicPacket.zeros(reply.number, len(reply.axes)).axes
     words = axes.view(np.int32).reshape(-1, WORDS_PER_AXIS)
     floats = words.view(np.float32)
-    for slot, axis in enumerate(answer.axes):
+    for slot, axis in enumerate(reply.axes):
         if axis.mirrored:
             words[slot] = sent.words[slot] & sent.mask[slot]
         else:
             words[slot, 0] = axis.mode
             floats[slot, [_D1, _D2]] = axis.d1, axis.d2
-    status = bytes((answer.status, *bytes(N_ARMS - 1)))
-    return CyclicPacket(answer.number, status, bytes(N_ARMS), axes).encode()
+    status = bytes((reply.status, *bytes(N_ARMS - 1)))
+    return CyclicPacket(reply.number, status, bytes(N_ARMS), axes).encode()
 
 
-def drive_off(sent: Sent) -> Answer:
-    """Mode 505 in every axis: what is sent where an answer cannot be."""
-    axis = AxisAnswer(False, int(Mode.DRIVE_OFF_REQUEST))
-    return Answer(next_number(sent.number), 0, (axis,) * len(sent.words))
+def drive_off(sent: Sent) -> Reply:
+    """Return a reply with mode 505 in every axis, sent if the actual one cannot be."""
+    axis = AxisReply(False, int(Mode.DRIVE_OFF_REQUEST))
+    return Reply(next_number(sent.number), 0, (axis,) * len(sent.words))
 
 
 class UpSet(NamedTuple):
-    """The frames of one cycle, read.
+    """Decoded frames of one cycle.
 
     Attributes:
         number, status: of the packet.
-        words: (n, 9) modes and numbers, the slow ones zero.
+        words: (n, 9) modes and numbers; slow values are zero.
         slow: index and four bytes of the slow value.
-        counts: (n,) D3 in counts, NaN out of range, where D4 has to be formed from them; None
-            where D4 was sent.
+        counts: (n,) D3 in counts, NaN out of range, to compute D4 from; None if D4 was sent.
     """
 
     number: int
@@ -280,8 +279,8 @@ class Codec(ABC):
     Attributes:
         up_ids, down_ids: identifiers of the frames of a cycle.
         lengths: bytes of each.
-        up_modulus, down_modulus: numbers in the frames count up modulo this.
-        span_cycles: within which a set must be complete, for its number repeats.
+        up_modulus, down_modulus: modulus of the cycle numbers in the frames.
+        span_cycles: time within which a set must be complete; its number repeats.
     """
 
     up_ids: tuple[int, ...]
@@ -298,29 +297,29 @@ class Codec(ABC):
         self.n_axes = n_axes
 
     def number(self, frame: Frame) -> int:
-        """What tells the frames of one cycle from those of another."""
+        """Return the cycle number in a frame."""
         mask = self._down_mask if frame.id in self.down_ids else self._up_mask
         return int.from_bytes(frame.data[:2], "little") & mask
 
     def is_reply_to(self, frame: Frame, sent_number: int) -> bool:
-        """Whether a frame down belongs to the answer to that packet."""
+        """Whether a frame down belongs to the reply to that packet."""
         return self.number(frame) == next_number(sent_number) & self._down_mask
 
     @abstractmethod
     def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
-        """Frames of a packet; CanModeError for a mode without a code."""
+        """Encode a packet; CanModeError for a mode without a code."""
 
     @abstractmethod
     def read_up(self, payloads: Sequence[bytes]) -> UpSet:
-        """Read the frames of one cycle; PacketError for a mode code without a meaning."""
+        """Decode the frames of one cycle; PacketError for an unknown mode code."""
 
     @abstractmethod
-    def down(self, answer: Answer, sent: Sent) -> list[Frame]:
-        """Frames of an answer; CanModeError, CanValueError where they cannot carry it."""
+    def down(self, reply: Reply, sent: Sent) -> list[Frame]:
+        """Encode a reply; CanModeError, CanValueError if the frames cannot carry it."""
 
     @abstractmethod
-    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:
-        """Read an answer; PacketError for what has no meaning."""
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Reply:
+        """Decode a reply; PacketError for an unknown code."""
 
     def _code(self, mode: int, slot: int) -> int:
         code = self._codes.get(mode)
@@ -358,7 +357,7 @@ class FdCodec(Codec):
     _codes = FD_MODE_CODES
 
     def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
-        """Frames of a packet; CanModeError for a mode without a code."""
+        """Encode a packet; CanModeError for a mode without a code."""
         modes = [self._code(mode, slot) for slot, mode in enumerate(words[:, 0].tolist())]
         values = np.zeros((MAX_AXES, WORDS_PER_AXIS), np.int32)
         values[: self.n_axes] = words
@@ -372,7 +371,7 @@ class FdCodec(Codec):
         return [Frame(FD_UP_A, a.tobytes()), Frame(FD_UP_B, b.tobytes())]
 
     def read_up(self, payloads: Sequence[bytes]) -> UpSet:
-        """Read the frames of one cycle; PacketError for a mode code without a meaning."""
+        """Decode the frames of one cycle; PacketError for an unknown mode code."""
         n = self.n_axes
         first, second = payloads
         a, b = np.frombuffer(first, _UP_A)[0], np.frombuffer(second, _UP_B)[0]
@@ -383,12 +382,12 @@ class FdCodec(Codec):
         floats[:2, _D4], floats[2:, _D4] = a["d4"], b["d4"]
         return UpSet(int(a["number"]), second[2], words[:n], (second[3], second[4:8]))
 
-    def down(self, answer: Answer, sent: Sent) -> list[Frame]:  # noqa: ARG002 - as classic frames
-        """The frame of an answer; CanModeError for a mode without a code."""
-        axes = (*answer.axes, *(AxisAnswer(False, 0),) * (MAX_AXES - self.n_axes))
+    def down(self, reply: Reply, sent: Sent) -> list[Frame]:  # noqa: ARG002 - as classic frames
+        """Encode a reply; CanModeError for a mode without a code."""
+        axes = (*reply.axes, *(AxisReply(False, 0),) * (MAX_AXES - self.n_axes))
         payload = _DOWN.pack(
-            answer.number,
-            answer.status,
+            reply.number,
+            reply.status,
             sum(axis.mirrored << slot for slot, axis in enumerate(axes)),
             *(self._code(axis.mode, slot) for slot, axis in enumerate(axes)),
             *(0.0 if axis.mirrored else axis.d1 for axis in axes),
@@ -396,15 +395,15 @@ class FdCodec(Codec):
         )
         return [Frame(FD_DOWN, payload)]
 
-    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:  # noqa: ARG002
-        """Read an answer; PacketError for a mode code without a meaning."""
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Reply:  # noqa: ARG002
+        """Decode a reply; PacketError for an unknown mode code."""
         number, status, mirrored, *fields = _DOWN.unpack(payloads[0])
         codes, d1, d2 = (fields[at : at + self.n_axes] for at in range(0, 3 * MAX_AXES, MAX_AXES))
         axes = tuple(
-            AxisAnswer(bool(mirrored >> slot & 1), _fd_mode(codes[slot]), d1[slot], d2[slot])
+            AxisReply(bool(mirrored >> slot & 1), _fd_mode(codes[slot]), d1[slot], d2[slot])
             for slot in range(self.n_axes)
         )
-        return Answer(number, status, axes)
+        return Reply(number, status, axes)
 
 
 def _fd_mode(code: int) -> int:
@@ -415,7 +414,7 @@ def _fd_mode(code: int) -> int:
 
 
 _ABSOLUTE: Final = (Mode.POSITION_FEED_FORWARD, Mode.POSITION, Mode.POSITION_RELATIVE)
-"""Modes whose D1 is a position."""
+"""Modes in which D1 is a position."""
 _CLASSIC_MODES: Final = np.array(list(CLASSIC_MODE_CODES), np.int32)
 """(16,) mode of each code, in order."""
 _WORDS: Final[Mapping[int, int]] = {
@@ -427,14 +426,14 @@ _D1_MOST: Final = _D1_MASK >> 1
 _MODE_AT, _D3_AT, _DIFFERENCE_AT, _CURRENT_AT = 4, 8, 35, 52
 _ACTION_AT: Final = (6, 35)
 _D1_AT: Final = (8, 37)
-FORGOTTEN: Final = 16
-"""Cycles between two set-points after which no velocity is formed from them."""
+MAX_STEP_CYCLES: Final = 16
+"""Cycles between two set-points above which no velocity is computed from them."""
 
 
 class ClassicCodec(Codec):
     """Frames of the classic profile.
 
-    The instance at the controller's end remembers the last set-points, to form their step.
+    The instance at the controller's end stores the last set-points to compute their step.
     """
 
     up_modulus = 1 << UP_COUNTER_BITS
@@ -452,7 +451,7 @@ class ClassicCodec(Codec):
         self._set_points: dict[int, tuple[int, int]] = {}
 
     def up(self, number: int, status: int, words: Words, slow: tuple[int, bytes]) -> list[Frame]:
-        """Frames of a packet; CanModeError for a mode without a code."""
+        """Encode a packet; CanModeError for a mode without a code."""
         codes = [self._code(mode, slot) for slot, mode in enumerate(words[:, 0].tolist())]
         with np.errstate(invalid="ignore"):  # a signalling NaN is one like any other
             numbers = words.view(np.float32).astype(np.float64)
@@ -470,7 +469,7 @@ class ClassicCodec(Codec):
         return [Frame(*frame) for frame in zip(self.up_ids, (header, *axes), strict=True)]
 
     def read_up(self, payloads: Sequence[bytes]) -> UpSet:
-        """Read the frames of one cycle."""
+        """Decode the frames of one cycle."""
         header = payloads[0]
         packed = np.frombuffer(b"".join(payloads[1:]), "<u8")
         actual = _unpacked(packed, REVOLUTION_BITS, _D3_AT)
@@ -484,28 +483,28 @@ class ClassicCodec(Codec):
         number = int.from_bytes(header[:2], "little")
         return UpSet(number, header[2], words, (header[3], header[4:8]), actual)
 
-    def down(self, answer: Answer, sent: Sent) -> list[Frame]:
-        """Frames of an answer; CanModeError, CanValueError where they cannot carry it."""
-        leaving = answer.status == EXIT_FROM_OPEN and sent.status == DRIVE_ON
+    def down(self, reply: Reply, sent: Sent) -> list[Frame]:
+        """Encode a reply; CanModeError, CanValueError if the frames cannot carry it."""
+        leaving = reply.status == EXIT_FROM_OPEN and sent.status == DRIVE_ON
         expected = 0 if sent.status == DRIVE_ON else sent.status
-        if not leaving and answer.status not in (0, expected):
+        if not leaving and reply.status not in (0, expected):
             raise CanModeError(
-                f"status {answer.status} in answer to status {sent.status} has no code"
+                f"status {reply.status} in reply to status {sent.status} has no code"
             )
         frames = []
         for pair, frame_id in enumerate(self.down_ids):
-            packed = answer.number & self._down_mask
+            packed = reply.number & self._down_mask
             for side, slot in enumerate(range(2 * pair, min(2 * pair + 2, self.n_axes))):
-                action, field = _act(answer.axes[slot], sent.modes[slot], slot, leaving=leaving)
+                action, field = _action(reply.axes[slot], sent.modes[slot], slot, leaving=leaving)
                 packed |= action << _ACTION_AT[side] | (field & _D1_MASK) << _D1_AT[side]
             frames.append(Frame(frame_id, packed.to_bytes(8, "little")))
         return frames
 
-    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Answer:
-        """Read an answer; the step of a set-point is that from the one before.
+    def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Reply:
+        """Decode a reply; the step of a set-point is that from the previous one.
 
         Raises:
-            PacketError: a word without a meaning, or a set-point out of range.
+            PacketError: an unknown code, or a set-point out of range.
         """
         number = next_number(sent.number)
         leaving = False
@@ -522,11 +521,11 @@ class ClassicCodec(Codec):
             self._set_points.pop(slot, None)
             word = field if action == Action.WORD else Word.MIRROR
             leaving |= bool(word & Word.EXIT)
-            axes.append(_understood(word & ~Word.EXIT, received))
+            axes.append(_word_reply(word & ~Word.EXIT, received))
         status = 0 if sent.status == DRIVE_ON else sent.status
-        return Answer(number, EXIT_FROM_OPEN if leaving else status, tuple(axes))
+        return Reply(number, EXIT_FROM_OPEN if leaving else status, tuple(axes))
 
-    def _set_point(self, slot: int, number: int, mode: int, field: int) -> AxisAnswer:
+    def _set_point(self, slot: int, number: int, mode: int, field: int) -> AxisReply:
         counts = field - (1 << REVOLUTION_BITS) if field > _D1_MOST else field
         if abs(counts) > _D1_MOST:
             raise PacketError("set-point", counts, "a number within its field")
@@ -534,14 +533,14 @@ class ClassicCodec(Codec):
         before = self._set_points.get(slot)
         if mode in _ABSOLUTE and before is not None:
             ahead = (number - before[0]) % LAST_NUMBER
-            if 1 <= ahead <= FORGOTTEN:
+            if 1 <= ahead <= MAX_STEP_CYCLES:
                 step = (counts - before[1]) / ahead / COUNTS_PER_REVOLUTION
         self._set_points[slot] = (number, counts)
-        return AxisAnswer(False, mode, counts / COUNTS_PER_REVOLUTION, step)
+        return AxisReply(False, mode, counts / COUNTS_PER_REVOLUTION, step)
 
 
-def _act(axis: AxisAnswer, received: int, slot: int, *, leaving: bool) -> tuple[int, int]:
-    """Action and D1 field of one axis; CanModeError, CanValueError where there is none."""
+def _action(axis: AxisReply, received: int, slot: int, *, leaving: bool) -> tuple[int, int]:
+    """Return action and D1 field of one axis; CanModeError, CanValueError if there is none."""
     still = axis.d1 == 0.0 and axis.d2 == 0.0
     if axis.mirrored:
         word = Word.MIRROR
@@ -556,7 +555,7 @@ def _act(axis: AxisAnswer, received: int, slot: int, *, leaving: bool) -> tuple[
     elif axis.mode == Mode.CLOSED and still:
         word = Word.CLOSED_ZERO
     else:
-        raise CanModeError(f"mode {axis.mode} in answer to {received} (slot {slot}) has no code")
+        raise CanModeError(f"mode {axis.mode} in reply to {received} (slot {slot}) has no code")
     if leaving:
         return Action.WORD, word | Word.EXIT
     return (Action.MIRROR, 0) if word == Word.MIRROR else (Action.WORD, word)
@@ -566,12 +565,12 @@ def _target(d1: float, slot: int) -> int:
     counts = round(d1 * COUNTS_PER_REVOLUTION) if math.isfinite(d1) else None
     if counts is None or abs(counts) > _D1_MOST:
         most = _D1_MOST / COUNTS_PER_REVOLUTION
-        raise _no_room("D1", slot, d1, f"{-most:.2f}..{most:.2f} motor revolutions")
+        raise _out_of_range("D1", slot, d1, f"{-most:.2f}..{most:.2f} motor revolutions")
     return counts
 
 
-def _understood(word: int, received: int) -> AxisAnswer:
-    """What a word says; PacketError if nothing that is known."""
+def _word_reply(word: int, received: int) -> AxisReply:
+    """Return the reply that a word stands for; PacketError if it is unknown."""
     modes = {
         Word.MIRROR: received,
         Word.CLOSED_ZERO: int(Mode.CLOSED),
@@ -581,16 +580,16 @@ def _understood(word: int, received: int) -> AxisAnswer:
     }
     if word not in modes:
         raise PacketError("word", word, "one of the classic CAN profile")
-    return AxisAnswer(word == Word.MIRROR, modes[word])
+    return AxisReply(word == Word.MIRROR, modes[word])
 
 
 def _counts(values: Array, per_unit: int) -> Array:
-    """Rounded; NaN for what is not finite."""
+    """Round; NaN for values that are not finite."""
     return np.where(np.isfinite(values), np.rint(values * per_unit), np.nan)
 
 
 def _packed(counts: Array, bits: int, at: int) -> NDArray[np.uint64]:
-    """Two's complement in place; the most negative value where it does not fit."""
+    """Return fields in two's complement; the most negative value for numbers out of range."""
     lowest = -(1 << bits - 1)
     whole = np.where(np.abs(counts) < -lowest, counts, lowest).astype(np.int64)
     field = whole.astype(np.uint64) & np.uint64((1 << bits) - 1)
@@ -598,7 +597,7 @@ def _packed(counts: Array, bits: int, at: int) -> NDArray[np.uint64]:
 
 
 def _unpacked(packed: NDArray[np.uint64], bits: int, at: int) -> Array:
-    """Signed numbers; NaN for the most negative value."""
+    """Return signed numbers; NaN for the most negative value."""
     left = np.uint64(64 - bits - at)
     signed = (packed << left).view(np.int64) >> np.int64(64 - bits)
     return np.where(signed == -(1 << bits - 1), np.nan, signed.astype(np.float64))

@@ -1,7 +1,7 @@
-"""Both ends of the profile without I/O: packets to frames and frames to packets.
+"""Conversion between packets and frames at both ends of the link, without I/O.
 
-Start packets, and anything else that cyclic frames cannot carry, go as segments. From the init
-packet on, cyclic packets go as cyclic frames, and an answer goes the way its question came.
+Start packets, and others that cyclic frames cannot carry, are sent as segments. After the init
+packet, cyclic packets are sent as cyclic frames, and a reply is sent as its packet was.
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ LONGEST: Final = 1500
 """Bytes of the longest packet."""
 _HEAD: Final = struct.Struct("<BBHI")
 _PREFIX: Final = 2
-ABANDONED: Final = 1.0
-"""s after which a transfer that stands still is given up."""
-REPEAT: Final = 0.1
-"""s within which a frame of a finished transfer counts as a duplicate."""
+TRANSFER_TIMEOUT: Final = 1.0
+"""Time without a new segment after which a transfer is abandoned, s."""
+DUPLICATE_TIME: Final = 0.1
+"""Time within which a frame of a complete transfer counts as a duplicate, s."""
 
 
 class Segmenter:
-    """Cuts packets into payloads of at most `size` bytes, 8 or 64.
+    """Divides packets into payloads of at most `size` bytes, 8 or 64.
 
     Segment 0 is the transfer number, 0, the length (u16) and the CRC-32 of the packet; the others
     are the transfer number, their index and data.
@@ -74,10 +74,10 @@ class Segmenter:
         self._transfer = 0
 
     def split(self, packet: bytes) -> list[bytes]:
-        """The payloads, in order.
+        """Return the payloads, in order.
 
         Raises:
-            ValueError: empty, or longer than 1500 bytes.
+            ValueError: the packet is empty or longer than 1500 bytes.
         """
         if not 1 <= len(packet) <= LONGEST:
             raise ValueError(f"a packet has 1..{LONGEST} bytes, not {len(packet)}")
@@ -93,12 +93,12 @@ class Segmenter:
 
 
 class SegmentAssembler:
-    """Puts packets together: each comes out whole and with the right CRC or not at all.
+    """Assembles packets from segments; only complete ones with the right CRC are returned.
 
     Args:
         size: bytes of a full payload, 8 or 64.
         discarded: counts "torn" (a segment is missing), "corrupt" (wrong CRC or length) and
-            "malformed" (no segment at all).
+            "malformed" (not a segment).
     """
 
     def __init__(self, size: int, discarded: Counter[str]) -> None:
@@ -107,23 +107,23 @@ class SegmentAssembler:
         self._transfer = -1
         self._parts: dict[int, bytes] = {}
         self._done = True
-        self._seen = 0.0
+        self._last = 0.0
         self._finished: dict[int, float] = {}
 
     def add(self, payload: bytes, time: float) -> bytes | None:
-        """Take one segment, received at `time` (s); the packet, if that completes it."""
+        """Add a segment received at `time` (s); returns the packet when it is complete."""
         if len(payload) <= _PREFIX or (payload[1] == 0 and len(payload) != _HEAD.size):
             self._discarded["malformed"] += 1
             return None
         transfer, index = payload[0], payload[1]
         finished = self._finished.get(transfer)
-        if finished is not None and abs(time - finished) <= REPEAT:
+        if finished is not None and abs(time - finished) <= DUPLICATE_TIME:
             return None
         if not self._belongs(transfer, index, payload, time):
             if not self._done:
                 self._discarded["torn"] += 1
             self._transfer, self._parts, self._done = transfer, {}, False
-        self._seen = time
+        self._last = time
         self._parts[index] = payload
         packet = self._complete()
         if self._done:
@@ -131,9 +131,9 @@ class SegmentAssembler:
         return packet
 
     def _belongs(self, transfer: int, index: int, payload: bytes, time: float) -> bool:
-        """Whether this is of the transfer under way."""
+        """Whether this segment is of the present transfer."""
         known = self._parts.get(index, payload)
-        recent = abs(time - self._seen) <= ABANDONED
+        recent = abs(time - self._last) <= TRANSFER_TIMEOUT
         return transfer == self._transfer and not self._done and known == payload and recent
 
     def _complete(self) -> bytes | None:
@@ -155,21 +155,21 @@ class SegmentAssembler:
 
 
 LATE: Final = 3
-"""Cycles by which a frame may come after one of a later cycle without starting a new set."""
+"""Cycles by which a frame may be older than the present set without starting a new one."""
 
 
 class SetAssembler:
     """Collects one frame of each identifier with the same cycle number.
 
-    A frame of another cycle starts a new set; the incomplete one before it is given up and
-    counted as "torn". A frame that comes once more changes nothing, and one of up to three cycles
-    earlier is ignored. Numbers repeat, so a set must also be complete within `span`.
+    A frame of another cycle starts a new set; an incomplete set is dropped and counted as "torn".
+    Duplicates and frames of up to `LATE` cycles earlier are ignored. Numbers repeat, so a set must
+    also be complete within `span`.
 
     Args:
-        ids: identifiers of a whole set.
-        modulus: the numbers count up modulo this.
-        span: s between the first and the last frame of a set, by their time of arrival.
-        discarded: where "torn" is counted.
+        ids: identifiers of a complete set.
+        modulus: of the cycle numbers.
+        span: longest time between the arrivals of the first and the last frame of a set, s.
+        discarded: counts "torn".
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class SetAssembler:
         self._done = True
 
     def add(self, frame_id: int, number: int, data: bytes, time: float) -> list[bytes] | None:
-        """Take a frame; all payloads in the order of `ids`, if that completes the set."""
+        """Add a frame; returns all payloads in the order of `ids` when the set is complete."""
         timely = abs(time - self._began) <= self._span
         if not timely or number != self._number or self._parts.get(frame_id, data) != data:
             if timely and self._number >= 0 and self._is_late(number):
@@ -205,18 +205,18 @@ class SetAssembler:
         return 1 <= (self._number - number) % self._modulus <= LATE
 
 
-REMEMBERED: Final = 16
-"""Packets that either end remembers, for answers that come late."""
+MAX_SENT: Final = 16
+"""Packets stored at each end, for late replies."""
 _ARM: Final = 1
 
 
 def require_carried(init: InitPacket, rates: BusRates) -> None:
-    """See that the session this init packet begins fits the profile.
+    """Check that the session of this init packet fits the profile.
 
     Raises:
         CanAxesError: more than six axes, or axes of another arm.
         CanBusLoadError: the cycle is too short.
-        PacketError: the axis map is not one.
+        PacketError: the axis map is invalid.
     """
     arms = {axis.arm for axis in init.open_axes()}
     if init.n_axes > MAX_AXES:
@@ -229,16 +229,16 @@ def require_carried(init: InitPacket, rates: BusRates) -> None:
 
 
 class End(ABC):
-    """What both ends have in common.
+    """Common base of both ends.
 
     Attributes:
-        discarded: frames, sets and packets thrown away, by kind: "foreign", "malformed", "torn",
-            "corrupt", "unannounced" (cyclic frames without an init packet), "stale" (answers to
-            packets too long ago).
+        discarded: frames, sets and packets discarded, by kind: "foreign", "malformed", "torn",
+            "corrupt", "unannounced" (cyclic frames without an init packet), "stale" (replies to
+            packets no longer stored).
     """
 
     _upwards: ClassVar[bool]
-    """Whether this end receives what the controller sends."""
+    """Whether this is the PC's end."""
 
     def __init__(self, rates: BusRates) -> None:
         self.discarded: Counter[str] = Counter()
@@ -250,16 +250,15 @@ class End(ABC):
         self._profile_ids = self._ids(self._kind(MAX_AXES))
         self._codec: Codec | None = None
         self._sets: SetAssembler | None = None
-        self._sent: deque[Sent] = deque(maxlen=REMEMBERED)
+        self._sent: deque[Sent] = deque(maxlen=MAX_SENT)
 
     def _ids(self, codec: Codec) -> tuple[int, ...]:
         return codec.up_ids if self._upwards else codec.down_ids
 
     def _cyclic_session(self, packet: bytes) -> InitPacket | None:
-        """The init packet, if cyclic frames follow it; None for any other packet.
+        """Return the init packet if cyclic frames follow it, None for any other packet.
 
-        An init packet that cannot be understood is for the session to judge; no cyclic frames
-        follow it.
+        One that is invalid is passed on to the session; no cyclic frames follow it.
         """
         if not is_init(packet):
             return None
@@ -271,7 +270,7 @@ class End(ABC):
         return init
 
     def _start(self, init: InitPacket) -> None:
-        """Cyclic frames of the session that this packet begins."""
+        """Prepare for the cyclic frames of a session."""
         self._codec = codec = self._kind(init.n_axes)
         modulus = codec.up_modulus if self._upwards else codec.down_modulus
         span = codec.span_cycles * init.period
@@ -279,7 +278,7 @@ class End(ABC):
         self._sent.clear()
 
     def receive(self, frame: Frame, time: float) -> bytes | None:
-        """Take a frame that arrived at `time` (s); the packet, if that completes one.
+        """Add a frame that arrived at `time` (s); returns the packet when it is complete.
 
         Raises:
             CanError: an init packet of a session that this bus cannot carry.
@@ -287,7 +286,7 @@ class End(ABC):
         if frame.id == (SEGMENT_UP if self._upwards else SEGMENT_DOWN):
             packet = self._segments.add(frame.data, time)
             if packet is not None:
-                self._whole(packet)
+                self._segmented_packet(packet)
             return packet
         codec, sets = self._codec, self._sets
         if frame.id not in self._profile_ids:
@@ -304,12 +303,12 @@ class End(ABC):
                 self.discarded["malformed"] += 1
         return None
 
-    def _whole(self, packet: bytes) -> None:  # noqa: B027  one end needs it
-        """A packet came as segments."""
+    def _segmented_packet(self, packet: bytes) -> None:  # noqa: B027  used by one end
+        """Handle a packet that came as segments."""
 
     @abstractmethod
     def _packet(self, codec: Codec, frame: Frame, payloads: Sequence[bytes]) -> bytes | None:
-        """The packet of a set that its last frame completes; PacketError for one without sense."""
+        """Decode a complete set of which `frame` is the last; PacketError if it is invalid."""
 
     def _as_segments(self, packet: bytes) -> list[Frame]:
         frame_id = SEGMENT_DOWN if self._upwards else SEGMENT_UP
@@ -320,7 +319,7 @@ class PcEnd(End):
     """The PC's end: frames of the controller to packets, replies to frames.
 
     Attributes:
-        ages: (n_axes, 8) of the packet that came out last; None for one that came as segments.
+        ages: (n_axes, 8) of the packet returned last; None if it came as segments.
     """
 
     _upwards = True
@@ -332,11 +331,11 @@ class PcEnd(End):
         self.ages: Ages | None = None
 
     def forget(self) -> None:
-        """The controller was silent for so long that nothing slow is known any more."""
+        """Discard the slow values after a silence."""
         self._slow.forget()
         self._before = None
 
-    def _whole(self, packet: bytes) -> None:
+    def _segmented_packet(self, packet: bytes) -> None:
         self.ages = None
         if not is_init(packet):
             return
@@ -352,7 +351,7 @@ class PcEnd(End):
         cycle = codec.read_up(payloads)
         ahead = self._slow.update(cycle.number, *cycle.slow, cycle.words)
         if cycle.counts is not None:
-            self._form_velocity(cycle.counts, cycle.words.view(np.float32), ahead)
+            self._set_velocity(cycle.counts, cycle.words.view(np.float32), ahead)
         status = bytes((cycle.status, 0, 0, 0))
         axes = cycle.words.view(AXIS_DTYPE).reshape(-1)
         packet = CyclicPacket(cycle.number, status, self._slow.functionality, axes).encode()
@@ -360,8 +359,8 @@ class PcEnd(End):
         self.ages = self._slow.ages
         return packet
 
-    def _form_velocity(self, counts: NDArray[np.float64], floats: Floats, ahead: int) -> None:
-        """D4 as the mean over the cycles since the last set, which is how old it is."""
+    def _set_velocity(self, counts: NDArray[np.float64], floats: Floats, ahead: int) -> None:
+        """Set D4 to the mean over the cycles since the last set, which is its age."""
         if self._before is None or ahead < 1:
             floats[:, 4] = np.nan
             self._slow.ages[:, 3] = NEVER
@@ -372,7 +371,7 @@ class PcEnd(End):
             self._before = counts
 
     def reply(self, packet: bytes) -> list[Frame]:
-        """Frames of an answer.
+        """Return the frames of a reply.
 
         Raises:
             CanModeError, CanValueError: the frames cannot carry it.
@@ -387,7 +386,7 @@ class PcEnd(End):
         return self._as_segments(packet)
 
     def drive_off(self) -> list[Frame]:
-        """Frames that ask for drive-off in answer to the newest cyclic packet, if there is one."""
+        """Return frames that request drive-off in reply to the newest cyclic packet, if any."""
         if not self._sent or self._codec is None:
             return []
         return self._codec.down(drive_off(self._sent[-1]), self._sent[-1])
@@ -408,7 +407,7 @@ class ControllerEnd(End):
         self.segmented = False
 
     def packet(self, packet: bytes) -> list[Frame]:
-        """Frames of a packet of the controller, whatever it is.
+        """Return the frames of a packet of the controller.
 
         Raises:
             CanError: an init packet of a session that this bus cannot carry.
@@ -423,7 +422,7 @@ class ControllerEnd(End):
         return self._as_segments(packet) if frames is None else frames
 
     def _cyclic(self, packet: bytes) -> list[Frame] | None:
-        """Cyclic frames, if they can carry this packet."""
+        """Return cyclic frames, None if they cannot carry this packet."""
         codec = self._codec
         if codec is None or len(packet) != cyclic_length(codec.n_axes):
             return None

@@ -1,8 +1,7 @@
 """Identifiers, fields and codes of the frames of both profiles.
 
-The DBC files beside this one say the same to any CAN tool; tests hold them against our frames, read
-and written by another program. Standard (11-bit) identifiers; the lower one wins the bus, so
-answers come first.
+The DBC files in this folder describe the same for CAN tools. Standard (11-bit) identifiers; lower
+ones have priority on the bus, so replies come first.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ CLASSIC_MODE_CODES: Final[dict[int, int]] = {
 
 
 class Action:
-    """What a classic frame says of one axis: two bits."""
+    """Action for one axis in a classic frame: two bits."""
 
     MIRROR: Final = 0
     SET: Final = 1

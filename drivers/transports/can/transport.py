@@ -35,7 +35,7 @@ from drivers.transports.can.layout import MAX_AXES, SEGMENT_DOWN, SEGMENT_UP, Fr
 
 _REMEDIES = {
     "socketcan": "bring it up: modprobe can_raw && ip link set {channel} up type can {rates}",
-    "slcan": "see that the adapter is there and that you may open its port (group dialout)",
+    "slcan": "check that the adapter is connected and its port may be opened (group dialout)",
     "udp_multicast": "it needs msgpack and a route for multicast: ip route add 239.0.0.0/8 dev lo",
 }
 
@@ -61,7 +61,7 @@ def open_bus(
             fast = rates.data_bitrate if rates.profile == "fd" else None
             bus.set_bitrate(rates.bitrate, fast)  # type: ignore[attr-defined]
     except (can.CanError, OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
-        _dispose_of_half_made(error)
+        _shut_down_partial(error)
         remedy = _REMEDIES.get(interface, "see python-can's documentation of this interface")
         wanted = f"bitrate {rates.bitrate}"
         if rates.profile == "fd":
@@ -71,12 +71,12 @@ def open_bus(
     return bus
 
 
-def _dispose_of_half_made(error: BaseException) -> None:
-    """Shut down what python-can had begun to open; left to the collector it complains on stderr."""
+def _shut_down_partial(error: BaseException) -> None:
+    """Shut down a bus that was not opened completely, which would warn on stderr when collected."""
     for frame, _ in traceback.walk_tb(error.__traceback__):
         for value in list(frame.f_locals.values()):
             if isinstance(value, can.BusABC):
-                # It may lack any of its parts: all that counts is that it was tried.
+                # Any of its attributes may be missing.
                 with contextlib.suppress(Exception):
                     value.shutdown()
 
@@ -88,7 +88,7 @@ def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
         arguments["protocol"] = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
     elif interface == "udp_multicast":
         group, _, port = channel.partition("/")
-        # Frames stay on this machine: nothing out there is to take them for a robot's.
+        # Frames must not leave this computer.
         arguments.update(channel=group, hop_limit=0, fd=True)
         if port:
             arguments["port"] = int(port)
@@ -103,34 +103,34 @@ def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _failing_as_closed() -> Iterator[None]:
-    """Turn what a bus raises into TransportClosed, with its cause."""
+    """Convert the errors of a bus to TransportClosed, with their cause."""
     try:
         yield
     except (can.CanError, OSError, ValueError, TypeError) as error:
         raise TransportClosed(f"the CAN bus failed: {error}") from error
 
 
-SEND_PATIENCE: Final = 0.05
-"""s that a full send queue is waited for; what is not accepted by then is lost."""
-SEGMENT_PATIENCE: Final = 0.5
-"""s for a segment: many come at once, and nothing moves yet."""
-LOOKS: Final = 1000
-"""Frames looked at after the time is over: those that wait, but no endless flood."""
-_ECHOES_REMEMBERED: Final = 256
+SEND_TIMEOUT: Final = 0.05
+"""Longest wait for a full send queue, s; a frame not accepted by then is lost."""
+SEGMENT_TIMEOUT: Final = 0.5
+"""The same for a segment, s: there are many at once, and nothing moves yet."""
+MAX_QUEUED: Final = 1000
+"""Frames read after the time-out."""
+_MAX_ECHOES: Final = 256
 
 
 class Port:
-    """Frames in, packets out.
+    """Sends and receives the frames of one end.
 
     Args:
-        bus: python-can's; closed with the port.
-        end: what the frames mean.
+        bus: of python-can; closed with the port.
+        end: converts frames to packets.
         fd: whether frames are FD frames.
-        clock: s, the arrival of frames that the bus does not stamp.
+        clock: time of arrival of frames without a time stamp, s.
 
     Attributes:
-        discarded: counts of the end, and "bus_error" (error frames) and "unsent" (frames that the
-            bus did not take).
+        discarded: counts of the end, and "bus_error" (error frames) and "unsent" (frames not
+            accepted by the bus).
     """
 
     def __init__(
@@ -143,31 +143,31 @@ class Port:
         self._clock = clock
         self._closed = False
         self._waiting: deque[can.Message] = deque()
-        # python-can's multicast bus hands every frame back to its sender.
+        # python-can's multicast bus returns every frame to its sender.
         echoes = isinstance(bus, UdpMulticastBus)
-        self._own: deque[Frame] | None = deque(maxlen=_ECHOES_REMEMBERED) if echoes else None
+        self._own: deque[Frame] | None = deque(maxlen=_MAX_ECHOES) if echoes else None
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet, or None after `timeout` s without one.
+        """Return the next packet, or None after `timeout` s without one.
 
         Raises:
             TransportClosed: closed, or the bus failed.
-            CanError: a session that this bus cannot carry.
+            CanError: the bus cannot carry the session.
         """
         self._require_open()
         end = time.monotonic() + timeout
         left = timeout
-        looks = LOOKS
+        queued = MAX_QUEUED
         while True:
             message = self._next(max(0.0, left))
             if message is not None:
-                packet = self._take(message)
+                packet = self._decode(message)
                 if packet is not None:
                     return packet
             left = end - time.monotonic()
             if left <= 0.0:
-                looks -= 1
-                if message is None or looks == 0:
+                queued -= 1
+                if message is None or queued == 0:
                     return None
 
     def _next(self, timeout: float) -> can.Message | None:
@@ -177,12 +177,12 @@ class Port:
             return self._bus.recv(timeout)
 
     def _fetch(self) -> None:
-        """Empty the bus's queue, which echoes of long packets would fill."""
+        """Empty the queue of the bus, which echoes of long packets would fill."""
         with _failing_as_closed():
             while (message := self._bus.recv(0.0)) is not None:
                 self._waiting.append(message)
 
-    def _take(self, message: can.Message) -> bytes | None:
+    def _decode(self, message: can.Message) -> bytes | None:
         if message.is_error_frame:
             self.discarded["bus_error"] += 1
             return None
@@ -193,11 +193,11 @@ class Port:
         if self._own is not None and frame in self._own:
             self._own.remove(frame)
             return None
-        # When it was on the bus matters, not when this program came to read it.
+        # The time on the bus matters, not that of reading.
         return self._end.receive(frame, message.timestamp or self._clock())
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send frames in order; a set whose frame the bus does not take is given up, and counted.
+        """Send frames in order; if the bus does not accept one, the rest is dropped and counted.
 
         Raises:
             TransportClosed: closed, or the bus failed.
@@ -205,13 +205,12 @@ class Port:
         self._require_open()
         for frame in frames:
             segment = frame.id in (SEGMENT_UP, SEGMENT_DOWN)
-            patience = SEGMENT_PATIENCE if segment else SEND_PATIENCE
+            timeout = SEGMENT_TIMEOUT if segment else SEND_TIMEOUT
             try:
                 with _failing_as_closed():
-                    self._bus.send(self._message(frame), patience)
+                    self._bus.send(self._message(frame), timeout)
             except TransportClosed as error:
-                # A full queue, or nobody who acknowledges. Whether the bus is gone for good is
-                # for `receive` to find out.
+                # A full queue, or no node that acknowledges; `receive` detects a failed bus.
                 if not isinstance(error.__cause__, can.CanOperationError | can.CanTimeoutError):
                     raise
                 self.discarded["unsent"] += 1
@@ -231,7 +230,7 @@ class Port:
         )
 
     def close(self) -> None:
-        """Give the bus up. Closing twice changes nothing."""
+        """Close the bus; may be called again."""
         if not self._closed:
             self._closed = True
             with contextlib.suppress(TransportClosed), _failing_as_closed():
@@ -242,29 +241,27 @@ class Port:
             raise TransportClosed("the CAN link was closed")
 
 
-_WITHIN_THIS_PROCESS: Final = "virtual"
-"""python-can's bus that no other program can open."""
+_IN_PROCESS: Final = "virtual"
+"""Interface of python-can within one process."""
 
 
 class BusLock:
-    """Keeps other programs of ours off a bus; whoever dies lets go of it.
-
-    Advisory, as that of a campaign's folder: programs that do not ask for it are not excluded.
+    """An advisory lock of a bus among programs of hil; released when the process ends.
 
     Raises:
-        TransportError: another program has the bus, or the lock cannot be made.
+        TransportError: another program has the bus, or the lock cannot be created.
     """
 
     def __init__(self, interface: str, channel: str) -> None:
         self._fd = -1
-        if interface == _WITHIN_THIS_PROCESS:
+        if interface == _IN_PROCESS:
             return
         link = f"CAN bus {interface}:{channel}"
         path = _path(interface, channel)
         try:
             self._fd = _opened(path)
         except OSError as error:
-            remedy = f"remove {path}, or make it writable"
+            remedy = f"remove {path} or make it writable"
             reason = f"its lock {path} cannot be opened ({error.strerror})"
             raise TransportError(link, reason, remedy) from error
         try:
@@ -274,21 +271,21 @@ class BusLock:
             self.release()
             raise TransportError(
                 link,
-                f"another program has it (process {holder or 'unknown'})",
-                "wait for its end, or stop it",
+                f"another program uses it (process {holder or 'unknown'})",
+                "wait for it to end, or stop it",
             ) from error
         os.ftruncate(self._fd, 0)
         os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
-        """Let go of the bus. Twice changes nothing."""
+        """Release the lock; may be called again."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
 def _path(interface: str, channel: str) -> Path:
-    """Of the lock; the same for each name of one serial port."""
+    """Return the path of the lock, the same for all names of one serial port."""
     if channel.startswith("/"):
         channel = str(Path(channel).resolve())
     name = re.sub(r"[^0-9A-Za-z.]+", "_", f"{interface}_{channel}")
@@ -296,34 +293,35 @@ def _path(interface: str, channel: str) -> Path:
 
 
 def _opened(path: Path) -> int:
-    """The file, for every user of this computer.
+    """Open the lock file, for all users of this computer.
 
-    The file stays: removing it would let two programs hold locks on two files of one name. In a
-    folder that all may write to, one that lies there may not be opened as if it were to be made.
+    The file is never removed, else two programs could lock two files of one name. O_CREAT is
+    refused for files of other users in a folder writable by all, so an existing file is opened
+    without it.
     """
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
     with contextlib.suppress(FileExistsError):
-        made = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
-        os.fchmod(made, 0o666)
-        return made
+        created = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+        os.fchmod(created, 0o666)
+        return created
     return os.open(path, flags)
 
 
 MOVABLE = frozenset((Mode.POSITION, Mode.POSITION_RELATIVE, Mode.DELTA_POSITION))
-"""Open modes whose set-points the frames can carry."""
+"""Open modes whose set-points fit the frames."""
 
 
 class CanTransport:
     """The PC's end of the CAN profile on an open bus.
 
-    What cannot be carried is never bent into shape: an answer that the frames have no room for is
-    replaced by a request for drive-off, and the link closes with the reason.
+    A reply that the frames cannot carry is replaced by a request for drive-off, and the link is
+    closed with the reason.
 
     Args:
-        bus: python-can's; closed with the transport.
+        bus: of python-can; closed with the transport.
         rates: profile and bit rates.
-        clock: s, the arrival of frames that the bus does not stamp.
-        lock: of the bus, where it has one; let go of when the transport is closed.
+        clock: time of arrival of frames without a time stamp, s.
+        lock: of the bus; released when the transport is closed.
     """
 
     def __init__(
@@ -340,20 +338,20 @@ class CanTransport:
 
     @property
     def now(self) -> float:
-        """CLOCK_MONOTONIC in s."""
+        """CLOCK_MONOTONIC, s."""
         return time.monotonic()
 
     @property
     def ages(self) -> NDArray[np.uint16] | None:
-        """(n_axes, 8) cycles since each value of the last cyclic packet was sent."""
+        """(n_axes, 8) ages of the values of the last cyclic packet, in cycles."""
         return self._end.ages
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet, or None after `timeout` s without one.
+        """Return the next packet, or None after `timeout` s without one.
 
         Raises:
-            TransportClosed: closed, the bus failed, or the controller began a session that this
-                bus cannot carry (its cause is the `CanError`).
+            TransportClosed: closed, the bus failed, or it cannot carry the session of the
+                controller (the cause is a `CanError`).
         """
         try:
             return self._port.receive(timeout)
@@ -362,11 +360,11 @@ class CanTransport:
             raise TransportClosed(str(error)) from error
 
     def send(self, packet: bytes) -> None:
-        """Answer the packet received last.
+        """Send the reply to the packet received last.
 
         Raises:
-            TransportClosed: closed, the bus failed, or the answer cannot be carried (its cause is
-                the `CanError`; drive-off was asked for instead).
+            TransportClosed: closed, the bus failed, or it cannot carry the reply (the cause is a
+                `CanError`; drive-off was requested instead).
         """
         try:
             frames = self._end.reply(packet)
@@ -377,17 +375,17 @@ class CanTransport:
         self._port.send(frames)
 
     def rejected(self) -> dict[str, int]:
-        """Frames and sets discarded since the last call, by kind; see `PcEnd` and `Port`."""
+        """Return frames and sets discarded since the last call, by kind; see `End` and `Port`."""
         counts = dict(self._port.discarded)
         self._port.discarded.clear()
         return counts
 
     def forget_peer(self) -> None:
-        """The session was lost: no slow value is known any more."""
+        """Discard the slow values of the lost session."""
         self._end.forget()
 
     def close(self) -> None:
-        """Give the bus up. Closing twice changes nothing."""
+        """Close the bus; may be called again."""
         try:
             self._port.close()
         finally:
@@ -397,7 +395,7 @@ class CanTransport:
 
 @dataclass(frozen=True)
 class CanSpec:
-    """A CAN link, to be opened.
+    """Settings of a CAN link.
 
     Attributes:
         interface: python-can's name of it: "socketcan", "slcan", "pcan", "udp_multicast", ...
@@ -426,7 +424,7 @@ class CanSpec:
         """Profile and bit rates.
 
         Raises:
-            ValueError: no such profile, or a rate that is not positive.
+            ValueError: unknown profile, or a rate that is not positive.
         """
         standard = BusRates(self.profile)
         return BusRates(
@@ -436,15 +434,15 @@ class CanSpec:
         )
 
     def check(self, mode: int | None = None) -> None:
-        """See that this bus can carry the session, before anything is opened.
+        """Check that this bus can carry the session.
 
         Args:
-            mode: open mode in which the robot is to be moved; None if it is not.
+            mode: open mode of the motions; None without motions.
 
         Raises:
-            CanAxesError: more axes than the frames have places for.
+            CanAxesError: more axes than the frames can carry.
             CanBusLoadError: the cycle is too short for the frames.
-            CanModeError: a mode whose set-points the frames cannot carry.
+            CanModeError: the set-points of this mode do not fit the frames.
         """
         if not 1 <= self.n_axes <= MAX_AXES:
             raise CanAxesError(f"the robot has {self.n_axes} axes")
@@ -456,8 +454,8 @@ class CanSpec:
         """Open the bus.
 
         Raises:
-            TransportError: it cannot be opened, another program has it, or (`CanError`) it could
-                not carry the session.
+            TransportError: it cannot be opened, another program uses it, or (`CanError`) it
+                cannot carry the session.
         """
         self.check()
         lock = BusLock(self.interface, self.channel)
