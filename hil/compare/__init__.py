@@ -1,4 +1,4 @@
-"""Campaigns of one arm compared: did the friction change, on which axis, and what it carries."""
+"""Changes of friction, payload and inertial parameters between campaigns of one arm."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Campaigns of one arm, and what changed from one to another; the rules are in `docs/compare.md`.
+"""Significant changes between campaigns of one arm; see `docs/compare.md`.
 
-A campaign's variance of a figure is the larger of that of its estimate and that of its repetitions,
-of which n correlated by ρ are worth n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946), ρ corrected
-for bias (Marriott and Pope 1954). Differences: Welch's t, all together by Holm's procedure.
+The variance of a value is the larger of that of the estimate and that of the repetitions, whose
+effective number is n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946) with ρ corrected for bias
+(Marriott and Pope 1954). Differences are tested by Welch's t test with Holm's procedure.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ from .trend import (
 
 Array = NDArray[np.float64]
 
-FEWEST: Final = 15
-"""Repetitions without which their correlation cannot be estimated. A campaign of fewer is assumed
-to be known no better than one of them is: they may all have been made while the arm warmed up."""
-CONFIDENCE: Final = 0.95  #: Of intervals, each by itself
-_HIGHEST: Final = 0.95
-_TWO: Final = "name two campaigns or more of one arm"
-_OTHER_SPEED: Final = 1.2
-"""Ratio of typical speeds from which two campaigns count as having moved differently."""
-_SHARE: Final = FALSE_ALARMS / 2.0  # of comparisons, each for friction and for the payload
-_LEAST: Final = f"{100.0 * LEAST_FRICTION:g} %"
+MIN_REPETITIONS: Final = 15
+"""Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
+may have been recorded while the arm warmed up."""
+CONFIDENCE: Final = 0.95  #: Of each interval
+_MAX_CORRELATION: Final = 0.95
+_TWO: Final = "give two or more campaigns of one arm"
+_SPEED_RATIO: Final = 1.2
+"""Ratio of rms speeds above which two campaigns have different motions."""
+_SHARE: Final = FALSE_ALARMS / 2.0  # of false alarms, each for friction and for the payload
+_MIN_CHANGE: Final = f"{100.0 * LEAST_FRICTION:g} %"
 _CAVEAT: Final = (
-    "A few campaigns do not show how much this arm differs from day to day without anything having "
-    "happened to it: a cold arm has tens of per cent more friction. Compare campaigns of an arm "
-    "that was equally warm; `hil reidentify` judges each of many by the scatter of those before."
+    "The normal variation from day to day is not known from a few campaigns: friction of a cold arm"
+    " is tens of per cent higher. Compare campaigns at the same temperature; `hil reidentify`"
+    " compares each of many campaigns with the scatter of the earlier ones."
 )
 
 
-class Known(NamedTuple):
-    """A figure of one campaign: value, its variance, and degrees of freedom of the variance."""
+class Figure(NamedTuple):
+    """A value of one campaign, its variance and the degrees of freedom of the variance."""
 
     value: float
     variance: float
@@ -71,69 +71,63 @@ class Known(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """Figures (k) of c campaigns, all others tested against the first; NaN where not known."""
+    """Figures (k) of c campaigns tested against the first campaign; NaN if unknown."""
 
     value: Array  #: (k, c)
     std: Array  #: (k, c)
-    change: Array  #: against the first campaign (k, c); NaN of the first itself, as the next ones
-    half: Array  #: of the 95 % interval of the change (k, c)
-    p_value: Array  #: of no change (k, c), adjusted for all figures and campaigns
-    limit: Array  #: smallest change that would count (k, c)
-    #: whether the change is more than chance and large enough to count (k, c)
-    changed: NDArray[np.bool_]
-    slight: NDArray[np.bool_]  #: whether it is more than chance and not large enough (k, c)
+    change: Array  #: from the first campaign (k, c); as below, NaN for the first
+    half: Array  #: half width of the 95 % interval of the change (k, c)
+    p_value: Array  #: of no change (k, c), adjusted for multiple tests
+    limit: Array  #: detection limit of a change (k, c)
+    changed: NDArray[np.bool_]  #: whether the change is significant and relevant (k, c)
+    slight: NDArray[np.bool_]  #: whether it is significant, but too small to be relevant (k, c)
 
     @property
     def shares(self) -> Array:
-        """Change and the ends of its interval as shares of the first campaign's value (k, c, 3)."""
+        """Relative change and the ends of its interval (k, c, 3)."""
         ends = np.stack([self.change, self.change - self.half, self.change + self.half], axis=2)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(ends / np.abs(self.value[:, :1, None]))
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
-    """Campaigns of one arm, in order of time; in the order given where not all have one (`dated`).
-
-    `repetitions` are those of each campaign in order, `broken` what could not be used.
-    """
+class CampaignSet:
+    """Campaigns of one arm."""
 
     arm: Arm
-    campaigns: tuple[LevelEstimate, ...]
-    repetitions: tuple[tuple[LevelEstimate, ...], ...]
-    dated: bool
-    broken: tuple[Unused, ...]
+    campaigns: tuple[LevelEstimate, ...]  #: in chronological order if `dated`, else as given
+    repetitions: tuple[tuple[LevelEstimate, ...], ...]  #: of each campaign
+    dated: bool  #: whether the time of all campaigns is known
+    broken: tuple[Unused, ...]  #: archives that could not be used
     simulated: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What changed over the c campaigns of one arm, compared with the first of them."""
+    """Changes of c campaigns of one arm from the first."""
 
-    arm: str  #: its name
-    simulated: bool  #: whether no robot moved
-    dated: bool  #: whether campaigns are in order of time
-    changed: bool  #: whether friction, payload or inertial parameters have
+    arm: str  #: name
+    simulated: bool
+    dated: bool  #: whether campaigns are in chronological order
+    changed: bool  #: whether friction, payload or inertial parameters changed
     verdict: str  #: one line
-    findings: tuple[Finding, ...]  #: everything in sentences, what changed first; never empty
-    warnings: tuple[str, ...]  #: what a reader must know of the archives
-    campaigns: tuple[LevelEstimate, ...]  #: in order
+    findings: tuple[Finding, ...]  #: changes first; never empty
+    warnings: tuple[str, ...]  #: about the archives
+    campaigns: tuple[LevelEstimate, ...]
     names: tuple[str, ...]  #: of the campaigns, with their days if known
-    axes: tuple[Axis, ...]  #: of the arm
+    axes: tuple[Axis, ...]
     friction: Tested  #: of the axes, mean of both directions
-    #: friction by each single repetition, campaign by campaign (m, n)
-    repetitions: tuple[Array, ...]
-    payload: PayloadTrend  #: of the last link
-    parameters: tuple[str, ...]  #: names of the parameters, base parameters first
+    repetitions: tuple[Array, ...]  #: friction of each repetition (m, n), by campaign
+    payload: PayloadTrend
+    parameters: tuple[str, ...]  #: names, base parameters first
     units: tuple[str, ...]  #: of the parameters
-    values: Tested  #: of the parameters, tested
-    #: ||e|| / ||tau|| of the model by row on the validation motions by column (c, c), NaN without
-    #: one
+    values: Tested  #: of the parameters
+    #: ||e|| / ||tau|| of the model (row) on the validation motions (column) (c, c), NaN without any
     prediction: Array
 
     @property
     def document(self) -> dict[str, Any]:
-        """Everything for a script: lists, None for what is not known."""
+        """JSON data, None for unknown values."""
         campaigns = [
             {"folder": one.campaign, "when": one.when or None, "stated": one.setup}
             for one in self.campaigns
@@ -154,15 +148,11 @@ def _as_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathered:
-    """Identify the campaigns below some places, and check that they can be compared.
-
-    By least squares, which draw no change towards anything.
-
-    The `results.json` of a campaign stands for its folder.
+def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> CampaignSet:
+    """Identify campaigns, given as folders or `results.json`, by unregularised least squares.
 
     Raises:
-        InputError: there is one campaign only, or campaigns are of different arms.
+        InputError: there is only one campaign, or they are of different arms.
     """
     roots = [
         str(Path(place).parent)
@@ -179,23 +169,22 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Gathe
     result = run.reidentify(roots, Options(estimator="wls"), workers, reporter, check=check)
     campaigns = list(result.campaigns)
     if len(campaigns) < 2:
-        why = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        reason = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
         only = campaigns[0].campaign if campaigns else None
-        raise InputError(only, f"is the only campaign that can be estimated{why}", remedy=_TWO)
+        raise InputError(only, f"is the only campaign that can be estimated{reason}", remedy=_TWO)
     absolute = [f"{_absolute(root)}/" for root in roots]
 
-    def named(one: LevelEstimate) -> tuple[int, str]:
-        """Sorts campaigns as their places were named."""
+    def given_order(one: LevelEstimate) -> tuple[int, str]:
         own = f"{_absolute(one.campaign)}/"
         found = [k for k, root in enumerate(absolute) if own.startswith(root)]
         return found[0] if found else len(absolute), own
 
     dated = all(one.when for one in campaigns)
-    campaigns.sort(key=lambda one: (one.when if dated else "", *named(one)))
+    campaigns.sort(key=lambda one: (one.when if dated else "", *given_order(one)))
     own = {(one.campaign, one.setup): list[LevelEstimate]() for one in campaigns}
     for rep in result.repetitions:
         own.get((rep.campaign, rep.setup), []).append(rep)
-    return Gathered(
+    return CampaignSet(
         arm=result.arms[campaigns[0].arm],
         campaigns=tuple(campaigns),
         repetitions=tuple(tuple(one) for one in own.values()),
@@ -210,24 +199,23 @@ def _absolute(place: str) -> str:
 
 
 def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
-    """Another arm has its own friction and mass, and one campaign has nothing beside it."""
-    of = {ref.key: ref for ref in found if ref.use == "excitation"}
-    if not of:
-        return  # and that is refused
-    first = next(iter(of.values()))
-    for one in of.values():
+    campaigns = {ref.key: ref for ref in found if ref.use == "excitation"}
+    if not campaigns:
+        return  # reidentify raises the error
+    first = next(iter(campaigns.values()))
+    for one in campaigns.values():
         if one.arm != first.arm:
             here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
-            why = "one of them is a simulation, or their controllers state other drives"
+            reason = "one of them is a simulation, or their controllers state different drives"
             if differing := arm_differences(here.cell, there.cell):
-                why = f"they differ in {' and '.join(differing)}"
+                reason = f"they differ in {' and '.join(differing)}"
             raise InputError(
                 one.campaign,
-                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): {why}",
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): {reason}",
                 remedy="compare campaigns of one arm",
             )
-    if len(of) < 2:
-        raise InputError(first.campaign, "is the only campaign that was named", remedy=_TWO)
+    if len(campaigns) < 2:
+        raise InputError(first.campaign, "is the only campaign given", remedy=_TWO)
 
 
 def _cell(ref: ArchiveRef) -> Cell:
@@ -235,7 +223,7 @@ def _cell(ref: ArchiveRef) -> Cell:
         return cell_in(archive)
 
 
-def compare_campaigns(gathered: Gathered) -> Comparison:
+def compare_campaigns(gathered: CampaignSet) -> Comparison:
     """Compare the campaigns of one arm with the first of them."""
     model, campaigns = gathered.arm.cell.model, gathered.campaigns
     names = campaign_names(campaigns, days=gathered.dated)
@@ -255,7 +243,7 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
     values = [(one.values, one.std) for one in campaigns]
     prediction = np.full((len(campaigns), len(campaigns)), np.nan)
     for (row, one), (column, motion) in product(enumerate(campaigns), repeat=2):
-        # What a model cannot know may be needed there.
+        # Undetermined parameters may act on the other motion.
         if motion.unseen is not None and np.isfinite(one.std).all():
             left, torque = errors(motion.unseen, one.values)
             prediction[row, column] = relative_error(left, torque, motion.unseen.samples)
@@ -266,7 +254,9 @@ def compare_campaigns(gathered: Gathered) -> Comparison:
     parts += ["inertial parameters"] if any(payload.other) else []
     verdict = f"Changed: {'; '.join(parts)}" if parts else "No significant change"
     if slight and not parts:
-        verdict = f"No change of {_LEAST} or more; friction of {', '.join(slight)} differs by less"
+        verdict = (
+            f"No change of {_MIN_CHANGE} or more; friction of {', '.join(slight)} differs by less"
+        )
     return Comparison(
         arm=gathered.arm.name,
         simulated=gathered.simulated,
@@ -293,12 +283,12 @@ def _known(
     pooled: Sequence[tuple[Array, Array]],
     repetitions: Sequence[Array],
 ) -> Array:
-    """Figures (k, c, 3): values and standard deviations (k,), single repetitions (m, k)."""
+    """Return `Figure`s (k, c, 3) from values and stds (k,) and single repetitions (m, k)."""
     freedom = [freedom_of(one) for one in campaigns]
     return np.array(
         [
             [
-                known(value[k], std[k] ** 2, free, own[:, k])
+                figure(value[k], std[k] ** 2, free, own[:, k])
                 for (value, std), free, own in zip(pooled, freedom, repetitions, strict=True)
             ]
             for k in range(len(pooled[0][0]))
@@ -306,8 +296,7 @@ def _known(
     )
 
 
-def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:
-    """What a reader must know: lost archives, few repetitions, other motions."""
+def _warnings(model: RobotModel, gathered: CampaignSet) -> list[str]:
     campaigns = gathered.campaigns
     names = short_names([one.campaign for one in campaigns])
     lost = zip(short_names([one.path for one in gathered.broken]), gathered.broken, strict=True)
@@ -315,20 +304,20 @@ def _warnings(model: RobotModel, gathered: Gathered) -> list[str]:
     single = [name for name, own in zip(names, gathered.repetitions, strict=True) if len(own) < 2]
     if single:
         found.append(
-            f"{', '.join(single)}: one repetition, so what repetitions differ by is not known, and "
-            "only noise is allowed for"
+            f"{', '.join(single)}: with one repetition, uncertainty includes noise only, not the "
+            "scatter of repetitions"
         )
     first = campaigns[0].speed_rms
     for name, one in zip(names[1:], campaigns[1:], strict=True):
         if first is None or one.speed_rms is None:
             continue
         with np.errstate(invalid="ignore", divide="ignore"):
-            far = np.abs(np.log(one.speed_rms / first)) > math.log(_OTHER_SPEED)
+            far = np.abs(np.log(one.speed_rms / first)) > math.log(_SPEED_RATIO)
         if far.any():
             fast = ", ".join(model.joint_names[j] for j in np.flatnonzero(far))
             found.append(
-                f"{name} moved differently from {names[0]} (typical speed of {fast}): what the"
-                " model leaves out can then look like a change"
+                f"{name} has another motion than {names[0]} (rms speed of {fast}): unmodelled"
+                " effects may appear as a change"
             )
     each = zip(names, campaigns, strict=True)
     return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
@@ -344,7 +333,6 @@ def _findings(
     payload: PayloadTrend,
     prediction: Array,
 ) -> list[Finding]:
-    """What changed first, then what did not, or by little, or is not known."""
     found = [
         _axis_finding(axes[j], friction, j, k, names)
         for j, k in np.argwhere(friction.changed | friction.slight).tolist()
@@ -353,16 +341,16 @@ def _findings(
         level: Level = "same" if one.level == "quiet" else "changed"
         found.append(Finding(level, one.words, one.next_step))
     same = []
-    known_at_all = np.isfinite(friction.p_value).any(axis=1)
+    tested = np.isfinite(friction.p_value).any(axis=1)
     differs = (friction.changed | friction.slight).any(axis=1)
-    if quiet := np.flatnonzero(known_at_all & ~differs).tolist():
+    if quiet := np.flatnonzero(tested & ~differs).tolist():
         limits = np.nanmax(friction.limit[quiet], axis=1) / np.abs(friction.value[quiet, 0])
         same.append(
             f"Friction of {', '.join(axes[j].joint for j in quiet)} has not changed significantly;"
             f" the detection limit is at most {100.0 * limits.max():.0f} %"
             f" ({axes[quiet[limits.argmax()]].joint})."
         )
-    if unknown := np.flatnonzero(~known_at_all).tolist():
+    if unknown := np.flatnonzero(~tested).tolist():
         same.append(f"Friction of {', '.join(axes[j].joint for j in unknown)} is not determined.")
     for k in range(1, len(names)):
         own, first = prediction[k, k], prediction[0, k]
@@ -373,15 +361,15 @@ def _findings(
                 f" {100.0 * first:.2g} % against {100.0 * own:.2g} % of the torque."
             )
     if payload.untested:
-        same.append(f"Whether it carries the same was not tested: {payload.untested}.")
+        same.append(f"The payload was not compared: {payload.untested}.")
     elif not any(payload.changed) and not any(payload.other):
         same.append("The payload has not changed significantly.")
-    # Stable: "changed" comes first.
+    # A stable sort by level: "changed" first.
     return sorted(found + [Finding("same", words) for words in same], key=lambda one: one.level)
 
 
 def _axis_finding(axis: Axis, friction: Tested, j: int, k: int, names: list[str]) -> Finding:
-    """A difference of friction that is more than chance; less than a change where it is slight."""
+    """Return the finding about a significant difference of friction."""
     first, value = friction.value[j, [0, k]]
     change, low, high = 100.0 * friction.shares[j, k]
     words = (
@@ -391,55 +379,58 @@ def _axis_finding(axis: Axis, friction: Tested, j: int, k: int, names: list[str]
         f" (95 %: {low:+.1f} to {high:+.1f} %)"
     )
     if friction.slight[j, k]:
-        less = f"more than chance, and less than the {_LEAST} that count as a change"
-        return Finding("same", f"{words}: {less}.")
-    colder = "Check this axis' gear, brake and lubrication; was it colder?"
-    warmer = "Was it warmer, or has gear or lubricant been changed?"
-    return Finding("changed", f"{words}.", colder if change > 0.0 else warmer)
+        return Finding("same", f"{words}: significant, but less than {_MIN_CHANGE}.")
+    rise = "Check gear, brake and lubrication of this axis, and whether it was colder."
+    fall = "Check whether it was warmer, or gear or lubricant were changed."
+    return Finding("changed", f"{words}.", rise if change > 0.0 else fall)
 
 
 # Statistics
 
 
-def known(value: float, variance: float, freedom: float, repetitions: Array) -> Known:
-    """A figure from its estimate and from the estimates of single repetitions.
+def figure(value: float, variance: float, freedom: float, repetitions: Array) -> Figure:
+    """Combine a pooled estimate with those of single repetitions.
 
-    The variance is that of the estimate's covariance, infinite if undetermined, with its degrees of
-    freedom; the repetitions (m,) are in order, NaN where one does not determine the figure.
+    Args:
+        value: pooled.
+        variance: of the pooled estimate; infinite if undetermined.
+        freedom: degrees of freedom of the variance.
+        repetitions: (m,) in order, NaN if undetermined.
     """
     if not np.isfinite(variance):
-        return Known(float("nan"), float("nan"), 1.0)
+        return Figure(float("nan"), float("nan"), 1.0)
     own = repetitions[np.isfinite(repetitions)]
     if len(own) < 2:
-        return Known(value, variance, freedom)
-    worth = effective_count(own)
-    scatter = float(np.var(own, ddof=1)) / worth
+        return Figure(value, variance, freedom)
+    count = effective_count(own)
+    scatter = float(np.var(own, ddof=1)) / count
     if scatter <= variance:
-        return Known(value, variance, freedom)
-    return Known(value, scatter, len(own) - 1.0 if len(own) < FEWEST else max(1.0, worth - 1.0))
+        return Figure(value, variance, freedom)
+    few = len(own) < MIN_REPETITIONS
+    return Figure(value, scatter, len(own) - 1.0 if few else max(1.0, count - 1.0))
 
 
 def effective_count(repetitions: Array) -> float:
-    """How many independent repetitions these (m,) are worth, between 1 and m."""
+    """Return the effective number of independent repetitions (m,), between 1 and m."""
     m = len(repetitions)
-    if m < FEWEST:
+    if m < MIN_REPETITIONS:
         return 1.0
     centred = repetitions - repetitions.mean()
     size = float(centred @ centred)
     if size == 0.0:
         return float(m)
     raw = float(centred[:-1] @ centred[1:]) / size
-    rho = min(max(raw + (1.0 + 4.0 * raw) / (m - 1), 0.0), _HIGHEST)
+    rho = min(max(raw + (1.0 + 4.0 * raw) / (m - 1), 0.0), _MAX_CORRELATION)
     return max(1.0, m * (1.0 - rho) / (1.0 + rho))
 
 
 def against_first(figures: ArrayLike, share: float, least: ArrayLike = 0.0) -> Tested:
-    """Test all campaigns but the first against it.
+    """Test all campaigns against the first.
 
     Args:
-        figures: a :class:`Known` for each figure and campaign (k, c, 3).
-        share: of cases in which any of the tests finds a change where there is none.
-        least: smallest change of each figure that counts (k,).
+        figures: a :class:`Figure` per row and campaign (k, c, 3).
+        share: family-wise error rate.
+        least: smallest relevant change (k,).
     """
     value, variance, freedom = np.moveaxis(np.asarray(figures, dtype=np.float64), 2, 0)
     change, total = value - value[:, :1], variance + variance[:, :1]
@@ -459,7 +450,7 @@ def against_first(figures: ArrayLike, share: float, least: ArrayLike = 0.0) -> T
         change=change,
         half=student.isf(0.5 - 0.5 * CONFIDENCE, both) * std,
         p_value=p_value,
-        # What Holm's procedure asks of the first of all tests.
+        # The first step of Holm's procedure is the strictest.
         limit=np.maximum(student.isf(share / tests / 2.0, both) * std, least),
         changed=sure & large,
         slight=sure & ~large,
@@ -467,7 +458,7 @@ def against_first(figures: ArrayLike, share: float, least: ArrayLike = 0.0) -> T
 
 
 def holm(p_values: Array) -> Array:
-    """P values adjusted for all of them being looked at (Holm 1979); NaN stays NaN, any shape."""
+    """Return p values of any shape adjusted for multiple tests (Holm 1979); NaN stays NaN."""
     flat = np.asarray(p_values, dtype=np.float64).ravel()
     adjusted = np.full(flat.shape, np.nan)
     places = np.flatnonzero(np.isfinite(flat))

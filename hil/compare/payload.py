@@ -1,13 +1,13 @@
-"""What an arm carries from campaign to campaign: one test on all that a payload would change.
+"""Changes of the payload between campaigns, by one joint test.
 
-A body at the last link changes base parameters in ten directions at most. Those of each campaign
-are projected onto these directions K, by least squares for the body with friction free,
+A body at the last link changes the base parameters b in at most ten directions K. The parameters of
+each campaign are projected onto these, by weighted least squares with friction free,
 
     x = (K' M K)^+ K' M b,    M = inverse of the inertial part of (sum of information)^-1,
 
-and the difference of two campaigns is tested jointly by Hotelling's T² (1931), divided by the
-median that the arm's own changes of campaign have. A payload that a cell states is no part of the
-parameters; where the statement changes, they are tested with the stated body put back, too.
+and the difference of two campaigns is tested by Hotelling's T² (1931), divided by the median of the
+arm's changes between campaigns. A payload stated by a cell is not part of b; if the statement
+changes, the parameters are also tested with the stated body added.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from identification.model.regressor import LINK_SYMBOLS
 Array = NDArray[np.float64]
 
 LEAST_EFFECT: Final = 0.10
-"""A change of payload counts if its RMS torque is at least this share of the torque residual."""
+"""Smallest relevant rms torque of a change, as a share of the torque residual."""
 PAYLOAD_LIKE: Final = 0.5
-"""Share of a change of the inertial parameters that a payload has to explain to be one."""
+"""Smallest share of a change of inertial parameters that a payload must explain."""
 
 Level = Literal["alarm", "past", "quiet", "changed", "same"]
 Verdict = Literal[
@@ -46,43 +46,41 @@ Verdict = Literal[
     "not tested",
 ]
 
-_MASS_PLACE: Final = LINK_SYMBOLS.index("m")
-_MOMENT_PLACES: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
-# Directions in which a body changes less than this share of the strongest are not seen.
-_SEEN: Final = 1e-4
-_BLIND: Final = 1e-3
-# What is put on an arm (mass, moments, inertia) is of this order.
-_USUAL: Final = {"m": 1.0, "c": 0.3, "I": 0.1}
-# Median of the arm's own changes from fewer than this says nothing of what campaigns scatter.
-_FEWEST_CHANGES: Final = 4
-# A covariance of fewer blocks than coordinates cannot be tested.
-_FEWEST_SPARE: Final = 2
+_MASS: Final = LINK_SYMBOLS.index("m")
+_MOMENTS: Final = [LINK_SYMBOLS.index(f"mc{axis}") for axis in "xyz"]
+# Relative singular values of directions that are observable, and components that are not.
+_OBSERVABLE: Final = 1e-4
+_UNOBSERVABLE: Final = 1e-3
+# Scale of a payload's mass, moments and inertia.
+_SCALE: Final = {"m": 1.0, "c": 0.3, "I": 0.1}
+_MIN_CHANGES: Final = 4  # for the median of the arm's changes
+_MIN_FREEDOM: Final = 2  # degrees of freedom of the denominator
 _NORMAL: Final = float(student.ppf(0.975, 1e6))
-_CERTAIN: Final = 2.0
+_SIGNIFICANT: Final = 2.0  # standard deviations
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing to know about an arm."""
+    """One finding about an arm."""
 
-    #: "alarm" concerns the last campaign, "past" earlier ones, "quiet" nothing; in a comparison
-    #: "changed", or "same" for what did not, or by little, or is not known
+    #: "alarm" of the last campaign, "past" of earlier ones, "quiet" for information; in a
+    #: comparison "changed" or "same"
     level: Level
     words: str  #: a sentence
-    next_step: str = ""  #: what to do about it; "" for nothing
+    next_step: str = ""  #: remedy
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """From parameters to what a body at the last link would have."""
+    """Projection of the base parameters onto those of a body at the last link."""
 
-    places: NDArray[np.intp]  #: inertial parameters that all campaigns determine (d,)
+    places: NDArray[np.intp]  #: inertial parameters determined by all campaigns (d,)
     metric: Array  #: M (d, d)
     directions: Array  #: K in an orthonormal basis of metric M (d, r)
-    #: ten inertial parameters of the body from the coordinates (10, r), as `LINK_SYMBOLS`; rows of
-    #: NaN for those that cannot be seen
+    #: inertial parameters of the body from the coordinates (10, r), as `LINK_SYMBOLS`; NaN for
+    #: unobservable ones
     body: Array
-    rows: int  #: samples of all joints that M is made of
+    rows: int  #: samples of all joints in M
 
     @property
     def rank(self) -> int:
@@ -90,131 +88,120 @@ class Projection:
         return int(self.directions.shape[1])
 
     @property
-    def reader(self) -> Array:
+    def to_coordinates(self) -> Array:
         """Matrix (r, d) from parameters to coordinates."""
         return np.asarray(self.directions.T @ self.metric)
 
 
 class State(NamedTuple):
-    """A campaign as the test sees it."""
+    """Projected parameters of a campaign."""
 
     values: Array  #: parameters at `Projection.places` (d,)
     covariance: Array  #: of its coordinates (r, r)
-    freedom: float  #: blocks that the covariance was estimated from, less one
+    freedom: float  #: degrees of freedom of the covariance
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """What a campaign has beside those before it."""
+    """Change of a campaign from the earlier ones."""
 
-    #: T² over its degrees of freedom, F distributed if campaigns differed by no more than their
-    #: covariance says
-    statistic: float
-    p_value: float  #: of nothing having changed
+    statistic: float  #: scaled T², F distributed without a change
+    p_value: float  #: of no change
     share: float  #: of the change of all inertial parameters that a payload explains
-    effect: float  #: RMS torque of the change, in standard deviations of the torque residual
-    mass: float  #: of what was put on [kg], negative if subtracted; NaN where it cannot be seen
-    mass_std: float  #: its standard deviation [kg]
-    moment: Array  #: mass times centre in the last joint's frame (3,) [kg m]
+    effect: float  #: rms torque of the change, in standard deviations of the torque residual
+    mass: float  #: added mass [kg]; NaN if unobservable
+    mass_std: float  #: [kg]
+    moment: Array  #: added mass times centre in the last joint's frame (3,) [kg m]
     moment_std: Array  #: (3,)
 
 
 def projection(
     model: RobotModel, known: NDArray[np.bool_], information: Array, rows: int
 ) -> Projection | None:
-    """The projection, None where a body at the last link would change nothing that is known.
+    """Return the projection, None if no determined parameter depends on a body at the last link.
 
-    Every campaign determines the `known` parameters (p,); `information` is the weighted Gram matrix
-    (p, p), a sum over all campaigns, and `rows` the samples of all joints in that sum.
+    Args:
+        model: of the arm.
+        known: (p,) parameters determined by all campaigns.
+        information: (p, p) weighted Gram matrix, sum over all campaigns.
+        rows: samples of all joints in that sum.
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]
     names = [model.standard_names[k] for k in last]
-    scale = np.array([_USUAL["c" if name.startswith("mc") else name[0]] for name in names])
+    scale = np.array([_SCALE["c" if name.startswith("mc") else name[0]] for name in names])
     grouping = model.base.grouping[np.ix_(places, last)] * scale
     if not grouping.any():
         return None
     inertial = np.arange(len(places))
     everything = pinvh(information[np.ix_(known, known)])
     metric = pinvh(everything[np.ix_(inertial, inertial)])
-    # Columns of unit length in the metric, whatever the units.
+    # Columns of unit length in the metric, for any units.
     squares, basis = np.linalg.eigh(grouping.T @ metric @ grouping)
-    seen = squares > _SEEN**2 * squares[-1]
-    if not seen.any():
+    observable = squares > _OBSERVABLE**2 * squares[-1]
+    if not observable.any():
         return None
-    to_body = basis[:, seen] / np.sqrt(squares[seen])
+    to_body = basis[:, observable] / np.sqrt(squares[observable])
     body = scale[:, None] * to_body
-    body[np.abs(basis[:, ~seen]).max(axis=1, initial=0.0) > _BLIND] = np.nan
+    body[np.abs(basis[:, ~observable]).max(axis=1, initial=0.0) > _UNOBSERVABLE] = np.nan
     return Projection(places, metric, grouping @ to_body, body, rows)
 
 
 def state(onto: Projection, values: Array, covariance: Array, freedom: float) -> State:
-    """A campaign with parameters (p,) and covariance (p, p) as the test sees it."""
+    """Project the parameters (p,) and covariance (p, p) of a campaign."""
     own = covariance[np.ix_(onto.places, onto.places)]
-    return State(values[onto.places], onto.reader @ own @ onto.reader.T, freedom)
+    return State(values[onto.places], onto.to_coordinates @ own @ onto.to_coordinates.T, freedom)
 
 
 def compare(onto: Projection, before: State, after: State, scatter: float = 1.0) -> Change | None:
-    """Test whether something was put on or subtracted, None where blocks are too few to tell.
+    """Test for a change of payload, None with too few degrees of freedom.
 
-    `scatter` says by how much T² of this arm is larger than it should be.
+    `scatter` is the ratio of T² between campaigns of this arm to its expected value.
     """
     difference = after.values - before.values
-    coordinates = onto.reader @ difference
+    coordinates = onto.to_coordinates @ difference
     covariance = before.covariance + after.covariance
-    spare = _spare(onto, before, after)
-    if spare < _FEWEST_SPARE:
+    freedom = _denominator_freedom(onto, before, after)
+    if freedom < _MIN_FREEDOM:
         return None
     squared = float(coordinates @ np.linalg.solve(covariance, coordinates))
-    statistic = squared * spare / ((spare + onto.rank - 1) * onto.rank)
+    statistic = squared * freedom / ((freedom + onto.rank - 1) * onto.rank)
     explained = float(coordinates @ coordinates)
-    whole = float(difference @ onto.metric @ difference)
+    total = float(difference @ onto.metric @ difference)
     body = onto.body @ coordinates
     std = np.sqrt(scatter * np.einsum("ir,rs,is->i", onto.body, covariance, onto.body))
     return Change(
         statistic=statistic,
-        p_value=float(fisher.sf(statistic / scatter, onto.rank, spare)),
-        share=explained / whole if whole > 0.0 else 0.0,
+        p_value=float(fisher.sf(statistic / scatter, onto.rank, freedom)),
+        share=explained / total if total > 0.0 else 0.0,
         effect=math.sqrt(explained / max(1, onto.rows)),
-        mass=float(body[_MASS_PLACE]),
-        mass_std=float(std[_MASS_PLACE]),
-        moment=body[_MOMENT_PLACES],
-        moment_std=std[_MOMENT_PLACES],
+        mass=float(body[_MASS]),
+        mass_std=float(std[_MASS]),
+        moment=body[_MOMENTS],
+        moment_std=std[_MOMENTS],
     )
 
 
-def _spare(onto: Projection, one: State, other: State) -> float:
-    """Degrees of freedom of the denominator.
-
-    The mean of many campaigns is known so well that the blocks of the other one are what counts.
-    """
+def _denominator_freedom(onto: Projection, one: State, other: State) -> float:
     return min(one.freedom, other.freedom) - onto.rank + 1
 
 
 def _own_scatter(onto: Projection, pairs: Sequence[tuple[State, State]]) -> float:
-    """How much more campaigns of this arm differ than their covariances say, at least 1.
-
-    The median over successive campaigns that state the same payload, so that a payload put on once
-    is no part of it.
-    """
+    """Return the median ratio of T² to its expected value over unchanged campaigns, at least 1."""
     ratios = [
-        change.statistic / float(fisher.median(onto.rank, _spare(onto, one, other)))
+        change.statistic / float(fisher.median(onto.rank, _denominator_freedom(onto, one, other)))
         for one, other in pairs
         if (change := compare(onto, one, other)) is not None
     ]
-    return max(1.0, float(np.median(ratios))) if len(ratios) >= _FEWEST_CHANGES else 1.0
+    return max(1.0, float(np.median(ratios))) if len(ratios) >= _MIN_CHANGES else 1.0
 
 
-# From campaign to campaign
+# Trend
 
 
 @dataclass(frozen=True)
 class Statement:
-    """A campaign that states another payload than the one before, None being none.
-
-    `verdict` says whether the arm, by its torques, carries what is stated as it did before, the
-    same as before (only the statement is new), one of these, or neither.
-    """
+    """A change of the stated payload, and whether the torques confirm it."""
 
     before: Payload | None
     after: Payload | None
@@ -223,30 +210,22 @@ class Statement:
 
 @dataclass(frozen=True, eq=False)
 class PayloadTrend:
-    """What the last link carries beside what it carried in the first of c campaigns."""
+    """Payload of the last link over c campaigns, relative to the first."""
 
-    #: of the parameters of each campaign against those before it since the last change; None of the
-    #: first
+    #: of each campaign from the earlier ones since the last change; None for the first
     changes: tuple[Change | None, ...]
-    #: which campaigns differ in what the last link carries, beside what is stated
-    changed: tuple[bool, ...]
-    #: which differ in their inertial parameters, but not as a payload would
-    other: tuple[bool, ...]
-    #: of the campaigns that state another payload than the one before
-    statements: tuple[Statement | None, ...]
-    #: on top of the first campaign's, stated or not [kg] (c,); NaN where it cannot be seen
-    mass: Array
+    changed: tuple[bool, ...]  #: whether the payload changed, beside the stated change
+    other: tuple[bool, ...]  #: whether inertial parameters changed in another way
+    statements: tuple[Statement | None, ...]  #: of campaigns with a new stated payload
+    mass: Array  #: difference of total payload to the first campaign [kg] (c,); NaN if unobservable
     mass_std: Array  #: (c,)
-    untested: str = ""  #: why there is no test; "" if there is
+    untested: str = ""  #: reason if there is no test
 
 
 def payload_trend(
     model: RobotModel, campaigns: Sequence[LevelEstimate], share: float
 ) -> PayloadTrend:
-    """Find what changed in what the arm carries, from campaigns in order of time.
-
-    `share` is that of campaigns said to differ if nothing has changed.
-    """
+    """Compute the trend of the payload; `share` is the false-alarm rate per campaign."""
     onto = _projection(model, campaigns)
     if isinstance(onto, str):
         return _untested(campaigns, onto)
@@ -265,7 +244,7 @@ def payload_trend(
 
     changes, statements = list[Change | None]([None]), list[Statement | None]([None])
     changed, other = [False], [False]
-    first = 0  # campaign since which nothing has changed
+    first = 0  # first campaign after the last change
     for k in range(1, len(campaigns)):
         values, covariances, freedoms = zip(*bare[first:k], strict=True)
         mean = np.sum(covariances, axis=0) / len(values) ** 2
@@ -273,7 +252,7 @@ def payload_trend(
         change = compare(onto, history, bare[k], scatter)
         differs, statement = different(change), None
         if not same[k - 1]:
-            # As if what was stated before were stated now.
+            # The test with the earlier statement.
             put_back = bare[k]._replace(values=bare[k].values + stated[k] - stated[k - 1])
             restated = not different(compare(onto, history, put_back, scatter))
             verdict: Verdict = "torques disagree" if differs else "torques agree"
@@ -290,7 +269,7 @@ def payload_trend(
         statements.append(statement)
         first = k if differs else first
     if not any(changes):
-        return _untested(campaigns, "the campaigns are too short to be compared jointly")
+        return _untested(campaigns, "the campaigns are too short")
     beside = [compare(onto, laden[0], one, scatter) for one in laden[1:]]
     masses = [(math.nan, math.nan) if one is None else (one.mass, one.mass_std) for one in beside]
     mass, mass_std = np.array([(0.0, 0.0), *masses]).T
@@ -300,7 +279,7 @@ def payload_trend(
 
 
 def _stated(model: RobotModel, payload: Payload | None) -> Array:
-    """What a payload adds to the base parameters (b,)."""
+    """Return the contribution of a payload to the base parameters (b,)."""
     if payload is None:
         return np.zeros(model.base.rank)
     joint, body = payload.carried_by(model.chain)
@@ -308,27 +287,27 @@ def _stated(model: RobotModel, payload: Payload | None) -> Array:
 
 
 def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projection | str:
-    """The projection onto a payload, or why there is none."""
+    """Return the projection, or the reason why there is none."""
     if len(campaigns) < 2:
-        return "there is one campaign and nothing to compare it with"
+        return "there is only one campaign"
     information = [one.information for one in campaigns if one.information is not None]
     if len(information) < len(campaigns) or any(one.covariance is None for one in campaigns):
         return "the estimator gives no information matrix to compare with"
     known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
     rows = sum(int(one.samples.sum()) for one in campaigns)
     onto = projection(model, known, np.sum(information, axis=0), rows)
-    return "nothing that is known of this arm depends on its payload" if onto is None else onto
+    return "no determined parameter depends on the payload" if onto is None else onto
 
 
-def _untested(campaigns: Sequence[LevelEstimate], why: str) -> PayloadTrend:
+def _untested(campaigns: Sequence[LevelEstimate], reason: str) -> PayloadTrend:
     no, unknown = (False,) * len(campaigns), np.full(len(campaigns), np.nan)
     pairs = pairwise(one.payload for one in campaigns)
     statements = (None, *(Statement(*pair) if pair[0] != pair[1] else None for pair in pairs))
-    return PayloadTrend((None,) * len(no), no, no, statements, unknown, unknown, why)
+    return PayloadTrend((None,) * len(no), no, no, statements, unknown, unknown, reason)
 
 
 def freedom_of(level: LevelEstimate) -> float:
-    """Degrees of freedom of the covariance, from the Student factor of its intervals."""
+    """Return the degrees of freedom of the covariance, from the Student factor of its intervals."""
     factor = level.interval_factor
     if factor <= _NORMAL:
         return 1e6
@@ -336,7 +315,7 @@ def freedom_of(level: LevelEstimate) -> float:
 
 
 def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Finding]:
-    """What was found of what an arm carries, campaign by campaign."""
+    """Return the findings about the payload in chronological order."""
     found = []
     for k, (change, statement) in enumerate(zip(payload.changes, payload.statements, strict=True)):
         level: Level = "alarm" if k == len(payload.changes) - 1 else "past"
@@ -345,38 +324,37 @@ def payload_findings(payload: PayloadTrend, names: Sequence[str]) -> list[Findin
                 f"From {names[k]} on the cell states {_load(statement.after)} instead of"
                 f" {_load(statement.before)}: {statement.verdict}."
             )
-            step = "Weigh the payload and measure its centre, then correct the cell file."
+            step = "Measure mass and centre of the payload and correct the cell file."
             wrong = statement.verdict == "torques disagree"
             found.append(Finding(level, words, step) if wrong else Finding("quiet", words))
         where = f"between {names[k - 1]} and {names[k]}"
         if change is not None and payload.changed[k]:
-            beside = "" if statement is None else ", beside what is stated,"
-            words = f"The payload{beside} has changed {where}: {_what(change)}."
-            step = "State the payload in the cell file, or check the tool and its fastening."
+            beside = "" if statement is None else ", besides the stated change,"
+            words = f"The payload{beside} has changed {where}: {_describe(change)}."
+            step = "State the payload in the cell file, or check the tool and its mounting."
             found.append(Finding(level, words, step))
         elif change is not None and payload.other[k]:
             words = (
-                f"Inertial parameters have changed {where}, but not as by something put on the"
-                f" last link: that explains {100.0 * change.share:.0f} % of the change."
+                f"Inertial parameters have changed {where}, of which a payload explains only"
+                f" {100.0 * change.share:.0f} %."
             )
-            step = "Check the torque constants and the calibration, and what links before it carry."
+            step = "Check torque constants, calibration and bodies mounted on other links."
             found.append(Finding(level, words, step))
     return found
 
 
 def _load(payload: Payload | None) -> str:
-    return f"a payload of {payload.mass:g} kg" if payload and payload.mass else "nothing"
+    return f"a payload of {payload.mass:g} kg" if payload and payload.mass else "no payload"
 
 
-def _what(change: Change) -> str:
-    """Mass if it can be seen, and how far from the last joint it sits if that is known."""
+def _describe(change: Change) -> str:
     if not math.isfinite(change.mass):
         moment = float(np.linalg.norm(np.nan_to_num(change.moment)))
-        return f"first moment by {moment:.2g} kg·m, while its mass cannot be seen by this arm"
+        return f"first moment by {moment:.2g} kg·m (this arm does not determine the mass)"
     mass = f"{change.mass:+.2f} ± {change.mass_std:.2g} kg"
-    if abs(change.mass) < _CERTAIN * change.mass_std:
-        return f"its mass not significantly ({mass}), but its centre or inertia"
+    if abs(change.mass) < _SIGNIFICANT * change.mass_std:
+        return f"its centre or inertia, not significantly its mass ({mass})"
     if not np.isfinite(change.moment).all():
         return mass
     centre = ", ".join(f"{1e3 * c / change.mass:.0f}" for c in change.moment)
-    return f"{mass}, centred at ({centre}) mm of the last joint"
+    return f"{mass}, centred at ({centre}) mm in the frame of the last joint"

@@ -1,8 +1,8 @@
-"""What became of an arm from campaign to campaign; the rules are in `docs/batch.md`.
+"""Trends of an arm over campaigns; see `docs/batch.md`.
 
-A robust control chart of each figure of an axis: median and Qn (Rousseeuw and Croux 1993) with
-limits by Student's t, for which Qn of n normal values has about 0.6 (n - 1) + 0.5 values, found by
-simulation (n = 5 to 30, tail 1e-2 and 1e-3, on the safe side). Drift: Mann 1945, Sen 1968.
+Robust control charts: median and Qn (Rousseeuw and Croux 1993) with limits by Student's t. Qn of n
+normal values has about 0.6 (n - 1) + 0.5 degrees of freedom, by simulation (n = 5 to 30, tails 1e-2
+and 1e-3, conservative). Drift: Mann 1945, Sen 1968.
 """
 
 from __future__ import annotations
@@ -28,47 +28,43 @@ from .payload import Finding, Level, PayloadTrend, payload_findings, payload_tre
 
 Array = NDArray[np.float64]
 
-FEWEST: Final = 5
-"""Earlier values without which nothing is judged, and values in a row that make a new level."""
+MIN_CAMPAIGNS: Final = 5
+"""Number of earlier values needed for a test, and of successive values that form a new level."""
 FALSE_ALARMS: Final = 0.01
-"""Share of campaigns of an unchanged arm in which any one of three rules finds a change: friction
-of an axis, torque error of an axis, payload. Each has a third, shared equally among the axes.
-The test for drift, which is made once for the whole history, has as much, shared likewise."""
+"""False alarms per campaign of an unchanged arm, shared equally by three rules (friction, torque
+error, payload) and the axes; also of the test for drift over the whole history."""
 LEAST_FRICTION: Final = 0.05
-"""A change of friction by less than this share is not reported, however certain."""
-LEAST_ERROR: Final = 0.10  #: The same of the torque error
+"""Smallest relevant relative change of friction."""
+LEAST_ERROR: Final = 0.10  #: Smallest relevant relative change of the torque error
 
 _RULES: Final = 3
 _DAY: Final = 86400.0
 _QN_NORMAL: Final = 2.2219
-# Speed [rad/s, m/s] where the data cannot say how fast an axis went: it has no viscous friction.
+# rad/s or m/s, if the speed of an axis is unknown: any will do, as it has no viscous friction then.
 _ANY_SPEED: Final = 0.5
-_SHIFTS: Final = 2  # of a figure that are described, the last ones
-_NAMED: Final = 5
+_MAX_SHIFTS: Final = 2  # most recent shifts that are reported
+_MAX_NAMES: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Watched:
-    """One figure over c campaigns, judged campaign by campaign."""
+class ControlChart:
+    """Control chart of one quantity over c campaigns."""
 
-    values: Array  #: (c,); NaN where there is none
-    stds: Array  #: (c,); zero where only the scatter of the history is known
-    limits: Array  #: centre, low, high by the level that it belongs to, or was expected at (c, 3)
-    #: which values belong to no level that was known then, by enough to matter
-    departs: tuple[bool, ...]
-    #: number of the level that a value belongs to, from 0; -1 for one that is not known, or
-    #: departed and made no new level
-    levels: tuple[int, ...]
+    values: Array  #: (c,); NaN if unknown
+    stds: Array  #: (c,); zero if unknown
+    limits: Array  #: centre, lower and upper limit (c, 3)
+    departs: tuple[bool, ...]  #: whether a value is outside the limits of all levels known then
+    levels: tuple[int, ...]  #: number of its level, from 0; -1 for none
 
     @property
     def at_last_level(self) -> NDArray[np.bool_]:
-        """Campaigns at the level that was reached last (c,)."""
+        """Campaigns at the latest level (c,)."""
         known = [level for level in self.levels if level >= 0]
         return np.asarray(np.array(self.levels) == (known[-1] if known else 0))
 
 
 class Drift(NamedTuple):
-    """A slope per unit of time, and the ends of its 95 % interval."""
+    """A slope per unit of time with its 95 % interval."""
 
     slope: float
     low: float
@@ -79,73 +75,71 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis, the unit of its friction, and the speed at which that is compared, NaN for any."""
+    """An axis and the speed at which its friction is compared."""
 
     joint: str
-    unit: str
-    speed: float
+    unit: str  #: of friction
+    speed: float  #: NaN if irrelevant
     speed_unit: str
 
     @property
     def at(self) -> str:
-        """The speed as the end of a phrase; "" if it does not matter."""
+        """Phrase " at <speed>", or an empty string."""
         return f" at {self.speed:.2g} {self.speed_unit}" if math.isfinite(self.speed) else ""
 
 
 @dataclass(frozen=True, eq=False)
 class AxisTrend(Axis):
-    """An axis over the campaigns."""
+    """Trend of an axis."""
 
-    friction: Watched  #: mean of both directions
-    error: Watched  #: standard deviation of what the model leaves of the torque
-    #: of the friction at the level reached last [unit per day, or per campaign]; None if there are
-    #: too few campaigns
+    friction: ControlChart  #: mean of both directions
+    error: ControlChart  #: standard deviation of the torque residual
+    #: of the friction at its latest level [unit per day, or per campaign]; None with too few values
     drift: Drift | None
-    drifts: bool  #: whether that is more than chance, and enough to matter
+    drifts: bool  #: whether the drift is significant and relevant
 
     @property
     def relative_drift(self) -> Array:
-        """Slope and the ends of its interval over the whole time, shares of the friction (3,)."""
+        """Relative change over the whole time with its interval (3,)."""
         if self.drift is None:
             return np.full(3, np.nan)
         return np.array(self.drift[:3]) * self.drift.span / (_size(self.friction.values) or np.nan)
 
 
 def _size(values: Array) -> float:
-    """Median of what is known of values (c,), without its sign; 0 where nothing is."""
+    """Return the median of the finite absolute values (c,), 0 if there are none."""
     known = np.abs(values[np.isfinite(values)])
     return float(np.median(known)) if known.size else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class ArmTrend:
-    """An arm over c campaigns."""
+    """Trends of an arm over c campaigns."""
 
     name: str  #: of the arm
-    campaigns: tuple[LevelEstimate, ...]  #: in order of time
-    time: Array  #: (c,) [days since the first]; number of the campaign where no time is known
-    dated: bool  #: whether times are known. If not, campaigns are in the order of their names.
+    campaigns: tuple[LevelEstimate, ...]  #: in chronological order
+    time: Array  #: (c,) [days since the first]; number of the campaign if times are unknown
+    dated: bool  #: whether times are known; otherwise campaigns are in the order of their names
     axes: tuple[AxisTrend, ...]
     payload: PayloadTrend
     names: tuple[str, ...]  #: of the campaigns, with their days if known
-    #: folders of further campaigns, without a time, that are no part of the history
-    undated: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()  #: what a reader must know of the archives
+    undated: tuple[str, ...] = ()  #: folders without a time, not part of the trend
+    warnings: tuple[str, ...] = ()  #: about the archives
 
 
 @dataclass(frozen=True, eq=False)
 class Trends:
-    """All arms of a batch by name, what was not used for it, and how many archives were fitted."""
+    """Trends of all arms of a batch."""
 
-    arms: tuple[ArmTrend, ...]
+    arms: tuple[ArmTrend, ...]  #: by name
     broken: tuple[Unused, ...]
     estimator: str
-    archives: int
+    archives: int  #: number of fitted archives
     skipped: tuple[Unused, ...] = ()
 
 
 def trends(result: BatchResult) -> Trends:
-    """Find what changed on every arm of a batch."""
+    """Compute the trends of every arm of a batch."""
     found = []
     for digest, arm in sorted(result.arms.items(), key=lambda item: item[1].name):
         campaigns = [one for one in result.campaigns if one.arm == digest]
@@ -159,10 +153,10 @@ def trends(result: BatchResult) -> Trends:
 
 
 def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) -> ArmTrend:
-    """Find what changed on one arm from campaign to campaign, in any order.
+    """Compute the trends of one arm.
 
-    Campaigns without a time of recording are left out if others have one, since nobody knows where
-    they belong. If none has, all are used in the order of their folders' names.
+    Campaigns without a recording time are excluded, unless none has one: then the order is that of
+    their folders' names.
     """
     known = [(at.timestamp(), one) for one in campaigns if (at := parse_time(one.when)) is not None]
     if known:
@@ -186,16 +180,13 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
 
 
 def _natural(name: str) -> list[tuple[int, str]]:
-    """Names in the order that people count in: the ninth before the tenth."""
+    """Return a sort key that orders embedded numbers by value."""
     parts = re.split(r"([0-9]+)", name)
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
 def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) -> list[str]:
-    """Campaigns as people call them: the last part of the folder, and if wanted the day.
-
-    Where a folder holds several campaigns also what their cells state.
-    """
+    """Return short names of campaigns, with the day if `days` and the setup if ambiguous."""
     folders = [one.campaign for one in campaigns]
     names = []
     for k, name in enumerate(short_names(folders)):
@@ -207,7 +198,7 @@ def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) ->
 
 
 def short_names(folders: Sequence[str]) -> list[str]:
-    """The end of each folder's path that no other one of them ends with: mostly its last part."""
+    """Return the shortest unique end of each folder's path."""
     paths = [folder.rstrip("/") for folder in folders]
 
     def short(path: str) -> str:
@@ -222,7 +213,7 @@ def short_names(folders: Sequence[str]) -> list[str]:
 
 
 def axes_of(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[Axis]:
-    """All axes, each with one speed, the median of what the campaigns had."""
+    """Return the axes with the median of their rms speeds."""
     speeds = [one.speed_rms for one in campaigns if one.speed_rms is not None]
     found = []
     for j, (joint, turns) in enumerate(zip(model.joint_names, model.chain.revolute, strict=True)):
@@ -233,10 +224,10 @@ def axes_of(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[Axis]
 
 
 def friction_weights(model: RobotModel, axes: Sequence[Axis]) -> Array:
-    """Weights G (n, p): ``G @ values`` is the friction of each axis at its speed [N·m, N].
+    """Return G (n, p): ``G @ values`` is the friction of each axis at its speed [N·m, N].
 
-    The mean of forwards and backwards, so that an offset and a difference by direction are no
-    part of it. Where coupled motors have friction, that of the axis' own motor counts as well.
+    The mean of both directions excludes offsets and direction-dependent friction; friction of the
+    axis' own motor is included.
     """
     weights = np.zeros((model.n_joints, model.n_parameters))
     for k, term in enumerate(model.friction.terms):
@@ -248,10 +239,10 @@ def friction_weights(model: RobotModel, axes: Sequence[Axis]) -> Array:
 
 
 def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
-    """Friction of each axis by one estimate and its standard deviation, each (n,) [N·m, N].
+    """Return the friction of each axis and its standard deviation, each (n,) [N·m, N].
 
-    NaN for an axis without friction, or with a coefficient that the data do not determine.
-    `weights` (n, p) are those of :func:`friction_weights`.
+    NaN for an axis without friction or with an undetermined coefficient; `weights` (n, p) see
+    :func:`friction_weights`.
     """
     covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
     known = np.isfinite(np.diag(covariance))
@@ -274,7 +265,7 @@ def _axes(
     for j, axis in enumerate(axes):
         least = LEAST_FRICTION * _size(friction[:, j])
         watched = chart(friction[:, j], stds[:, j], share, least=least)
-        # At one level: a step is no drift.
+        # Only at the latest level: a step is not a drift.
         slope = drift(time, np.where(watched.at_last_level, watched.values, np.nan))
         certain = slope is not None and slope.p_value < FALSE_ALARMS / model.n_joints
         found.append(
@@ -289,11 +280,8 @@ def _axes(
     return tuple(found)
 
 
-def _error(values: Array, share: float) -> Watched:
-    """A larger torque error is a fault, and a smaller one is none.
-
-    In logarithms: residuals scatter by a share of their size.
-    """
+def _error(values: Array, share: float) -> ControlChart:
+    """Return the one-sided chart of the logarithm, as residuals scatter in proportion to size."""
     with np.errstate(divide="ignore"):
         logarithm = np.where(values > 0.0, np.log(values), np.nan)
     least = float(np.log1p(LEAST_ERROR))
@@ -306,16 +294,19 @@ def _error(values: Array, share: float) -> Watched:
 
 def chart(
     values: Array, stds: Array, share: float, *, least: float = 0.0, rise_only: bool = False
-) -> Watched:
-    """Judge each value by those before it that did not depart themselves.
+) -> ControlChart:
+    """Compute the control chart of a quantity.
 
-    Values that departed are no history for later ones, unless `FEWEST` of them in a row stay on one
-    side: they are a new level, by which later ones are judged. A value that belongs to an earlier
-    level has returned to it. Scatter is that about all levels.
+    Each value is compared with the earlier values that did not depart. `MIN_CAMPAIGNS` successive
+    departures to one side form a new level; a value may return to an earlier level. The scatter is
+    that around all levels.
 
-    Values (n,) are in order of time, NaN where there is none, and came with standard deviations
-    (n,). If nothing has changed `share` of them lie beyond the limits. A departure from the centre
-    matters from `least` on; with `rise_only` only upwards.
+    Args:
+        values: (n,) in chronological order, NaN if unknown.
+        stds: (n,) standard deviations, zero if unknown.
+        share: of values outside the limits if nothing changes.
+        least: smallest relevant departure from the centre.
+        rise_only: whether only a rise is a departure.
     """
     share = 2.0 * share if rise_only else share
     members, now, away = [list[int]()], 0, list[int]()
@@ -343,7 +334,7 @@ def chart(
         if away and (value > expected[0]) != (values[away[-1]] > expected[0]):
             away = []
         away.append(k)
-        if len(away) == FEWEST:
+        if len(away) == MIN_CAMPAIGNS:
             now = len(members)
             members.append(away)
             for one in away:
@@ -351,29 +342,29 @@ def chart(
             away = []
     if rise_only:
         found[:, 1] = np.where(np.isnan(found[:, 1]), np.nan, -np.inf)
-    return Watched(values, stds, found, tuple(departs), tuple(levels))
+    return ControlChart(values, stds, found, tuple(departs), tuple(levels))
 
 
 def limits(
     values: Array, stds: Array, share: float, members: list[list[int]], level: int, std: float
 ) -> tuple[float, float, float]:
-    """Centre, low and high of a value of this standard deviation if it belonged to a level.
+    """Return centre, lower and upper limit of a level for a value of standard deviation `std`.
 
-    NaN with fewer than `FEWEST` values there. `values` (n,) have standard deviations `stds` (n,),
-    zero where unknown, and scatter alike on all levels; `members` are the places of those of each.
+    NaN with fewer than `MIN_CAMPAIGNS` values; `members` are the indices of the values (n,) of each
+    level. The scatter is the same at all levels.
     """
     own, every = members[level], np.concatenate(members).astype(np.intp)
-    if len(own) < FEWEST:
+    if len(own) < MIN_CAMPAIGNS:
         return math.nan, math.nan, math.nan
     centre = float(np.median(values[own]))
     residuals = np.concatenate([values[one] - np.median(values[one]) for one in members])
-    # Each level has subtracted its own median from its residuals.
+    # The median of each level takes one degree of freedom.
     spare = len(every) - len(members)
     scatter = qn_scale(residuals) * math.sqrt((len(every) - 1) / spare)
     typical = float(np.median(stds[every]))
-    # Few values may lie close together by chance, but not closer than each is known.
+    # The scatter of few values may be small by chance, but not below their own uncertainty.
     scale = max(scatter, typical)
-    # A campaign of fewer repetitions than usual is known less well than the history scatters.
+    # A campaign with fewer repetitions has a larger uncertainty than the others.
     one = scale**2 + max(0.0, std**2 - typical**2)
     spread = math.sqrt(one + scale**2 * math.pi / (2.0 * len(own)))
     reach = float(student.isf(share / 2.0, 0.6 * spare - 0.5)) * spread
@@ -381,10 +372,7 @@ def limits(
 
 
 def qn_scale(values: Array) -> float:
-    """Qn, a robust standard deviation: a low quantile of all distances between two values.
-
-    Half of the values (n,) may be anything.
-    """
+    """Return Qn of values (n,), a robust standard deviation with a breakdown point of 50 %."""
     n = len(values)
     if n < 2:
         return 0.0
@@ -397,25 +385,25 @@ def qn_scale(values: Array) -> float:
 
 
 def drift(time: Array, values: Array) -> Drift | None:
-    """Slope of values (n,) in time (n,), None for fewer than `FEWEST` or one instant."""
+    """Return the drift of values (n,) over time (n,), None with fewer than `MIN_CAMPAIGNS`."""
     known = np.isfinite(values)
     at, own = time[known], values[known]
-    if len(own) < FEWEST or np.ptp(at) == 0.0 or np.ptp(own) == 0.0:
+    if len(own) < MIN_CAMPAIGNS or np.ptp(at) == 0.0 or np.ptp(own) == 0.0:
         return None
     slope, _, low, high = theilslopes(own, at, 0.95)
     p_value = float(kendalltau(at, own).pvalue)
     return Drift(float(slope), float(low), float(high), p_value, float(np.ptp(at)))
 
 
-# What it means, in sentences
+# Findings
 
 
 def findings(arm: ArmTrend) -> tuple[Finding, ...]:
-    """What was found of an arm, what concerns its last campaign first; never empty."""
+    """Return the findings about an arm, those about its last campaign first; never empty."""
     found = payload_findings(arm.payload, arm.names)
     for axis in arm.axes:
         for what, watched in (("friction", axis.friction), ("torque error", axis.error)):
-            found += [_shift(arm, axis, what, one) for one in shifts(watched)[-_SHIFTS:]]
+            found += [_shift(arm, axis, what, one) for one in shifts(watched)[-_MAX_SHIFTS:]]
         if axis.drifts:
             slope, low, high = 100.0 * axis.relative_drift
             since = arm.names[int(np.flatnonzero(axis.friction.at_last_level)[0])]
@@ -423,7 +411,7 @@ def findings(arm: ArmTrend) -> tuple[Finding, ...]:
                 f"Friction of {axis.joint} {'rises' if slope > 0 else 'falls'} steadily:"
                 f" {slope:+.0f} % since {since} (95 %: {low:+.0f} to {high:+.0f})."
             )
-            step = "Wear, lubricant that ages, or campaigns run ever warmer."
+            step = "Check for wear, aged lubricant and rising temperature of the campaigns."
             found.append(Finding("alarm", words, step))
     if all(one.level == "quiet" for one in found):
         found.insert(0, Finding("quiet", _nothing(arm)))
@@ -432,40 +420,37 @@ def findings(arm: ArmTrend) -> tuple[Finding, ...]:
 
 
 def summary(arm: ArmTrend) -> str:
-    """One line: what the last campaign shows of the arm."""
+    """Return the state of the arm in one line."""
     levels, count = [one.level for one in findings(arm)], len(arm.campaigns)
     alarms, past = levels.count("alarm"), levels.count("past")
     if alarms:
-        return f"{plural(alarms, 'thing')} to look into"
+        return plural(alarms, "change")
     if count < 2:
-        return "one campaign, nothing to compare it with"
+        return "only one campaign"
     if past:
         return f"no new change; {plural(past, 'earlier change')}"
-    few = "no change found, but too few campaigns to judge the axes"
-    return "as before" if count > FEWEST else few
+    few = "no change, but too few campaigns to test the axes"
+    return "no change" if count > MIN_CAMPAIGNS else few
 
 
 class Shift(NamedTuple):
-    """Campaigns in a row, from number `first` to `last`, that are elsewhere than those before."""
+    """Successive campaigns at another level than those before."""
 
-    returns: bool  #: whether at a level that was left before
-    first: int
+    returns: bool  #: whether to an earlier level
+    first: int  #: number of the first campaign
     last: int
-    #: medians of those before, and of these
-    before: float
-    value: float
-    lasts: bool  #: whether no later campaign is elsewhere
-    #: whether that is a thing to look into: what has risen, however long ago, stays one until it
-    #: returns; what has fallen, until that is a level
-    alarming: bool
+    before: float  #: median of the earlier level
+    value: float  #: median of these campaigns
+    lasts: bool  #: whether it includes the last campaign
+    alarming: bool  #: whether it lasts, and is a rise or not yet a level
 
 
-def shifts(watched: Watched) -> list[Shift]:
-    """All shifts of a figure, in order of time."""
+def shifts(watched: ControlChart) -> list[Shift]:
+    """Return all shifts in chronological order."""
     values, centres = watched.values, watched.limits[:, 0]
 
     def place(k: int) -> tuple[int, bool]:
-        """The level of a campaign, and if it has none its side of the history."""
+        """Return the level of a campaign, and without one whether it is above the centre."""
         level = watched.levels[k]
         return level, level < 0 and bool(values[k] > centres[k])
 
@@ -484,12 +469,13 @@ def shifts(watched: Watched) -> list[Shift]:
 
 
 _STEPS: Final = {
-    ("friction", "above"): "Check this axis' gear, brake and lubrication; was it colder than"
-    " before?",
-    ("friction", "below"): "Was it warmer than before, or has gear or lubricant been changed?",
-    ("friction", "returned"): "Repaired, greased, or equally warm again?",
-    ("torque error", "above"): "Look at the residual of this axis in hil identify on that campaign:"
-    " backlash, a rubbing hose or another motion make it.",
+    ("friction", "above"): "Check gear, brake and lubrication of this axis, and whether it was"
+    " colder.",
+    ("friction", "below"): "Check whether it was warmer, or gear or lubricant were changed.",
+    ("friction", "returned"): "Check whether it was repaired, greased or at the earlier"
+    " temperature.",
+    ("torque error", "above"): "See the residual of this axis in hil identify of that campaign:"
+    " backlash, a hose or another motion.",
 }
 
 
@@ -502,7 +488,7 @@ def _shift(arm: ArmTrend, axis: AxisTrend, what: str, shift: Shift) -> Finding:
     how = "has returned to an earlier level" if shift.returns else "departs from its history"
     words = (
         f"{axis.joint} {how}: {what}{axis.at if what == 'friction' else ''} is"
-        f" {100.0 * change:.0f} % {side} what it was, {shift.value:.3g} against"
+        f" {100.0 * change:.0f} % {side} the earlier level, {shift.value:.3g} against"
         f" {shift.before:.3g} {axis.unit}, {when}."
     )
     step = _STEPS.get((what, "returned" if shift.returns else side), "")
@@ -512,29 +498,28 @@ def _shift(arm: ArmTrend, axis: AxisTrend, what: str, shift: Shift) -> Finding:
 def _nothing(arm: ArmTrend) -> str:
     count, untested = len(arm.campaigns), arm.payload.untested
     if count < 2:
-        return "There is one campaign, and nothing to compare it with."
-    payload = f"Its payload was not tested: {untested}." if untested else "Its payload is the same."
-    axes = "Friction and torque error of every axis are within the limits of those before"
-    if count <= FEWEST:
-        axes = f"Its axes are judged from the campaign on that has {FEWEST} before it"
-    return f"No change was found in {count} campaigns. {payload} {axes}."
+        return "There is only one campaign."
+    payload = f"Payload not tested: {untested}." if untested else "The payload has not changed."
+    axes = "Friction and torque error of all axes are within the limits of the earlier campaigns"
+    if count <= MIN_CAMPAIGNS:
+        axes = f"Axes are tested in campaigns with at least {MIN_CAMPAIGNS} earlier ones"
+    return f"No change in {count} campaigns. {payload} {axes}."
 
 
 def _order_findings(arm: ArmTrend) -> list[Finding]:
-    """What a reader must know of the order of campaigns."""
     if arm.undated:
         names = [one.rstrip("/").rsplit("/", 1)[-1] for one in arm.undated]
-        names[_NAMED:] = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+        names[_MAX_NAMES:] = [f"{len(names) - _MAX_NAMES} more"] if len(names) > _MAX_NAMES else []
         words = (
-            f"{plural(len(arm.undated), 'further campaign')} ({', '.join(names)}) without a time of"
-            " recording: left out here, since nobody knows where they belong."
+            f"{plural(len(arm.undated), 'campaign')} ({', '.join(names)}) without recording time:"
+            " not part of the trend."
         )
     elif arm.dated or len(arm.campaigns) < 2:
         return []
     else:
         words = (
-            "No campaign has a time of recording: they are used in the order of their folders'"
-            f" names, from {arm.names[0]} to {arm.names[-1]}."
-            " If that is not the order of time, before and after mean nothing here."
+            "No campaign has a recording time: the order is that of their folders' names, from"
+            f" {arm.names[0]} to {arm.names[-1]}. If that is not chronological, the trends are"
+            " meaningless."
         )
     return [Finding("quiet", words)]

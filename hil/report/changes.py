@@ -9,18 +9,17 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from hil.compare.comparison import FEWEST as FEWEST_REPETITIONS
-from hil.compare.comparison import Comparison
+from hil.compare.comparison import MIN_REPETITIONS, Comparison
 from hil.compare.payload import LEAST_EFFECT
 from hil.compare.trend import (
     FALSE_ALARMS,
-    FEWEST,
     LEAST_ERROR,
     LEAST_FRICTION,
+    MIN_CAMPAIGNS,
     ArmTrend,
     AxisTrend,
+    ControlChart,
     Trends,
-    Watched,
     findings,
     summary,
 )
@@ -54,8 +53,8 @@ _RULES: Final = {
     "friction": f"{100.0 * LEAST_FRICTION:g} %",
     "error": f"{100.0 * LEAST_ERROR:g} %",
     "effect": f"{100.0 * LEAST_EFFECT:g} %",
-    "fewest": FEWEST,
-    "repetitions": FEWEST_REPETITIONS,
+    "fewest": MIN_CAMPAIGNS,
+    "repetitions": MIN_REPETITIONS,
 }
 
 
@@ -125,7 +124,7 @@ def _trend(arm: ArmTrend, key: str) -> dict[str, Any]:
 
 
 def _panel(
-    panels: list[Panel], arm: ArmTrend, axis: AxisTrend, watched: Watched, key: str, what: str
+    panels: list[Panel], arm: ArmTrend, axis: AxisTrend, watched: ControlChart, key: str, what: str
 ) -> None:
     """Draw an axis over the campaigns: 95 % intervals, limits, drift; departures as squares."""
     values, half = watched.values, _INTERVAL * np.nan_to_num(watched.stds)

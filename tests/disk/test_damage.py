@@ -168,7 +168,7 @@ def test_an_estimate_of_other_parameters_has_to_be_told_of(
     ("said", "found"),
     [
         (None, "one campaign was compared"),
-        ("{root}: is the only campaign that was named", ""),
+        ("{root}: is the only campaign given", ""),
         ("{root}: is of another arm", "it says: "),
         ("nothing was given", "it says: "),
     ],

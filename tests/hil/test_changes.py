@@ -26,10 +26,10 @@ from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.cli import app
 from hil.compare import Comparison, compare_campaigns, gather, payload
-from hil.compare.comparison import Gathered, against_first, effective_count, holm, known
+from hil.compare.comparison import CampaignSet, against_first, effective_count, figure, holm
 from hil.compare.trend import (
     FALSE_ALARMS,
-    FEWEST,
+    MIN_CAMPAIGNS,
     ArmTrend,
     Axis,
     Trends,
@@ -107,8 +107,8 @@ SCATTER = [1.0, 1.1, 0.9, 1.05, 0.95, 1.02, 1.0]
 @pytest.mark.parametrize(
     ("values", "std", "departing"),
     [
-        ([1.0] * FEWEST + [99.0], 0.0, [FEWEST]),
-        ([1.0] * (FEWEST - 1) + [99.0], 0.0, []),  # too short a history
+        ([1.0] * MIN_CAMPAIGNS + [99.0], 0.0, [MIN_CAMPAIGNS]),
+        ([1.0] * (MIN_CAMPAIGNS - 1) + [99.0], 0.0, []),  # too short a history
         ([1.0] * 8 + [1.5], 0.0, [8]),
         ([1.0] * 8 + [1.5], 0.5, []),  # no narrower than its values are known
         ([*SCATTER, 3.0, 3.0, 3.0, 3.0], 0.0, [7, 8, 9, 10]),  # what departed is no history
@@ -123,12 +123,12 @@ def test_departures(values: list[float], std: float, departing: list[int]) -> No
 def test_values_that_stay_away_are_a_new_level() -> None:
     there = [3.0 * one for one in SCATTER]
     found = chart(np.array([*SCATTER, *there, 4.9]), np.zeros(15), 0.01)
-    assert found.departs == (False,) * 7 + (True,) * FEWEST + (False,) * 2 + (True,)
+    assert found.departs == (False,) * 7 + (True,) * MIN_CAMPAIGNS + (False,) * 2 + (True,)
     assert found.levels == (0,) * 7 + (1,) * 7 + (-1,)
     assert found.limits[-1, 0] == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize("stay", [1, 3, FEWEST, 9])
+@pytest.mark.parametrize("stay", [1, 3, MIN_CAMPAIGNS, 9])
 @pytest.mark.parametrize("rise_only", [False, True])
 def test_a_figure_that_departs_and_returns_has_changed_twice(stay: int, rise_only: bool) -> None:
     damaged = (3.0 * np.array(SCATTER * 2)[:stay]).tolist()
@@ -147,7 +147,7 @@ def test_values_to_both_sides_of_a_history_make_no_level() -> None:
 @pytest.mark.slow
 def test_after_a_change_of_level_as_few_depart() -> None:
     runs, share = 2000, 0.01
-    values = np.random.default_rng(11).standard_normal((runs, 9 + FEWEST))
+    values = np.random.default_rng(11).standard_normal((runs, 9 + MIN_CAMPAIGNS))
     values[:, 8:] += 1000.0
     departing = sum(chart(one, np.zeros(len(one)), share).departs[-1] for one in values)
     assert departing / runs <= share + 3.0 * math.sqrt(share / runs)
@@ -213,7 +213,7 @@ def changed() -> ArmTrend:
 def test_an_arm_without_changes_is_said_to_have_none() -> None:
     arm = quiet()
     assert [one.level for one in findings(arm)] == ["quiet"]
-    assert summary(arm) == "as before"
+    assert summary(arm) == "no change"
 
 
 def test_wear_and_damage_are_those_of_their_axis_alone() -> None:
@@ -269,7 +269,7 @@ def test_inertia_of_another_link_is_no_payload() -> None:
     found = arm_trend("arm", arm, [before, replace(after, values=moved)])
     assert found.payload.changed == (False, False)
     assert found.payload.other == (False, True)
-    assert "not as by something put on" in findings(found)[0].words
+    assert "of which a payload explains only" in findings(found)[0].words
 
 
 def test_the_joint_test_is_rarely_wrong_of_unchanged_arms() -> None:
@@ -348,7 +348,7 @@ def test_a_payload_that_is_put_on_and_stated_is_no_discovery() -> None:
     assert not any(arm.payload.changed + arm.payload.other)
     statement = arm.payload.statements[2]
     assert (statement.before, statement.after, statement.verdict) == (None, STATED, "torques agree")
-    assert any("states a payload of 3 kg instead of nothing" in f.words for f in findings(arm))
+    assert any("states a payload of 3 kg instead of no payload" in f.words for f in findings(arm))
     assert {one.level for one in findings(arm)} == {"quiet"}
     np.testing.assert_allclose(arm.payload.mass, [0.0, 0.0, 3.0, 3.0], atol=0.3)
 
@@ -389,7 +389,7 @@ def test_campaigns_are_in_order_of_their_times_or_names() -> None:
     assert not arm.dated
     assert arm.time.tolist() == [1.0, 2.0, 3.0]
     assert arm.names == ("c1", "c9", "c10")
-    assert "in the order of their folders' names, from c1 to c10" in findings(arm)[-1].words
+    assert "the order is that of their folders' names, from c1 to c10" in findings(arm)[-1].words
     campaigns = history(steady, 4, seed=2)
     campaigns[1] = replace(campaigns[1], when="")
     arm = arm_trend("arm", model(), campaigns[::-1])
@@ -397,7 +397,7 @@ def test_campaigns_are_in_order_of_their_times_or_names() -> None:
     assert [name[:3] for name in arm.names] == ["c00", "c02", "c03"]  # in order of time
     assert arm.time[:2].tolist() == [0.0, 31.0]
     assert arm.undated == ("line/c01",)
-    assert "1 further campaign (c01) without a time of recording" in findings(arm)[-1].words
+    assert "1 campaign (c01) without recording time" in findings(arm)[-1].words
 
 
 def test_axes_of_which_nothing_is_known_are_left_out() -> None:
@@ -546,7 +546,7 @@ def test_a_script_gets_numbers_and_an_exit_status(folders: dict[str, Path], tmp_
     ("other", "why"),
     [
         ("other", r"(march|other): is of another arm.*\[drive_train\]"),
-        ("march", r"march.*only campaign.*name two"),
+        ("march", r"march.*only campaign.*give two"),
     ],
 )
 def test_refused_before_anything_is_estimated(
@@ -574,7 +574,7 @@ def in_memory(
         for level in levels
     ]
     arm = Arm("digest", arm_histories.cell())
-    return compare_campaigns(Gathered(arm, tuple(levels), tuple(single), not folders, ()))
+    return compare_campaigns(CampaignSet(arm, tuple(levels), tuple(single), not folders, ()))
 
 
 def test_a_payload_that_nobody_stated_is_weighed() -> None:
@@ -607,7 +607,7 @@ def test_a_change_too_small_to_matter_is_a_difference() -> None:
     assert np.all(found.friction.p_value[slight, 1] < 0.005)
     assert np.all(np.abs(found.friction.shares[slight, 1, 0]) < 0.05)
     assert found.verdict.startswith("No change of 5 % or more; friction of ")
-    less = [one.words for one in found.findings if "less than the 5 % that count" in one.words]
+    less = [one.words for one in found.findings if "significant, but less than 5 %" in one.words]
     assert len(less) == len(slight) and {one.level for one in found.findings} == {"same"}
     (unchanged,) = (
         one.words
@@ -660,7 +660,7 @@ def test_what_cannot_be_known_is_not_judged() -> None:
     unknown = replace(second, std=np.full_like(second.std, np.inf), covariance=None)
     arm = Arm("digest", arm_histories.cell())
     levels = (first, unknown)
-    again = compare_campaigns(Gathered(arm, levels, ((first,), (unknown,)), True, ()))
+    again = compare_campaigns(CampaignSet(arm, levels, ((first,), (unknown,)), True, ()))
     assert not again.changed
     assert any("is not determined" in one.words for one in again.findings)
     assert any("one repetition" in warning for warning in again.warnings)
@@ -673,9 +673,9 @@ def test_what_cannot_be_known_is_not_judged() -> None:
 
 def test_variances_and_counts_are_of_what_repetitions_share() -> None:
     apart = np.array([9.0, 10.0, 11.0])
-    assert known(10.0, 0.01, 30.0, apart).variance == pytest.approx(1.0)
-    assert known(10.0, 4.0, 30.0, apart) == known(10.0, 4.0, 30.0, apart[:1])
-    assert np.isnan(known(10.0, np.inf, 30.0, apart).value)
+    assert figure(10.0, 0.01, 30.0, apart).variance == pytest.approx(1.0)
+    assert figure(10.0, 4.0, 30.0, apart) == figure(10.0, 4.0, 30.0, apart[:1])
+    assert np.isnan(figure(10.0, np.inf, 30.0, apart).value)
     drifting = np.linspace(0.0, 1.0, 30)
     assert effective_count(drifting) < 3.0
     random = np.random.default_rng(0)
@@ -696,7 +696,7 @@ def test_of_two_alike_campaigns_few_are_said_to_differ(count: int, memory: float
             found.append(memory * found[-1] + np.sqrt(1.0 - memory**2) * shock)
         return np.array(found)
 
-    pairs = [[known(own.mean(), 0.0, 30.0, own) for own in (one(), one())] for _ in range(2000)]
+    pairs = [[figure(own.mean(), 0.0, 30.0, own) for own in (one(), one())] for _ in range(2000)]
     found = [against_first([pair], 0.05).p_value[0, 1] for pair in pairs]
     assert np.mean(np.array(found) < 0.05) < 0.09
 
