@@ -175,7 +175,7 @@ def sizes(path: Path) -> list[dict[str, Any]]:
     with path.open("rb") as stream:
         size = path.stat().st_size
         packed_chunks = [
-            (container.chunk(record), record.offset)
+            (container.parse_chunk(record), record.offset)
             for record in container.records(stream, size)
             if record.opcode == container.CHUNK
         ]

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.archive import CONTROLLERS_OWN, ArchiveName, ArchiveSpec
+from hil.archive import CONTROLLER_PROGRAM, ArchiveName, ArchiveSpec
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.files import make_folder
@@ -45,7 +45,7 @@ def record(
         OperatorStopError: stopped before it came.
         ArchiveWriteError: the archive cannot be written.
     """
-    metadata = {"motion": CONTROLLERS_OWN, **kind_entry(path, kind), **origin_of(cell)}
+    metadata = {"motion": CONTROLLER_PROGRAM, **kind_entry(path, kind), **origin_of(cell)}
     spec = archive_spec(cell, path, metadata, durable=durable)
     return link.record(spec, stop, duration=duration, wait=wait, watch=watch)
 

@@ -87,7 +87,7 @@ def recording_of(archive: Archive) -> Recording:
         problem = f"holds no sample{f' ({archive.damage})' if archive.damage else ''}"
         remedy = "record it again"
         raise ArchiveError(archive.path, problem, remedy=remedy)
-    imported, own = archive.kind == "imported", archive.header.controllers_own
+    imported, own = archive.kind == "imported", archive.header.by_controller_program
     provenance = {"archive": archive.path.name, **archive.header.entries}
     for key, value in (archive.outcome.entries if archive.outcome else {}).items():
         provenance[key if key == "outcome" else f"outcome.{key}"] = value

@@ -1,8 +1,8 @@
-"""Archives: one MCAP file per interval of motion, whole in itself and readable by other tools."""
+"""Archives: one MCAP file per interval of motion, complete in itself, readable by other tools."""
 
 from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
-    CONTROLLERS_OWN,
+    CONTROLLER_PROGRAM,
     FORMAT_VERSION,
     KINDS,
     ArchiveHeader,
@@ -15,18 +15,18 @@ from hil.archive.recorder import ArchiveSpec, Recorder
 from hil.archive.writer import ArchiveWriter, Samples, write_samples
 
 __all__ = [
-    "CONTROLLERS_OWN",
+    "CONTROLLER_PROGRAM",
+    "FORMAT_VERSION",
+    "KINDS",
     "Archive",
-    "ArchiveHeader",
-    "ArchiveOutcome",
     "ArchiveDamage",
+    "ArchiveHeader",
     "ArchiveName",
+    "ArchiveOutcome",
     "ArchiveSpec",
     "ArchiveWriter",
     "ArchivedEvent",
-    "FORMAT_VERSION",
     "Findings",
-    "KINDS",
     "Level",
     "Recorder",
     "Samples",

@@ -1,10 +1,9 @@
 """CDR messages of constant size as numpy structures.
 
-ROS 2 messages in CDR begin with four bytes of encapsulation; every primitive is then aligned to its
-own size, counted from after those four bytes. Where names and array lengths never change, all
-messages of a channel have the same bytes at the same places, so a message is one element of a
-structured array: encoding fills its columns, decoding is a view. A JointState holds names and
-sequences, but they stay the same over a recording, so it has a constant layout all the same.
+A ROS 2 message in CDR begins with four bytes of encapsulation; every primitive is aligned to its
+own size, counted from after those four bytes. Where names and array lengths are constant, as in a
+recording of JointState messages, all messages of a channel have the same bytes at the same places:
+encoding fills the columns of a structured array, decoding is a view.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ Rows = NDArray[np.void]
 
 ENCAPSULATION = b"\x00\x01\x00\x00"  # CDR without parameter list, little endian
 LARGEST_MESSAGE: Final = 1 << 20
-"""Bytes; the longest of ours has some ten thousand. A layout takes memory in proportion."""
+"""Bytes; own messages have at most some 10 000. A layout takes memory in proportion."""
 
 _PRIMITIVES = {
     **dict.fromkeys(("bool", "byte", "char"), np.dtype("u1")),
@@ -41,19 +40,18 @@ _SEQUENCE = -1
 
 
 class LayoutError(ValueError):
-    """A message whose bytes cannot be laid out once and for all."""
+    """A message without constant layout."""
 
 
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
-    """Where the fields of a message lie.
+    """Byte layout of a message.
 
     Attributes:
-        dtype: the fields that change from message to message; the structure is as long as a
-            message.
-        template: one message with every constant byte in place.
-        constant: the bytes that are the same in every message (padding is not among them: writers
-            may leave anything there).
+        dtype: the fields that change from message to message, of the length of a message.
+        template: a message with every constant byte in place.
+        constant: the bytes that are the same in every message, without padding, which may be
+            anything.
     """
 
     dtype: np.dtype[np.void]
@@ -66,11 +64,11 @@ class MessageLayout:
         return len(self.template)
 
     def rows(self, count: int) -> Rows:
-        """So many messages with the constant bytes in place, to be filled column by column."""
+        """Return messages with the constant bytes in place, to be filled column by column."""
         return np.frombuffer(bytearray(self.template * count), dtype=self.dtype)
 
-    def holds_in(self, messages: NDArray[np.uint8]) -> bool:
-        """Whether messages (k, size) have the size and the constant bytes of the template."""
+    def matches(self, messages: NDArray[np.uint8]) -> bool:
+        """Return whether messages (k, size) have the size and constant bytes of the template."""
         expected = np.frombuffer(self.template, np.uint8)
         return messages.shape[1] == self.size and all(
             (messages[:, part] == expected[part]).all() for part in self.constant
@@ -78,7 +76,7 @@ class MessageLayout:
 
 
 class LayoutBuilder:
-    """Lays out a message field by field; what becomes too long is a `LayoutError`."""
+    """Builds a layout field by field; a message that is too long raises `LayoutError`."""
 
     def __init__(self) -> None:
         self._template = bytearray(ENCAPSULATION)
@@ -86,34 +84,34 @@ class LayoutBuilder:
         self._fields: list[tuple[str, Any, int]] = []
 
     def next_place(self, size: int) -> int:
-        """Where a number of `size` bytes would begin."""
+        """Return where a number of `size` bytes would begin."""
         return len(self._template) + -(len(self._template) - len(ENCAPSULATION)) % size
 
     def variable(self, name: str, primitive: str, count: int | None = None) -> None:
-        """Place a number, or an array of `count` numbers, that changes with each message."""
+        """Add a number, or an array of `count` numbers, that changes with each message."""
         item = _PRIMITIVES[primitive]
         size = item.itemsize * (1 if count is None else count)
         place = self._extend(item.itemsize, size)
         self._fields.append((name, item if count is None else (item, (count,)), place))
 
     def count(self, value: int) -> None:
-        """Place the constant length of a sequence."""
+        """Add the constant length of a sequence."""
         self._fix(4, value.to_bytes(4, "little"))
 
     def string(self, value: str) -> None:
-        """Place a constant string."""
+        """Add a constant string."""
         data = value.encode() + b"\0"
         self.count(len(data))
         self._fix(1, data)
 
     def sequence(self, name: str, primitive: str, count: int) -> None:
-        """Place a sequence of constant length; one of length zero has no column."""
+        """Add a sequence of constant length; one of length zero has no column."""
         self.count(count)
         if count:
             self.variable(name, primitive, count)
 
     def build(self) -> MessageLayout:
-        """The layout of the fields placed so far.
+        """Return the layout of the fields added so far.
 
         Raises:
             LayoutError: two fields have one name.
@@ -146,7 +144,7 @@ class LayoutBuilder:
 def joint_state_layout(
     names: tuple[str, ...], *, position: int, velocity: int, effort: int
 ) -> MessageLayout:
-    """Lay out a sensor_msgs/JointState with these names and lengths of its arrays."""
+    """Return the layout of sensor_msgs/JointState with these names and lengths of its arrays."""
     builder = LayoutBuilder()
     builder.variable("sec", "int32")
     builder.variable("nanosec", "uint32")
@@ -161,12 +159,12 @@ def joint_state_layout(
 
 @lru_cache(maxsize=64)
 def fixed_layout(definition: str) -> MessageLayout:
-    """Lay out messages of numbers and fixed arrays, with or without a header, by their definition.
+    """Return the layout of messages of numbers and fixed arrays; a header is optional.
 
     The stamp of the header has the fields ``sec`` and ``nanosec``.
 
     Raises:
-        LayoutError: the size of a field depends on the message, or one is of no known type.
+        LayoutError: the size of a field depends on the message, or its type is unknown.
     """
     layout = _laid_out("", definition, None)
     names = layout.dtype.names or ()
@@ -175,15 +173,12 @@ def fixed_layout(definition: str) -> MessageLayout:
 
 
 def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
-    """The layout of messages like this one, fields named by their paths.
+    """Return the layout of messages like this one, fields named by their paths.
 
-    Args:
-        kind: name of the type.
-        definition: its ros2msg text with all dependencies.
-        message: in little-endian CDR.
+    `definition` is ros2msg text with all dependencies, the message is little-endian CDR.
 
     Raises:
-        LayoutError: the definition cannot be understood, or the message does not keep it.
+        LayoutError: the definition is not supported, or the message does not fit it.
     """
     if message[:4] != ENCAPSULATION:
         raise LayoutError("its messages are not little-endian CDR")
@@ -191,10 +186,7 @@ def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
 
 
 def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayout:
-    """Go through a message along its definition, and lay out what is there.
-
-    Without a message, strings are empty, and there must be no sequence.
-    """
+    """Build the layout of a message; without one, strings are empty, a sequence is an error."""
     types, builder, places = _types(kind, definition), LayoutBuilder(), 0
 
     def part(place: int, size: int) -> bytes:
@@ -217,7 +209,7 @@ def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayou
         nonlocal places
         if kind not in types:
             raise LayoutError(f"its definition lacks {kind}")
-        places += 1  # types may hold themselves, or nothing
+        places += 1  # types may contain themselves, or nothing
         if depth > _DEEPEST or places > _MOST_PLACES:
             raise LayoutError(f"its definition nests {kind} too deep or too often")
         for field in types[kind]:
@@ -250,7 +242,7 @@ def _laid_out(kind: str, definition: str, message: bytes | None) -> MessageLayou
 
 
 class _Field(NamedTuple):
-    """One line of a definition: `length` is None of a single value."""
+    """One line of a definition; `length` is None of a single value."""
 
     kind: str
     name: str
@@ -258,13 +250,13 @@ class _Field(NamedTuple):
 
 
 def _short(kind: str) -> str:
-    """``package/Type`` without ``msg``."""
+    """Return ``package/Type`` without ``msg``."""
     return kind.replace("/msg/", "/")
 
 
 @lru_cache(maxsize=64)
 def _types(kind: str, definition: str) -> Mapping[str, Sequence[_Field]]:
-    """Fields by type, of a definition with its dependencies."""
+    """Return the fields by type of a definition with its dependencies."""
     own, *others = _SEPARATOR.split(definition)
     parts = [(kind, own)]
     for part in others:

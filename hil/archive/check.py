@@ -1,7 +1,7 @@
-"""Says what an archive holds, and whether a file keeps the archive profile, aspect by aspect.
+"""Conformance of an archive with the profile, aspect by aspect, and an overview of its content.
 
-`docs/archive-format.md` is the profile in words; each rule here is one of its sentences. The check
-is of the file alone: whether the motion in it is any good is not asked.
+`docs/archive-format.md` is the profile; each rule here is one of its sentences. Only the file is
+checked, not the quality of the motion.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     CHUNKS,
     FORMAT_VERSION,
+    KIND_NAMES,
     KINDS,
     REJECTED,
-    WORDS,
     ArchiveHeader,
     ArchiveName,
     ArchiveOutcome,
     HeaderError,
-    is_known,
+    is_supported,
     motion_name,
 )
 from hil.archive.reader import open_archive
-from hil.archive.repair import is_indexed, survey
+from hil.archive.repair import has_valid_index, scan_file
 from hil.archive.scan import Scan
 
 ASPECTS = {
     "container": "MCAP records in order, header of profile ros2 by hil",
     "metadata": "record hil: version, kind, joints, period; its checksum",
-    "attachments": "those that the metadata name; their checksums",
+    "attachments": "those named in the metadata; their checksums",
     "schemas": "texts of the messages",
     "channels": "topics, types and encodings",
     "chunks": "zstd, one per 100 ms; their checksums",
     "sizes": "messages of a channel have one layout",
-    "sequence": "messages are counted from 0 without a hole",
-    "times": "log time, publish time and stamp agree; cycles grow",
+    "sequence": "messages are numbered from 0 without a gap",
+    "times": "log time, publish time and stamp agree; cycles increase",
     "joint_states": "repeat the columns of the cycles",
-    "outcome": "record hil.outcome: word and counts; its checksum",
+    "outcome": "record hil.outcome: outcome and counts; its checksum",
     "index": "message indexes, statistics and summary fit the data",
 }
-"""What is checked, and of what it consists."""
+"""Aspects that are checked."""
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
 
@@ -59,21 +59,21 @@ _STATES = {
     schema.MEASURED: {"position": "position", "velocity": "velocity", "effort": "torque"},
     schema.COMMANDED: {"position": "commanded_position", "velocity": "commanded_velocity"},
 }
-"""Which columns of the cycles each channel repeats; targets stand for commands that are NaN."""
+"""Columns of the cycles that each channel repeats; targets replace commands that are NaN."""
 _CYCLE_FIELDS = {"cycle", "gap"}.union(*(columns.values() for columns in _STATES.values()))
 _MOST = 5  # faults of one aspect that are shown
 
 
 @dataclass(frozen=True)
 class Check:
-    """Whether a file keeps the profile.
+    """Result of a check.
 
     Attributes:
         path: the file.
-        version: of the profile, as the file says.
-        faults: what is wrong, by aspect; an aspect without entry is sound.
-        samples: samples that can be read.
-        repaired: whether the file says that it was repaired.
+        version: of the profile, as stated in the file.
+        faults: what is wrong, by aspect; an aspect without entry conforms.
+        samples: number of samples that can be read.
+        repaired: whether the outcome states a repair with loss.
     """
 
     path: Path
@@ -84,12 +84,12 @@ class Check:
 
     @property
     def conforms(self) -> bool:
-        """Whether all aspects of the profile are sound."""
+        """Whether the file conforms in all aspects."""
         return not self.faults
 
 
 def check_archive(path: str | PathLike[str]) -> Check:
-    """Check a file.
+    """Check whether a file conforms to the profile.
 
     Raises:
         NotAnArchiveError: it is of another kind.
@@ -97,21 +97,21 @@ def check_archive(path: str | PathLike[str]) -> Check:
     """
     path = Path(path)
     checker = _Checker()
-    found, say = survey(path, checker.visit), checker.say
+    found, add = scan_file(path, checker.visit), checker.add
     outcome = found.outcome
-    if not found.faults and found.header is not None and not is_indexed(path, found):
-        say("index", "the message indexes or the index at the end do not fit what is there")
+    if not found.faults and found.header is not None and not has_valid_index(path, found):
+        add("index", "the message indexes or the summary do not fit the content")
     if found.metadata is None:
         if not any(fault.aspect == "metadata" for fault in found.faults):
-            open_archive(path, fields=())  # says why it is none
-        say("metadata", "without the record hil the rest cannot be checked")
+            open_archive(path, fields=())  # raises with the reason
+        add("metadata", "without the record hil the rest cannot be checked")
     else:
         for text in _description_faults(path, found.metadata):
-            say("metadata", text)
+            add("metadata", text)
     if outcome is not None and outcome.outcome not in OUTCOMES:
-        say("outcome", f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}")
+        add("outcome", f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}")
     if outcome is not None and CHUNKS in outcome.record and outcome.chunks is None:
-        say("outcome", f"{CHUNKS} is no list of checksums")
+        add("outcome", f"{CHUNKS} is not a list of checksums")
     if found.header is not None and found.pieces:
         checker.finish(found)
     texts: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
@@ -129,12 +129,12 @@ def check_archive(path: str | PathLike[str]) -> Check:
 def _shortened(texts: list[str]) -> tuple[str, ...]:
     unique = list(dict.fromkeys(texts))
     more = len(unique) - _MOST
-    return tuple([*unique[:_MOST], f"and {more} more of the kind"] if more > 0 else unique)
+    return tuple([*unique[:_MOST], f"and {more} more"] if more > 0 else unique)
 
 
 def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
-    """What is wrong with the ``hil`` record."""
-    if not is_known(entries):
+    """Return the faults of the ``hil`` record."""
+    if not is_supported(entries):
         return [f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"]
     faults = []
     kind = entries.get("kind", "")
@@ -154,19 +154,15 @@ def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
 
 
 class _Checker:
-    """Checks sound chunks, one after the other; then the rest.
-
-    Attributes:
-        faults: what is wrong: aspect of the profile, and sentence.
-    """
+    """Checks of valid chunks, then of the rest; collects aspect and sentence of each fault."""
 
     def __init__(self) -> None:
         self.faults: list[tuple[str, str]] = []
         self._layouts: dict[str, MessageLayout | None] = {}
         self._gaps = 0
 
-    def say(self, aspect: str, text: str) -> None:
-        """Note a fault."""
+    def add(self, aspect: str, text: str) -> None:
+        """Add a fault."""
         self.faults.append((aspect, text))
 
     def visit(self, found: Scan, messages: Mapping[str, Messages], offset: int) -> None:
@@ -174,16 +170,16 @@ class _Checker:
         if found.header is None:
             return
         place = f"the chunk at byte {offset}"
-        compression = container.chunk(found.record).compression
+        compression = container.parse_chunk(found.record).compression
         if compression != "zstd":
-            self.say("chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd")
+            self.add("chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd")
         rows: dict[str, Rows] = {}
         for topic, of_topic in messages.items():
             if topic in schema.ONCE:
                 continue
             times = of_topic.of_heads("log_time"), of_topic.of_heads("publish_time")
             if not all(np.array_equal(time, of_topic.stamps) for time in times):
-                self.say("times", f"{place} has messages logged at another time than their stamp")
+                self.add("times", f"{place} has messages logged at another time than their stamp")
             try:
                 if topic == schema.EVENTS:
                     for message in of_topic.all():
@@ -191,7 +187,7 @@ class _Checker:
                 else:
                     rows[topic] = self._rows(found, topic, of_topic)
             except LayoutError as error:
-                self.say("sizes", f"{place} has messages of {topic}: {error}")
+                self.add("sizes", f"{place} has messages of {topic}: {error}")
         if schema.CYCLE in rows and set(rows[schema.CYCLE].dtype.names or ()) >= _CYCLE_FIELDS:
             self._check_cycles(found.header.period, messages, rows, place)
 
@@ -203,20 +199,20 @@ class _Checker:
         if parser.channels:
             cycles = () if imported else (schema.CYCLE, schema.COMMANDED)
             for topic in sorted({schema.MEASURED, schema.EVENTS, *cycles} - parser.topics):
-                self.say("channels", f"there is no {topic}")
+                self.add("channels", f"there is no {topic}")
             for channel in parser.channels.values():
                 self._check_channel(channel, parser, len(header.joint_names))
         if imported or outcome is None or outcome.repaired or found.losses:
             return
         if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
             stated = outcome.record["lost_packets"]
-            self.say("outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}")
+            self.add("outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}")
 
     def _check_channel(self, channel: Channel, parser: ChunkParser, n_joints: int) -> None:
         topic = channel.topic
         profile = schema.profile(n_joints).get(topic)
         if profile is None:
-            return  # a later version may add channels
+            return  # later versions may add channels
         found = parser.schemas.get(channel.schema_id) or Schema(0, b"", "", "")
         for aspect, what, is_now, must_be in (
             ("channels", "message encoding", channel.message_encoding, "cdr"),
@@ -224,17 +220,21 @@ class _Checker:
             ("schemas", "encoding of the schema", found.encoding, "ros2msg"),
         ):
             if is_now != must_be:
-                self.say(aspect, f"{topic}: {what} is {is_now!r}, not {must_be!r}")
+                self.add(aspect, f"{topic}: {what} is {is_now!r}, not {must_be!r}")
         text = found.data.decode(errors="replace")
         same = text == profile.definition
-        if topic == schema.CYCLE and not same:  # fields may be added at its end, and age was
-            ours, theirs = _fields(profile.definition), _fields(text)
-            same = theirs[: len(ours)] in (ours, ours[:-1])
+        if topic == schema.CYCLE and not same:  # fields may be added at its end, as age was
+            expected, recorded = _fields(profile.definition), _fields(text)
+            same = recorded[: len(expected)] in (expected, expected[:-1])
         if not same:
-            self.say("schemas", f"that of {topic} is not the text of the profile")
+            self.add("schemas", f"that of {topic} is not the text of the profile")
 
     def _rows(self, found: Scan, topic: str, messages: Messages) -> Rows:
-        """The messages as a structured array; a `LayoutError` where one has another layout."""
+        """Return the messages as a structured array.
+
+        Raises:
+            LayoutError: one has another layout than the first.
+        """
         assert found.header is not None
         if topic not in self._layouts:
             self._layouts[topic] = None
@@ -242,8 +242,8 @@ class _Checker:
             names = found.header.joint_names
             self._layouts[topic] = schema.message_layout(topic, names, record, first)
         layout = self._layouts[topic]
-        if layout is None or not all(map(layout.holds_in, messages.data)):
-            raise LayoutError("they are unlike its others")
+        if layout is None or not all(map(layout.matches, messages.data)):
+            raise LayoutError("their layout differs from the first")
         return np.concatenate(messages.data).view(layout.dtype)[:, 0]
 
     def _check_cycles(
@@ -259,14 +259,14 @@ class _Checker:
         if period is not None:
             period_ns = period * 1e9
             if not np.array_equal(stamp, np.rint(number * period_ns)):
-                self.say("times", f"{place} has cycles whose stamp is not cycle times period")
+                self.add("times", f"{place} has cycles whose stamp is not cycle times period")
             if (int(number[-1]) - int(number[0])) * period_ns >= max(_CHUNK_NS, period_ns):
-                self.say("chunks", f"{place} spans more than 100 ms")
+                self.add("chunks", f"{place} spans more than 100 ms")
         self._gaps += int(cycles["gap"].sum())
         for topic in _STATES.keys() & rows.keys():
             same = np.array_equal(found[topic].stamps, stamp)
             if not (same and _repeats(rows[topic], cycles, _STATES[topic])):
-                self.say("joint_states", f"{place} has messages of {topic} unlike its cycles")
+                self.add("joint_states", f"{place} has messages of {topic} unlike its cycles")
 
 
 def _fields(text: str) -> list[str]:
@@ -277,10 +277,10 @@ def _fields(text: str) -> list[str]:
 def _repeats(state: Rows, cycles: Rows, columns: Mapping[str, str]) -> bool:
     if {*(state.dtype.names or ())} != {"sec", "nanosec", *columns}:
         return False
-    for word, name in columns.items():
-        repeated, column = state[word], cycles[name]
-        if name.startswith("commanded"):  # NaN in archives that show no target in its place
-            column = np.where(np.isnan(repeated), column, schema.set_points(cycles, word))
+    for field, name in columns.items():
+        repeated, column = state[field], cycles[name]
+        if name.startswith("commanded"):  # NaN in older archives, without the target
+            column = np.where(np.isnan(repeated), column, schema.set_points(cycles, field))
         if repeated.tobytes() != column.tobytes():
             return False
     return True
@@ -294,20 +294,16 @@ _SHOWN_ELSEWHERE = frozenset(
 
 @dataclass(frozen=True)
 class Overview:
-    """What an archive holds.
+    """Overview of an archive, as `hil archive info` prints it.
 
     Attributes:
-        path: the file.
         title: kind, index and attempt.
         outcome: how it ended, and why.
         lost: what the link or this PC lost, "" where nothing.
-        samples: how many can be read.
-        duration: from the first to the last [s].
+        duration: from the first to the last sample [s].
         period: cycle [s], None where it is not fixed.
-        joint_names: in the order of the columns.
         size: of the file in bytes.
         per_minute: bytes for a minute of motion, None without samples.
-        chunks: how many stand.
         channels: topic, type and number of messages.
         attachments: bytes by name.
         metadata: the other entries.
@@ -333,26 +329,26 @@ class Overview:
     damage: str | None
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the overview for JSON."""
         entries = asdict(self)
         return {"file": str(entries.pop("path")), "archive": True, **entries}
 
 
-def overview(path: str | PathLike[str]) -> Overview:
-    """Look into an archive.
+def read_overview(path: str | PathLike[str]) -> Overview:
+    """Return the overview of an archive.
 
     Raises:
         NotAnArchiveError: another kind of file.
         ArchiveError: it cannot be read.
     """
-    archive, found = open_archive(path, fields=()), survey(Path(path))
+    archive, found = open_archive(path, fields=()), scan_file(Path(path))
     header, outcome, stamp = archive.header, archive.outcome, archive.columns["stamp"]
     ended, lost = _ended(outcome)
     further = {
         **header.entries,
         **{f"outcome.{key}": text for key, text in (outcome.entries if outcome else {}).items()},
     }
-    title, duration = WORDS.get(header.kind, header.kind), 0.0
+    title, duration = KIND_NAMES.get(header.kind, header.kind), 0.0
     if header.index is not None:
         attempt = 1 if header.attempt is None else header.attempt
         title = f"{motion_name(header.kind, header.index)}, attempt {attempt}"
@@ -386,7 +382,7 @@ def overview(path: str | PathLike[str]) -> Overview:
 
 
 def _ended(outcome: ArchiveOutcome | None) -> tuple[str, str]:
-    """How a recording ended, and what was lost, in words."""
+    """Return sentences on how a recording ended, and on what was lost."""
     if outcome is None:
         return "missing", ""
     reason = f": {outcome.reason}" if outcome.reason else ""

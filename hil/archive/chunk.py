@@ -1,8 +1,8 @@
-"""The messages of decompressed chunks, found all at once.
+"""Vectorised search for the messages of decompressed chunks.
 
-A recording repeats itself: each cycle adds the same few messages of the same lengths. Once that
-pattern is known, what follows is read as a matrix with a pattern per row, and *verified*: opcode,
-length and channel where each message should begin. Anything else is walked record by record.
+Each cycle of a recording adds the same few messages of the same lengths. Once that pattern is
+known, the rest is read as a matrix with one repetition per row, after opcode, length and channel of
+each message were verified. Anything else is read record by record.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ HEAD = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-"""What precedes the data of a message."""
+"""Record head and fixed fields in front of the data of a message."""
 _FIXED = struct.Struct("<BQH")  # the part of it that repeats with the pattern
 _STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
 _STAMP_AT = slice(HEAD.itemsize + 4, HEAD.itemsize + 4 + _STAMP.itemsize)  # after the encapsulation
@@ -43,10 +43,10 @@ _LONGEST_PATTERN = 16  # messages
 
 @dataclass(frozen=True, eq=False)
 class Messages:
-    """The messages of one channel in one chunk, or in several that follow each other.
+    """The messages of one channel in one chunk, or in several consecutive ones.
 
     Attributes:
-        parts: their records in order, each an array (k, size) of bytes of messages of one size.
+        parts: records in order, each an array (k, size) of bytes of messages of one size.
         places: where in the chunk the records of each part begin, (k,).
     """
 
@@ -57,7 +57,7 @@ class Messages:
         return sum(len(part) for part in self.parts)
 
     def of_heads(self, name: str) -> NDArray[Any]:
-        """A field of `HEAD`, of all messages."""
+        """Return a field of `HEAD` of all messages."""
         heads = [part[:, : HEAD.itemsize].view(HEAD)[:, 0][name] for part in self.parts]
         return heads[0] if len(heads) == 1 else np.concatenate(heads)
 
@@ -68,7 +68,7 @@ class Messages:
 
     @cached_property
     def stamps(self) -> NDArray[np.int64]:
-        """Time stamps of all, shape (k,) [ns]; none where a message is too short for one."""
+        """Time stamps, shape (k,) [ns]; empty where a message is too short for one."""
         if any(part.shape[1] < _STAMP_AT.stop for part in self.parts):
             return np.zeros(0, np.int64)
         found = [part[:, _STAMP_AT].view(_STAMP)[:, 0] for part in self.parts]
@@ -76,15 +76,15 @@ class Messages:
         return stamps[0] if len(stamps) == 1 else np.concatenate(stamps)
 
     def all(self) -> list[bytes]:
-        """The data of each message."""
+        """Return the data of each message."""
         return [bytes(message) for data in self.data for message in data]
 
 
 class ChunkParser:
-    """Finds messages, chunk after chunk, and takes the schemas and channels among them.
+    """Finds the messages of chunks, and reads the schemas and channels among them.
 
-    What a number or a topic means stays what it is: were it to change in mid-file, samples of one
-    channel would be mistaken for those of another.
+    A number or a topic must not be redefined: samples of one channel would be mistaken for those of
+    another.
 
     Attributes:
         schemas, channels: those known so far, by their numbers.
@@ -109,19 +109,19 @@ class ChunkParser:
         return [*self.schemas.values(), *self.channels.values()]
 
     def schema(self, topic: str) -> Schema | None:
-        """The schema of a topic's messages, if it is known."""
+        """Return the schema of a topic's messages, if it is known."""
         identity = next(one.schema_id for one in self.channels.values() if one.topic == topic)
         return self.schemas.get(identity)
 
     def define(self, record: Record) -> None:
-        """Take a schema or channel; other records are passed over.
+        """Read a schema or channel; other records are ignored.
 
         Raises:
-            Damage: the record is torn, or says something else than one before.
+            Damage: the record is truncated, or redefines a number or topic.
         """
         if record.opcode not in (container.SCHEMA, container.CHANNEL):
             return
-        item, again = container.item(record), ""
+        item, again = container.parse_item(record), ""
         if isinstance(item, Schema):
             if not item.id:
                 raise Damage(record.offset, "(schema) has the number 0, which means none")
@@ -134,17 +134,17 @@ class ChunkParser:
                 again = f"channel {item.id}"
             self.channels.setdefault(item.id, item)
         if again:
-            raise Damage(record.offset, f"announces {again} a second time, as another")
+            raise Damage(record.offset, f"defines {again} a second time, differently")
 
     def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
-        """The messages of a chunk by channel; of several chunks that follow each other likewise.
+        """Return the messages of a chunk, or of several consecutive ones, by channel.
 
         Args:
             chunk: decompressed records.
             offset: where the chunk's record begins in the file, for the error.
 
         Raises:
-            Damage: the chunk does not hold whole records, or definitions that fit one another.
+            Damage: the chunk has truncated records, or contradictory definitions.
         """
         found: dict[int, Messages] = {}
         recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)
@@ -159,7 +159,7 @@ class ChunkParser:
                     messages.places.append(first + place.start)
                 at += rows.size
                 continue
-            opcode, end = container.bounds(chunk, at, offset)
+            opcode, end = container.record_bounds(chunk, at, offset)
             if opcode == container.MESSAGE:
                 if end - at < HEAD.itemsize:
                     raise Damage(offset, "(chunk) ends within a record")
@@ -178,7 +178,7 @@ class ChunkParser:
         return found
 
     def _repeated(self, chunk: Content, at: int) -> Bytes:
-        """As many repetitions of the pattern as follow from `at` on, shape (k, size)."""
+        """Return the repetitions of the pattern that follow from `at` on, shape (k, size)."""
         if not self._round or chunk[at : at + _FIXED.size] != self._begin:
             return np.zeros((0, 0), np.uint8)
         size = self._round[-1][1].stop
@@ -188,7 +188,7 @@ class ChunkParser:
         return rows if same.all() else rows[: int(same.argmin())]
 
     def _learn(self, heads: Sequence[Content]) -> bool:
-        """Take one round of heads for the pattern, if it is new and no channel comes twice."""
+        """Use one round of heads as the pattern, if it is new and no channel occurs twice."""
         _, lengths, channels = zip(*map(_FIXED.unpack, heads), strict=True)
         ends = np.cumsum([container.RECORD.size + length for length in lengths]).tolist()
         begins = [0, *ends[:-1]]

@@ -1,9 +1,8 @@
-"""The MCAP container as far as an archive needs it: records in file order, each verified.
+"""The MCAP container: records in file order, each verified.
 
-The `mcap` library reads and writes single records; files are walked here, twice as fast, and what
-is torn or forged becomes `Damage` with its place. Only the data section is believed: it is
-self-delimiting and its chunks and attachments carry checksums, so a file cut off anywhere can be
-read up to its last whole chunk.
+The `mcap` library reads and writes single records; files are read here, twice as fast, and a
+truncated or forged record becomes `Damage` with its place. Only the data section is trusted: chunks
+and attachments have checksums, so a truncated file is readable up to its last complete chunk.
 
 Layout: https://mcap.dev/spec
 """
@@ -38,9 +37,9 @@ from mcap.records import (
 )
 
 MAGIC = b"\x89MCAP0\r\n"
-LARGEST_CHUNK = 1 << 24  # bytes; ours have a tenth of a megabyte
+LARGEST_CHUNK = 1 << 24  # bytes; own chunks have a tenth of a megabyte
 MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
-LARGEST_RECORD = 1 << 28  # bytes; neither attachments nor summaries come near
+LARGEST_RECORD = 1 << 28  # bytes; attachments and summaries are far smaller
 _FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
@@ -54,8 +53,8 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the co
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _NO_CRC = 0
-_SMALL = 4096  # bytes that are read sooner than skipped
-_UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, behind those of its checksum
+_SMALL = 4096  # bytes that are read faster than skipped
+_UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, not covered by the checksum
 _KINDS: dict[int, type[McapRecord]] = {
     SCHEMA: Schema,
     CHANNEL: Channel,
@@ -67,8 +66,8 @@ _KINDS: dict[int, type[McapRecord]] = {
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 
 
-class Damage(Exception):  # noqa: N818 - handed on as a finding, too
-    """Bytes that do not keep the format.
+class Damage(Exception):  # noqa: N818 - also passed on as a finding
+    """Bytes that violate the format.
 
     Attributes:
         offset: where in the file the damaged record begins.
@@ -90,7 +89,7 @@ class Record(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes with its head."""
+        """Number of bytes with its head."""
         return RECORD.size + len(self.body)
 
     @property
@@ -105,7 +104,7 @@ class Record(NamedTuple):
 
 
 class _Body(ReadDataStream):
-    """The fields of a record; running out is the end of the file, not a shorter field."""
+    """The fields of a record; a field that is cut short raises `EndOfFile`."""
 
     def __init__(self, body: bytes) -> None:
         super().__init__(BytesIO(body))
@@ -117,11 +116,11 @@ class _Body(ReadDataStream):
         return super().read(length)
 
 
-def parsed(kind: type[_Parsed], record: Record) -> _Parsed:
-    """Read the body of a record.
+def parse(kind: type[_Parsed], record: Record) -> _Parsed:
+    """Return a record of this kind.
 
     Raises:
-        Damage: it is not one of this kind.
+        Damage: the body does not fit the kind.
     """
     try:
         found: _Parsed = kind.read(_Body(record.body))  # type: ignore[attr-defined]
@@ -132,18 +131,18 @@ def parsed(kind: type[_Parsed], record: Record) -> _Parsed:
     return found
 
 
-def encoded(record: McapRecord) -> bytes:
-    """The bytes of a record, with its head."""
+def encode(record: McapRecord) -> bytes:
+    """Return the bytes of a record, with its head."""
     builder: Any = RecordBuilder()  # its methods are not annotated
     record.write(builder)
     return bytes(builder.end())
 
 
-def bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, int]:
-    """Opcode and end of the record at `at`, in a chunk or summary at `offset` of the file.
+def record_bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, int]:
+    """Return opcode and end of the record at `at`, in a chunk or summary at `offset` of the file.
 
     Raises:
-        Damage: it is cut off.
+        Damage: it is truncated.
     """
     if len(data) - at >= RECORD.size:
         opcode, length = RECORD.unpack_from(data, at)
@@ -153,21 +152,21 @@ def bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, int]:
     raise Damage(offset, "(chunk) ends within a record")
 
 
-def split(data: bytes, offset: int) -> Iterator[Record]:
-    """The records of a chunk or summary one by one, each with its place in it.
+def split_records(data: bytes, offset: int) -> Iterator[Record]:
+    """Yield the records of a chunk or summary, each with its place in it.
 
     Raises:
-        Damage: the last one is cut off.
+        Damage: the last one is truncated.
     """
     at = 0
     while at < len(data):
-        opcode, end = bounds(data, at, offset)
+        opcode, end = record_bounds(data, at, offset)
         yield Record(at, opcode, data[at + RECORD.size : end])
         at = end
 
 
 def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
-    """Read the record that an index says begins at `offset`, `length` with its head.
+    """Read the record that an index places at `offset`, `length` with its head.
 
     Raises:
         Damage: it is not there.
@@ -191,17 +190,17 @@ def records(
     skip: Collection[int] = (),
     check_end: bool = True,
 ) -> Iterator[Record]:
-    """Walk the records of the data section, DataEnd included; then check the end of the file.
+    """Yield the records of the data section up to DataEnd; then check the end of the file.
 
     Args:
         stream: the file, at its beginning.
         size: its length.
-        only: opcodes of the records that are read; others are passed over.
+        only: opcodes of the records that are read; others are skipped.
         skip: places of records of which only the head is read.
         check_end: whether to check summary and footer.
 
     Raises:
-        Damage: the file is cut off, or its bytes do not keep the format.
+        Damage: the file is truncated, or its bytes violate the format.
     """
     if stream.read(len(MAGIC)) != MAGIC:
         raise Damage(0, "is not the beginning of an MCAP file")
@@ -214,7 +213,7 @@ def records(
         if len(head) < RECORD.size:
             raise Damage(offset, "is cut off")
         opcode, length = RECORD.unpack(head)
-        if not opcode:  # a hole of a file is zeros, and would be as many records as it has bytes
+        if not opcode:  # a sparse file would have as many records as bytes
             raise Damage(offset, "is zeros, where one must begin")
         if length > size - offset - RECORD.size:
             raise Damage(offset, "is cut off, or its length is corrupt")
@@ -238,43 +237,43 @@ def records(
 
 
 def _footer(tail: bytes) -> Footer | None:
-    """The footer at the end of these bytes; None where they do not end a file."""
+    """Return the footer at the end of these bytes; None where they do not end a file."""
     start = len(tail) - FOOTER_SIZE - len(MAGIC)
     head = (FOOTER, FOOTER_SIZE - RECORD.size)
     if start < 0 or not tail.endswith(MAGIC) or RECORD.unpack_from(tail, start) != head:
         return None
-    return parsed(Footer, Record(0, FOOTER, tail[start + RECORD.size : -len(MAGIC)]))
+    return parse(Footer, Record(0, FOOTER, tail[start + RECORD.size : -len(MAGIC)]))
 
 
-def item(record: Record) -> Any:
-    """A schema, channel, metadata record, attachment or entry of an index.
+def parse_item(record: Record) -> Any:
+    """Return a schema, channel, metadata record, attachment or entry of an index.
 
     Raises:
-        Damage: it is none of these, or damaged.
+        Damage: it is of another kind, or damaged.
     """
     if record.opcode == ATTACHMENT:
-        return attachment(record)
+        return parse_attachment(record)
     if record.opcode not in _KINDS:
         raise Damage(record.offset, "is of another kind")
-    return parsed(_KINDS[record.opcode], record)
+    return parse(_KINDS[record.opcode], record)
 
 
-def attachment(record: Record) -> Attachment:
-    """An attachment, its checksum verified."""
-    found = parsed(Attachment, record)
+def parse_attachment(record: Record) -> Attachment:
+    """Return an attachment, its checksum verified."""
+    found = parse(Attachment, record)
     if _CRC.unpack(record.body[-_CRC.size :]) != (crc32(record.body[: -_CRC.size]),):
         raise Damage(record.offset, f"(attachment {found.name!r}) fails its checksum")
     return found
 
 
-def metadata(record: Record) -> tuple[str, dict[str, str]]:
-    """Name and entries of a metadata record."""
-    found = parsed(Metadata, record)
+def parse_metadata(record: Record) -> tuple[str, dict[str, str]]:
+    """Return name and entries of a metadata record."""
+    found = parse(Metadata, record)
     return found.name, found.metadata
 
 
-def chunk(record: Record) -> Chunk:
-    """Read a chunk record, without decompressing it; three times as fast as the library does."""
+def parse_chunk(record: Record) -> Chunk:
+    """Return a chunk record, still compressed; three times as fast as the library."""
     body = record.body
     try:
         start, end, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
@@ -289,37 +288,37 @@ def chunk(record: Record) -> Chunk:
     return Chunk(compression, data, end, start, crc, size)
 
 
-def chunk_data(chunk: Chunk, offset: int) -> bytes:
-    """The records of a chunk at `offset`, decompressed, their checksum verified."""
-    data = decompressed(chunk, offset)
-    if crc32(data) != chunk.uncompressed_crc:
-        missing = chunk.uncompressed_crc == _NO_CRC
+def chunk_data(head: Chunk, offset: int) -> bytes:
+    """Return the records of a chunk at `offset`, decompressed, their checksum verified."""
+    data = decompress(head, offset)
+    if crc32(data) != head.uncompressed_crc:
+        missing = head.uncompressed_crc == _NO_CRC
         raise Damage(offset, f"(chunk) {'has no' if missing else 'fails its'} checksum")
     return data
 
 
-def decompressed(chunk: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
-    """The records of a chunk at `offset`, their checksum not verified.
+def decompress(head: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
+    """Return the records of a chunk at `offset`, their checksum not verified.
 
     At most one byte more than declared is decompressed: a corrupt frame fills no memory.
 
     Raises:
-        Damage: they are more than `largest` bytes or inflated beyond measure, not as many as
-            stated, or cannot be decompressed.
+        Damage: the size is above `largest` or `MOST_INFLATION`, not as stated, or the data cannot
+            be decompressed.
     """
-    size, data = chunk.uncompressed_size, chunk.data
+    size, data = head.uncompressed_size, head.data
     if size > min(largest, MOST_INFLATION * len(data)):
         raise Damage(offset, f"(chunk) claims {size} bytes of content")
     try:
-        if chunk.compression == "zstd":
+        if head.compression == "zstd":
             if zstandard.frame_content_size(data) not in (-1, size):
                 raise Damage(offset, "(chunk) has another length than it claims")
             decompressor = _decompressor(threading.get_ident())
             data = decompressor.decompress(data, max_output_size=max(1, size))
-        elif chunk.compression == "lz4":
+        elif head.compression == "lz4":
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-        elif chunk.compression:
-            problem = f"(chunk) is compressed with {chunk.compression!r}, known: zstd, lz4"
+        elif head.compression:
+            problem = f"(chunk) is compressed with {head.compression!r}, known: zstd, lz4"
             raise Damage(offset, problem)
     except (zstandard.ZstdError, RuntimeError, EOFError) as error:
         raise Damage(offset, "(chunk) cannot be decompressed") from error
@@ -335,13 +334,13 @@ def _decompressor(thread: int) -> zstandard.ZstdDecompressor:  # noqa: ARG001 - 
 
 @dataclass(frozen=True)
 class Summary:
-    """The records of a file's summary, which are parsed when they are asked for."""
+    """The records of a file's summary, parsed on demand."""
 
     records: Sequence[Record]
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
-        """Read it; None where there is none, or where it is not whole.
+        """Read the summary; None where it is missing or incomplete.
 
         Args:
             stream: the file.
@@ -364,7 +363,7 @@ class Summary:
         if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
             return None
         try:
-            return cls([*split(data[: last - start], 0)])
+            return cls([*split_records(data[: last - start], 0)])
         except Damage:
             return None
 
@@ -374,8 +373,8 @@ class Summary:
         return [record for record in self.records if record.opcode in (SCHEMA, CHANNEL)]
 
     def entries(self, opcode: int) -> list[Any]:
-        """The entries of one kind of index."""
-        return [item(record) for record in self.records if record.opcode == opcode]
+        """Return the entries of one kind of index."""
+        return [parse_item(record) for record in self.records if record.opcode == opcode]
 
     @property
     def places(self) -> list[tuple[int, int]]:

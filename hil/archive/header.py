@@ -1,7 +1,7 @@
-"""What an archive says of itself: file name, header and outcome, parsed and bounded once.
+"""File name, header and outcome of an archive, parsed and bounded once when the file is opened.
 
-MCAP metadata are texts by name, and whoever wrote a file may have written anything into them. Here
-they become typed values, once for each file that is opened; what stands behind trusts them.
+MCAP metadata are texts by name, from any writer. Here they become typed values, which the rest of
+the program trusts.
 """
 
 from __future__ import annotations
@@ -35,29 +35,29 @@ from hil.reading import parse_count
 
 KINDS = ("standstill", "move", "warmup", "dryrun", "excitation", "validation", "imported")
 SUFFIX = ".mcap"
-WORDS = {
+KIND_NAMES = {
     "dryrun": "dry run",
     "warmup": "warm-up",
     "excitation": "repetition",
     "imported": "recording",
 }
-"""What a person calls a kind, where that is another word."""
+"""Names of kinds in messages, where they differ from the kind."""
 
 FORMAT_VERSION = 1
 METADATA = "hil"
-"""Name of the metadata record that holds the header."""
+"""Name of the metadata record with the header."""
 OUTCOME = "hil.outcome"
-"""Name of the metadata record that holds the outcome."""
+"""Name of the metadata record with the outcome."""
 DESCRIPTION = "description"
 """Entry of the outcome: checksum of the header it belongs to. Older files have none."""
 CHUNKS = "chunks"
-"""Entry of the outcome: the checksums of all chunks in order. Older files have none."""
+"""Entry of the outcome: checksums of all chunks in order. Older files have none."""
 SEALS = (DESCRIPTION, CHUNKS)
-"""Entries of the outcome that serve to verify the file, and say nothing of the recording."""
-CONTROLLERS_OWN = "controller"
-"""Entry ``motion`` of an archive whose motion was made by the controller's own program."""
+"""Entries of the outcome that only serve to verify the file."""
+CONTROLLER_PROGRAM = "controller"
+"""Entry ``motion`` of an archive whose motion was made by a program of the controller."""
 REJECTED = "rejected"
-"""Outcome of a motion that ended well and failed its quality check."""
+"""Outcome of a motion that completed and failed its quality check."""
 MOST_JOINTS: Final = 256
 
 _DIGITS = 8  # of a checksum
@@ -67,18 +67,18 @@ _PATTERN = re.compile(
 
 
 def motion_name(kind: str, index: int) -> str:
-    """What a person calls a motion, counted from 1: "repetition 1" for the excitation 0."""
-    return f"{WORDS.get(kind, kind)} {index + 1}"
+    """Return the name of a motion in messages, numbered from 1: "repetition 1" is excitation 0."""
+    return f"{KIND_NAMES.get(kind, kind)} {index + 1}"
 
 
 @dataclass(frozen=True, order=True)
 class ArchiveName:
-    """What an archive is called: ``excitation_007_a1.mcap`` is kind, index and attempt.
+    """File name of an archive: ``excitation_007_a1.mcap`` is kind, index and attempt.
 
     Attributes:
         kind: why the arm moved, one of `KINDS`.
         index: number of the interval within its kind, from 0.
-        attempt: 1 for the first try at this interval; a torn or stopped one is done again.
+        attempt: from 1; a truncated or stopped interval is repeated as the next attempt.
     """
 
     kind: str
@@ -99,7 +99,7 @@ class ArchiveName:
 
     @classmethod
     def parse(cls, path: str | PathLike[str]) -> ArchiveName | None:
-        """Read kind, index and attempt from a file name; None when it is not such a name."""
+        """Read kind, index and attempt from a file name; None where it is not such a name."""
         match = _PATTERN.fullmatch(Path(path).name)
         if match is None or match["kind"] not in KINDS:
             return None
@@ -107,16 +107,16 @@ class ArchiveName:
 
     @property
     def motion(self) -> str:
-        """What a person calls it; without the attempt."""
+        """Name of the motion in messages, without the attempt."""
         return motion_name(self.kind, self.index)
 
     def metadata(self) -> dict[str, str]:
-        """The name as entries of the header."""
+        """Return the name as entries of the header."""
         return {"kind": self.kind, "index": str(self.index), "attempt": str(self.attempt)}
 
 
 class HeaderError(ValueError):
-    """Entries of a header that cannot be used.
+    """Invalid entries of a header.
 
     Attributes:
         problems: what is wrong, by entry.
@@ -133,8 +133,10 @@ def _printable(name: str) -> str:
     return name
 
 
-def _or_default(value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-    """An entry that only informs: one that cannot be read counts as unreadable, not as damage."""
+def _readable_or_default(
+    value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
+) -> Any:
+    """Replace an informative entry that cannot be read: it makes no archive invalid."""
     try:
         return handler(value)
     except ValidationError:
@@ -142,11 +144,11 @@ def _or_default(value: Any, handler: ValidatorFunctionWrapHandler, info: Validat
 
 
 class Findings(BaseModel):
-    """What was found in a recording when it was imported.
+    """What the import of a recording found.
 
     Attributes:
         lines: the time base, and the range of each joint.
-        warnings: what looks like a slip of the column map, in sentences.
+        warnings: possible errors of the column map, in sentences.
     """
 
     model_config = ConfigDict(frozen=True, strict=True)
@@ -157,7 +159,7 @@ class Findings(BaseModel):
 
 _UNREADABLE: Final[Mapping[str, Any]] = {
     "planted": {},
-    "findings": Findings(lines=(), warnings=("what its import found cannot be read",)),
+    "findings": Findings(lines=(), warnings=("the findings of its import cannot be read",)),
     "losses": (),
 }
 
@@ -173,23 +175,21 @@ class ArchiveHeader(BaseModel):
     Attributes:
         kind: why the arm moved, one of `KINDS`.
         joint_names: in the order of the columns.
-        attachments: names of those that must be there.
+        attachments: names of the required attachments.
         period: cycle time [s]; None of an imported recording without a fixed one.
-        index, attempt: of the interval within its kind, None where they are not stated.
-        motion: `CONTROLLERS_OWN`, or empty.
-        simulated: whether only a simulated arm can have moved, "yes" or "no"; empty where nothing
-            says it.
-        use: of an imported recording, the kind it serves as.
-        cell: name of the cell.
-        plan_hash: of cell, URDF and plan.
+        index, attempt: of the interval within its kind, None where not stated.
+        motion: `CONTROLLER_PROGRAM`, or empty.
+        simulated: "yes" where only a simulated arm can have moved, "no", or empty where unknown.
+        use: of an imported recording, the kind that identification uses it as.
+        plan_hash: digest of cell, URDF and plan.
         recorded_at: time of day, None in virtual time.
-        effects: of a simulated arm, what its model leaves out.
-        held_joints: joints that did not move on purpose.
+        effects: effects of a simulated arm that the model does not contain.
+        held_joints: joints that were held still.
         motor_from_joint: motor angles per joint angle, n rows of n numbers.
-        planted: parameters of a simulated arm by name; None where they are not stated, empty where
-            they cannot be read.
+        planted: true parameters of a simulated arm by name; None where not stated, empty where
+            unreadable.
         findings: of an import.
-        entries: all entries as texts, the checksum left out.
+        entries: all entries as texts, without the checksum.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -209,8 +209,8 @@ class ArchiveHeader(BaseModel):
     effects: _Names = ()
     held_joints: _Names = ()
     motor_from_joint: Json[tuple[tuple[_Finite, ...], ...]] | None = None
-    planted: Annotated[Json[dict[str, _Finite]] | None, WrapValidator(_or_default)] = None
-    findings: Annotated[Json[Findings], WrapValidator(_or_default)] = Findings(
+    planted: Annotated[Json[dict[str, _Finite]] | None, WrapValidator(_readable_or_default)] = None
+    findings: Annotated[Json[Findings], WrapValidator(_readable_or_default)] = Findings(
         lines=(), warnings=()
     )
     entries: Mapping[str, str] = Field(default_factory=dict)
@@ -220,7 +220,7 @@ class ArchiveHeader(BaseModel):
         """Parse the entries of the ``hil`` record.
 
         Raises:
-            HeaderError: some of them cannot be used.
+            HeaderError: some of them are invalid.
         """
         try:
             return cls.model_validate({**entries, "entries": entries})
@@ -238,9 +238,9 @@ class ArchiveHeader(BaseModel):
     @classmethod
     def _check_joints(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if "" in names or len(set(names)) != len(names):
-            raise ValueError("some are empty or alike")
+            raise ValueError("names are empty or not unique")
         if len(names) > MOST_JOINTS:
-            raise ValueError(f"{len(names)} joints, known are {MOST_JOINTS}")
+            raise ValueError(f"{len(names)} joints, at most {MOST_JOINTS} are supported")
         return names
 
     @field_validator("motor_from_joint")
@@ -250,7 +250,7 @@ class ArchiveHeader(BaseModel):
     ) -> tuple[tuple[float, ...], ...] | None:
         n = len(info.data.get("joint_names", ()))
         if rows is not None and [len(row) for row in rows] != [n] * n:
-            raise ValueError(f"is no matrix of {n} by {n} numbers")
+            raise ValueError(f"is not a matrix of {n} by {n} numbers")
         return rows
 
     @property
@@ -259,34 +259,33 @@ class ArchiveHeader(BaseModel):
         return self.simulated == "yes"
 
     @property
-    def controllers_own(self) -> bool:
-        """Whether the controller's own program made the motion."""
-        return self.motion == CONTROLLERS_OWN
+    def by_controller_program(self) -> bool:
+        """Whether a program of the controller made the motion."""
+        return self.motion == CONTROLLER_PROGRAM
 
     @property
-    def serves_as(self) -> str:
-        """The kind that identification takes it for."""
+    def purpose(self) -> str:
+        """The kind that identification uses the archive as."""
         return self.use if self.kind == "imported" else self.kind
 
 
 class ArchiveOutcome(BaseModel):
-    """How a recording ended, and what was written; a count that is no number is None.
+    """How a recording ended, and what was written; an invalid count is None.
 
     Attributes:
         outcome: such as ``completed``, ``stopped``, ``refused``.
-        reason: why, in a sentence, when it did not complete.
-        samples, events, packets: how many were written.
+        reason: why it did not complete.
+        samples, events, packets: numbers written.
         first_cycle, last_cycle: of the controller.
-        lost_packets, records_lost, events_lost: what the link and this PC lost.
-        late_replies: late, or left out for that to a newer packet.
-        replies_not_accepted: those that the controller's target shows it did not accept.
-        repaired: whether something was lost and the file repaired.
-        samples_lost: by repairs, None where nobody can say.
+        lost_packets, records_lost, events_lost: lost by the link and by this PC.
+        late_replies: late, or omitted because a newer packet had arrived.
+        replies_not_accepted: not accepted according to the target of the controller.
+        repaired: whether the file was repaired with loss.
+        samples_lost: by repairs, None where unknown.
         losses: by repairs, a sentence each.
         description: checksum of the header, None in older files.
-        chunks: checksums of all chunks in order; None in older files, or where the entry is no
-            such list.
-        record: all entries as texts, the checksum of the record left out.
+        chunks: checksums of all chunks in order; None in older files, or where invalid.
+        record: all entries as texts, without the checksum of the record.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -305,9 +304,13 @@ class ArchiveOutcome(BaseModel):
     replies_not_accepted: Annotated[_Count, Field(alias="answers_not_taken")] = None
     repaired: Annotated[bool, BeforeValidator(lambda text: text == "yes")] = False
     samples_lost: Annotated[_Count, Field(alias="repaired.samples_lost")] = 0
-    losses: Annotated[_Names, WrapValidator(_or_default), Field(alias="repaired.losses")] = ()
+    losses: Annotated[
+        _Names, WrapValidator(_readable_or_default), Field(alias="repaired.losses")
+    ] = ()
     description: str | None = None
-    chunks: Annotated[tuple[int, ...] | None, BeforeValidator(lambda text: checksums(text))] = None
+    chunks: Annotated[
+        tuple[int, ...] | None, BeforeValidator(lambda text: parse_chunk_list(text))
+    ] = None
     record: Mapping[str, str] = Field(default_factory=dict)
 
     @classmethod
@@ -317,26 +320,26 @@ class ArchiveOutcome(BaseModel):
 
     @property
     def entries(self) -> dict[str, str]:
-        """What the record says of the recording: all but the seals."""
+        """The entries about the recording: all but `SEALS`."""
         return {key: text for key, text in self.record.items() if key not in SEALS}
 
     def belongs_to(self, header: ArchiveHeader | None) -> bool:
-        """Whether it is of the recording with this header, as far as is known."""
+        """Return whether it may be of the recording with this header; older files do not say."""
         return header is None or self.description in (None, checksum(header.entries))
 
 
-def is_known(entries: Mapping[str, str]) -> bool:
-    """Whether the entries of a header are of the version that this software reads."""
+def is_supported(entries: Mapping[str, str]) -> bool:
+    """Return whether the entries of a header are of the version that this software reads."""
     return entries.get("format_version") == str(FORMAT_VERSION)
 
 
-def chunk_list(chunks: Iterable[int]) -> str:
-    """The checksums of chunks as the outcome lists them."""
+def format_chunk_list(chunks: Iterable[int]) -> str:
+    """Return the checksums of chunks as text of the outcome."""
     return "".join(f"{crc:08x}" for crc in chunks)
 
 
-def checksums(text: str) -> tuple[int, ...] | None:
-    """The checksums that such a list holds; None where it is none."""
+def parse_chunk_list(text: str) -> tuple[int, ...] | None:
+    """Return the checksums in such a text; None where it is invalid."""
     try:
         data = bytes.fromhex(text)
     except ValueError:
@@ -347,11 +350,11 @@ def checksums(text: str) -> tuple[int, ...] | None:
 
 
 def checksum(entries: Mapping[str, str]) -> str:
-    """CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
+    """Return the CRC-32 of metadata entries; MCAP itself protects chunks and attachments only."""
     text = json.dumps(dict(entries), sort_keys=True, separators=(",", ":"))
     return f"{zlib.crc32(text.encode()):08x}"
 
 
-def sealed(entries: Mapping[str, str]) -> dict[str, str]:
-    """The entries of a metadata record with their checksum."""
+def with_checksum(entries: Mapping[str, str]) -> dict[str, str]:
+    """Return the entries of a metadata record with their checksum."""
     return {**entries, "checksum": checksum(entries)}

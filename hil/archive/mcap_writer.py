@@ -1,9 +1,8 @@
-"""MCAP records in file order, with the index at the end; whole batches of messages at a time.
+"""Writer of MCAP files that adds whole batches of messages at a time.
 
-Record for record what `mcap.writer.Writer` makes of the same messages, but for the level of
-compression. That one takes messages singly, at some microseconds each, which is most of the time of
-an archive of three messages a millisecond; here a batch of messages of constant size is one
-structured array. The library makes all other records.
+It makes the same records as `mcap.writer.Writer`, but for the level of compression. The library
+adds messages singly, at some microseconds each, which would be most of the time of an archive with
+three messages a millisecond; here a batch of messages of constant size is one structured array.
 
 Layout: https://mcap.dev/spec
 """
@@ -38,21 +37,21 @@ from numpy.typing import NDArray
 from hil.archive import container
 from hil.archive.cdr import Rows
 from hil.archive.chunk import HEAD, Messages
-from hil.archive.container import MAGIC, MESSAGE, RECORD, Record, encoded
+from hil.archive.container import MAGIC, MESSAGE, RECORD, Record, encode
 
 _ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _HEAD = struct.Struct("<BQHIQQ")
 _MESSAGE_INDEX = struct.Struct("<BQHI")
 _LEVEL = -1
-"""Of Zstandard. Against the usual 3 it costs 4 % in size, and saves a third of the time both of
-writing and of reading (`python -m benchmarks.archive --sizes`)."""
+"""Of Zstandard. Compared with 3, the default, files are 4 % larger, and writing and reading take a
+third less time (`python -m benchmarks.archive --sizes`)."""
 
 Entries = Mapping[int, NDArray[np.void]]
-"""Stamps and offsets of the messages of a chunk by channel, in the order of the first ones."""
+"""Stamps and offsets of the messages of a chunk, by channel in order of first occurrence."""
 
 
 def entries_of(found: Mapping[int, Messages]) -> Entries:
-    """The entries of messages that were read."""
+    """Return the index entries of messages that were read."""
     return {
         number: _entries(messages.of_heads("log_time"), np.concatenate(messages.places))
         for number, messages in found.items()
@@ -66,24 +65,17 @@ def _entries(stamp: NDArray[np.int64], offset: NDArray[np.int64]) -> NDArray[np.
 
 
 def span(entries: Entries) -> tuple[int, int]:
-    """First and last stamp [ns], zeros of a chunk without messages."""
+    """Return first and last stamp [ns], zeros of a chunk without messages."""
     stamps = [part["stamp"] for part in entries.values() if len(part)] or [np.zeros(1, np.uint64)]
     return int(min(part.min() for part in stamps)), int(max(part.max() for part in stamps))
 
 
 class McapWriter:
-    """Writes one MCAP file to `write`, which receives whole records.
+    """Writes one MCAP file to `write`, which receives complete records.
 
-    Chunks end at `flush` and nowhere else; a chunk without messages is not written, what was
-    registered for it goes into the next. Compressed by Zstandard, with checksums of chunks,
-    attachments and index.
-
-    Message indexes and summary follow from the other records: a file that lost them gets them back
-    to the byte.
-
-    Args:
-        write: takes the next bytes of the file.
-        profile, library: of its header.
+    Chunks end at `flush` only; a chunk without messages is not written, and what was registered for
+    it is added to the next. Compressed by Zstandard; chunks, attachments, index have checksums.
+    Message indexes and summary depend on the other records only, so a repair restores them exactly.
 
     Attributes:
         position: where the next record begins.
@@ -104,51 +96,51 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._put(MAGIC)
-        self.put(encoded(Header(profile, library)))
+        self.put(encode(Header(profile, library)))
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Add a metadata record, in front of the chunk in progress."""
-        self.put(encoded(Metadata(name, dict(entries))))
+        self.put(encode(Metadata(name, dict(entries))))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Add an attachment without times, in front of the chunk in progress."""
-        self.put(encoded(Attachment(0, 0, name, media_type, data)))
+        self.put(encode(Attachment(0, 0, name, media_type, data)))
 
     def put(self, data: bytes) -> None:
-        """Add a record that is no chunk, given with its head, and list it in the summary.
+        """Add an encoded record other than a chunk, and list it in the summary.
 
         Raises:
             Damage: its body is not of its kind.
         """
         record, place = Record(self.position, data[0], data[RECORD.size :]), self.position
         if record.opcode == container.METADATA:
-            name, _ = container.metadata(record)
+            name, _ = container.parse_metadata(record)
             self._metadata.append(MetadataIndex(place, len(data), name))
         elif record.opcode == container.ATTACHMENT:
-            item = container.attachment(record)
+            item = container.parse_attachment(record)
             times, size = (item.log_time, item.create_time), len(item.data)
             self._attachments.append(
                 AttachmentIndex(place, len(data), *times, size, item.name, item.media_type)
             )
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.note(container.item(record))
+            self.note(container.parse_item(record))
         self._put(data)
 
     def register(
         self, topic: str, message_encoding: str, schema: str, encoding: str, definition: bytes
     ) -> int:
-        """Announce a channel and the schema of its messages; returns the channel's id."""
+        """Define a channel and the schema of its messages; return the channel's id."""
         number = len(self._channels) + 1
         for item in (
             Schema(number, definition, encoding, schema),
             Channel(number, topic, message_encoding, {}, number),
         ):
             self.note(item)
-            self._append(encoded(item))
+            self._append(encode(item))
         return number
 
     def note(self, item: McapRecord) -> None:
-        """List a schema or channel in the summary; it stands in a chunk."""
+        """List a schema or channel, which is in a chunk, in the summary."""
         if isinstance(item, Schema):
             self._schemas.setdefault(item.id, item)
         elif isinstance(item, Channel):
@@ -169,12 +161,12 @@ class McapWriter:
         sequence: NDArray[np.int64],
         messages: Sequence[Rows],
     ) -> None:
-        """Add messages of several channels of the same instants, instant by instant.
+        """Add messages of several channels, one of each at each stamp.
 
         Args:
             channels: their ids.
             stamp: shape (k,), nanoseconds.
-            sequence: shape (k,), the number of each instant, below 2^32.
+            sequence: shape (k,), number of the messages at each stamp, below 2^32.
             messages: per channel its k messages, contiguous.
         """
         if not len(stamp):
@@ -207,13 +199,8 @@ class McapWriter:
         self.add_chunk(Chunk("zstd", packed, last, first, crc32(data), len(data)), entries)
 
     def add_chunk(self, chunk: Chunk, entries: Entries) -> None:
-        """Add a whole chunk and its message indexes, in front of the chunk in progress.
-
-        Args:
-            chunk: its record.
-            entries: of its messages.
-        """
-        start, record = self.position, encoded(chunk)
+        """Add a complete chunk and its message indexes, in front of the chunk in progress."""
+        start, record = self.position, encode(chunk)
         self._put(record)
         end = self.position
         offsets: dict[int, int] = {}
@@ -241,9 +228,9 @@ class McapWriter:
         )
 
     def finish(self) -> None:
-        """Write what is left, the index and the footer."""
+        """Write the pending chunk, the index and the footer."""
         self.flush()
-        self._put(encoded(DataEnd(0)))
+        self._put(encode(DataEnd(0)))
         start = self.position
         statistics = Statistics(
             attachment_count=len(self._attachments),
@@ -266,11 +253,11 @@ class McapWriter:
         ]
         summary, offsets = b"", b""
         for opcode, records in groups:
-            data = b"".join(map(encoded, records))
-            offsets += encoded(SummaryOffset(opcode, start + len(summary), len(data)))
+            data = b"".join(map(encode, records))
+            offsets += encode(SummaryOffset(opcode, start + len(summary), len(data)))
             summary += data
         # The checksum of the index covers the footer up to the checksum itself.
-        footer = encoded(Footer(start, start + len(summary), 0))
+        footer = encode(Footer(start, start + len(summary), 0))
         covered = (summary + offsets + footer)[: -struct.calcsize("<I")]
         self._put(covered + struct.pack("<I", crc32(covered)) + MAGIC)
 
@@ -285,7 +272,7 @@ class McapWriter:
 
 @cache
 def _records_dtype(sizes: tuple[int, ...]) -> np.dtype[np.void]:
-    """The message records of one instant, one of each data size [bytes], without padding."""
+    """Return the type of the records at one stamp, one of each data size [bytes], unpadded."""
     head = [(name, HEAD[name]) for name in HEAD.names or ()]
     return np.dtype(
         [(str(place), np.dtype([*head, ("data", f"V{size}")])) for place, size in enumerate(sizes)]

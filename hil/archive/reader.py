@@ -1,4 +1,4 @@
-"""Opens archives: whole ones, and torn ones up to their last whole chunk."""
+"""Reading of archives: complete ones, and truncated ones up to their last complete chunk."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json
 
-_COLUMN_OF: Final = {"effort": "torque"}  # where a message has another word for it than we
+_COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
 _REMEDIES: Final = {
-    errno.ENOENT: "see whether it was moved or removed",
-    errno.EACCES: "make it readable for yourself",
+    errno.ENOENT: "check whether it was moved or removed",
+    errno.EACCES: "make it readable",
     errno.EIO: "its disk fails: restore it from a copy",
 }
 
 
 @dataclass(frozen=True)
 class ArchiveDamage:
-    """What an archive lost.
+    """Damage of an archive.
 
     Attributes:
         offset: byte in the file from which nothing was read.
         bytes_dropped: bytes from there to the end of the file.
-        text: what is wrong there, and how much could be read.
+        text: what is wrong, and how much could be read.
     """
 
     offset: int
@@ -52,17 +52,16 @@ class ArchiveDamage:
 
 @dataclass(frozen=True, eq=False)
 class Archive:
-    """What an archive holds.
+    """The content of an archive.
 
     Attributes:
-        path: the file.
-        header: what it says of itself.
-        outcome: how the recording ended, None when that is missing.
+        header: metadata at its beginning.
+        outcome: how the recording ended, None where missing.
         attachments: content by file name.
         columns: contiguous read-only arrays (m,) or (m, n) by name: the fields of the cycle
             message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
-            recording as far as it has them; and ``stamp`` (m,), nanoseconds.
-        events: what happened, in the order of writing.
+            recording where recorded; and ``stamp`` (m,), nanoseconds.
+        events: in the order of writing.
         damage: what was lost, None when nothing was.
     """
 
@@ -76,12 +75,12 @@ class Archive:
 
     @property
     def complete(self) -> bool:
-        """Whether the archive is whole: it was closed, and all its content passed its checks."""
+        """Whether the archive was closed, and all its content passed its checks."""
         return self.damage is None
 
     @property
     def missing(self) -> str | None:
-        """What is missing, as a sentence; None when the archive is complete."""
+        """Sentence about what is missing; None when the archive is complete."""
         return None if self.damage is None else f"{self.path}: {self.damage}"
 
     @property
@@ -105,29 +104,29 @@ class Archive:
         return len(self.columns["stamp"])
 
     def recorded(self, *names: str) -> Mapping[str, NDArray[Any]]:
-        """The columns, of an archive that has all of these.
+        """Return the columns of an archive that must have all of these.
 
         Raises:
-            ArchiveError: one is missing, as in one that was imported.
+            ArchiveError: one is missing, as in an imported recording.
         """
         if missing := [name for name in names if name not in self.columns]:
             raise ArchiveError(
                 self.path,
-                f"is no recording of a motion of hil's own: it has no {missing[0]}",
-                remedy="take it out of the folder",
+                f"is not a recording by hil: it has no column {missing[0]}",
+                remedy="remove it from the folder",
             )
         return self.columns
 
     def text(self, name: str) -> str:
-        """An attachment that is text.
+        """Return an attachment as text.
 
         Raises:
-            ArchiveError: it is not there, or not UTF-8.
+            ArchiveError: it is missing, or not UTF-8.
         """
         if name not in self.attachments:
             raise ArchiveError(
                 self.path,
-                f"carries no {name}",
+                f"has no attachment {name}",
                 remedy="import the recording again with a URDF or a cell file",
             )
         try:
@@ -135,16 +134,16 @@ class Archive:
         except UnicodeDecodeError as error:
             raise ArchiveError(
                 self.path,
-                f"is no text in UTF-8 ({error.reason} at byte {error.start})",
+                f"is not UTF-8 text ({error.reason} at byte {error.start})",
                 field=name,
                 remedy="import the recording again with a URDF or a cell file in UTF-8",
             ) from error
 
     def table(self, name: str) -> dict[str, Any]:
-        """An attachment that is a JSON object; empty where it is not there.
+        """Return an attachment that is a JSON object; empty where it is missing.
 
         Raises:
-            ArchiveError: it is no JSON object.
+            ArchiveError: it is not a JSON object.
         """
         try:
             found = parse_json(self.attachments.get(name, b"{}"))
@@ -153,17 +152,17 @@ class Archive:
         if not isinstance(found, dict):
             raise ArchiveError(
                 self.path,
-                "is no JSON object",
+                "is not a JSON object",
                 field=name,
-                remedy="leave the archive out, or take the attachment from another of its campaign",
+                remedy="remove the archive, or use the attachment of another one of its campaign",
             )
         return found
 
     def cycles(self) -> Rows:
-        """The cycle records as the session wrote them, structure of `drivers.cycle_dtype`.
+        """Return the cycle records as the session wrote them, of type `drivers.cycle_dtype`.
 
         Raises:
-            ArchiveError: the archive was opened without all fields, or holds no cycles.
+            ArchiveError: the archive was opened without all fields, or has no cycles.
         """
         rows = np.zeros(self.n_samples, cycle_dtype(len(self.joint_names)))
         for name in rows.dtype.names or ():
@@ -175,11 +174,7 @@ class Archive:
 
 
 class _Content:
-    """What is selected of a file; see `open_archive` for the arguments.
-
-    Attributes:
-        events: what happened, in the order of writing.
-    """
+    """Columns and events selected from a file; see `open_archive` for the arguments."""
 
     def __init__(
         self,
@@ -197,14 +192,14 @@ class _Content:
         self._count = 0
 
     def visit(self, scan: Scan, found: Mapping[str, Messages], offset: int) -> None:
-        """Decode messages; nothing of them is held before all are verified."""
+        """Decode messages; none of them is added before all are verified."""
         topics = scan.topics
         wanted = [topic for topic in topics if topic in found and topic != EVENTS]
         if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
             raise Damage(offset, "(chunk) has samples in other channels than those before")
         layouts = {topic: self._layout(scan, topic, found[topic], offset) for topic in wanted}
         for topic, layout in layouts.items():
-            if not all(map(layout.holds_in, found[topic].data)):
+            if not all(map(layout.matches, found[topic].data)):
                 raise Damage(offset, "(chunk) has messages that differ from those before")
         start, stop = self._times
         if EVENTS in topics and EVENTS in found:
@@ -232,7 +227,7 @@ class _Content:
             self._append(topic, found[topic], begin, chosen)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """The columns by our names, contiguous and read-only, all of the same length."""
+        """Return the columns, contiguous and read-only, all of the same length."""
         columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
         for (topic, name), raw in self._raw.items():
             dtype = self._layouts[topic].dtype[name]
@@ -243,7 +238,7 @@ class _Content:
         return columns
 
     def _layout(self, scan: Scan, topic: str, messages: Messages, offset: int) -> MessageLayout:
-        """How the messages of a topic are laid out, by its schema or by the first of them."""
+        """Return the layout of a topic's messages by its schema or by the first of them."""
         if topic in self._layouts:
             return self._layouts[topic]
         assert scan.header is not None
@@ -254,7 +249,7 @@ class _Content:
             raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
 
     def _begin(self, topic: str, layout: MessageLayout, room: int) -> None:
-        """Begin the columns of a topic, with room for so many samples."""
+        """Create the columns of a topic, with room for so many samples."""
         self._layouts[topic], self._stamps = layout, np.resize(self._stamps, room)
         for name in layout.dtype.names or ():
             wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
@@ -264,7 +259,7 @@ class _Content:
     def _append(
         self, topic: str, messages: Messages, at: int, chosen: NDArray[np.bool_] | None
     ) -> None:
-        """Put messages, or those chosen of them (k,), into the columns from a place on."""
+        """Copy messages, or those chosen of them (k,), into the columns from a place on."""
         fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
         columns = [(raw, fields[name][1]) for (own, name), raw in self._raw.items() if own == topic]
         begin = 0
@@ -289,21 +284,20 @@ def open_archive(
 ) -> Archive:
     """Read an archive.
 
-    A file that was cut off or damaged is read up to its last whole chunk before the damage; what
-    is read is what was written, or the archive says what it lost. Where only some times are wanted
-    and the index of the file is whole, other chunks are not even read, and their damages go
-    unnoticed.
+    A truncated or damaged file is read up to its last complete chunk before the damage, and
+    `Archive.damage` states what is missing. Where only some times are wanted and the index of the
+    file is intact, other chunks are not read, nor is their damage detected.
 
     Args:
         path: the file.
         fields: columns wanted, None for all.
         topics: channels wanted, such as ``/joint_states_commanded`` instead of ``/hil/cycle``;
-            None for those that hold the numbers and the events.
-        start: first instant wanted [s], on the clock of ``stamp`` and of the events.
-        stop: end of the time wanted [s]; what happened then is left out.
+            None for those with the numbers and the events.
+        start: first time wanted [s], on the clock of ``stamp`` and of the events.
+        stop: end of the times wanted [s], exclusive.
 
     Raises:
-        NotAnArchiveError: another kind of file, or one torn before it held anything.
+        NotAnArchiveError: another kind of file, or one truncated before its header.
         ArchiveVersionError: written by a newer version of the profile.
         ArchiveError: the file cannot be read, or has no such channel.
     """
@@ -339,7 +333,7 @@ def open_archive(
         dropped, stamp = scan.size - damage.offset, columns["stamp"]
         text = f"the record at byte {damage.offset} {damage.reason}"
         text += f" ({dropped} bytes from there on are unused)"
-        if fields is None or fields:  # else nobody counts them
+        if fields is None or fields:  # else samples are not counted
             duration = 1e-9 * float(stamp[-1] - stamp[0]) if len(stamp) else 0.0
             text += f"; {len(stamp)} samples ({duration:.6g} s) could be read"
         text += "; the outcome is missing" if scan.outcome is None else ""
@@ -356,17 +350,17 @@ def open_archive(
 
 
 def refusal(path: Path, error: OSError) -> ArchiveError:
-    """That the system does not let an archive be read."""
+    """Return the error of an archive that the system cannot read."""
     remedy = _REMEDIES.get(error.errno or 0, "")
     return ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy)
 
 
 def _unreadable(path: Path, scan: Scan) -> ArchiveError:
-    """Why a file without a header that can be used is refused."""
-    if scan.unusable is not None:
-        field, problem = next(iter(scan.unusable.problems.items()))
-        remedy = f"what wrote this archive does not keep the profile: its record {METADATA!r} "
-        return ArchiveError(path, problem, field=field, remedy=f"{remedy}must be mended there")
+    """Return the error of a file without a valid header."""
+    if scan.header_error is not None:
+        field, problem = next(iter(scan.header_error.problems.items()))
+        remedy = f"correct the program that wrote its metadata record {METADATA!r}, "
+        return ArchiveError(path, problem, field=field, remedy=f"{remedy}and write it again")
     if scan.metadata is not None:
         version = scan.metadata.get("format_version")
         return ArchiveVersionError(
@@ -385,5 +379,5 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
         remedy = "name a file that hil recorded, or import this one first"
     else:
         place = f"the record at byte {scan.damage.offset} {scan.damage}"
-        problem = f"is torn before its first data: {place}"
+        problem = f"is truncated before its first data: {place}"
     return NotAnArchiveError(path, problem, remedy=remedy)

@@ -1,9 +1,8 @@
-"""Says what of a torn or damaged archive can be believed, and makes of it one for every reader.
+"""Repair of truncated or damaged archives.
 
-The reader stops at the first damage; a survey goes on, so that what follows can be saved. What is
-believed has passed the same checks (`hil.archive.scan`) and is copied record by record; message
-indexes and summary are made anew, and the outcome says what is lost. Nothing is invented: what
-cannot be verified is left out.
+What passes the checks of `hil.archive.scan` is copied record by record, also behind a damage;
+message indexes and summary are regenerated, and the outcome states what is lost. What cannot be
+verified is left out.
 """
 
 from __future__ import annotations
@@ -30,12 +29,12 @@ from hil.reading import open_file
 Visit = Callable[[Scan, Mapping[str, Messages], int], None]
 
 
-def survey(path: Path, visit: Visit = lambda *_: None) -> Scan:
-    """Go through a whole file, past its damages.
+def scan_file(path: Path, visit: Visit = lambda *_: None) -> Scan:
+    """Scan a whole file, past its damages.
 
     Args:
         path: the file.
-        visit: called with each sound chunk, with its messages by topic and its offset.
+        visit: called with each valid chunk, with its messages by topic and its offset.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -49,27 +48,27 @@ def survey(path: Path, visit: Visit = lambda *_: None) -> Scan:
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done to an archive.
+    """Result of a repair.
 
     Attributes:
-        path: the archive as it was.
+        path: the archive.
         output: the repaired file, None where nothing had to be written.
-        whole: whether nothing was wrong with it.
-        losses: what is lost, one sentence each; empty if everything that was written is there.
-        samples: samples that are there.
-        samples_lost: samples that are not, None where nobody can say.
+        intact: whether the archive had no fault.
+        losses: what is lost, one sentence each; empty if all that was written is there.
+        samples: number of samples in the repaired file.
+        samples_lost: number of samples lost, None where unknown.
     """
 
     path: Path
     output: Path | None
-    whole: bool
+    intact: bool
     losses: tuple[str, ...]
     samples: int
     samples_lost: int | None
 
 
 def repaired_name(path: Path) -> Path:
-    """What a repaired archive is called unless a name is given."""
+    """Return the default file name of a repaired archive."""
     return path.with_name(f"{path.stem}_repaired{path.suffix}")
 
 
@@ -81,68 +80,67 @@ def repair(
 ) -> Repair:
     """Repair an archive.
 
-    The file appears under its name only when it is complete and has been read back. One that lost
-    its index alone becomes what it was, to the byte; one that is whole is copied where an output
-    is named, and left alone otherwise.
+    The output gets its name only when it is complete and has been read back. A file that lost only
+    its index is restored to the byte; an intact one is copied where an output is named.
 
     Args:
-        path: the archive, which stays as it is unless `in_place`.
+        path: the archive, unchanged unless `in_place`.
         output: the file to write, which must not exist; `repaired_name` by default.
         in_place: replace the archive by the repaired one instead.
 
     Raises:
-        NotAnArchiveError: another kind of file, or one whose description is lost.
-        ArchiveWriteError: the output exists, or the disk refuses.
+        NotAnArchiveError: another kind of file, or its header is lost.
+        ArchiveWriteError: the output exists or cannot be written.
         ArchiveError: it cannot be read, or nothing of it can be saved.
     """
     path = Path(path)
-    found = survey(path)
+    found = scan_file(path)
     if found.header is None:
-        open_archive(path, fields=())  # says why it is none
+        open_archive(path, fields=())  # raises with the reason
         raise NotAnArchiveError(path, "is not an archive")
     if found.mixed:
-        problem = "its begin and its end are of two recordings, and the samples of either"
+        problem = "its beginning and its end are of two recordings, its samples of either"
         raise ArchiveError(path, problem, remedy="restore it from a copy, or record again")
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
-    whole = not found.faults and is_indexed(path, found)
+    intact = not found.faults and has_valid_index(path, found)
     written = None
-    if not whole or (output is not None and not in_place):
+    if not intact or (output is not None and not in_place):
         _rewrite(path, found, target)
         written = target
-    return Repair(path, written, whole, tuple(found.losses), found.samples, found.samples_lost)
+    return Repair(path, written, intact, tuple(found.losses), found.samples, found.samples_lost)
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
-    """Replace outcome and reason of a whole archive; all else stays as it was written.
+    """Replace outcome and reason of an intact archive.
 
-    The file is written anew beside its name, read back, and then takes its name: whatever
-    interrupts it leaves the old or the new file.
+    The file is written beside the old one, read back, and then renamed: an interruption leaves the
+    old or the new file.
 
     Args:
         path: the archive.
-        outcome: how the interval is judged now, such as ``rejected``.
+        outcome: such as ``rejected``.
         reason: why, in a sentence.
 
     Raises:
-        ArchiveError: it is no whole archive.
-        ArchiveWriteError: the disk refuses; the archive is as it was.
+        ArchiveError: it is not an intact archive.
+        ArchiveWriteError: it cannot be written; the archive is unchanged.
     """
     path = Path(path)
-    found = survey(path)
-    if found.faults or found.header is None or found.outcome is None or not is_indexed(path, found):
-        raise ArchiveError(path, "is not whole", remedy="repair it with `hil archive repair`")
+    found = scan_file(path)
+    if (
+        found.faults
+        or found.header is None
+        or found.outcome is None
+        or not has_valid_index(path, found)
+    ):
+        raise ArchiveError(path, "is damaged", remedy="repair it with `hil archive repair`")
     _rewrite(path, found, path, {"outcome": outcome, "reason": reason})
 
 
-def is_indexed(path: Path, found: Scan) -> bool:
-    """Whether message indexes, summary and all else that follows from a sound content fit it.
-
-    Args:
-        path: the file.
-        found: what is in it, without a fault.
-    """
+def has_valid_index(path: Path, found: Scan) -> bool:
+    """Return whether message indexes and summary fit the content, which has no fault."""
     with open_file(path) as stream, open_file(path) as other:
         same = True
 
@@ -157,19 +155,19 @@ def is_indexed(path: Path, found: Scan) -> bool:
 def _rewrite(
     path: Path, found: Scan, target: Path, outcome: Mapping[str, str] | None = None
 ) -> None:
-    """Make an archive of what is sound of another; `target` is always what it was, or whole.
+    """Write the valid content of an archive to `target`, which is replaced as a whole.
 
-    File and folder are on the disk when this returns, and the file has the mode of its source.
+    The output is on the disk when this returns, and has the mode of its source.
 
     Args:
         path: the source.
-        found: what is sound of it.
+        found: its valid content.
         target: the file to write or to replace, which may be the source.
-        outcome: entries of its outcome that are to be others than before.
+        outcome: entries of its outcome to replace.
 
     Raises:
-        ArchiveWriteError: the disk refuses.
-        ArchiveError: what was written cannot be read back; it is thrown away.
+        ArchiveWriteError: the output cannot be written.
+        ArchiveError: the output cannot be read back; it is removed.
     """
     try:
         with path.open("rb") as stream, replace_file(target) as temporary:
@@ -182,8 +180,8 @@ def _rewrite(
             if not back.complete:
                 raise ArchiveError(
                     path,
-                    f"cannot be written anew: {back.damage}",
-                    remedy="it is as it was, and what opens of it can be read: restore it from a "
+                    f"cannot be rewritten: {back.damage}",
+                    remedy="it is unchanged and can be read as far as it opens: restore it from a "
                     "copy, or record again",
                 )
         sync_folder(target.parent)
@@ -191,8 +189,7 @@ def _rewrite(
         raise ArchiveWriteError(
             target,
             f"cannot be written: {error.strerror}",
-            remedy="what was there is as it was: make room or make its folder writable, "
-            "and do it again",
+            remedy="nothing was changed: make room or make its folder writable, and repeat",
         ) from error
 
 
@@ -202,17 +199,17 @@ def _copy(
     write: Callable[[bytes], object],
     outcome: Mapping[str, str] | None = None,
 ) -> None:
-    """Write what is sound of an archive as a new one."""
+    """Write the valid content of an archive as a new one."""
     writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
     described = _description(found)
-    writer.add_metadata(METADATA, header.sealed(described))
+    writer.add_metadata(METADATA, header.with_checksum(described))
     for opcode, *place in found.pieces:
         record = container.record_at(stream, *place)
         if opcode != container.CHUNK:
             parser.define(record)
             writer.put(record.data)
             continue
-        head = container.chunk(record)
+        head = container.parse_chunk(record)
         messages = parser.messages(container.chunk_data(head, record.offset), record.offset)
         if not messages.keys() <= parser.channels.keys():
             for definition in found.definitions:
@@ -225,12 +222,12 @@ def _copy(
         head = replace(head, message_start_time=first, message_end_time=last)
         writer.add_chunk(head, entries)
     stated = _outcome(found, described, writer.checksums)
-    writer.add_metadata(OUTCOME, header.sealed({**stated, **(outcome or {})}))
+    writer.add_metadata(OUTCOME, header.with_checksum({**stated, **(outcome or {})}))
     writer.finish()
 
 
 def _description(found: Scan) -> dict[str, str]:
-    """The ``hil`` record: as it was, without the attachments that are lost."""
+    """Return the ``hil`` record without the attachments that are lost."""
     assert found.metadata is not None and found.header is not None
     names = [name for name in found.header.attachments if name in found.attachments]
     if len(names) == len(found.header.attachments):
@@ -239,8 +236,8 @@ def _description(found: Scan) -> dict[str, str]:
 
 
 def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
-    """The ``hil.outcome`` record of a file of these chunks: as it was where nothing is lost."""
-    chunk_list = {header.CHUNKS: header.chunk_list(chunks)}
+    """Return the ``hil.outcome`` record of a file with these chunks, unchanged without loss."""
+    chunk_list = {header.CHUNKS: header.format_chunk_list(chunks)}
     if not found.losses and found.outcome is not None:
         record = found.outcome.record  # other chunks than before if another program cut them
         return {**record, **(chunk_list if header.CHUNKS in record else {})}

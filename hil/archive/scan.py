@@ -1,9 +1,9 @@
-"""Goes through an archive record by record, and verifies that each is one that was written.
+"""Verification of an archive, record by record.
 
-The reader stops at the first damage, checks and repairs go on behind it. The checksum of a chunk
-says that it is whole, not that it is of this recording: a file system may put a chunk of another
-archive in its place. The outcome has the checksums of all chunks in order, so that each is known by
-its own; where there is no such list, the cycles must do, which grow.
+A reader stops at the first damage, checks and repairs continue behind it. The checksum of a chunk
+shows that it is intact, not that it belongs to this recording: a file system may put a chunk of
+another archive in its place. The outcome therefore lists the checksums of all chunks in order;
+where this list is missing, cycle numbers must increase.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from hil.archive.header import (
     ArchiveOutcome,
     HeaderError,
     checksum,
-    is_known,
+    is_supported,
 )
 
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
-"""Channels that have one message of each sample."""
+"""Channels with one message per sample."""
 ALWAYS: Final = -(1 << 63), 1 << 63
-"""ns, before and beyond every stamp."""
+"""ns, before and after every stamp."""
 
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
@@ -47,14 +47,14 @@ _ASPECTS = {
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What a file must hold, as its begin and its end say.
+    """The content that begin and end of a file state.
 
     Attributes:
         written_by: profile and library, None where the record is damaged.
-        chunks: their checksums in order, shape (k,); None where nothing says so.
-        mixed: whether that end is of another recording than the beginning.
-        repaired: whether messages were lost before the file was written as it is.
-        samples: how many were written, but no more than fit into the file.
+        chunks: their checksums in order, shape (k,); None where not stated.
+        mixed: whether the end is of another recording than the beginning.
+        repaired: whether messages were lost before the file was written.
+        samples: how many were written, limited to what fits into the file.
     """
 
     written_by: tuple[str, str] | None = None
@@ -65,57 +65,59 @@ class Expected:
 
     @classmethod
     def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Expected:
-        """Find it, where the summary says or from head to head; the stream is left anywhere."""
+        """Read it by the summary or from head to head; moves the stream."""
         found, by = {}, None
         stream.seek(0)
         try:
             record = next(container.records(stream, size, check_end=False))
             if record.opcode == container.HEADER:
-                head = container.parsed(Header, record)
+                head = container.parse(Header, record)
                 by = head.profile, head.library
         except Damage:
             pass
         if summary is not None:
             entries = summary.entries(container.METADATA_INDEX)
-            found = _ours(container.record_at(stream, one.offset, one.length) for one in entries)
+            found = _own_metadata(
+                container.record_at(stream, one.offset, one.length) for one in entries
+            )
         if found.keys() != {METADATA, OUTCOME}:
             stream.seek(0)
             only = (container.METADATA,)
-            found = _ours(container.records(stream, size, only=only, check_end=False))
+            found = _own_metadata(container.records(stream, size, only=only, check_end=False))
         try:
             header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
         except (HeaderError, KeyError):
             return cls(by)
         if not outcome.belongs_to(header):
             return cls(by, mixed=True)
-        # Another program that copies a file may cut its chunks anew, and then names itself.
+        # Another program that copies a file may divide it into other chunks, and writes its name.
         has_list = outcome.chunks is not None and by is not None and by[1] == schema.LIBRARY
         chunks = np.array(outcome.chunks, np.uint32) if has_list else None
         samples = min(outcome.samples or 0, size // _LEAST)
         return cls(by, chunks, repaired=outcome.repaired, samples=samples)
 
 
-def _ours(records: Iterable[Record]) -> dict[str, dict[str, str]]:
-    """The first of each of our two metadata records that passes its checksum."""
+def _own_metadata(records: Iterable[Record]) -> dict[str, dict[str, str]]:
+    """Return the first record of header and outcome that passes its checksum, by name."""
     found: dict[str, dict[str, str]] = {}
     try:
         for record in records:
-            name, entries = container.metadata(record)
+            name, entries = container.parse_metadata(record)
             claimed = entries.pop("checksum", None)
             if name in (METADATA, OUTCOME) and claimed == checksum(entries):
                 found.setdefault(name, entries)
     except Damage:
-        pass  # what comes behind it cannot be found this way
+        pass
     return found
 
 
 class Fault(NamedTuple):
-    """Something that is not as it must be.
+    """A violation of the profile.
 
     Attributes:
         aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
-        text: what is wrong, as a sentence without its end.
-        loss: whether content is lost by it; otherwise it follows from what is there.
+        text: what is wrong, without full stop.
+        loss: whether content is lost; otherwise it can be restored from the rest.
     """
 
     aspect: str
@@ -124,35 +126,34 @@ class Fault(NamedTuple):
 
 
 class Scan:
-    """What has been verified of an archive.
+    """The verified content of an archive.
 
     Args:
         stream: the file.
-        visit: uses verified messages by topic, of the chunk at an offset (and of some behind it
-            where damage ends the scan); raises `Damage` where they cannot be used, and then nothing
-            of them counts.
+        visit: receives verified messages by topic, of the chunk at an offset (and of some that
+            follow); raises `Damage` where they cannot be used, and then they do not count.
         topics: channels wanted, None for those of the samples and the events; others are verified
-            only past damages.
-        times: range of the stamps wanted [ns]; chunks that lie outside, by the index, are not read.
-        past_damage: whether to go on behind damages, `faults`, or to end at the first, `damage`.
+            only with `past_damage`.
+        times: range of the stamps wanted [ns]; chunks outside, by the index, are not read.
+        past_damage: whether to continue behind damage, listed in `faults`, or to stop at the first,
+            `damage`.
 
     Attributes:
         size: of the file.
-        expected: what must come.
-        metadata: entries of the ``hil`` record, None before it came.
-        header: the same, parsed; None where they cannot be used, or are of another version.
-        unusable: why not.
-        outcome: the ``hil.outcome`` record, None before it came.
+        expected: what the file states about its content.
+        metadata: entries of the ``hil`` record, None until it was read.
+        header: the same, parsed; None where invalid (`header_error`) or of another version.
+        outcome: the ``hil.outcome`` record, None until it was read.
         attachments: content by file name.
         parser: of the chunks.
         definitions: schema and channel records of the summary.
         counts: messages by topic.
-        chunks: how many chunks were accepted.
-        pieces: sound records, but for header and outcome, in the order of the file: opcode, offset
+        chunks: number of valid chunks.
+        pieces: valid records except header and outcome, in the order of the file: opcode, offset
             and length with the head.
-        record: the one that is examined.
-        damage: the first damage, where the scan ends at it.
-        faults: what is wrong, where it goes on; message indexes and summary are not looked at.
+        record: the record in progress.
+        damage: the first damage, where the scan stops there.
+        faults: what is wrong, except message indexes and summary, where it continues.
     """
 
     def __init__(
@@ -167,7 +168,7 @@ class Scan:
         self.size = os.fstat(stream.fileno()).st_size
         self.metadata: dict[str, str] | None = None
         self.header: ArchiveHeader | None = None
-        self.unusable: HeaderError | None = None
+        self.header_error: HeaderError | None = None
         self.outcome: ArchiveOutcome | None = None
         self.attachments: dict[str, bytes] = {}
         self.parser = ChunkParser()
@@ -180,11 +181,11 @@ class Scan:
         self._visit = visit
         self._topics = topics
         self._past_damage = past_damage
-        self._gap = False  # whether something was lost behind the last sound chunk
-        self._skipped = False  # whether chunks were left out: channels go on at any number
+        self._gap = False  # whether something was lost behind the last valid chunk
+        self._skipped = False  # whether chunks were left out: channels continue at any number
         self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
-        self._waiting: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
-        self._place = 0  # place in the list of the chunk that comes next
+        self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
+        self._place = 0  # of the next chunk in the list of checksums
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._newest = -1  # stamp of a cycle [ns]
@@ -194,46 +195,46 @@ class Scan:
         self.definitions = summary.definitions if summary else []
         stream.seek(0)
         if past_damage:
-            self._survey(stream, summary)
+            self._read_all(stream, summary)
         else:
-            self._read(stream, _outside(summary, times))
+            self._read(stream, _chunks_outside(summary, times))
 
     @property
     def topics(self) -> Collection[str]:
         """The channels wanted."""
         if self._topics is not None:
             return self._topics
-        own = schema.CYCLE in self.parser.topics
-        samples = (schema.CYCLE,) if own else (schema.MEASURED, schema.MOTOR_CURRENT)
+        recorded = schema.CYCLE in self.parser.topics
+        samples = (schema.CYCLE,) if recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
         return (*samples, schema.EVENTS)
 
     @property
     def mixed(self) -> bool:
-        """Whether begin and end are of two recordings, and the samples of nobody knows which."""
+        """Whether begin and end are of two recordings; the samples may be of either."""
         return self.outcome is not None and not self.outcome.belongs_to(self.header)
 
     @property
     def samples(self) -> int:
-        """Samples that are sound."""
+        """Number of valid samples."""
         return max(self.counts.get(topic, 0) for topic in NUMBERS)
 
     @property
     def losses(self) -> list[str]:
-        """What is lost, and where; empty if everything that was written is there."""
+        """What is lost, and where; empty if all that was written is there."""
         if not any(fault.loss for fault in self.faults):
             return []
         return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
 
     @property
     def samples_lost(self) -> int | None:
-        """Samples that are not sound, None where nobody can say."""
+        """Number of lost samples, None where unknown."""
         if not self.losses:
             return 0
         stated = self.outcome.samples if self.outcome else None
         return None if stated is None else max(0, stated - self.samples)
 
     def _read(self, stream: BinaryIO, outside: Collection[int]) -> None:
-        """Take records up to their end or the first damage."""
+        """Read records up to their end or the first damage."""
         try:
             try:
                 for record in container.records(stream, self.size, skip=outside):
@@ -242,11 +243,11 @@ class Scan:
                         self._place, self._skipped = self._place + 1, True
                         self._next.clear()
                         continue
-                    self._take(record)
+                    self._add(record)
                     if record.opcode == container.METADATA:
-                        self._require_ours(record.offset)
+                        self._check_metadata(record.offset)
             finally:
-                self._flush()  # what waits is in front of any damage so far
+                self._flush()  # pending chunks precede any damage found so far
             chunks = self.expected.chunks
             if outside and chunks is not None and self._place < len(chunks):
                 raise Damage(self.size, "is not there: a chunk is missing")
@@ -256,26 +257,26 @@ class Scan:
         except Damage as damage:
             self.damage = damage
 
-    def _require_ours(self, offset: int) -> None:
-        """Header and outcome must be of what can be read here, and of one recording."""
-        if self.metadata is not None and not is_known(self.metadata):
+    def _check_metadata(self, offset: int) -> None:
+        """Require a header of this version and an outcome of the same recording."""
+        if self.metadata is not None and not is_supported(self.metadata):
             raise Damage(offset, "is of another version")
-        if self.unusable is not None:
-            raise Damage(offset, f"(metadata {METADATA!r}) cannot be used: {self.unusable}")
+        if self.header_error is not None:
+            raise Damage(offset, f"(metadata {METADATA!r}) cannot be used: {self.header_error}")
         if self.mixed:
             self.outcome = None
             raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
 
-    def _survey(self, stream: BinaryIO, summary: Summary | None) -> None:
-        """Take all records that are sound, also those that only the index leads to."""
+    def _read_all(self, stream: BinaryIO, summary: Summary | None) -> None:
+        """Read all valid records, also those that only the index leads to."""
         seen: set[int] = set()
         try:
             for record in container.records(stream, self.size, check_end=False):
                 seen.add(record.offset)
-                self._examine(record)
+                self._try_add(record)
         except Damage as damage:
-            self._gap = True  # and what is lost, counts and outcome will tell
-            self._fault("container", damage, loss=False)
+            self._gap = True  # counts and outcome show what is lost
+            self._add_fault("container", damage, loss=False)
         try:
             places = summary.places if summary else []
         except Damage:
@@ -284,24 +285,24 @@ class Scan:
             if place[0] not in seen:
                 seen.add(place[0])
                 try:
-                    self._examine(container.record_at(stream, *place))
+                    self._try_add(container.record_at(stream, *place))
                 except Damage as damage:
-                    self._fault("container", damage, loss=True)
+                    self._add_fault("container", damage, loss=True)
         if self.metadata is not None:
             if self.expected.written_by != (schema.PROFILE, schema.LIBRARY):
-                self._fault("container", "the header is not that of the profile", loss=False)
+                self._add_fault("container", "the header is not that of the profile", loss=False)
             if self.mixed:
-                self._fault("outcome", "the outcome is that of another recording", loss=True)
+                self._add_fault("outcome", "the outcome is that of another recording", loss=True)
             for aspect, text in self._shortfalls():
-                self._fault(aspect, text, loss=True)
+                self._add_fault(aspect, text, loss=True)
 
-    def _examine(self, record: Record) -> None:
+    def _try_add(self, record: Record) -> None:
         try:
-            self._take(record)
+            self._add(record)
         except Damage as damage:
-            self._fault(_ASPECTS.get(record.opcode, "container"), damage, loss=True)
+            self._add_fault(_ASPECTS.get(record.opcode, "container"), damage, loss=True)
 
-    def _fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
+    def _add_fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
         self._gap |= loss
         if isinstance(problem, Damage):
             problem = f"the record at byte {problem.offset} {problem.reason}"
@@ -309,27 +310,27 @@ class Scan:
         if fault not in self.faults:
             self.faults.append(fault)
 
-    def _take(self, record: Record) -> None:
-        """Verify the next record, and take what it holds.
+    def _add(self, record: Record) -> None:
+        """Verify the next record, and add what it contains.
 
         Raises:
-            Damage: it is not one that was written, or not the next.
+            Damage: it is not the next record that was written.
         """
         self.record, offset = record, record.offset
         if record.opcode == container.CHUNK:
             if self.metadata is None:
                 return  # some other MCAP file
-            head = container.chunk(record)
+            head = container.parse_chunk(record)
             data = container.chunk_data(head, offset)
             self._check_order(head.uncompressed_crc, offset)
-            self._take_chunk(data, offset)
+            self._add_chunk(data, offset)
         elif record.opcode == container.ATTACHMENT:
-            attachment = container.attachment(record)
+            attachment = container.parse_attachment(record)
             if attachment.name in self.attachments:
                 raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode == container.METADATA:
-            if self._take_metadata(record):
+            if self._add_metadata(record):
                 return
         elif record.opcode in (container.SCHEMA, container.CHANNEL):
             self.parser.define(record)
@@ -338,9 +339,9 @@ class Scan:
         if self.metadata is not None:
             self.pieces.append((record.opcode, offset, record.size))
 
-    def _take_metadata(self, record: Record) -> bool:
-        """Take header or outcome; whether the record is one of them."""
-        name, entries = container.metadata(record)
+    def _add_metadata(self, record: Record) -> bool:
+        """Add header or outcome; return whether the record is one of them."""
+        name, entries = container.parse_metadata(record)
         if name not in (METADATA, OUTCOME):
             return False
         if entries.pop("checksum", None) != checksum(entries):
@@ -352,14 +353,14 @@ class Scan:
             return True
         self.metadata = entries
         try:
-            self.header = ArchiveHeader.of(entries) if is_known(entries) else None
+            self.header = ArchiveHeader.of(entries) if is_supported(entries) else None
         except HeaderError as error:
-            self.unusable = error
+            self.header_error = error
         return True
 
-    def _take_chunk(self, data: bytes, offset: int) -> None:
-        """Decode the content of a chunk, or have it wait for others."""
-        begin = self._waiting[-1][1].stop if self._waiting else 0
+    def _add_chunk(self, data: bytes, offset: int) -> None:
+        """Decode the content of a chunk, or buffer it to decode several at once."""
+        begin = self._pending[-1][1].stop if self._pending else 0
         if begin + len(data) >= len(self._buffer):
             self._flush()
             begin = 0
@@ -367,32 +368,31 @@ class Scan:
             self._decode(data, offset)
             self.chunks += 1
         else:
-            self._waiting.append((offset, slice(begin, begin + len(data))))
+            self._pending.append((offset, slice(begin, begin + len(data))))
             self._buffer[begin : begin + len(data)] = data
-            if not self.parser.channels:  # they stand in the first
+            if not self.parser.channels:  # they are in the first
                 self._flush()
 
     def _flush(self) -> None:
-        """Decode the chunks that wait: all at once, or one by one where that fails.
+        """Decode the buffered chunks: all at once, or one by one where that fails.
 
         Raises:
             Damage: one of them does not follow those before.
         """
-        waiting, self._waiting = self._waiting, []
-        if len(waiting) > 1:
+        pending, self._pending = self._pending, []
+        if len(pending) > 1:
             try:
-                whole = self._buffer[: waiting[-1][1].stop]
-                self._decode(whole, waiting[0][0], several=True)
-                self.chunks += len(waiting)
+                self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
+                self.chunks += len(pending)
                 return
             except Damage:
                 pass  # in one of them
-        for offset, place in waiting:
+        for offset, place in pending:
             self._decode(self._buffer[place], offset)
             self.chunks += 1
 
     def _shortfalls(self) -> Iterator[tuple[str, str]]:
-        """What the file says that it holds and does not: aspect of the profile, and sentence."""
+        """Yield aspect and sentence for what the file states to contain and does not."""
         for name in self.header.attachments if self.header else ():
             if name not in self.attachments:
                 yield "attachments", f"attachment {name!r} is missing"
@@ -426,16 +426,16 @@ class Scan:
             return
         places = np.flatnonzero(chunks == crc)
         if not len(places) or places[-1] < self._place:
-            why = "comes after one that followed it" if len(places) else "is of another recording"
+            why = "is out of order" if len(places) else "is of another recording"
             raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
         if not self._past_damage:
             raise Damage(offset, "(chunk) does not continue the one before")
         self._place = int(places[-1]) + 1
 
     def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
-        """Take messages that must be the next of their channels; else nothing of them counts.
+        """Add messages that must be the next of their channels; else none of them.
 
-        Several chunks at once must not define channels: what was in front of these is judged first.
+        Several chunks at once must not define channels: the chunks before must be checked first.
         """
         parser = self.parser
         before = dict(parser.schemas), dict(parser.channels)
@@ -463,7 +463,7 @@ class Scan:
                 self._check_gap(missing, offset)
             self._visit(self, found, offset)
         except Damage:
-            parser.schemas, parser.channels = before  # what it says goes with it
+            parser.schemas, parser.channels = before
             raise
         self._gap = False
         self._newest = max(self._newest, newest)
@@ -473,7 +473,7 @@ class Scan:
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
 
     def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> list[str]:
-        """Check that messages do not repeat those before; topics of which some are missing."""
+        """Check that no message is repeated; return the topics of which some are missing."""
         gaps = {}
         for topic, messages in found.items():
             sequence = messages.of_heads("sequence")
@@ -483,29 +483,28 @@ class Scan:
             gaps[topic] = first - self._next.get(topic, first if self._skipped else 0)
             gaps[topic] %= _SEQUENCES
             if gaps[topic] > _SEQUENCES // 2:
-                raise Damage(offset, "(chunk) repeats messages that were before")
+                raise Damage(offset, "(chunk) repeats messages of those before")
         if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
             raise Damage(offset, "(chunk) has channels of different length")
         return [topic for topic, gap in gaps.items() if gap]
 
     def _check_gap(self, topics: Collection[str], offset: int) -> None:
-        """Messages of these topics are missing in front of the chunk at `offset`."""
+        """Handle missing messages of these topics in front of the chunk at `offset`."""
         if not self._past_damage:
             if not self.expected.repaired:
                 reason = "(chunk) does not continue the one before it: a chunk is missing"
                 raise Damage(offset, reason)
             return
         if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
-            raise Damage(offset, "(chunk) comes after a gap that nothing would show")
+            raise Damage(offset, "(chunk) follows a gap that no cycle number would show")
         if not self._gap and not self.expected.repaired:
             damage = Damage(offset, "(chunk) does not continue the one before")
-            self._fault("sequence", damage, loss=True)
+            self._add_fault("sequence", damage, loss=True)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
-        """Check that cycles follow those before and are of this recording.
+        """Check that cycles increase; return the newest stamp [ns], -1 without cycles.
 
-        Where there are no cycles, all channels must have the same times. Returns the newest stamp
-        [ns], -1 without cycles.
+        Without cycles, all channels must have the same times.
         """
         samples = [topic for topic in found if topic in NUMBERS]
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples
@@ -520,14 +519,14 @@ class Scan:
         if timed[0] not in schema.PER_CYCLE or schema.CYCLE not in self.parser.topics:
             return -1
         if (np.diff(stamp) <= 0).any():
-            raise Damage(offset, "(chunk) has cycles that do not grow")
+            raise Damage(offset, "(chunk) has cycles that do not increase")
         if stamp[0] <= self._newest:
             raise Damage(offset, "(chunk) has cycles that do not follow those before")
         return int(stamp[-1])
 
 
 def _data_end(stream: BinaryIO, size: int) -> int | None:
-    """Where the data section ends, from head to head: not where its index says if records moved."""
+    """Return where the data section ends, from head to head: records may have moved."""
     walk = container.records(stream, size, only=(container.DATA_END,), check_end=False)
     try:
         return next(walk).end
@@ -535,10 +534,10 @@ def _data_end(stream: BinaryIO, size: int) -> int | None:
         return None
 
 
-def _outside(summary: Summary | None, times: tuple[int, int]) -> Collection[int]:
-    """Where chunks begin that hold nothing of these times, by the index.
+def _chunks_outside(summary: Summary | None, times: tuple[int, int]) -> Collection[int]:
+    """Return the places of chunks without messages of these times, by the index.
 
-    Where none does, the first is read all the same: it says what columns there are.
+    If that is all of them, the first is read anyway: it defines the columns.
     """
     if summary is None or times == ALWAYS:
         return ()

@@ -1,6 +1,6 @@
-"""The archive profile: topics, schemas, and how cycle records become messages.
+"""The archive profile: topics, schemas, and the conversion of cycle records to messages.
 
-`docs/archive-format.md` describes the profile for readers of the files.
+`docs/archive-format.md` describes the profile.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ DESCRIPTION = "/robot_description"
 TRANSFORMS = "/tf_static"
 
 ONCE = frozenset((DESCRIPTION, TRANSFORMS))
-"""Channels of one message that has no stamp: what viewers draw the arm with."""
+"""Channels of one message without stamp, from which viewers draw the arm."""
 
 PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
-"""Channels of which each cycle has one message, where there are cycles."""
+"""Channels with one message per cycle, where there are cycles."""
 
 LATER_FIELDS = frozenset(("age",))
-"""Fields of a cycle that older archives do not have; zero is what they would have held."""
+"""Fields of a cycle that older archives do not have; they read as zero."""
 
 _STAMP_TYPES = {"sec": (np.dtype("<i4"),), "nanosec": (np.dtype("<u4"),)}
 
@@ -141,8 +141,7 @@ uint32 line
 class Channel:
     """One topic and the ros2msg schema of its messages, with all its dependencies.
 
-    The text is the one description of the messages: writer and reader compute their byte layouts
-    from it, and foreign programs decode with it.
+    Writer and reader compute their byte layouts from the text, and other programs decode with it.
     """
 
     topic: str
@@ -199,7 +198,7 @@ TRANSFORM_CHANNEL = Channel(
 
 @lru_cache(maxsize=16)
 def profile(n_joints: int) -> Mapping[str, Channel]:
-    """The channels of the profile by topic, for so many joints."""
+    """Return the channels of the profile by topic, for a number of joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
     cycle, current, packet = (
         _text(text.format(n=n_joints, size=LONGEST_PACKET), _HEADER, _TIME)
@@ -219,7 +218,7 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
 
 
 class Batch(NamedTuple):
-    """Messages of several channels of the same instants.
+    """Messages of several channels, one of each at each stamp.
 
     Attributes:
         stamp: shape (k,), nanoseconds.
@@ -231,15 +230,13 @@ class Batch(NamedTuple):
 
 
 def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: Array) -> Batch:
-    """The three messages that an archive holds for each cycle.
-
-    `/hil/cycle` holds everything; the two JointState channels repeat what viewers plot.
+    """Return the messages of k cycles: `/hil/cycle` and two JointState channels for viewers.
 
     Args:
         names: of the joints.
         period: of the controller [s].
-        records: of k cycles.
-        torque: of their joints (k, n).
+        records: of the cycles.
+        torque: of the joints (k, n) [N·m].
     """
     stamp = _stamp(records, period)
     columns = {name: records[name] for name in records.dtype.names or ()}
@@ -256,7 +253,7 @@ def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: A
 
 
 def packet_messages(period: float, packets: Rows) -> Batch:
-    """Raw packets of the link, rows of `drivers.record.PACKET_DTYPE`, as messages."""
+    """Return raw packets of the link, rows of `drivers.record.PACKET_DTYPE`, as messages."""
     stamp = _stamp(packets, period)
     columns = {name: packets[name] for name in packets.dtype.names or ()}
     return Batch(stamp, {PACKETS: _numbers(profile(0)[PACKETS], stamp, columns)})
@@ -268,14 +265,13 @@ def sample_messages(
     states: Mapping[str, Array],
     motor_current: Array | None,
 ) -> Batch:
-    """Samples of a foreign recording as messages.
+    """Return samples of an imported recording as messages.
 
     Args:
         names: of the joints.
         stamp: (k,) [ns].
-        states: ``position``, ``velocity`` and ``effort`` (k, n), as far as they were recorded; what
-            was not is left out of the messages, not invented.
-        motor_current: (k, n) [A], None where it was not recorded.
+        states: ``position``, ``velocity`` and ``effort`` (k, n), where recorded.
+        motor_current: (k, n) [A], None where not recorded.
     """
     messages = {MEASURED: joint_states(names, stamp, states)}
     if motor_current is not None:
@@ -287,12 +283,12 @@ def sample_messages(
 def joint_states(
     names: Sequence[str], stamp: NDArray[np.int64], values: Mapping[str, Array]
 ) -> Rows:
-    """Messages sensor_msgs/JointState with stamps (k,) [ns] and those values (k, n) that are given.
+    """Return messages sensor_msgs/JointState.
 
     Args:
         names: of the joints.
-        stamp: theirs.
-        values: of ``position``, ``velocity`` and ``effort``.
+        stamp: (k,) [ns].
+        values: those of ``position``, ``velocity`` and ``effort`` that are known, (k, n).
     """
     position, velocity, effort = (
         len(names) * (word in values) for word in ("position", "velocity", "effort")
@@ -302,7 +298,7 @@ def joint_states(
 
 
 def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
-    """Set-points (k, n) that a viewer shows: those inside the controller where none was sent.
+    """Return set-points (k, n) for viewers: those inside the controller where none was sent.
 
     Args:
         records: of cycles, or columns of them.
@@ -325,7 +321,7 @@ def _numbers(
 def _filled(
     layout: MessageLayout, stamp: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
 ) -> Rows:
-    """Messages with these stamps (k,) [ns], and the columns that they have a place for."""
+    """Return messages with these stamps (k,) [ns], and the columns that are fields of them."""
     rows = layout.rows(len(stamp))
     rows["sec"], rows["nanosec"] = np.divmod(stamp, 10**9)
     for name in columns.keys() & set(rows.dtype.names or ()):
@@ -336,17 +332,16 @@ def _filled(
 def message_layout(
     topic: str, joints: Sequence[str], record: Schema | None, first: bytes
 ) -> MessageLayout:
-    """How the messages of a topic of numbers are laid out.
+    """Return the layout of the messages of a topic of numbers.
 
     Args:
-        topic: theirs.
+        topic: of the messages.
         joints: names of the joints.
-        record: the schema that the file has of them, None where it has none.
-        first: one of them; joint states may lack quantities.
+        record: the schema in the file, None where it has none.
+        first: one of the messages; joint states may lack quantities.
 
     Raises:
-        LayoutError: they are not those of the profile: a number is missing, or of another type or
-            length.
+        LayoutError: a number is missing, or of another type or length than in the profile.
     """
     n = len(joints)
     if topic in (MEASURED, COMMANDED):
@@ -354,9 +349,9 @@ def message_layout(
         for lengths in product((n, 0), repeat=3):
             sizes = dict(zip(("position", "velocity", "effort"), lengths, strict=True))
             state = joint_state_layout(tuple(joints), **sizes)
-            if state.size == len(first) and state.holds_in(row):
+            if state.size == len(first) and state.matches(row):
                 return state
-        raise LayoutError(f"they are no joint states of these {n} joints")
+        raise LayoutError(f"they are not joint states of these {n} joints")
     if record is None:
         raise LayoutError("their schema is missing")
     layout = fixed_layout(record.data.decode(errors="replace"))
@@ -373,11 +368,11 @@ def message_layout(
 
 
 WORLD: Final = "world"
-"""Frame that the base stands in, where the description has no link of that name."""
+"""Parent frame of the base, where the description has no link of that name."""
 
 
 def description_messages(urdf: bytes) -> dict[Channel, bytes]:
-    """The messages that describe an arm, by channel; none of what is no URDF, or is too long.
+    """Return the messages that describe an arm, by channel; none for an invalid or too long URDF.
 
     The transforms are those of the fixed joints, and of the base in the world.
     """
@@ -433,7 +428,7 @@ def _link(joint: Element, end: str) -> str:
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Turns about the fixed axes x, y and z in that order, as (x, y, z, w)."""
+    """Return rotations about the fixed axes x, y and z in that order, as (x, y, z, w)."""
     (a, p), (b, q), (c, r) = ((math.sin(t / 2.0), math.cos(t / 2.0)) for t in (roll, pitch, yaw))
     return (
         a * q * r - p * b * c,

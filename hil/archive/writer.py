@@ -1,4 +1,4 @@
-"""Writes cycle records to an archive while they arrive, and whole foreign recordings."""
+"""Writing of archives: cycle records as they arrive, and imported recordings."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from hil.archive.header import (
     OUTCOME,
     ArchiveName,
     checksum,
-    chunk_list,
-    sealed,
+    format_chunk_list,
+    with_checksum,
 )
 from hil.archive.mcap_writer import McapWriter
 from hil.archive.schema import (
@@ -53,7 +53,7 @@ from hil.files import sync_folder
 
 Array = NDArray[np.float64]
 
-FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash costs at most that
+FLUSH_PERIOD = 0.1  # s of the controller's time in one chunk; a crash loses at most that
 _SAMPLES_PER_CHUNK: Final = 1000
 _MOST_NUMBERS: Final = 1 << 32  # message numbers are counted modulo this
 _MEDIA_TYPES: Final = {
@@ -68,27 +68,26 @@ _MEDIA_TYPES: Final = {
 class ArchiveFile:
     """An MCAP file of the archive profile, open for writing.
 
-    The file gets its final name at once; one without footer is torn and readable up to its last
-    whole chunk. An existing file is never overwritten.
+    The file has its final name from the start; without footer it is truncated, and readable up to
+    its last complete chunk. An existing file is never overwritten.
 
     Args:
         path: where to write.
         joint_names: joints in the order of the columns.
         topics: of the channels.
         metadata: entries of the ``hil`` metadata record. Kind, index and attempt are read from the
-            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, must be
-            among them.
+            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, is required.
         period: cycle time [s], None where it is not fixed.
-        attachments: file name to content; viewers get a ``robot.urdf`` as a message as well.
-        durable: wait at each flush until the disk has the data.
+        attachments: content by file name; viewers get a ``robot.urdf`` as a message as well.
+        durable: wait at each flush until the data are on the disk.
 
     Attributes:
         counts: messages written so far, by topic.
-        slowest_flush: longest time that the disk took for what was handed to it at once [s].
+        slowest_flush: longest time that the disk took for one flush [s].
         closed: whether the file is closed, by `finish` or by a failure of the disk.
 
     Raises:
-        ArchiveWriteError: the file exists or cannot be created, or the metadata cannot stand.
+        ArchiveWriteError: the file exists or cannot be created, or the metadata are invalid.
     """
 
     def __init__(
@@ -120,17 +119,17 @@ class ArchiveFile:
         self._parts: list[bytes] = []  # to be written at once
         self._writer = McapWriter(self._parts.append, PROFILE, LIBRARY)
         with self._guarded():
-            self._writer.add_metadata(METADATA, sealed(described))
+            self._writer.add_metadata(METADATA, with_checksum(described))
             for name, data in sorted(attachments.items()):
                 media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
                 self._writer.add_attachment(name, media_type, data)
             self._write()
-            if durable:  # only now: the file is empty for as short a time as possible
+            if durable:  # at last, so that the file is empty for as short a time as possible
                 sync_folder(path.parent)
         self._numbers = {channel.topic: register(self._writer, channel) for channel in channels}
 
     def add(self, batch: Batch) -> None:
-        """Add messages of channels that count alike to the chunk in progress."""
+        """Add messages of several channels to the chunk in progress."""
         topics = [*batch.messages]
         numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
         channels = [self._numbers[topic] for topic in topics]
@@ -153,7 +152,7 @@ class ArchiveFile:
         self.counts[EVENTS] += 1
 
     def flush(self) -> None:
-        """End the chunk in progress and hand everything to the operating system, or the disk."""
+        """End the chunk in progress and write everything to the file."""
         with self._guarded():
             self._writer.flush()
             self._write()
@@ -164,11 +163,14 @@ class ArchiveFile:
             return
         with self._guarded():
             self._writer.flush()
-            seals = {DESCRIPTION: self._description, CHUNKS: chunk_list(self._writer.checksums)}
-            self._writer.add_metadata(OUTCOME, sealed({**outcome, **seals}))
+            seals = {
+                DESCRIPTION: self._description,
+                CHUNKS: format_chunk_list(self._writer.checksums),
+            }
+            self._writer.add_metadata(OUTCOME, with_checksum({**outcome, **seals}))
             self._writer.finish()
             self._write()
-            self._close()  # some file systems tell only now that they did not take everything
+            self._close()  # some file systems report only here that the disk is full
 
     def _write(self) -> None:
         data = memoryview(b"".join(self._parts))
@@ -182,7 +184,7 @@ class ArchiveFile:
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
-        """Turn a failure of the disk into our error, and close the file for good."""
+        """Convert a failure of the disk into `ArchiveWriteError`, and close the file."""
         if self.closed:
             raise ArchiveWriteError(self._path, "the archive is closed")
         try:
@@ -193,7 +195,7 @@ class ArchiveFile:
             raise ArchiveWriteError(
                 self._path,
                 f"cannot be written further: {error.strerror}",
-                remedy="what was flushed before can be read; make room or mend the disk, "
+                remedy="what was flushed before can be read; make room or repair the disk, "
                 "and record again",
             ) from error
 
@@ -204,7 +206,7 @@ class ArchiveFile:
 
 
 def register(writer: McapWriter, channel: Channel) -> int:
-    """Announce a channel of CDR messages; returns its number."""
+    """Define a channel of CDR messages; return its number."""
     return writer.register(
         channel.topic,
         "cdr",
@@ -225,17 +227,15 @@ def _create(path: Path) -> int:
         raise ArchiveWriteError(
             path,
             f"cannot be created: {error.strerror}",
-            remedy="see that its folder is there and writable and its disk has room, "
-            "and record again",
+            remedy="make sure that its folder exists, is writable and has room, and record again",
         ) from error
 
 
 def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
-    """The caller's entries with what the file name says.
+    """Return the caller's entries with those of the file name.
 
     Raises:
-        ArchiveWriteError: no kind or an unknown one, or a contradiction between entries and file
-            name.
+        ArchiveWriteError: the kind is missing or unknown, or entries contradict the file name.
     """
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}
@@ -248,7 +248,7 @@ def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]
     if entries.get("kind") not in KINDS:
         raise ArchiveWriteError(
             path,
-            f"{entries.get('kind')!r} is no kind of archive",
+            f"{entries.get('kind')!r} is not a kind of archive",
             field="kind",
             remedy=f"use {', '.join(KINDS)}",
         )
@@ -256,29 +256,25 @@ def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]
 
 
 class ArchiveWriter:
-    """An archive being recorded.
+    """An archive that is being recorded.
 
-    Chunks end at fixed cycles, every 100 ms of the controller's time, wherever the caller cuts his
-    batches: the same records give the same bytes. A killed process loses what came after the last
-    whole chunk. Used as a context manager it is closed in any case: ``interrupted`` with the reason
-    when an exception passes, ``unknown`` when the outcome is not given.
+    Chunks end at fixed cycles, every 100 ms of the controller's time: the same records give the
+    same bytes however they are divided into calls. A killed process loses what follows the last
+    complete chunk. As a context manager it closes the archive with outcome ``interrupted`` on an
+    exception, else ``unknown`` if no outcome was given.
 
     Args:
         path: the file, which must not exist.
         joint_names: joints in the order of the records' columns.
         period: cycle time of the controller [s].
-        metadata: see `ArchiveFile`. Times of day belong here only when a real arm moved.
-        attachments: what the archive needs to be understood alone, by file name: ``cell.toml``,
-            ``robot.urdf``, ``drive_train.json``, ``plan.json``.
-        durable: wait at each flush until the disk has the data.
-        packets: whether raw packets will come as well, see `add_packets`.
-
-    Attributes:
-        path, period: as given.
-        with_packets: whether the archive keeps raw packets.
+        metadata: see `ArchiveFile`. Times of day only if a real arm moves.
+        attachments: by file name: ``cell.toml``, ``robot.urdf``, ``drive_train.json``,
+            ``plan.json``.
+        durable: wait at each flush until the data are on the disk.
+        packets: whether to store raw packets, see `add_packets`.
 
     Raises:
-        ArchiveWriteError: the file exists, the disk refuses, or the metadata cannot stand.
+        ArchiveWriteError: the file exists or cannot be written, or the metadata are invalid.
     """
 
     def __init__(
@@ -314,13 +310,13 @@ class ArchiveWriter:
 
     @property
     def chunk_ends_in(self) -> float:
-        """The controller's time until the chunk in progress is full and written [s]."""
+        """Time of the controller until the chunk in progress is complete and written [s]."""
         begun = 0 if self._first is None else self._newest + 1 - self._first
         return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self.period
 
     @property
     def slowest_flush(self) -> float:
-        """Longest time that the disk took for what was handed to it at once [s]."""
+        """Longest time that the disk took for one flush [s]."""
         return self._file.slowest_flush
 
     @property
@@ -332,13 +328,13 @@ class ArchiveWriter:
         """Append cycle records.
 
         Args:
-            records: shape (k,), structure of `drivers.cycle_dtype`; held until their chunk is
-                written, so hand over a copy. Batches of some 100 cycles cost least.
-            torque: joint torque of each record, shape (k, n) [N·m]; None when it is not known.
+            records: shape (k,), of type `drivers.cycle_dtype`; referenced until their chunk is
+                written, so pass a copy. Batches of some 100 cycles are most efficient.
+            torque: joint torque of each record, shape (k, n) [N·m]; None where unknown.
 
         Raises:
-            ArchiveWriteError: the disk refuses, the archive is closed, or the cycles do not grow,
-                in which case nothing of these records is written.
+            ArchiveWriteError: the disk fails, the archive is closed, or the cycles do not increase,
+                in which case none of these records is written.
         """
         if self._file.closed:
             raise ArchiveWriteError(self.path, "the archive is closed")
@@ -371,20 +367,20 @@ class ArchiveWriter:
         last = int(cycles[at - 1]) if at else before
         raise ArchiveWriteError(
             self.path,
-            f"cycle {int(cycles[at])} cannot follow cycle {last}: the cycles of an archive grow",
+            f"cycle {int(cycles[at])} follows cycle {last}: the cycles of an archive increase",
             field="cycle",
             remedy="begin another archive for another session with the controller",
         )
 
     def add_packets(self, packets: Rows) -> None:
-        """Take raw packets; each is written with the chunk of its cycle.
+        """Add raw packets; each is written with the chunk of its cycle.
 
-        To be called before the records of the same cycles are: a packet whose chunk is gone goes
-        into the next.
+        Packets must be added before the records of the same cycles: a packet whose chunk was
+        written goes into the next.
 
         Args:
-            packets: shape (k,), structure `drivers.record.PACKET_DTYPE`, cycles not
-                falling; held until written, so hand over a copy.
+            packets: shape (k,), of type `drivers.record.PACKET_DTYPE`, cycles not decreasing;
+                referenced until written, so pass a copy.
 
         Raises:
             ValueError: the archive was opened without packets.
@@ -403,20 +399,20 @@ class ArchiveWriter:
         level: Level = Level.INFO,
         data: Mapping[str, Any] | None = None,
     ) -> None:
-        """Note an event; it is flushed with the cycles that follow.
+        """Add an event; it is flushed with the cycles that follow.
 
         Args:
             cycle: cycle of the controller in which it happened, None for the newest one written.
             name: kind of event.
-            text: one line for a person.
+            text: one line of text.
             level: severity.
-            data: the same for a program, anything JSON can hold.
+            data: machine-readable content, JSON values.
         """
         time = (self._newest if cycle is None else cycle) * self.period
         self._file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
     def flush(self) -> None:
-        """Write out what is pending, chunk or not; for links that have fallen silent."""
+        """Write all pending records, also those of an incomplete chunk."""
         self._emit(everything=True)
         self._emit_packets(None)
         self._file.flush()
@@ -424,11 +420,11 @@ class ArchiveWriter:
     def close(
         self, outcome: str, *, reason: str = "", details: Mapping[str, str] | None = None
     ) -> None:
-        """Complete the archive.
+        """Write the outcome and close the archive.
 
         Args:
             outcome: how the interval ended, such as ``completed``, ``stopped``, ``refused``.
-            reason: why, in a sentence, when it did not complete.
+            reason: why it did not complete.
             details: further entries of the ``hil.outcome`` metadata record.
         """
         if self._file.closed:
@@ -457,11 +453,11 @@ class ArchiveWriter:
             self.close("interrupted", reason=f"{type(error).__name__}: {error}")
 
     def _slot(self, cycle: int) -> int:
-        """The chunk that a cycle belongs to."""
+        """Return the number of the chunk that a cycle belongs to."""
         return (cycle - (self._first or 0)) // self._cycles_per_chunk
 
     def _emit(self, *, everything: bool) -> None:
-        """Write the pending records slot by slot; the slot still open only if all is wanted."""
+        """Write the pending records slot by slot; those of the open slot only if `everything`."""
         if not self._pending:
             return
         records = np.concatenate([part for part, _ in self._pending])
@@ -493,14 +489,14 @@ class ArchiveWriter:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """A foreign recording, m samples of n joints, joint side in SI units.
+    """A recording to be imported, m samples of n joints, joint side in SI units.
 
     Attributes:
-        stamp: (m,) nanoseconds, of whatever clock the recording has.
+        stamp: (m,) nanoseconds, on any clock.
         position: (m, n) [rad].
-        velocity: (m, n) [rad/s], None when it was not recorded.
-        torque: (m, n) [N·m], None when it was not recorded.
-        motor_current: (m, n) [A], motor side, None when it was not recorded.
+        velocity: (m, n) [rad/s], None where not recorded.
+        torque: (m, n) [N·m], None where not recorded.
+        motor_current: (m, n) [A], motor side, None where not recorded.
     """
 
     stamp: NDArray[np.int64]
@@ -520,25 +516,25 @@ def write_samples(
     period: float | None = None,
     durable: bool = True,
 ) -> Path:
-    """Write a foreign recording as an archive of kind ``imported``.
+    """Write a recording as an archive of kind ``imported``.
 
     Args:
         path: the file, which must not exist.
-        samples: what was recorded.
+        samples: of the recording.
         joint_names: joints in the order of the columns.
-        metadata: entries of the ``hil`` metadata record, such as where the recording comes from.
+        metadata: entries of the ``hil`` metadata record.
         attachments: content by file name.
-        period: step [s] of a recording at a fixed rate; its time is then counted in samples.
-        durable: wait until the disk has the data.
+        period: sampling step [s] of a recording at a fixed rate.
+        durable: wait until the data are on the disk.
 
     Raises:
-        ArchiveWriteError: the file exists, the disk refuses, or a stamp cannot be stored.
+        ArchiveWriteError: the file exists or cannot be written, or a stamp cannot be stored.
     """
     path = Path(path)
     stamp, current = samples.stamp, samples.motor_current
     if stamp.size and not 0 <= stamp.min() <= stamp.max() < 2**31 * 10**9:
         raise ArchiveWriteError(
-            path, "a stamp lies outside 0 .. 2^31 s", remedy="shift the recording's clock"
+            path, "a stamp is outside 0 .. 2^31 s", remedy="shift the recording's clock"
         )
     recorded = {
         "position": samples.position, "velocity": samples.velocity, "effort": samples.torque

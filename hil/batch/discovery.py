@@ -259,7 +259,7 @@ def _inspected(place: Location, path: Path, cache: CacheLocation) -> ArchiveRef:
     ref = ArchiveRef(
         location=place.location,
         sha256=sha256,
-        use=header.serves_as,
+        use=header.purpose,
         arm="",
         campaign=place.campaign,
         index=index,

@@ -75,7 +75,7 @@ def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
         _require_same(path, ref)
         try:
             archive = open_archive(path, fields=_FIELDS)
-            if archive.header.controllers_own:
+            if archive.header.by_controller_program:
                 archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
         finally:
             if ref.stamp is not None:  # what was written meanwhile is no fault of the archive

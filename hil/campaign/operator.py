@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.states import State
-from hil.archive.header import WORDS
+from hil.archive.header import KIND_NAMES
 
 if TYPE_CHECKING:
     from .dry_run import DryRun
@@ -288,7 +288,7 @@ class RunWatch:
         self._duration, self._most, self.began = duration, most, time.time()
         self._tell(
             None,
-            phase=cast(Phase, WORDS.get(kind, kind)),
+            phase=cast(Phase, KIND_NAMES.get(kind, kind)),
             number=number,
             total=total,
             motions_left=max(0, self.status.motions_left - 1),

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.archive.check import ASPECTS, Check, Overview, check_archive, overview
+from hil.archive.check import ASPECTS, Check, Overview, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
 from hil.archive.repair import repaired_name
 from hil.cli import exit_code_of
@@ -33,7 +33,7 @@ def info(files: Files, as_json: JsonOption = False) -> None:
     failed = 0
     for path in files:
         try:
-            found = overview(path)
+            found = read_overview(path)
         except ArchiveError as error:
             failed = exit_code_of(error)
             _print_error(path, error, as_json=as_json)
@@ -91,7 +91,7 @@ def repair(
             {
                 "file": str(done.path),
                 "output": None if done.output is None else str(done.output),
-                "whole": done.whole,
+                "whole": done.intact,
                 "losses": list(done.losses),
                 "samples": done.samples,
                 "samples_lost": done.samples_lost,

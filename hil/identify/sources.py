@@ -125,7 +125,7 @@ def gather_sources(
     archives = [open_archive(path) for path in [*paths, *predict]]
     by_use: defaultdict[str, list[Archive]] = defaultdict(list)
     for k, archive in enumerate(archives):
-        use = archive.header.serves_as if k < len(paths) else "validation"
+        use = archive.header.purpose if k < len(paths) else "validation"
         rejected = archive.outcome is not None and archive.outcome.outcome == REJECTED
         by_use[REJECTED if rejected else use].append(archive)
     fitted, predicted = by_use["excitation"], by_use["validation"]
@@ -340,7 +340,7 @@ def useful_part(archive: Archive, recording: Recording) -> range | None:
     These are the samples with a commanded position, or, for motions of the controller's own
     program, those with the drive on (otherwise the brakes carry the arm).
     """
-    if archive.header.controllers_own and "status" in archive.columns:
+    if archive.header.by_controller_program and "status" in archive.columns:
         usable, problem = archive.columns["status"] == DRIVE_ON, "the drive is never on"
     elif recording.commanded_position is not None:
         usable = ~np.isnan(recording.commanded_position).any(axis=1)

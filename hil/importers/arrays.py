@@ -81,7 +81,7 @@ def _columns(
     """The fields of messages of one topic, given with their log times [ns], and their stamps."""
     joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
     data = joined.reshape(len(messages), layout.size)
-    if not layout.holds_in(data):
+    if not layout.matches(data):
         raise LayoutError("its messages differ in names or lengths of arrays")
     rows = data.view(layout.dtype)[:, 0]
     columns: dict[str, NDArray[Any]] = {

@@ -78,10 +78,10 @@ def read(
     with _opened(path) as stream:
         for record in _records(stream):
             if record.opcode == container.SCHEMA:
-                schema = container.item(record)
+                schema = container.parse_item(record)
                 schemas.setdefault(schema.id, schema)
             elif record.opcode == container.CHANNEL:
-                channel: Channel = container.item(record)
+                channel: Channel = container.parse_item(record)
                 kind = schemas.get(channel.schema_id, Schema(0, b"", "", "without schema"))
                 topic = Topic(kind.name, channel.message_encoding, kind.encoding, kind.data)
                 topics.setdefault(channel.topic, topic)
@@ -112,11 +112,11 @@ def _records(stream: BinaryIO) -> Iterator[Record]:
         if record.opcode != container.CHUNK:
             yield record
             continue
-        head = container.chunk(record)
-        data = container.decompressed(head, record.offset, largest=LARGEST_CHUNK)
+        head = container.parse_chunk(record)
+        data = container.decompress(head, record.offset, largest=LARGEST_CHUNK)
         if head.uncompressed_crc and crc32(data) != head.uncompressed_crc:
             raise Damage(record.offset, "(chunk) fails its checksum")
-        yield from container.split(data, record.offset)
+        yield from container.split_records(data, record.offset)
 
 
 @contextmanager

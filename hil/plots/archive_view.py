@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.packets import DRIVE_ON
 from drivers.states import State
 from hil.archive import Archive, open_archive
-from hil.archive.check import Overview, overview
+from hil.archive.check import Overview, read_overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
@@ -158,7 +158,7 @@ def view_of(
             gaps += time[columns["gap"] > 0].tolist()
     events = [(one.time - origin, one.name, one.text, one.level >= 30) for one in head.events]
     return ArchiveView(
-        facts=overview(path),
+        facts=read_overview(path),
         joint_names=tuple(head.joint_names[j] + " [mm]" * bool(scales.slides[j]) for j in shown),
         start=begin,
         stop=end,

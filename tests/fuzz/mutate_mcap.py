@@ -18,8 +18,8 @@ import zstandard
 from mcap.records import Attachment, Chunk, Metadata
 
 from hil.archive import container, header
-from hil.archive.container import Damage, encoded
-from hil.archive.header import chunk_list
+from hil.archive.container import Damage, encode
+from hil.archive.header import format_chunk_list
 from tests.fuzz.draw import mutate_bytes, mutate_text
 from tests.hil.mcap_bytes import Indexed
 from tests.hil.mcap_bytes import record as record_of
@@ -70,15 +70,15 @@ def _split(data: bytes) -> list[tuple[int, bytes]]:
     """Opcodes and bodies, up to where the bytes are no record any more."""
     found: list[tuple[int, bytes]] = []
     with contextlib.suppress(Damage):
-        found.extend((record.opcode, record.body) for record in container.split(data, 0))
+        found.extend((record.opcode, record.body) for record in container.split_records(data, 0))
     return found
 
 
 def _opened(opcode: int, body: bytes) -> Record:
     with contextlib.suppress(Damage):  # no chunk, or damaged beyond reading: as it is
         if opcode == container.CHUNK:
-            head = container.chunk(container.Record(0, opcode, body))
-            plain = container.decompressed(head, 0)
+            head = container.parse_chunk(container.Record(0, opcode, body))
+            plain = container.decompress(head, 0)
             inside = [Record(*piece) for piece in _split(plain)]
             times = head.message_start_time, head.message_end_time
             return Record(opcode, body, inside, head.compression, times)
@@ -92,14 +92,14 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
     described = _described(records)
     for one in records:
         body = _sealed(
-            one, {header.DESCRIPTION: described, header.CHUNKS: chunk_list(built.checksums)}
+            one, {header.DESCRIPTION: described, header.CHUNKS: format_chunk_list(built.checksums)}
         )
         if index:
             built.put(record_of(one.opcode, body))
             continue
         if one.opcode == container.CHUNK:
             with contextlib.suppress(Damage):
-                head = container.chunk(container.Record(0, one.opcode, body))
+                head = container.parse_chunk(container.Record(0, one.opcode, body))
                 built.checksums.append(head.uncompressed_crc)
         file += record_of(one.opcode, body)
     if index:
@@ -133,16 +133,16 @@ def _sealed(one: Record, seals: dict[str, str]) -> bytes:
             name, entries = _entries(one)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
-                return _body(Metadata(name, header.sealed(entries)))
+                return _body(Metadata(name, header.with_checksum(entries)))
     return one.body
 
 
 def _body(record: Attachment | Chunk | Metadata) -> bytes:
-    return encoded(record)[container.RECORD.size :]
+    return encode(record)[container.RECORD.size :]
 
 
 def _entries(one: Record) -> tuple[str, dict[str, str]]:
-    return container.metadata(container.Record(0, one.opcode, one.body))
+    return container.parse_metadata(container.Record(0, one.opcode, one.body))
 
 
 def _change(records: list[Record], rng: random.Random) -> None:
@@ -230,7 +230,7 @@ def _of_metadata(one: Record, rng: random.Random) -> None:
 
 def _of_an_attachment(one: Record, rng: random.Random) -> None:
     try:
-        found = container.parsed(Attachment, container.Record(0, one.opcode, one.body))
+        found = container.parse(Attachment, container.Record(0, one.opcode, one.body))
     except Damage:
         return
     if rng.random() < 0.1:

@@ -16,8 +16,8 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from hil.archive import container
 from hil.archive.chunk import ChunkParser
-from hil.archive.container import Record, encoded
-from hil.archive.header import sealed
+from hil.archive.container import Record, encode
+from hil.archive.header import with_checksum
 from hil.archive.mcap_writer import McapWriter, entries_of
 from hil.archive.schema import CYCLE
 
@@ -42,22 +42,22 @@ def text(value: str) -> bytes:
 
 
 def metadata(name: str, entries: Mapping[str, str]) -> bytes:
-    return encoded(Metadata(name, dict(entries)))
+    return encode(Metadata(name, dict(entries)))
 
 
 def chunk(content: bytes, times: tuple[int, int] = (0, 0), level: int = 3) -> bytes:
     packed = zstandard.compress(content, level)
-    return encoded(Chunk("zstd", packed, times[1], times[0], zlib.crc32(content), len(content)))
+    return encode(Chunk("zstd", packed, times[1], times[0], zlib.crc32(content), len(content)))
 
 
 def attachment(name: str, content: bytes) -> bytes:
-    return encoded(Attachment(0, 0, name, "", content))
+    return encode(Attachment(0, 0, name, "", content))
 
 
 def heads(chunk: bytes) -> Iterator[Head]:
     """The messages of a decompressed chunk."""
     head = struct.Struct("<HIQQ")
-    for item in container.split(chunk, 0):
+    for item in container.split_records(chunk, 0):
         if item.opcode == container.MESSAGE:
             channel, sequence, log_time, _ = head.unpack_from(item.body)
             start = item.offset + container.RECORD.size
@@ -68,7 +68,7 @@ def chunks(data: bytes) -> list[tuple[int, int]]:
     """Where each chunk of a file begins and ends."""
     found, at = [], len(container.MAGIC)
     while at < len(data) and data[at] != container.DATA_END:
-        opcode, end = container.bounds(data, at, 0)
+        opcode, end = container.record_bounds(data, at, 0)
         if opcode == container.CHUNK:
             found.append((at, end))
         at = end
@@ -142,7 +142,7 @@ class Content:
                 stream, self.chunk_size, compression=self.compression, index_types=self.indexes
             )
             writer.start(self.profile, self.library)
-            writer.add_metadata("hil", sealed(self.metadata))
+            writer.add_metadata("hil", with_checksum(self.metadata))
             for name, data in sorted(self.attachments.items()):
                 writer.add_attachment(0, 0, name, "text/plain", data)
             channels: dict[str, int] = {}
@@ -159,7 +159,7 @@ class Content:
                 times = message.log_time, message.data, message.publish_time, message.sequence
                 writer.add_message(channels[message.topic], *times)
             writer.flush()
-            writer.add_metadata("hil.outcome", sealed(self.outcome))
+            writer.add_metadata("hil.outcome", with_checksum(self.outcome))
             writer.finish()
         return path
 
@@ -184,7 +184,7 @@ class Indexed:
         if item.opcode != container.CHUNK:
             self._writer.put(data)
             return
-        head, parser = container.chunk(item), ChunkParser()
+        head, parser = container.parse_chunk(item), ChunkParser()
         found = parser.messages(container.chunk_data(head, item.offset), item.offset)
         for definition in parser.definitions:
             self._writer.note(definition)

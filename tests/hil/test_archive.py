@@ -203,7 +203,7 @@ class TestBadInput:
         [
             (f"nowhere/{NAME}", {}, r"nowhere.*cannot be created: No such file"),
             (NAME, {"kind": "validation"}, "'validation', but the file name says 'excitation'"),
-            ("x.mcap", {}, "None is no kind of archive; use standstill"),
+            ("x.mcap", {}, "None is not a kind of archive; use standstill"),
         ],
     )
     def test_what_cannot_begin_leaves_no_file(self, tmp_path, name, metadata, sentence):
@@ -224,7 +224,7 @@ class TestBadInput:
                 archive.write(np.zeros(3, cycle_dtype(6)))
             archive.write(rows[:0])
             archive.write(rows, torques(rows))
-            sentence = rf"cycle {first} cannot follow cycle 12099.*begin another archive"
+            sentence = rf"cycle {first} follows cycle 12099.*begin another archive"
             with pytest.raises(ArchiveWriteError, match=sentence):
                 archive.write(records(100, first=first))
             archive.close("completed")
@@ -236,7 +236,7 @@ class TestBadInput:
         rows = records(100)
         rows["cycle"][60:] -= 30
         with writer(tmp_path / NAME) as archive:
-            with pytest.raises(ArchiveWriteError, match="cycle 12030 cannot follow cycle 12059"):
+            with pytest.raises(ArchiveWriteError, match="cycle 12030 follows cycle 12059"):
                 archive.write(rows)
             archive.close("void")
         assert open_archive(tmp_path / NAME).n_samples == 0

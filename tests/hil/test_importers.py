@@ -1159,7 +1159,7 @@ class TestImportCommand:
         assert "warning: as mapped" in result.stdout
         assert 'write unit = "deg"' in result.stdout
         header = open_archive(tmp_path / "log.mcap").header
-        assert header.serves_as == "validation"
+        assert header.purpose == "validation"
         assert any("deg" in warning for warning in header.findings.warnings)
         assert json.loads(header.entries["source"]) == ["log.npz"]
 

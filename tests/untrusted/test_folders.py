@@ -468,7 +468,7 @@ def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, fold
         lambda: Played.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
     ):
-        with pytest.raises(ArchiveError, match="is no recording of a motion of hil's own"):
+        with pytest.raises(ArchiveError, match="is not a recording by hil"):
             way()
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from drivers import InitPacket
 from drivers.record import cycle_dtype
 from hil.archive import Archive, ArchiveWriter, Samples, open_archive, write_samples
-from hil.archive.check import check_archive, overview
+from hil.archive.check import check_archive, read_overview
 from hil.archive.repair import repair
 from hil.errors import ArchiveError, ArchiveWriteError, InputError
 from hil.new import cell_of_urdf, from_archive
@@ -81,7 +81,7 @@ def as_told(path: Path) -> None:
     with suppress(ArchiveError):
         check_archive(path)
     with suppress(ArchiveError):
-        json.dumps(overview(path).to_dict())
+        json.dumps(read_overview(path).to_dict())
 
 
 def as_drawn(path: Path) -> None:
@@ -101,7 +101,7 @@ def as_repaired(path: Path, archive: Archive) -> None:
     except (ArchiveError, ArchiveWriteError):
         return
     if made.output is None:
-        assert made.whole
+        assert made.intact
         return
     again = open_archive(target)
     assert again.complete, again.damage

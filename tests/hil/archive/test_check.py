@@ -179,7 +179,7 @@ class TestAnotherFile:
 
     def test_a_file_that_is_not_there_comes_with_a_remedy(self, tmp_path):
         for read in (check_archive, open_archive, repair):
-            with pytest.raises(ArchiveError, match="No such file or directory; see whether"):
+            with pytest.raises(ArchiveError, match="No such file or directory; check whether"):
                 read(tmp_path / "nowhere.mcap")
 
 

@@ -121,13 +121,13 @@ def mixed(data: bytes, other: bytes, place: int) -> bytes:
 def earlier(data: bytes, path: Path) -> bytes:
     """The archive as versions wrote it that had no list of chunks."""
     at = data.index(b"\x0b\x00\x00\x00hil.outcome") - container.RECORD.size
-    _, end = container.bounds(data, at, 0)
+    _, end = container.record_bounds(data, at, 0)
     record = container.Record(at, container.METADATA, data[at + container.RECORD.size : end])
-    name, entries = container.metadata(record)
+    name, entries = container.parse_metadata(record)
     for key in (header.CHUNKS, header.DESCRIPTION, "checksum"):
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data[:at] + mcap_bytes.metadata(name, header.sealed(entries)))
+    path.write_bytes(data[:at] + mcap_bytes.metadata(name, header.with_checksum(entries)))
     done = repair(path, in_place=True)  # makes the index anew
     assert done.losses == ()
     assert header.CHUNKS.encode() + b"\x28" not in path.read_bytes()
@@ -146,7 +146,7 @@ def assert_saved(path: Path, written: Written, sound: list[int]) -> None:
     assert back.complete, back.missing
     written.assert_true(back)
     assert back.columns["cycle"].tolist() == cycles
-    assert repair(done.output).whole
+    assert repair(done.output).intact
     assert check_archive(done.output).conforms
 
 
@@ -159,7 +159,7 @@ class TestChunksOfAnotherArchive:
         assert archive.n_samples == 43
         assert header.CHUNKS not in archive.outcome.entries
         assert check_archive(path).conforms
-        assert repair(path).whole
+        assert repair(path).intact
 
     @pytest.mark.parametrize("place", [0, 1, 4])
     def test_one_with_cycles_of_another_time_costs_itself(self, written, path, place):
@@ -259,7 +259,7 @@ def mended(path: Path, data: bytes) -> tuple[Repair, bytes]:
     done = repair(path, output)
     second = repair(output, again)
     assert path.read_bytes() == data, "the original stays as it is"
-    assert second.whole, "a repaired archive has no fault"
+    assert second.intact, "a repaired archive has no fault"
     assert again.read_bytes() == output.read_bytes(), "repairing twice changes nothing"
     return done, output.read_bytes()
 
@@ -368,12 +368,12 @@ class TestNothingLost:
             "nothing": written.data,
         }[what]
         done, output = mended(path, data)
-        assert done.whole == (what == "nothing")
+        assert done.intact == (what == "nothing")
         assert not done.losses
         assert output == written.data
-        if done.whole:  # a whole archive is left alone
+        if done.intact:  # a whole archive is left alone
             again = repair(path)
-            assert again.whole and again.output is None
+            assert again.intact and again.output is None
 
 
 class TestLoss:
@@ -484,7 +484,7 @@ class TestRefused:
     def test_what_does_not_read_back_is_thrown_away_with_a_remedy(self, path, monkeypatch):
         torn = open_archive(path)
         monkeypatch.setattr(repairing, "open_archive", lambda *_, **__: torn)
-        with pytest.raises(ArchiveError, match=r"cannot be written anew.*restore it from a copy"):
+        with pytest.raises(ArchiveError, match=r"cannot be rewritten.*restore it from a copy"):
             repair(path)
 
     def test_a_full_disk_is_our_error(self, path, monkeypatch):

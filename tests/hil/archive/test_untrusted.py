@@ -23,9 +23,9 @@ from typer.testing import CliRunner
 import hil
 from hil.archive import container, header, open_archive, schema
 from hil.archive.cdr import LayoutError, fixed_layout
-from hil.archive.check import check_archive, overview
+from hil.archive.check import check_archive, read_overview
 from hil.archive.container import Record
-from hil.archive.header import ArchiveHeader, HeaderError, chunk_list
+from hil.archive.header import ArchiveHeader, HeaderError, format_chunk_list
 from hil.archive.repair import repair
 from hil.archive.schema import sample_messages
 from hil.archive.writer import ArchiveFile
@@ -42,7 +42,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "a range": lambda path: open_archive(path, start=50.0, stop=50.2),
     "open_recording": hil.open_recording,
     "check": check_archive,
-    "info": overview,
+    "info": read_overview,
     "repair": lambda path: repair(path, path.with_name("repaired.mcap")),
 }
 
@@ -64,19 +64,20 @@ def forged(
         if record.opcode in (container.MESSAGE_INDEX, container.DATA_END):
             continue
         if record.opcode == container.METADATA:
-            name, entries = container.metadata(record)
+            name, entries = container.parse_metadata(record)
             del entries["checksum"]
-            seals = {header.CHUNKS: chunk_list(made.checksums), header.DESCRIPTION: described}
+            chunks = format_chunk_list(made.checksums)
+            seals = {header.CHUNKS: chunks, header.DESCRIPTION: described}
             entries |= {key: seals[key] for key in seals.keys() & entries.keys()}
             entries |= given[name]
             described = described or header.checksum(entries)
-            data = mcap_bytes.metadata(name, header.sealed(entries))
+            data = mcap_bytes.metadata(name, header.with_checksum(entries))
         elif record.opcode == container.CHUNK:
-            head = container.chunk(record)
+            head = container.parse_chunk(record)
             content = chunk(container.chunk_data(head, record.offset))
             data = mcap_bytes.chunk(content, (head.message_start_time, head.message_end_time))
         elif record.opcode == container.ATTACHMENT:
-            found = container.attachment(record)
+            found = container.parse_attachment(record)
             content = (attachments or {}).get(found.name, found.data)
             data = mcap_bytes.attachment(found.name, content)
         made.put(data)
@@ -162,7 +163,7 @@ def test_what_is_written_for_a_number_stops_no_reader(number, written, path):
     )
     said = outcomes(path)
     assert set(said.values()) == {""}, said
-    assert "validation" in overview(path).title
+    assert "validation" in read_overview(path).title
 
 
 def test_a_count_that_is_no_number_is_a_fault(written, path):
@@ -173,7 +174,7 @@ def test_a_count_that_is_no_number_is_a_fault(written, path):
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
 def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
     path = forged(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
-    with pytest.raises(ArchiveError, match=f"{name}: is no text in UTF-8"):
+    with pytest.raises(ArchiveError, match=f"{name}: is not UTF-8 text"):
         cell_of(open_archive(path))
     result = CliRunner().invoke(app, ["identify", str(path), "--in-sample", "-o", str(tmp_path)])
     assert isinstance(result.exception, ArchiveError)
@@ -206,9 +207,9 @@ def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, path):
     assert done.samples == 43
     assert done.samples_lost is None
     again = repair(done.output, done.output.with_name("again.mcap"))
-    assert again.whole
+    assert again.intact
     assert again.output.read_bytes() == done.output.read_bytes()
-    assert overview(path).samples == 43
+    assert read_overview(path).samples == 43
 
 
 class TestEvents:
@@ -234,7 +235,7 @@ CYCLE, ELSEWHERE = 1, 9  # numbers of channels; the second is nobody's
 
 
 def channel(number: int, topic: str, *, schema_id: int = 1) -> bytes:
-    return container.encoded(Channel(number, topic, "cdr", {}, schema_id))
+    return container.encode(Channel(number, topic, "cdr", {}, schema_id))
 
 
 def another_schema(chunk: bytes) -> bytes:
@@ -264,7 +265,7 @@ def with_cycles(chunk: bytes) -> bytes:
     return channel(ELSEWHERE, schema.CYCLE) + changed
 
 
-class TestAnnouncements:
+class TestDefinitions:
     """What a number or a topic means is said once: else samples of one were taken for another's."""
 
     @pytest.mark.parametrize(
@@ -275,11 +276,11 @@ class TestAnnouncements:
             (another_schema, "schema 1 a second time"),
         ],
     )
-    def test_announced_again_as_something_else(self, second, why, written, tmp_path):
+    def test_defined_again_as_something_else(self, second, why, written, tmp_path):
         # Where cycles are counted, a gap shows, and what is behind it stands.
         self.assert_first_alone(written, tmp_path, [bytes, second], why, repaired=33)
 
-    def test_announced_again_as_it_was(self, written, path):
+    def test_defined_again_as_it_was(self, written, path):
         again = channel(CYCLE, schema.CYCLE)
         path = forged(written, path, chunk=lambda chunk: again + chunk)
         assert check_archive(path).conforms
@@ -460,7 +461,7 @@ class TestSizes:
         start = struct.unpack_from("<Q", data, len(data) - len(container.MAGIC) - 20)[0]
         body = data[start : -container.FOOTER_SIZE - len(container.MAGIC)]
         summary = b""
-        for record in (one.data for one in container.split(body, 0)):
+        for record in (one.data for one in container.split_records(body, 0)):
             if record[0] == container.SUMMARY_OFFSET:
                 continue
             summary += b"".join(change(record) if record[0] == container.CHUNK_INDEX else [record])
