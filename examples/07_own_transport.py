@@ -81,7 +81,7 @@ def main() -> None:
     ring = CycleRing(len(cell.joint_names), capacity=1000)
     guard = Guard(cell.guard_limits, cell.period)
     session = Session(cell.drive_train, guard, ring, **cell.session_settings())
-    link = Link(PipeTransport(near, cell.period), session, ring, guard)
+    link = Link(PipeTransport(near, cell.period), session, ring, guard, cell)
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
         way = straight_way(cell, link.connect(stop), cell.home)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from drivers.events import MotionEnded
 from hil.campaign.errors import MotionRefusedError
 from hil.campaign.intervals import Interval, player_of, way
-from hil.campaign.motion_link import MotionLink, checks_in_force
+from hil.campaign.motion_link import MotionLink, active_checks
 from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
 from hil.cell import AngleFrame, Cell
@@ -187,7 +187,7 @@ def straight_way(
         start: (n,) rad.
         target: (n,) rad.
         speed: fraction of the joints' speeds; the cell's `approach_speed` if left out.
-        checks: the cell's if left out; `checks_in_force` has those with a connected controller's
+        checks: the cell's if left out; `active_checks` has those with a connected controller's
             own limits, which `send` asks for again.
 
     Raises:
@@ -228,7 +228,7 @@ def send(
         ControllerFault: it was not accepted (nothing moved), or the link broke.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
     """
-    checks = checks_in_force(cell, link.connection, planned.checks)
+    checks = active_checks(cell, link.connection, planned.checks)
     if checks is not planned.checks:
         _require(checks, planned.trajectory)
     spec = archive_spec(

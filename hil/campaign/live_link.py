@@ -1,9 +1,9 @@
-"""A real link: exchange and archive in processes of their own, supervised from here.
+"""Link over a real transport: exchange and archive in processes of their own.
 
-This process only asks: it hands motions and archives over, says every 50 ms that it lives (as long
-as the loop that supervises a motion turns), and reports. The exchange answers the controller,
-whatever happens here; the archive process writes what the exchange leaves in shared memory. Each of
-the three notices the death of the others, and then the arm comes to rest on its path.
+This process requests motions and archives, sends a heartbeat every 50 ms while the loop that
+supervises a motion runs, and reports. The exchange process replies to the controller, the archive
+process writes what the exchange leaves in shared memory. Each of the three detects the death of
+the others, and then the arm comes to rest on its path.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import Final, Self, TypeVar, get_args
+from typing import ClassVar, Final, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ from drivers.exchange.event_log import (
     ExchangeFailed,
     Leaving,
 )
-from drivers.exchange.process import ExchangeProcess, ExchangeSettings, WithdrawnError
+from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.motion_source import MotionSource
 from drivers.record import CAPACITY, RingReader
@@ -62,48 +62,45 @@ from hil.archive.supervised import (
 )
 from hil.cell import Cell
 from hil.cell.cell import stays_here
-from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
+from hil.errors import ArchiveWriteError, ControllerFault
 from hil.terminal_text import plural
 
 from .motion_link import (
     END_TIMEOUT,
-    Beginning,
     Connection,
+    MotionLink,
     Progress,
     Recorded,
+    StartTimeout,
     Watch,
+    active_drive_train,
+    active_guard,
     described,
-    drives_in_force,
-    guard_in_force,
-    not_ready,
-    unwatched,
+    recording_end,
 )
-from .operator import MotionWatch, Stop, unwatched_motion
-from .steering import NOT_BEGUN, PacketCounts, Steering
+from .operator import Stop
+from .steering import PacketCounts, Steering
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-BEAT: Final = 0.05
-"""s between two heartbeats; the exchange stops the arm after 0.5 s without one."""
+HEARTBEAT_PERIOD: Final = 0.05
+"""s; the exchange stops the arm after 0.5 s without a heartbeat."""
 STALL: Final = 1.0
-"""s within which the loop that supervises a motion must have turned."""
+"""Longest time between two turns of the loop that supervises a motion, s."""
 _STARVED: Final = 0.4
-"""s between two beats that are reported: the exchange may have missed them."""
+"""Time between two heartbeats that is reported, s: the exchange may have missed them."""
 HUNG: Final = 5.0
-"""s without a sign of life after which an exchange process is ended: the controller, unanswered
-for so long, has acted by its own watch."""
-READY: Final = frozenset((State.CLOSED, State.OPENING, State.OPEN))
-"""States with the drive on. A controller may open its axes at once: they are held where they are
-until a motion is asked for."""
+"""s without a heartbeat after which an exchange process is killed: the controller, without replies
+for so long, has acted by its own watchdog."""
 POLL: Final = 0.02
-"""s between two looks at everything while a motion runs."""
+"""Period of the supervising loop, s."""
 OPEN_TIMEOUT = 10.0
 """s within which a file must have been created, or completed."""
 SLOW_DISK: Final = 1.0
-"""s at once that a disk takes for a flush when something is wrong with it."""
+"""Duration of one flush that is reported as a fault of the disk, s."""
 REST_TIMEOUT: Final = 30.0
-"""s for an arm that was asked to stop to rest, and for the archive of a motion that has ended."""
+"""s for an arm to come to rest, and for the archive of a motion that has ended."""
 _M_MMAP_THRESHOLD: Final = -3
 LARGE: Final = 128 * 1024
 """Bytes; glibc's own value, before it adapts."""
@@ -112,15 +109,15 @@ LARGE: Final = 128 * 1024
 def return_large_arrays() -> None:
     """Have arrays of `LARGE` bytes and more returned to the system when they are freed.
 
-    glibc takes larger and larger ones from its heap, once such have been freed. They come to lie
-    between small ones that stay, and over hours the heap grows around the holes.
+    Otherwise glibc takes ever larger ones from its heap once such have been freed, and over hours
+    the heap grows around the holes between small ones.
     """
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)
 
 
 class Heartbeat:
-    """Beats for a link."""
+    """Heartbeat of this process to the exchange; it pauses while the supervising loop stalls."""
 
     def __init__(
         self, beat: Callable[[], None], clock: Callable[[], float] = time.monotonic
@@ -129,37 +126,37 @@ class Heartbeat:
         self._turned: float | None = None
         self._stalled = self._starved = 0.0
         self._last = clock()
-        self._over = False
+        self._ended = False
 
     def start(self) -> None:
         """Beat in a thread until `end`."""
 
         def beat() -> None:
-            while not self._over:
-                self.look()
-                time.sleep(BEAT)
+            while not self._ended:
+                self.update()
+                time.sleep(HEARTBEAT_PERIOD)
 
         threading.Thread(target=beat, daemon=True).start()
 
     def end(self) -> None:
-        """Beat no more."""
-        self._over = True
+        """End the thread."""
+        self._ended = True
 
     def begin(self) -> None:
-        """A motion is asked for: what went before is no cause of what happens to it."""
+        """A motion is requested: forget the delays of before, and require turns of the loop."""
         self._stalled = self._starved = 0.0
         self.turn()
 
     def turn(self) -> None:
-        """The loop that supervises a motion turns; it must again within `STALL` s, until `rest`."""
+        """The supervising loop turned; it must again within `STALL` s, until `rest`."""
         self._turned = self._clock()
 
     def rest(self) -> None:
-        """No motion is supervised any more: other work may take as long as it likes."""
+        """No motion is supervised: other work may take any time."""
         self._turned = None
 
-    def look(self) -> None:
-        """Beat, unless the supervision stands still."""
+    def update(self) -> None:
+        """Beat, unless the supervising loop stalls."""
         now, turned = self._clock(), self._turned
         self._starved, self._last = max(self._starved, now - self._last), now
         stalled = 0.0 if turned is None else now - turned
@@ -168,15 +165,15 @@ class Heartbeat:
         else:
             self._beat()
 
-    def explained(self, text: str) -> str:
-        """What the exchange says, with the cause where it missed our signs of life."""
+    def with_cause(self, text: str) -> str:
+        """Return a reason of the exchange, with the cause where it missed our heartbeat."""
         starved = max(self._starved, self._clock() - self._last)
         if NO_SUPERVISOR not in text:
             return text
         if self._stalled:
             cause = (
-                f"whatever looks at the motion (show, request) did not return for "
-                f"{self._stalled:.1f} s, and nobody could have passed on a stop"
+                f"show or request of the motion's watch did not return for {self._stalled:.1f} s, "
+                "so that no stop could be passed on"
             )
         elif starved > _STARVED:
             cause = (
@@ -190,34 +187,34 @@ class Heartbeat:
 
 @dataclass(eq=False)
 class ExchangeView:
-    """What the supervising process knows of its exchange process.
+    """State of the exchange process and of the motion requested last, from its events.
 
     Attributes:
         exchange: the process.
-        explained: adds the cause to what the process says, where it is known here.
-        connection: what is known of the controller.
+        with_cause: adds its cause to a reason of the process.
+        connection: state of the controller.
         lost: the last loss of the link.
-        ended: the end of the motion asked for last, if its event came.
+        ended: the end of the motion, if its event came.
         inits: init packets so far.
-        refused: the refusal since a motion was asked for last.
-        not_understood: of packets that came last and got no answer, how many and why.
-        began: whether the motion asked for last has sent anything, or may have.
-        ended_for: what a process that had to be ended was ended for; "" for none.
+        refused: the refusal since the motion was requested.
+        not_understood: number and cause of packets without a reply; "" for none.
+        started: whether the motion has sent anything, or may have.
+        ended_for: why the process was killed; "" if it was not.
     """
 
     exchange: ExchangeProcess
-    explained: Callable[[str], str] = str
+    with_cause: Callable[[str], str] = str
     connection: Connection = field(default_factory=Connection)
     lost: LinkLost | None = None
     ended: MotionEnded | None = None
     inits: int = 0
-    began: bool = False
+    started: bool = False
     refused: Refused | None = None
     not_understood: str = ""
     ended_for: str = ""
-    _beginning: Beginning = field(default_factory=lambda: Beginning(time.monotonic()))
+    _start: StartTimeout = field(default_factory=lambda: StartTimeout(time.monotonic()))
     _rejected: int = 0
-    _said: str = ""
+    _last_message: str = ""
     _ended_before: int = 0
     _monitor: HeartbeatMonitor = field(init=False)
 
@@ -225,11 +222,11 @@ class ExchangeView:
         control = ControlBlock(self.exchange.control_fd)
         self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
 
-    def look(self) -> list[ExchangeEvent]:
-        """Take in what the exchange says, and return it."""
+    def poll(self) -> list[ExchangeEvent]:
+        """Receive the events of the exchange, update the state with them, and return them."""
         events = self.exchange.events()
         for event in events:
-            self.connection.note(event)
+            self.connection.update(event)
             match event:
                 case InitReceived():
                     self.inits += 1
@@ -244,28 +241,28 @@ class ExchangeView:
                     packets = plural(self._rejected, "packet")
                     self.not_understood = f"{packets} came and got no answer: {event.reason}"
                 case MotionStarted() | EventsLost():
-                    self.began = True
+                    self.started = True
                 case ExchangeFailed():
-                    self._said = event.trace.strip().splitlines()[-1]
-                case Leaving() | ExchangeEnded() if not self._said:
-                    self._said = self.explained(event.reason)
+                    self._last_message = event.trace.strip().splitlines()[-1]
+                case Leaving() | ExchangeEnded() if not self._last_message:
+                    self._last_message = self.with_cause(event.reason)
         return events
 
-    def forget_motion(self) -> None:
-        """Another motion is about to be asked for."""
-        self.look()
-        self.ended, self.refused, self.began = None, None, False
-        self._beginning = Beginning(time.monotonic())
+    def reset_motion(self) -> None:
+        """Forget the last motion: another one is about to be requested."""
+        self.poll()
+        self.ended, self.refused, self.started = None, None, False
+        self._start = StartTimeout(time.monotonic())
         self._ended_before = self.status.ended_count
 
-    def not_begun(self) -> str | None:
-        """Why the motion asked for will not begin any more, in words; None while it may."""
-        found = self._beginning.hopeless(self.state, time.monotonic())
-        return None if self.began or self.motion_ended else found
+    def no_start(self) -> str | None:
+        """Return why the motion will not start; None while it may, and once it has."""
+        found = self._start.no_start(self.state, time.monotonic())
+        return None if self.started or self.motion_ended else found
 
     @property
     def motion_ended(self) -> bool:
-        """Whether the motion asked for has ended; the event that says so may have been lost."""
+        """Whether the motion has ended; its event may have been lost."""
         return self.ended is not None or self.status.ended_count != self._ended_before
 
     @property
@@ -275,47 +272,40 @@ class ExchangeView:
 
     @property
     def state(self) -> State:
-        """Of the session."""
+        """State of the session."""
         return State(self.status.state)
 
     def failure(self) -> str | None:
-        """Why no answers come any more, in words; None as long as they do.
-
-        A process that hangs is ended.
-        """
+        """Return why the process no longer replies, None while it does; kill one that hangs."""
         if self.exchange.alive and self._monitor.silence() > HUNG:
             self.exchange.kill()
             self.ended_for = f"sent no heartbeat for {HUNG:g} s and was ended"
         if self.exchange.alive:
             return None
-        self.look()
-        said = f" ({self._said})" if self._said else ""
-        return f"the exchange process {self.ended_for or 'ended' + said}"
+        self.poll()
+        message = f" ({self._last_message})" if self._last_message else ""
+        return f"the exchange process {self.ended_for or 'ended' + message}"
 
 
 @dataclass(eq=False)
-class LiveLink:
-    """A connection over a real transport, in real time; a `MotionLink`.
+class LiveLink(MotionLink):
+    """Connection over a real transport, in real time.
 
-    Use it as a context manager: leaving it, for whatever reason, brings the arm to rest, leaves
-    open mode and ends both processes.
+    A context manager: leaving it, also by an error, brings the arm to rest, leaves open mode and
+    ends both processes.
 
     Attributes:
-        cell: whose controller is at the far end.
-        exchange: the process that answers.
+        exchange: the process that replies.
         archive: the process that writes.
-        heart: tells the exchange that this process lives.
-        finish: asks the far end to end the session; only a simulated one can be asked.
-        view: what is known of the exchange.
+        heart: heartbeat of this process.
+        finish: asks the controller to end the session; only a simulated one can be asked.
+        view: state of the exchange.
         inits: init packets until the controller was connected.
-        cycles: records archived so far.
-        late: answers so far that were late or left out for a newer one's.
-        not_accepted: answers so far that the controller did not take.
+        late: replies so far that were late or left out for a newer one's.
+        not_accepted: replies so far that the controller did not accept.
         job: number of the archive opened last.
         open_path: of the archive that is open; "" if none is.
-        live: where viewers may look, None if nowhere.
-        only_simulated: whether the transport really opened ends on this computer, so that nothing
-            but a simulated controller can be at the far end.
+        live: where viewers connect, None if nowhere.
     """
 
     cell: Cell
@@ -329,14 +319,22 @@ class LiveLink:
     not_accepted: int = 0
     live: LiveView | None = None
     only_simulated: bool = False
+    connection: Connection = field(init=False)
     view: ExchangeView = field(init=False)
     job: int = 0
     open_path: str = ""
+    _reader: RingReader = field(init=False)
+    _position: Array | None = None
     _late_path: str = ""
     _closed: bool = False
+    # With the drive on. A controller may open its axes at once: they are held where they are
+    # until a motion is requested.
+    _READY: ClassVar[frozenset[State]] = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 
     def __post_init__(self) -> None:
-        self.view = ExchangeView(self.exchange, explained=self.heart.explained)
+        self.view = ExchangeView(self.exchange, with_cause=self.heart.with_cause)
+        self.connection = self.view.connection
+        self._restart_reader()
 
     @classmethod
     def open(
@@ -352,19 +350,19 @@ class LiveLink:
     ) -> LiveLink:
         """Start both processes on the cell's link, or on another `transport` to it.
 
-        From here on large arrays of this process go back to the system when they are freed.
+        From here on large arrays of this process return to the system when they are freed.
 
         Args:
             cell: the cell.
             transport: in place of the cell's own.
             accept_init: use the controller's figures where they differ from the cell's.
-            only_axis: the axis, from 1, that alone is to be open; None for all.
-            realtime: what the exchange asks of the system.
-            finish: asks the far end to end the session.
-            live: lets viewers look at what is recorded.
+            only_axis: the only axis, from 1, that is opened; None for all.
+            realtime: what the exchange requests from the system.
+            finish: asks the controller to end the session.
+            live: where viewers may connect.
 
         Raises:
-            LiveViewError: the live view cannot be served as asked for.
+            LiveViewError: the live view cannot be served.
             CellError: the cell names no real link.
             ControllerFault: the link cannot be opened (port in use, not permitted, no adapter), or
                 the system refuses a process.
@@ -387,7 +385,7 @@ class LiveLink:
             raise ControllerFault(str(error)) from error
         except OSError as error:
             raise ControllerFault(f"the exchange process cannot be started: {error}") from error
-        # At once: the archive process may take longer to start than the exchange waits for a sign.
+        # At once: the archive process may take longer to start than the exchange waits for a beat.
         heart = Heartbeat(exchange.send_heartbeat)
         heart.start()
         try:
@@ -410,70 +408,19 @@ class LiveLink:
                 raise
         return link
 
-    @property
-    def connection(self) -> Connection:
-        """What is known of the controller."""
-        return self.view.connection
-
     def notes(self) -> tuple[str, ...]:
-        """What the system refused to the exchange, in sentences; none of it is needed."""
+        """Return what the system refused to the exchange, in sentences; none of it is needed."""
         return (*self.exchange.realtime.refused, *self.exchange.notes)
 
-    def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
-        """See `MotionLink.connect`."""
-        deadline = time.monotonic() + timeout
-        self._await_late(stop)
-        reader = self.reader()
-        last: Array | None = None
-        while not stop.requested and time.monotonic() < deadline:
-            self.view.look()
-            self.connection.require_usable(self.cell)
-            records = reader.drain()
-            if len(records):
-                last = records["target_position"][-1].copy()
-            if self.view.state in READY and last is not None:
-                self.inits = self.view.inits
-                return last
-            if (failure := self.view.failure()) is not None:
-                raise ControllerFault(f"{failure}; the controller gets no answers")
-            time.sleep(POLL)
-        if stop.requested:
-            raise ControllerFault("stopped by the operator before anything moved")
-        raise not_ready(self.view.state, timeout)
-
-    def run(
-        self,
-        source: MotionSource,
-        spec: ArchiveSpec,
-        stop: Stop,
-        *,
-        override: float = 1.0,
-        watch: MotionWatch = unwatched_motion,
-    ) -> MotionEnded:
-        """See `MotionLink.run`."""
-        return _LiveMotion(self, source, spec, stop, watch, override).run()
-
-    def record(
-        self,
-        spec: ArchiveSpec,
-        stop: Stop,
-        *,
-        duration: float | None = None,
-        wait: float | None = None,
-        watch: Watch = unwatched,
-    ) -> Recorded:
-        """See `MotionLink.record`."""
-        return _LiveRecording(self, stop, watch).run(spec, duration, wait)
-
     def close(self) -> None:
-        """End the session where the far end can be asked to, then both processes.
+        """End the session where the controller can be asked to, then both processes.
 
         Raises:
-            ControllerFault: one of them did not end by itself.
+            ControllerFault: one of them did not end properly.
         """
-        trouble = self._shut()
-        if trouble is not None:
-            raise ControllerFault(trouble)
+        problem = self._shut()
+        if problem is not None:
+            raise ControllerFault(problem)
 
     def __enter__(self) -> Self:
         return self
@@ -486,72 +433,69 @@ class LiveLink:
             self.exchange.stop()
         self._shut()
 
-    def reader(self) -> RingReader:
-        """A reader of the records that does not stand in the archive process's way."""
-        n_joints = len(self.cell.joint_names)
-        return RingReader(self.exchange.ring_fd, n_joints, acknowledge=False)
+    # --- archives
 
-    def open_archive(self, spec: ArchiveSpec, *, from_now: bool, until_ended: bool) -> None:
-        """Have an archive opened; nothing may move before that.
+    @contextmanager
+    def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
+        """See `MotionLink.open_archive`; what is still open at an error is closed with the link.
 
         Raises:
             ArchiveWriteError: it cannot be created.
             ControllerFault: the archive process does not answer.
         """
-        drives = drives_in_force(self.cell, self.connection)
+        drives = active_drive_train(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
         spec = replace(spec, packets=self.cell.controller.packets)
         self.view.lost = None
         self.job += 1
         self.open_path = str(spec.path)
-        command = Open(self.job, spec, drives, from_now, until_ended)
+        command = Open(self.job, spec, drives, not own_motion, not own_motion)
         unsent = f"nothing was sent, and {spec.path} is not recorded"
-        if self._asked(command, Opened, unsent) is not None:
-            self._late_path = ""  # commands are obeyed in order
-            return
-        # Should it come to it after all, it is to be closed at once.
-        self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
-        self.open_path, self._late_path = "", str(spec.path)
-        late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
-        raise ControllerFault(f"the archive process {late}; nothing was sent")
+        if self._request(command, Opened, unsent) is None:
+            # Should it be opened after all, it is to be closed at once.
+            self.archive.send(Close(self.job, "void", "nothing was sent: it was opened too late"))
+            self.open_path, self._late_path = "", str(spec.path)
+            late = f"did not open {spec.path} within {OPEN_TIMEOUT:g} s"
+            raise ControllerFault(f"the archive process {late}; nothing was sent")
+        self._late_path = ""  # commands are executed in order
+        self._restart_reader()
+        yield
 
     def complete(self, outcome: str, reason: str) -> Closed:
-        """Have the archive completed.
+        """See `MotionLink.complete`.
 
         Raises:
             ArchiveWriteError: the disk refuses.
             ControllerFault: the archive process does not answer.
         """
-        self.heart.rest()  # what was supervised is over, or never began
+        self.heart.rest()  # the motion has ended, or never began
         path = self.open_path
         incomplete = f"{path} is not complete ({outcome}: {reason})"
-        closed = self._asked(Close(self.job, outcome, reason), Closed, incomplete)
+        closed = self._request(Close(self.job, outcome, reason), Closed, incomplete)
         if closed is None:
             raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
-        self.count(closed)
+        self._add_counts(closed)
         return closed
 
-    def write_failed(self, failed: Failed) -> ArchiveWriteError:
-        """The error of an archive that cannot be written further."""
-        self.open_path = ""
-        return write_error(failed)
-
-    def archive_failure(self) -> str | None:
-        """What is wrong with the archive process; whoever asks tells what becomes of the file."""
-        failure = self.archive.failure()
-        if failure is not None:
-            self.open_path = ""
-        return failure
-
-    def count(self, closed: Closed) -> None:
-        """Add up what an archive holds."""
+    def _add_counts(self, closed: Closed) -> None:
         self.open_path = ""
         self.cycles += closed.records
         self.late += closed.late
         self.not_accepted += closed.not_accepted
 
-    def _asked(self, command: Command, wanted: type[T], otherwise: str) -> T | None:
-        """The answer to a command to the archive process; None if none came in `OPEN_TIMEOUT` s.
+    def _write_failed(self, failed: Failed) -> ArchiveWriteError:
+        self.open_path = ""
+        return write_error(failed)
+
+    def _archive_failure(self) -> str | None:
+        """Return what is wrong with the archive process; the caller reports the open file."""
+        failure = self.archive.failure()
+        if failure is not None:
+            self.open_path = ""
+        return failure
+
+    def _request(self, command: Command, answer: type[T], consequence: str) -> T | None:
+        """Return the answer to a command to the archive process; None after `OPEN_TIMEOUT` s.
 
         Raises:
             ArchiveWriteError: the disk refuses.
@@ -560,18 +504,41 @@ class LiveLink:
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
         while time.monotonic() < deadline:
-            answer = self.archive.answer(POLL, self.job)
-            if isinstance(answer, wanted):
-                return answer
-            if isinstance(answer, Failed):
+            found = self.archive.answer(POLL, self.job)
+            if isinstance(found, answer):
+                return found
+            if isinstance(found, Failed):
                 self._late_path = ""
-                raise self.write_failed(answer)
-            if (failure := self.archive_failure()) is not None:
-                raise ControllerFault(f"{failure}; {otherwise}")
+                raise self._write_failed(found)
+            if (failure := self._archive_failure()) is not None:
+                raise ControllerFault(f"{failure}; {consequence}")
         return None
 
-    def _await_late(self, stop: Stop) -> None:
-        """Until an archive that was opened too late is closed; only then are free names known."""
+    def _serve(self, view: LiveView) -> None:
+        """Have the archive process serve viewers."""
+        cell = self.cell
+        self.job += 1
+        command = Serve(self.job, view, cell.joint_names, cell.period, cell.drive_train)
+        try:
+            answer = self._request(command, Serving, "nothing was sent")
+        except ArchiveWriteError as error:
+            raise LiveViewError(None, error.problem, remedy=error.remedy) from error
+        if answer is None:
+            raise ControllerFault("the archive process does not answer; nothing was sent")
+        self.live = replace(view, port=answer.port)
+
+    # --- exchange
+
+    def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
+        """See `MotionLink.connect`."""
+        self._await_late_archive(stop)
+        self._restart_reader()
+        target = super().connect(stop, timeout)
+        self.inits = self.view.inits
+        return target
+
+    def _await_late_archive(self, stop: Stop) -> None:
+        """Wait until an archive that was opened too late is closed: its name is in use then."""
         deadline = time.monotonic() + OPEN_TIMEOUT
         while self._late_path and not stop.requested:
             answer = self.archive.answer(POLL, self.job)
@@ -581,167 +548,36 @@ class LiveLink:
                 raise ControllerFault(f"{failure}; nothing was sent")
             elif time.monotonic() > deadline:
                 waits = f"the archive process still waits for the disk to open {self._late_path}"
-                raise ControllerFault(f"{waits}; nothing was sent, look after that disk")
+                raise ControllerFault(f"{waits}; nothing was sent, check that disk")
 
-    def _serve(self, view: LiveView) -> None:
-        """Have the archive process let viewers look."""
-        cell = self.cell
-        self.job += 1
-        command = Serve(self.job, view, cell.joint_names, cell.period, cell.drive_train)
-        try:
-            answer = self._asked(command, Serving, "nothing was sent")
-        except ArchiveWriteError as error:
-            raise LiveViewError(None, error.problem, remedy=error.remedy) from error
-        if answer is None:
-            raise ControllerFault("the archive process does not answer; nothing was sent")
-        self.live = replace(view, port=answer.port)
+    def _exchange_until(self, finished: Callable[[], bool], consequence: str) -> None:
+        while not finished():
+            if (failure := self.view.failure()) is not None:
+                raise ControllerFault(f"{failure}; {consequence}")
+            time.sleep(POLL)
 
-    def _shut(self) -> str | None:
-        """End both processes; what was wrong with them, None if nothing was."""
-        if self._closed:
-            return None
-        self._closed = True
-        self.heart.end()
-        trouble: str | None = None
-        try:
-            self.finish()
-            self.exchange.finish()
-            deadline = time.monotonic() + END_TIMEOUT
-            while self.view.failure() is None and time.monotonic() < deadline:
-                self.exchange.send_heartbeat()
-                time.sleep(POLL)
-            if self.view.ended_for:
-                trouble = f"the exchange process {self.view.ended_for}"
-            if self.exchange.alive:
-                trouble = (
-                    f"the exchange process still answers {END_TIMEOUT:g} s after it was asked to "
-                    "end (an axis is open); it ends when the axes are closed"
-                )
-        finally:
-            failure = self.archive.end()
-            if failure is not None and self.open_path:
-                trouble = f"{failure}; {self.open_path} is not complete"
-            self.exchange.close()
-        return trouble
+    def _now(self) -> float:
+        return time.monotonic()
 
+    def _state(self) -> State:
+        return self.view.state
 
-class _LiveMotion:
-    """One motion on a `LiveLink`.
+    def _poll(self) -> list[ExchangeEvent]:
+        return self.view.poll()
 
-    Whatever happens here delays no answer: the exchange is asked through shared memory.
-    """
+    def _restart_reader(self) -> None:
+        """Read the records that are still in the ring; the archive process reads independently."""
+        n_joints = len(self.cell.joint_names)
+        self._reader = RingReader(self.exchange.ring_fd, n_joints, acknowledge=False)
 
-    def __init__(
-        self,
-        link: LiveLink,
-        source: MotionSource,
-        spec: ArchiveSpec,
-        stop: Stop,
-        watch: MotionWatch,
-        override: float,
-    ) -> None:
-        self._link, self._source, self._path, self._stop = link, source, spec.path, stop
-        self._spec = spec
-        self._view, self._exchange, self._reader = link.view, link.exchange, link.reader()
-        self._steering = Steering(source, watch, override, self._counts)
-        self._stop_passed = False
-
-    def run(self) -> MotionEnded:
-        """See `MotionLink.run`."""
-        link, view = self._link, self._view
-        self._begins()  # no archive is opened while a hold stands
-        link.open_archive(self._spec, from_now=True, until_ended=True)
-        # That may have taken seconds: nothing is asked for that is no longer wanted.
-        while self._begins():
-            if view.inits > link.inits:  # with limits that no motion was checked against
-                why = "the controller began a new session since it was connected"
-                link.complete("void", why)
-                raise ControllerFault(
-                    f"{why}; nothing was sent, run again: its limits are checked anew"
-                )
-            view.forget_motion()
-            self._reader.drain()
-            link.heart.begin()
-            try:
-                self._submit()
-                return self._supervised()
-            except WithdrawnError:
-                continue  # it was stopped, held or slowed meanwhile, or a new session began
-            finally:
-                link.heart.rest()
-        link.complete("stopped", NOT_BEGUN)
-        return MotionEnded("stopped", NOT_BEGUN, -1, -1)
-
-    def _begins(self) -> bool:
-        """See `Steering.begin`; what the exchange says meanwhile is not lost."""
-        try:
-            return self._steering.begin(self._stop, self._view.look)
-        except ControllerFault as error:
-            if self._link.open_path:
-                self._link.complete("void", str(error))
-            raise
-        finally:
-            self._view.look()
-
-    def _still_wanted(self) -> bool:
-        """Whether it may begin the next moment, as it was handed over."""
-        self._link.heart.turn()
-        self._view.look()
-        same_session = self._view.inits == self._link.inits
-        return same_session and self._steering.unchanged(self._stop)
-
-    def _submit(self) -> None:
-        try:
-            self._exchange.submit(self._source, self._still_wanted)
-        except WithdrawnError:
-            raise
-        except RequestError as error:
-            self._link.complete("refused", str(error))
-            why = self._link.heart.explained(str(error))
-            raise ControllerFault(f"{why}; {self._path} says so") from error
-        except DriverError as error:
-            self._require_archive()
-            self._exchange.stop()
-            self._view.look()
-            why = self._view.failure() or str(error)
-            closed = self._link.complete("void", why)
-            raise ControllerFault(f"{why}; {self._path} is {closed.outcome}") from error
-
-    def _supervised(self) -> MotionEnded:
-        """How the motion that was asked for ended."""
-        link, view, due = self._link, self._view, math.inf
-        drives = drives_in_force(link.cell, link.connection)
-        guard = guard_in_force(link.cell, drives, link.connection.init)
-        while True:
-            link.heart.turn()
-            self._steering.note(view.look())
-            if self._stop.requested and not self._stop_passed:
-                self._exchange.stop()
-                self._stop_passed = True
-            if not view.motion_ended:
-                self._steering.follow(self._exchange)
-            if self._steering.due:
-                self._steering.take(self._reader.drain())
-                status = view.status
-                self._steering.show(drives, guard, view.state, status.motion_time, status.rate)
-            if (idle := view.not_begun()) is not None:
-                return self._given_up(idle)
-            answer = link.archive.answer(POLL, link.job)
-            if isinstance(answer, Closed):
-                return self._ending(answer)
-            if isinstance(answer, Failed):
-                error = link.write_failed(answer)
-                self._come_to_rest()
-                raise error
-            self._require_archive()
-            if view.motion_ended or view.failure() is not None:
-                due = min(due, time.monotonic() + REST_TIMEOUT)
-            if time.monotonic() > due:
-                what = f"{self._path} was not completed within {REST_TIMEOUT:g} s"
-                raise ControllerFault(f"the motion is over, but {what}")
+    def _new_records(self) -> NDArray[np.void]:
+        records = self._reader.drain()
+        if len(records):
+            self._position = records["position"][-1].copy()
+        return records
 
     def _counts(self) -> PacketCounts:
-        status = self._view.status
+        status = self.view.status
         return PacketCounts(
             status.answered,
             status.missed,
@@ -751,10 +587,115 @@ class _LiveMotion:
             1e-6 * status.worst_turnaround_us,
         )
 
-    def _ending(self, closed: Closed) -> MotionEnded:
-        view = self._view
-        self._link.count(closed)
-        view.look()
+    def _with_cause(self, reason: str) -> str:
+        return self.heart.with_cause(reason)
+
+    def _shut(self) -> str | None:
+        """End both processes; return what was wrong with them, None if nothing was."""
+        if self._closed:
+            return None
+        self._closed = True
+        self.heart.end()
+        problem: str | None = None
+        try:
+            self.finish()
+            self.exchange.finish()
+            deadline = time.monotonic() + END_TIMEOUT
+            while self.view.failure() is None and time.monotonic() < deadline:
+                self.exchange.send_heartbeat()
+                time.sleep(POLL)
+            if self.view.ended_for:
+                problem = f"the exchange process {self.view.ended_for}"
+            if self.exchange.alive:
+                problem = (
+                    f"the exchange process still replies {END_TIMEOUT:g} s after it was asked to "
+                    "end (an axis is open); it ends when the axes are closed"
+                )
+        finally:
+            failure = self.archive.end()
+            if failure is not None and self.open_path:
+                problem = f"{failure}; {self.open_path} is not complete"
+            self.exchange.close()
+        return problem
+
+    # --- one motion; nothing here delays a reply: the exchange is asked through shared memory
+
+    def _submit(self, source: MotionSource, wanted: Callable[[], bool], /) -> None:
+        path = self.open_path
+        if self.view.inits > self.inits:  # with limits that no motion was checked against
+            reason = "the controller began a new session since it was connected"
+            self.complete("void", reason)
+            raise ControllerFault(
+                f"{reason}; nothing was sent, run again: its limits are checked again"
+            )
+        self.view.reset_motion()
+        self.heart.begin()
+
+        def still_wanted() -> bool:
+            self.heart.turn()
+            self.view.poll()
+            return self.view.inits == self.inits and wanted()
+
+        accepted = False
+        try:
+            self.exchange.submit(source, still_wanted)
+            accepted = True
+        except RequestError:
+            raise
+        except DriverError as error:
+            self._require_archive(path)
+            self.exchange.stop()
+            self.view.poll()
+            reason = self.view.failure() or str(error)
+            closed = self.complete("void", reason)
+            raise ControllerFault(f"{reason}; {path} is {closed.outcome}") from error
+        finally:
+            if not accepted:
+                self.heart.rest()
+
+    def _supervise(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
+        try:
+            return self._await_end(spec, steering, stop)
+        finally:
+            self.heart.rest()
+
+    def _await_end(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
+        view, due, stop_sent = self.view, math.inf, False
+        drives = active_drive_train(self.cell, self.connection)
+        guard = active_guard(self.cell, drives, self.connection.init)
+        while True:
+            self.heart.turn()
+            steering.add_events(view.poll())
+            if stop.requested and not stop_sent:
+                self.exchange.stop()
+                stop_sent = True
+            if not view.motion_ended:
+                steering.follow(self.exchange)
+            if steering.due:
+                steering.add_records(self._new_records())
+                status = view.status
+                steering.show(drives, guard, view.state, status.motion_time, status.rate)
+            if (reason := view.no_start()) is not None:
+                return self._give_up(spec, reason)
+            answer = self.archive.answer(POLL, self.job)
+            if isinstance(answer, Closed):
+                return self._ended(answer)
+            if isinstance(answer, Failed):
+                error = self._write_failed(answer)
+                self._come_to_rest()
+                raise error
+            self._require_archive(str(spec.path))
+            if view.motion_ended or view.failure() is not None:
+                due = min(due, time.monotonic() + REST_TIMEOUT)
+            if time.monotonic() > due:
+                late = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
+                raise ControllerFault(f"the motion has ended, but {late}")
+
+    def _ended(self, closed: Closed) -> MotionEnded:
+        """Return how the motion of a completed archive ended."""
+        view = self.view
+        self._add_counts(closed)
+        view.poll()
         ended = view.ended
         if ended is None and closed.outcome in get_args(Outcome) and view.motion_ended:
             outcome: Outcome = closed.outcome  # type: ignore[assignment]
@@ -762,213 +703,118 @@ class _LiveMotion:
         if ended is None:
             failure = view.failure() or closed.reason
             raise ControllerFault(
-                f"{failure}; the controller gets no answers and acts by its own watch; "
-                f"the archive ({closed.outcome}) is whole so far"
+                f"{failure}; the controller gets no answers and acts by its own watchdog; "
+                f"the archive ({closed.outcome}) is complete up to then"
             )
         if ended.reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
             waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
-            return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: look after that disk)")
-        return replace(ended, reason=self._link.heart.explained(ended.reason))
+            return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: check that disk)")
+        return replace(ended, reason=self.heart.with_cause(ended.reason))
 
-    def _given_up(self, why: str) -> MotionEnded:
-        """A motion that has not begun is dropped; without an archive it cannot begin any more."""
-        refused = self._view.refused
-        reason = why if refused is None else str(refused.error)
-        self._link.complete("void" if refused is None else "refused", reason)
-        self._exchange.stop()
+    def _give_up(self, spec: ArchiveSpec, reason: str) -> MotionEnded:
+        """Drop a motion that has not started; without an archive it cannot start any more."""
+        refused = self.view.refused
+        reason = reason if refused is None else str(refused.error)
+        self.complete("void" if refused is None else "refused", reason)
+        self.exchange.stop()
         if refused is None:
-            raise ControllerFault(f"{why}; nothing was sent ({self._path})")
+            raise ControllerFault(f"{reason}; nothing was sent ({spec.path})")
         return MotionEnded("refused", reason, -1, -1)
 
-    def _require_archive(self) -> None:
+    def _require_archive(self, path: str) -> None:
         """Raise ControllerFault if the archive process is gone or hangs; the arm rests first."""
-        if (failure := self._link.archive_failure()) is not None:
+        if (failure := self._archive_failure()) is not None:
             rests = "the arm was brought to rest"
             if not self._come_to_rest():
-                state = self._view.state.name
+                state = self.view.state.name
                 rests = f"the arm was asked to stop, but was not seen at rest ({state})"
-            readable = f"{self._path} is readable up to its last part"
+            readable = f"{path} is readable up to its last part"
             raise ControllerFault(f"{failure}; {rests}, and {readable}")
 
     def _come_to_rest(self) -> bool:
-        """Whether the motion has ended; the exchange stops it by itself, but is asked to again."""
-        self._exchange.stop()
+        """Ask the exchange to stop, as it does on its own; return whether the motion ended."""
+        self.exchange.stop()
         deadline = time.monotonic() + REST_TIMEOUT
-        while not self._view.motion_ended and time.monotonic() < deadline:
-            if self._view.failure() is not None:
+        while not self.view.motion_ended and time.monotonic() < deadline:
+            if self.view.failure() is not None:
                 return False
-            self._link.heart.turn()
-            self._view.look()
+            self.heart.turn()
+            self.view.poll()
             time.sleep(POLL)
-        return self._view.motion_ended
+        return self.view.motion_ended
 
+    # --- one recording
 
-SILENCE: Final = 1.0
-"""s without a packet after which nobody is there to be answered."""
-NOBODY: Final = frozenset((State.SYNC, State.INIT, State.ENDED))
-"""States in which no session is going on."""
-TARGET_MOVED: Final = 1e-5
-"""rad; a target at rest does not change at all, but its rounding may."""
-ARM_MOVED: Final = 5e-4
-"""rad; more than an encoder's noise, less than any motion makes in a second."""
-REST: Final = 1.0
-"""s of the controller's time without motion after which the arm is at rest."""
-OFF: Final = 1.0
-"""s with the drive off after which answers end; a session that is being ended is ended by then."""
+    def _no_session(self, wait: float) -> str:
+        status, table = self.view.status, self.cell.controller
+        who = table.host if table.transport == "udp" else "the controller"
+        some = status.answered > 0 or self.view.not_understood
+        what = "no init packet" if some else "nothing"
+        also = f"; {self.view.not_understood}" if self.view.not_understood else ""
+        return (
+            f"{what} heard from {who} within {wait:g} s ({status.foreign} packets from "
+            f"elsewhere{also})"
+        )
 
-
-class Standstill:
-    """Looks at records for the last motion of target or arm. A joint not known counts as moving.
-
-    Args:
-        period: cycle of the controller, s.
-    """
-
-    def __init__(self, period: float) -> None:
-        self._cycles = round(REST / period)
-        self._still: NDArray[np.void] | None = None
-
-    def take(self, records: NDArray[np.void]) -> bool:
-        """Whether the arm has been at rest for `REST` at the end of the next records (k,)."""
-        for record in records:
-            last = self._still
-            if (
-                last is None
-                or not record["cycle"] > last["cycle"]
-                or not _near(record, last, "target_position", TARGET_MOVED)
-                or not _near(record, last, "position", ARM_MOVED)
-            ):
-                self._still = record.copy()
-        if self._still is None or not len(records):
-            return False
-        return int(records["cycle"][-1]) - int(self._still["cycle"]) >= self._cycles
-
-
-def _near(record: NDArray[np.void], other: NDArray[np.void], name: str, bound: float) -> bool:
-    return bool(np.all(np.abs(record[name] - other[name]) <= bound))
-
-
-class _LiveRecording:
-    """One recording on a `LiveLink`.
-
-    The controller's own program goes on when a recording ends, for whatever reason, and what it
-    does with a PC that falls silent in the middle of a motion is not known. So answers go on until
-    the arm has stood still for a second, the drive is off, the session has ended or nothing is
-    heard any more; or until the operator insists.
-    """
-
-    def __init__(self, link: LiveLink, stop: Stop, watch: Watch) -> None:
-        self._link, self._stop, self._watch = link, stop, watch
-        self._view, self._reader = link.view, link.reader()
-        self._position: Array | None = None
-
-    def run(self, spec: ArchiveSpec, duration: float | None, wait: float | None) -> Recorded:
-        """Wait for the controller, record, and answer until the arm rests."""
-        self._await_controller(wait)
-        self._link.connection.require_usable(self._link.cell)
-        inits = self._view.inits
-        self._link.open_archive(spec, from_now=False, until_ended=False)
-        self._reader = self._link.reader()
-        try:
-            recorded = self._record(spec, duration, inits)
-        except (ArchiveWriteError, ControllerFault) as error:
-            self._answer_until_rest(f"the recording failed ({error})")
-            raise
-        self._answer_until_rest("recording complete")
-        return recorded
-
-    def _await_controller(self, wait: float | None) -> None:
-        until = math.inf if wait is None else time.monotonic() + wait
-        while self._link.connection.init is None:
-            self._view.look()
-            self._show()
-            if self._stop.requested:
-                raise OperatorStopError("ended before the controller came: nothing was recorded")
-            if (failure := self._view.failure()) is not None:
-                raise ControllerFault(f"{failure}: nothing was recorded")
-            if time.monotonic() > until:
-                status = self._view.status
-                table = self._link.cell.controller
-                who = table.host if table.transport == "udp" else "the controller"
-                some = status.answered > 0 or self._view.not_understood
-                what = "no init packet" if some else "nothing"
-                also = f"; {self._view.not_understood}" if self._view.not_understood else ""
-                raise ControllerFault(
-                    f"{what} heard from {who} within {wait:g} s ({status.foreign} packets from "
-                    f"elsewhere{also}): nothing was recorded"
-                )
-            time.sleep(POLL)
-
-    def _record(self, spec: ArchiveSpec, duration: float | None, inits: int) -> Recorded:
-        link = self._link
+    def _record(
+        self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
+    ) -> Recorded:
+        inits, period = self.view.inits, self.cell.period
         while True:
-            ending = self._ends(duration, restarted=self._view.inits > inits)
-            self._records()
-            self._show()
+            # First the process: its last message and the last state of the session are known then.
+            failure = self.view.failure()
+            self.view.poll()
+            status, lost = self.view.status, self.view.lost
+            ending = recording_end(
+                restarted=self.view.inits > inits,
+                complete=duration is not None and (status.cycle + 1) * period >= duration,
+                ended=status.state == State.ENDED,
+                lost=failure or ("" if lost is None else describe(lost)),
+                stopped=stop.requested,
+                limited=duration is not None,
+                refused=self.view.refused,
+            )
+            self._new_records()
+            self._show_recording(watch)
             if ending is not None:
-                seconds = (self._view.status.cycle + 1) * link.cell.period
-                closed = link.complete(*ending)
+                closed = self.complete(*ending)
+                seconds = (status.cycle + 1) * period
                 return Recorded.of(closed.outcome, closed.reason, seconds, closed)
-            if isinstance(answer := link.archive.answer(POLL, link.job), Failed):
+            if isinstance(answer := self.archive.answer(POLL, self.job), Failed):
                 raise write_error(answer)
-            if (failure := link.archive_failure()) is not None:
+            if (failure := self._archive_failure()) is not None:
                 raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
 
-    def _ends(self, duration: float | None, *, restarted: bool) -> tuple[str, str] | None:
-        """Outcome and reason of a recording that is to end now, or None."""
-        # The process first: what it said and how the session stood at its end is known then.
-        failure = self._view.failure()
-        self._view.look()
-        status = self._view.status
-        ending = None
-        if restarted:
-            ending = "stopped", "the controller began a new session"
-        elif duration is not None and (status.cycle + 1) * self._link.cell.period >= duration:
-            ending = "completed", "as long as was asked for"
-        elif status.state == State.ENDED:
-            ending = "completed", "the controller ended the session"
-        elif failure is not None:
-            ending = "lost", failure
-        elif self._view.lost is not None:
-            ending = "lost", describe(self._view.lost)
-        elif self._stop.requested:
-            outcome = "completed" if duration is None else "stopped"
-            ending = outcome, "ended by the operator"
-        if ending is not None and self._view.refused is not None:
-            return "refused", str(self._view.refused.error)
-        return ending
+    def _reply_until_rest(self, stop: Stop, watch: Watch, reason: str) -> None:
+        """Let the exchange continue to reply until the arm rests.
 
-    def _answer_until_rest(self, why: str) -> None:
-        """Do nothing, for as long as the exchange should go on answering."""
-        stopped, still = self._stop.requested, Standstill(self._link.cell.period)
-        driven, heard = time.monotonic(), 1
-        pulse = HeartbeatMonitor(lambda: heard, max_interval=5 * POLL)
-        self._reader = self._link.reader()
-        self._reader.drain()
-        while not (self._stop.insisted or (self._stop.requested and not stopped)):
-            failure, state, now = self._view.failure(), self._view.state, time.monotonic()
+        The controller's own program continues when a recording ends, and its reaction to a PC that
+        becomes silent in the middle of a motion is not known. So replies continue until the arm
+        has rested for a second, the drive is off, the session has ended or no packet arrives; or
+        until the operator insists.
+        """
+        stopped, still = stop.requested, Standstill(self.cell.period)
+        drive_on, received = time.monotonic(), 1
+        monitor = HeartbeatMonitor(lambda: received, max_interval=5 * POLL)
+        self._restart_reader()
+        self._new_records()
+        while not (stop.insisted or (stop.requested and not stopped)):
+            failure, state, now = self.view.failure(), self.view.state, time.monotonic()
             if state is not State.DRIVE_OFF:
-                driven = now
-            if failure is not None or state in NOBODY or now - driven > OFF:
+                drive_on = now
+            if failure is not None or state in NO_SESSION or now - drive_on > OFF:
                 return
-            self._view.look()
-            records = self._records()
-            heard += len(records) > 0
-            if still.take(records) or pulse.silence() > SILENCE:
+            self.view.poll()
+            records = self._new_records()
+            received += len(records) > 0
+            if still.add(records) or monitor.silence() > SILENCE:
                 return
-            self._show(over=why)
+            self._show_recording(watch, over=reason)
             time.sleep(POLL)
 
-    def _records(self) -> NDArray[np.void]:
-        """Records since the last call; the last position is shown."""
-        records = self._reader.drain()
-        if len(records):
-            self._position = records["position"][-1].copy()
-        return records
-
-    def _show(self, over: str = "") -> None:
-        status = self._view.status
-        self._watch(
+    def _show_recording(self, watch: Watch, over: str = "") -> None:
+        status = self.view.status
+        watch(
             Progress(
                 status.cycle,
                 status.missed,
@@ -978,14 +824,59 @@ class _LiveRecording:
                 not_accepted=status.unanswered,
                 foreign=status.foreign,
                 heard=status.answered > 0,
-                not_understood=self._view.not_understood,
+                not_understood=self.view.not_understood,
                 over=over,
             )
         )
 
 
+SILENCE: Final = 1.0
+"""s without a packet after which the controller is assumed to have gone."""
+NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))
+"""States without a session."""
+TARGET_MOVED: Final = 1e-5
+"""rad; a target at rest does not change, but its rounding may."""
+ARM_MOVED: Final = 5e-4
+"""rad; more than an encoder's noise, less than any motion moves in a second."""
+REST: Final = 1.0
+"""s of the controller's time without motion after which the arm is at rest."""
+OFF: Final = 1.0
+"""s with the drive off after which replies end; a session that is being ended has ended by then."""
+
+
+class Standstill:
+    """Detects that target and arm are at rest; a joint of unknown position counts as moving.
+
+    Args:
+        period: cycle of the controller, s.
+    """
+
+    def __init__(self, period: float) -> None:
+        self._cycles = round(REST / period)
+        self._still: NDArray[np.void] | None = None
+
+    def add(self, records: NDArray[np.void]) -> bool:
+        """Return whether the arm has been at rest for `REST` at the end of these records (k,)."""
+        for record in records:
+            last = self._still
+            if (
+                last is None
+                or not record["cycle"] > last["cycle"]
+                or not _close(record, last, "target_position", TARGET_MOVED)
+                or not _close(record, last, "position", ARM_MOVED)
+            ):
+                self._still = record.copy()
+        if self._still is None or not len(records):
+            return False
+        return int(records["cycle"][-1]) - int(self._still["cycle"]) >= self._cycles
+
+
+def _close(record: NDArray[np.void], other: NDArray[np.void], name: str, bound: float) -> bool:
+    return bool(np.all(np.abs(record[name] - other[name]) <= bound))
+
+
 def write_error(failed: Failed) -> ArchiveWriteError:
-    """What is raised where the archive process cannot write."""
+    """Return the error of an archive process that cannot write."""
     error = ArchiveWriteError(failed.path or None, failed.problem, remedy=failed.remedy)
     if failed.errno is not None:
         error.__cause__ = OSError(failed.errno, os.strerror(failed.errno))

@@ -1,18 +1,27 @@
-"""What a campaign needs of a link, in virtual or in real time, and what is known of its far end."""
+"""Connections to a controller: run motions on it, or record those of its own program.
+
+`MotionLink` has the stages of a connection, a motion and a recording. `hil.campaign.link`
+implements them in virtual time, `hil.campaign.live_link` in real time.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import Final, Literal, Protocol
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
+from drivers.errors import RequestError
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange.event_log import ExchangeEvent
+from drivers.exchange.process import WithdrawnError
 from drivers.guard import Guard
 from drivers.init_check import InitCheck, compare, float32_text, is_narrower
 from drivers.motion_source import MotionSource
@@ -22,41 +31,44 @@ from hil.archive import ArchiveSpec
 from hil.archive.recorder import Recorder, describe
 from hil.archive.supervised import Closed
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 from hil.motion_checks import MotionChecks
 
 from .operator import MotionWatch, Stop, unwatched_motion
+from .steering import PacketCounts, Steering
 
 Array = NDArray[np.float64]
 
-BEGIN_TIMEOUT: Final = 60.0
-"""s within which a motion that was accepted must have begun."""
+START_TIMEOUT: Final = 60.0
+"""s within which an accepted motion must have started."""
 OFF_TIMEOUT: Final = 2.0
-"""s with the drive off after which a motion that was accepted does not begin any more."""
+"""s with the drive off after which an accepted motion is given up."""
 END_TIMEOUT: Final = 30.0
-"""s within which a session has to end after that was asked for."""
+"""s within which a session must end after that was requested."""
+NOT_STARTED: Final = "it had not begun"
+"""Reason of a motion that was stopped before it was requested."""
 _WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)
 
 
-class Beginning:
-    """Whether a motion that was accepted may still begin.
+class StartTimeout:
+    """Detects that an accepted motion will not start.
 
     Args:
-        now: when it was asked for [s of any monotonic clock].
+        now: time of the request [s of any monotonic clock].
     """
 
     def __init__(self, now: float) -> None:
-        self._asked = self._driven = now
+        self._requested = self._drive_on = now
 
-    def hopeless(self, state: State, now: float) -> str | None:
-        """Why a motion that has not begun will not begin any more, in words; None while it may."""
+    def no_start(self, state: State, now: float) -> str | None:
+        """Return why a motion that has not started will not start; None while it may."""
         if state not in _WITHOUT_DRIVE:
-            self._driven = now
-        if now - self._driven > OFF_TIMEOUT:
-            came = "a refusal came" if state is State.FAULTED else "the drive went off"
-            return f"{came} before the motion began"
-        if now - self._asked > BEGIN_TIMEOUT:
-            return f"the motion did not begin within {BEGIN_TIMEOUT:g} s ({state.name})"
+            self._drive_on = now
+        if now - self._drive_on > OFF_TIMEOUT:
+            event = "a refusal came" if state is State.FAULTED else "the drive went off"
+            return f"{event} before the motion began"
+        if now - self._requested > START_TIMEOUT:
+            return f"the motion did not begin within {START_TIMEOUT:g} s ({state.name})"
         return None
 
 
@@ -69,10 +81,10 @@ class Recorded:
         reason: in a sentence.
         seconds: of the controller's time since its init packet.
         records, records_lost: cycles archived, and overwritten before they could be.
-        events_lost: events overwritten likewise.
+        events_lost: events overwritten before they could be archived.
         missed: packets that never arrived.
-        late: packets whose answer was late, or left out for a newer one.
-        not_accepted: answers that the controller did not take.
+        late: packets whose reply was late, or left out for a newer one.
+        not_accepted: replies that the controller did not accept.
     """
 
     outcome: str
@@ -87,35 +99,26 @@ class Recorded:
 
     @classmethod
     def of(cls, outcome: str, reason: str, seconds: float, counts: Recorder | Closed) -> Recorded:
-        """With the counts of its archive."""
-        return cls(
-            outcome,
-            reason,
-            seconds,
-            records=counts.records,
-            records_lost=counts.records_lost,
-            events_lost=counts.events_lost,
-            missed=counts.missed,
-            late=counts.late,
-            not_accepted=counts.not_accepted,
-        )
+        """Return the result with the counts of its archive."""
+        names = ("records", "records_lost", "events_lost", "missed", "late", "not_accepted")
+        return cls(outcome, reason, seconds, **{name: getattr(counts, name) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """What a recording shows while it goes on.
+    """Progress of a recording.
 
     Attributes:
         cycles: archived so far.
         missed: packets that never arrived.
         state: of the session.
         position: (n,) rad, measured last; None before the first record.
-        late: packets whose answer was late, or left out for a newer one.
-        not_accepted: answers that the controller did not take.
-        foreign: packets from elsewhere; they got no answer.
-        heard: whether any packet of the controller was answered yet.
-        not_understood: of packets that got no answer, how many came and why; "" without any.
-        over: why nothing is recorded any more though answers go on; "" while it is recorded.
+        late: packets whose reply was late, or left out for a newer one.
+        not_accepted: replies that the controller did not accept.
+        foreign: packets from other addresses; they get no reply.
+        heard: whether any packet of the controller was replied to yet.
+        not_understood: number and cause of packets without a reply; "" for none.
+        over: why nothing is recorded any more while replies continue; "" during the recording.
     """
 
     cycles: int
@@ -130,24 +133,20 @@ class Progress:
     over: str = ""
 
 
-Watch = Callable[[Progress], None]
-
-
-def unwatched(_progress: Progress) -> None:
-    """Nobody looks."""
+Watch = Callable[[Progress], object]
 
 
 @dataclass(eq=False)
 class Connection:
-    """What has become known of the controller since the link was opened.
+    """State of the controller since the link was opened.
 
     Attributes:
         init: its init packet.
         unusable: why the arm cannot be moved, None if it can.
-        differences: what it says otherwise than the cell.
+        differences: figures in which it differs from the cell.
         adopted: whether its figures are used instead of the cell's.
         refused: the last refusal of the session.
-        say: tells a person at once of each refusal.
+        report: receives a line for each refusal at once.
     """
 
     init: InitPacket | None = None
@@ -155,30 +154,26 @@ class Connection:
     differences: tuple[str, ...] = ()
     adopted: bool = False
     refused: Refused | None = None
-    say: Callable[[str], object] = str
+    report: Callable[[str], object] = str
 
-    def note(self, event: ExchangeEvent) -> None:
-        """Take in an event."""
+    def update(self, event: ExchangeEvent) -> None:
+        """Update the state with an event."""
         if isinstance(event, InitReceived):
             self.init, self.unusable = event.init, event.unusable
             self.differences, self.adopted = event.differences, event.adopted
         elif isinstance(event, Refused):
             self.refused = event
-            self.say(f"REFUSED: {describe(event)}")
+            self.report(f"REFUSED: {describe(event)}")
 
-    def require_usable(self, cell: Cell | None) -> None:
-        """Refuse a controller that is not the cell's.
-
-        Raises:
-            ControllerFault: the arm cannot be moved.
-        """
+    def require_usable(self, cell: Cell) -> None:
+        """Raise ControllerFault if the controller is not the cell's."""
         if self.unusable is None:
             return
         remedy = ""
         if self.differences and not self.adopted:
             remedy = "; correct the cell file, or the controller"
             # Another cycle or a closed axis cannot be accepted.
-            if cell is not None and self.init is not None and _accepted(cell, self.init).adopted:
+            if self.init is not None and _accepted(cell, self.init).adopted:
                 remedy += (
                     "; only `hil record` and `hil move` can use the controller's figures instead "
                     "(--accept-init)"
@@ -187,47 +182,65 @@ class Connection:
 
 
 def not_ready(state: State, waited: float) -> ControllerFault:
-    """What is reported of a controller that was `waited` s for, and not ready for a motion."""
-    after, drive = f"within {waited:.3g} s", "switch the drive on and try again"
-    anew = "start the program on the controller anew and try again"
-    if state is State.SYNC:
-        what = (
-            f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
-            f"began before this program; {anew}"
-        )
-    elif state is State.ENDED:
-        what = f"ended the session {after} before its drive was on; {anew}"
-    else:
-        what = f"did not reach drive-on {after} (state {state.name}); {drive}"
-    return ControllerFault(f"the controller {what}")
+    """Return the error of a controller that was not ready for a motion after `waited` s."""
+    after, restart = f"within {waited:.3g} s", "start the program on the controller anew"
+    match state:
+        case State.SYNC:
+            problem = (
+                f"did not begin a session {after} (state SYNC): it is silent, or still in one that "
+                f"began before this program; {restart} and try again"
+            )
+        case State.ENDED:
+            problem = f"ended the session {after} before its drive was on; {restart} and try again"
+        case _:
+            problem = f"did not reach drive-on {after} (state {state.name}); switch the drive on"
+            problem += " and try again"
+    return ControllerFault(f"the controller {problem}")
 
 
-class MotionLink(Protocol):
-    """One connection to a controller: motions are run on it and archived."""
+class MotionLink(ABC):
+    """Connection to a controller: runs motions and archives every cycle of them.
 
-    @property
-    def cycles(self) -> int:
-        """Records archived so far."""
-        ...
+    Attributes:
+        cell: its controller is connected.
+        connection: state of the controller.
+        cycles: records archived so far.
+        only_simulated: whether only a simulated controller can be connected.
+    """
 
-    @property
-    def connection(self) -> Connection:
-        """What is known of the controller."""
-        ...
-
-    @property
-    def only_simulated(self) -> bool:
-        """Whether nothing but a simulated controller can be at the far end."""
-        ...
+    cell: Cell
+    connection: Connection
+    cycles: int
+    only_simulated: bool
+    _READY: ClassVar[frozenset[State]]
 
     def connect(self, stop: Stop, timeout: float = 60.0) -> Array:
-        """Exchange until the drive is on and the axes are closed; the target position then (n,).
+        """Exchange packets until the drive is on; return the target position (n,) [rad].
 
         Raises:
-            ControllerFault: the controller did not get there within `timeout` s, cannot be used,
-                or a stop was asked for.
+            ControllerFault: the controller was not ready within `timeout` s of the link's time,
+                cannot be used, or a stop was requested.
         """
-        ...
+        began = self._now()
+        target: Array | None = None
+
+        def finished() -> bool:
+            nonlocal target
+            self._poll()
+            self.connection.require_usable(self.cell)
+            if len(records := self._new_records()):
+                target = records["target_position"][-1].copy()
+            ready = target is not None and self._state() in self._READY
+            return ready or stop.requested or self._now() - began > timeout
+
+        self._exchange_until(finished, "the controller gets no answers")
+        self._poll()
+        self.connection.require_usable(self.cell)
+        if stop.requested:
+            raise ControllerFault("stopped by the operator before anything moved")
+        if target is None or self._state() not in self._READY:
+            raise not_ready(self._state(), self._now() - began)
+        return target
 
     def run(
         self,
@@ -238,25 +251,42 @@ class MotionLink(Protocol):
         override: float = 1.0,
         watch: MotionWatch = unwatched_motion,
     ) -> MotionEnded:
-        """Run one motion, archive every cycle of it, and say how it ended.
+        """Run one motion, archive every cycle of it, and return how it ended.
 
-        Should archiving fail, the arm is brought to rest on its path before the error is raised.
+        If archiving fails, the arm is brought to rest on its path before the error is raised.
 
         Args:
             source: the motion.
             spec: its archive.
-            stop: asks for a stop on the path.
-            override: the largest fraction of the planned speed. The motion runs at the smaller of
-                this and the request's, from its very first cycle.
-            watch: sees the motion, and may slow, hold and release it. Nothing begins while its
-                request is a hold.
+            stop: requests a stop on the path.
+            override: the largest fraction of the planned speed. From its first cycle on the motion
+                runs at the smaller of this and the operator's request.
+            watch: is shown the motion, and may slow, hold and release it. No motion starts while
+                its request is a hold.
 
         Raises:
             ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it
-                is to be slower and knows no override.
+                is to be slowed and supports no override.
             ArchiveWriteError: the archive cannot be written; the motion was stopped.
         """
-        ...
+        steering = Steering(source, watch, override, self._counts)
+        steering.begin(stop, self._poll)  # no archive is open during a hold
+        self._poll()
+        with self.open_archive(spec, own_motion=False):
+            # Opening it may have taken seconds: the requests are read again.
+            while self._may_start(steering, stop):
+                self._new_records()
+                try:
+                    self._submit(source, lambda: steering.unchanged(stop))
+                except WithdrawnError:
+                    continue  # stopped, held or slowed meanwhile, or a new session began
+                except RequestError as error:
+                    self.complete("refused", str(error))
+                    reason = self._with_cause(str(error))
+                    raise ControllerFault(f"{reason}; see the outcome of {spec.path}") from error
+                return self._supervise(spec, steering, stop)
+            self.complete("stopped", NOT_STARTED)
+            return MotionEnded("stopped", NOT_STARTED, -1, -1)
 
     def record(
         self,
@@ -265,30 +295,165 @@ class MotionLink(Protocol):
         *,
         duration: float | None = None,
         wait: float | None = None,
-        watch: Watch = unwatched,
+        watch: Watch = lambda _: None,
     ) -> Recorded:
-        """Answer safely and archive every cycle from the controller's first on.
+        """Reply without commanding anything, and archive every cycle from the first one on.
 
-        Where the far end goes by real time, answers go on after the recording until the arm rests.
+        In real time replies continue after the recording until the arm rests.
 
         Raises:
-            ControllerFault: the controller cannot be read, or did not come within `wait` s.
-            OperatorStopError: a stop was asked for before it came.
+            ControllerFault: the controller cannot be read, or began no session within `wait` s.
+            OperatorStopError: a stop was requested before it began one.
             ArchiveWriteError: the archive cannot be written.
         """
-        ...
+        self._await_session(stop, math.inf if wait is None else wait, watch)
+        self.connection.require_usable(self.cell)
+        with self.open_archive(spec, own_motion=True):
+            try:
+                recorded = self._record(spec, stop, duration, watch)
+            except (ArchiveWriteError, ControllerFault) as error:
+                self._reply_until_rest(stop, watch, f"the recording failed ({error})")
+                raise
+        self._reply_until_rest(stop, watch, "recording complete")
+        return recorded
 
+    @abstractmethod
     def close(self) -> None:
         """End the connection; nothing moves any more.
 
         Raises:
-            ControllerFault: it did not end as it should.
+            ControllerFault: it did not end properly.
         """
-        ...
+
+    @abstractmethod
+    def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> AbstractContextManager[None]:
+        """Open an archive, of one motion or of the controller's own; nothing moves before."""
+
+    @abstractmethod
+    def complete(self, outcome: str, reason: str) -> Recorder | Closed:
+        """Complete the archive that is open, and return its counts."""
+
+    def _may_start(self, steering: Steering, stop: Stop) -> bool:
+        """Wait for the end of a hold; return whether the motion may be requested now."""
+        try:
+            return steering.begin(stop, self._poll)
+        except ControllerFault as error:
+            self.complete("void", str(error))
+            raise
+        finally:
+            self._poll()
+
+    def _await_session(self, stop: Stop, wait: float, watch: Watch) -> None:
+        """Exchange packets until the controller's init packet came."""
+        deadline = self._now() + wait
+
+        def finished() -> bool:
+            self._poll()
+            self._show_recording(watch)
+            late = self._now() > deadline
+            return self.connection.init is not None or stop.requested or late
+
+        self._exchange_until(finished, "nothing was recorded")
+        if self.connection.init is None and stop.requested:
+            raise OperatorStopError("ended before the controller came: nothing was recorded")
+        if self.connection.init is None:
+            raise ControllerFault(f"{self._no_session(wait)}: nothing was recorded")
+
+    # --- what the two kinds of link do differently
+
+    def _with_cause(self, reason: str) -> str:
+        """Return a reason with its cause, where that is known here."""
+        return reason
+
+    def _show_recording(self, watch: Watch, over: str = "") -> None:
+        """Show the state of a recording; in virtual time only when records are archived."""
+        del watch, over
+
+    def _reply_until_rest(self, stop: Stop, watch: Watch, reason: str) -> None:
+        """Continue to reply until the arm rests; in virtual time it may be left at once."""
+        del stop, watch, reason
+
+    @abstractmethod
+    def _now(self) -> float:
+        """Return the time of the link, s."""
+
+    @abstractmethod
+    def _state(self) -> State:
+        """Return the state of the session."""
+
+    @abstractmethod
+    def _poll(self) -> Sequence[ExchangeEvent]:
+        """Receive events, update the connection with them, and return them."""
+
+    @abstractmethod
+    def _new_records(self) -> NDArray[np.void]:
+        """Return the cycle records since the last call."""
+
+    @abstractmethod
+    def _counts(self) -> PacketCounts:
+        """Return the packet counts of the session."""
+
+    @abstractmethod
+    def _exchange_until(self, finished: Callable[[], bool], consequence: str, /) -> None:
+        """Exchange packets until `finished()`; `consequence` ends the message of a failure."""
+
+    @abstractmethod
+    def _submit(self, source: MotionSource, wanted: Callable[[], bool], /) -> None:
+        """Request a motion; withdraw it where it is not `wanted()` when it could start.
+
+        Raises:
+            RequestError: it was not accepted, or withdrawn (WithdrawnError).
+        """
+
+    @abstractmethod
+    def _supervise(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
+        """Wait for the end of the requested motion and of its archive; pass on requests."""
+
+    @abstractmethod
+    def _record(
+        self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
+    ) -> Recorded:
+        """Record until an end is found, and complete the archive."""
+
+    @abstractmethod
+    def _no_session(self, wait: float, /) -> str:
+        """Return the problem of a controller that began no session within `wait` s."""
+
+
+def recording_end(
+    *,
+    restarted: bool,
+    complete: bool,
+    ended: bool,
+    lost: str,
+    stopped: bool,
+    limited: bool,
+    refused: Refused | None,
+) -> tuple[str, str] | None:
+    """Return outcome and reason of a recording that is to end now, None while it continues.
+
+    Args:
+        restarted: whether the controller began a new session.
+        complete: whether it lasts as long as requested.
+        ended: whether the controller ended the session.
+        lost: how the link was lost; "" if it was not.
+        stopped: whether the operator requested the end.
+        limited: whether a duration was requested.
+        refused: the last refusal; it becomes the reason of any end.
+    """
+    ends = (
+        (restarted, "stopped", "the controller began a new session"),
+        (complete, "completed", "as long as was asked for"),
+        (ended, "completed", "the controller ended the session"),
+        (bool(lost), "lost", lost),
+        (stopped, "stopped" if limited else "completed", "ended by the operator"),
+    )
+    end = next(((outcome, reason) for true, outcome, reason in ends if true), None)
+    return ("refused", str(refused.error)) if end is not None and refused is not None else end
 
 
 def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> ArchiveSpec:
-    """The archive with the controller's init packet, and with the drive train in force.
+    """Return the archive with the controller's init packet, and with the active drive train.
 
     Its `drive_train.json`, the cell's, gets the ratios, calibration and coupling of `drives`.
     """
@@ -309,15 +474,15 @@ def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> 
     return spec.with_more(metadata, attachments)
 
 
-def drives_in_force(cell: Cell, connection: Connection) -> DriveTrain:
-    """The cell's drive train, or that of a controller whose figures were accepted."""
+def active_drive_train(cell: Cell, connection: Connection) -> DriveTrain:
+    """Return the cell's drive train, or that of a controller whose figures were accepted."""
     if connection.init is None or not connection.adopted:
         return cell.drive_train
     return _accepted(cell, connection.init).drive_train
 
 
-def guard_in_force(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> Guard:
-    """A guard with the limits in force: the narrower of the cell's and the controller's."""
+def active_guard(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> Guard:
+    """Return a guard with the narrower limits of the cell and the controller."""
     guard = Guard(cell.guard_limits, cell.period)
     if init is not None:
         current = np.fmin(_stated(cell, init, "current_limit"), drives.current_limit)
@@ -325,17 +490,17 @@ def guard_in_force(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> G
     return guard
 
 
-def checks_in_force(
+def active_checks(
     cell: Cell, connection: Connection, checks: MotionChecks | None = None
 ) -> MotionChecks:
-    """What a motion to a connected controller is checked against.
+    """Return the checks of motions to a connected controller.
 
-    The narrower of the cell's and the controller's current limits count, and gears that were
-    accepted from the controller; the very `checks` where both are the cell's.
+    They have the narrower current limits of the cell and the controller, and gears that were
+    accepted from it; `checks` itself is returned where both are the cell's.
     """
     checks = MotionChecks.of(cell) if checks is None else checks
     if connection.adopted:
-        gears = drives_in_force(cell, connection).motor_from_joint
+        gears = active_drive_train(cell, connection).motor_from_joint
         checks = replace(checks, currents=replace(checks.currents, motor_from_joint=gears))
     if connection.init is None:
         return checks
@@ -346,30 +511,30 @@ Limit = Literal["current_limit", "following_error"]
 
 
 def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
-    """Limits of the controller below the cell's, in words joint by joint.
+    """Return a sentence for each limit of the controller that is below the cell's.
 
-    No model tells how far a servo lags behind, so that no motion can be checked against thresholds
-    of the following error.
+    No model predicts the following error of a servo, so that motions cannot be checked against
+    its thresholds.
     """
     if connection.init is None:
         return ()
-    theirs, ours = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
+    stated, own = _stated(cell, connection.init, limit), getattr(cell.drive_table, limit)
     unit = "A" if limit == "current_limit" else "motor revolutions"
     return tuple(
-        f"{cell.joint_names[joint]}: {float32_text(theirs[joint])} {unit} in the controller, "
-        f"{ours[joint]:.9g} in the cell file"
-        for joint in np.flatnonzero(is_narrower(theirs, np.array(ours)))
+        f"{cell.joint_names[joint]}: {float32_text(stated[joint])} {unit} in the controller, "
+        f"{own[joint]:.9g} in the cell file"
+        for joint in np.flatnonzero(is_narrower(stated, np.array(own)))
     )
 
 
 def _accepted(cell: Cell, init: InitPacket) -> InitCheck:
-    """The init packet held against the cell, its figures accepted where they can be."""
+    """Compare an init packet with the cell, accepting its figures where possible."""
     table = cell.controller
     others = frozenset(table.other_axes)
     return compare(cell.drive_train, cell.period, init, table.arm, True, others)
 
 
 def _stated(cell: Cell, init: InitPacket, limit: Limit) -> Array:
-    """A limit of the cell's arm in an init packet (n,), NaN where it has none."""
+    """Return a limit of the cell's arm in an init packet (n,), NaN where it has none."""
     values = getattr(init, limit)[cell.controller.arm - 1, : len(cell.joint_names)]
     return np.asarray(values, dtype=np.float64)

@@ -34,7 +34,7 @@ from .gates import require_as_rehearsed, require_gates
 from .intervals import REPEATED, Interval, StraightMoves, player_of, require_sound, wanted
 from .link import Link
 from .live_link import LiveLink
-from .motion_link import MotionLink, checks_in_force, narrower_limits
+from .motion_link import MotionLink, active_checks, narrower_limits
 from .operator import Operator, RunWatch, Stop
 from .plan import CampaignPlan, moves_to_dict
 from .quality import Entering, Rejected
@@ -242,7 +242,7 @@ class Run:
         require_sound(sent, checks)
         own = cell_link(cell, live=self.live) if self.link is None else nullcontext(self.link)
         with own as link:
-            link.connection.say = reporter.say
+            link.connection.report = reporter.say
             if isinstance(link, LiveLink):
                 for note in link.notes():
                     reporter.say(f"note: {note}")
@@ -250,7 +250,7 @@ class Run:
                     reporter.say(link.live.invitation)
             where = link.connect(self.stop)
             require_as_rehearsed(self, link.connection, dry_run.found())
-            narrowed = checks_in_force(cell, link.connection, checks)
+            narrowed = active_checks(cell, link.connection, checks)
             if narrowed is not checks:  # the controller's own limits, for the first time known
                 require_sound(sent, narrowed)
             if below := narrower_limits(cell, link.connection, "current_limit"):

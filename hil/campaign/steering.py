@@ -1,4 +1,4 @@
-"""One motion under way: its operator's requests passed on to it, and what is to be seen of it."""
+"""A motion that is being run: passes the operator's requests on to it, and shows its progress."""
 
 from __future__ import annotations
 
@@ -27,19 +27,16 @@ from hil.errors import ControllerFault
 
 from .operator import Latency, MotionProgress, MotionWatch, Stop
 
-NOT_BEGUN: Final = "it had not begun"
-"""Why a motion ends that was stopped before it was asked for."""
-ASKED_EVERY: Final = 0.02
-"""s between two questions for a request where nothing else is to be done."""
-SHOWN_EVERY: Final = 0.1
-"""s between two looks of the watch."""
-REMEMBERED: Final = 8
-"""Events that are shown."""
+REQUEST_PERIOD: Final = 0.02
+"""Period of reading the operator's request during a hold, s."""
+SHOW_PERIOD: Final = 0.1
+"""Period of showing the motion, s."""
+EVENTS_SHOWN: Final = 8
 
 
 @dataclass(frozen=True)
 class PacketCounts:
-    """Fates of packets of one session up to a moment; see `drivers.events.Counters`."""
+    """Packets of one session up to a moment; see `drivers.events.Counters`."""
 
     answered: int
     missed: int
@@ -50,20 +47,20 @@ class PacketCounts:
 
 
 class Steering:
-    """Takes the requests of one motion's watch to the motion, and shows the motion to it.
+    """Passes the requests of a motion's watch on to the motion, and shows the motion to it.
 
     Args:
-        source: the motion.
-        watch: looks, and has the requests.
+        source: the motion; an attribute.
+        watch: shows the motion, and has the requests.
         most: largest fraction of the planned speed, whatever is requested.
-        counts: of packets, now.
+        counts: returns the present packet counts.
 
     Attributes:
-        fraction: asked of the motion last.
-        held: whether it was asked to rest.
+        fraction: passed on to the motion last.
+        held: whether a hold was passed on last.
 
     Raises:
-        ValueError: `most` is not one of 0..1.
+        ValueError: `most` is not in 0..1.
     """
 
     def __init__(
@@ -75,50 +72,50 @@ class Steering:
     ) -> None:
         if not 0.0 < most <= 1.0:
             raise ValueError(f"an override of {most!r} is not above 0 and at most 1")
-        self._source, self._watch, self._most, self._counts = source, watch, most, counts
+        self.source, self._watch, self._most, self._counts = source, watch, most, counts
         duration = getattr(source, "duration", None)
         self._duration = float(duration) if isinstance(duration, int | float) else None
         self.fraction, self.held = most, False
         self._before = counts()
-        self._messages: deque[str] = deque(maxlen=REMEMBERED)
+        self._messages: deque[str] = deque(maxlen=EVENTS_SHOWN)
         self._last: NDArray[np.void] | None = None
         self._due = -math.inf
 
-    def begin(self, stop: Stop, meanwhile: Callable[[], object] = lambda: None) -> bool:
-        """Have the motion begin at the speed requested; waits while a hold is requested.
+    def begin(self, stop: Stop, meanwhile: Callable[[], object]) -> bool:
+        """Set the requested speed; wait while a hold is requested.
 
         Returns:
-            Whether it may be asked for now; False once a stop is asked for.
+            Whether the motion may be requested now; False once a stop is requested.
 
         Raises:
-            ControllerFault: it is to be slower than planned and knows no override.
+            ControllerFault: it is to be slower than planned and supports no override.
         """
         request = self._watch.request()
         while request.held and not stop.requested:
             meanwhile()
-            time.sleep(ASKED_EVERY)
+            time.sleep(REQUEST_PERIOD)
             request = self._watch.request()
         if stop.requested:
             return False
         self.fraction = min(self._most, request.override)
-        change = getattr(self._source, "override", None)
+        change = getattr(self.source, "override", None)
         if callable(change):
             change(self.fraction)
         elif self.fraction < 1.0:
             raise ControllerFault(
-                f"a {type(self._source).__name__} knows no override and cannot be run at "
+                f"a {type(self.source).__name__} supports no override and cannot be run at "
                 f"{100.0 * self.fraction:.0f} %; nothing was sent"
             )
         self._before = self._counts()
         return True
 
     def unchanged(self, stop: Stop) -> bool:
-        """Whether the motion may begin as `begin` left it; not if it is to be slower or to rest."""
+        """Return whether the motion may begin as `begin` left it: no stop, hold or lower speed."""
         request = self._watch.request()
         return not (stop.requested or request.held or request.override < self.fraction)
 
     def follow(self, motion: Session | ExchangeProcess) -> None:
-        """Pass on what is requested now. A motion held before it began begins at rest."""
+        """Pass on the present request. A motion held before it began begins at rest."""
         request = self._watch.request()
         fraction = min(self._most, request.override)
         commands: list[Callable[[], None]] = []
@@ -136,31 +133,31 @@ class Steering:
 
     @property
     def due(self) -> bool:
-        """Whether the watch is to look again."""
+        """Whether the motion is to be shown again."""
         return time.monotonic() >= self._due
 
-    def note(self, events: Iterable[ExchangeEvent]) -> None:
-        """Take events in."""
+    def add_events(self, events: Iterable[ExchangeEvent]) -> None:
+        """Add events to be shown."""
         self._messages.extend(map(describe, events))
 
-    def take(self, records: NDArray[np.void]) -> None:
-        """Take cycle records in; the last one counts."""
+    def add_records(self, records: NDArray[np.void]) -> None:
+        """Add cycle records; the last one is shown."""
         if len(records):
             self._last = records[-1:].copy()
 
     def show(
         self, drives: DriveTrain, guard: Guard, state: State, motion_time: float, rate: float
     ) -> None:
-        """Let the watch look.
+        """Show the motion.
 
         Args:
-            drives: in force, for the shares.
-            guard: narrowed to the limits in force.
+            drives: the active drive train, for the shares.
+            guard: with the active limits.
             state: of the session.
-            motion_time: s of the planned motion done, NaN where it is not known.
-            rate: fraction of the planned speed, likewise.
+            motion_time: s of the planned motion done, NaN if unknown.
+            rate: fraction of the planned speed, NaN if unknown.
         """
-        self._due = time.monotonic() + SHOWN_EVERY
+        self._due = time.monotonic() + SHOW_PERIOD
         counts, before = self._counts(), self._before
         arrays: dict[str, NDArray[np.float64]] = {}
         if self._last is not None:

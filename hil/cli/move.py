@@ -14,7 +14,7 @@ import numpy as np
 import typer
 
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.motion_link import checks_in_force, narrower_limits
+from hil.campaign.motion_link import active_checks, narrower_limits
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
@@ -79,7 +79,7 @@ def move(
         motion = None if campaign is None else campaign.plan.excitation.trajectory
         wanted = posture(cell, to, None if motion is None else motion.sample(np.array([0.0]))[0][0])
     with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
-        link.connection.say = partial(say, err=True)
+        link.connection.report = partial(say, err=True)
         if yes and not link.only_simulated:
             most = 100.0 * cell.campaign.approach_speed
             if speed is not None and speed > most:
@@ -104,7 +104,7 @@ def move(
             here,
             target,
             speed=None if speed is None else speed / 100.0,
-            checks=checks_in_force(cell, link.connection),
+            checks=active_checks(cell, link.connection),
         )
         if not json:
             typer.echo(printable(_described(way, cell, link)))

@@ -74,7 +74,7 @@ def record(
         ) as link,
         View(loaded, stop, quiet=quiet or json) as view,
     ):
-        link.connection.say = view.warn
+        link.connection.report = view.warn
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
             view.say(link.live.invitation)

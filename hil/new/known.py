@@ -254,7 +254,7 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
     deadline = time.monotonic() + wait
     while view.connection.init is None:
         view.exchange.send_heartbeat()
-        view.look()
+        view.poll()
         if (failure := view.failure()) is not None:
             raise ControllerFault(failure)
         if stop.requested:

@@ -297,10 +297,12 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
                 person.now = OperatorRequest(held=what.startswith("hold"))
                 threading.Timer(1.5, setattr, (stop, "requested", True)).start()
 
-            def opened(*spec: ArchiveSpec, what: str = what, **how: bool) -> None:
-                opening(*spec, **how)
-                if what.endswith("opening"):
-                    press()
+            @contextmanager
+            def opened(*spec: ArchiveSpec, what: str = what, **how: bool) -> Iterator[None]:
+                with opening(*spec, **how):
+                    if what.endswith("opening"):
+                        press()
+                    yield
 
             def asked(source: MotionSource, *how: Callable[[], bool], what: str = what) -> int:
                 press() if what.endswith("asked for") else None
@@ -315,9 +317,10 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             assert ended.outcome == "stopped", what
             archive = open_archive(path)
             assert archive.complete
-            sent = archive.columns["commanded_position"]
-            sent = sent[np.isfinite(sent).all(axis=1)]
-            assert np.abs(sent - where).max(initial=0.0) < 1e-4, what
+            if archive.n_samples:  # none where it was closed at once
+                sent = archive.columns["commanded_position"]
+                sent = sent[np.isfinite(sent).all(axis=1)]
+                assert np.abs(sent - where).max(initial=0.0) < 1e-4, what
             assert ended.reason == "it had not begun"
             assert "MotionStarted" not in [event.name for event in archive.events]
 

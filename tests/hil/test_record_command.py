@@ -137,7 +137,7 @@ def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
     """One packet of mode 3: cause, axis and remedy stand on one line and in the archive."""
     link = own_motion_link(cell, Corrupt(600, offset=12, mask=3))
     lines: list[str] = []
-    link.connection.say = lines.append
+    link.connection.report = lines.append
     done = record(
         link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False
     )

@@ -48,7 +48,7 @@ from hil.campaign.errors import (
 )
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.motion_link import checks_in_force
+from hil.campaign.motion_link import active_checks
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Played, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
@@ -798,7 +798,7 @@ def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campai
     assert campaign.run(link, dry_run_only=True).dry_run == "accepted"
     link.connect(Stop())
     checks = MotionChecks.of(campaign.cell)
-    assert checks_in_force(campaign.cell, link.connection, checks) is checks
+    assert active_checks(campaign.cell, link.connection, checks) is checks
 
 
 def test_a_narrower_limit_that_is_kept_is_noted(tmp_path: Path, dry: Campaign) -> None:
@@ -1018,7 +1018,7 @@ def test_a_script_that_slows_each_attempt_is_ended(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hil.campaign.run.MOST_BY_HAND", 2)
-    monkeypatch.setattr("hil.campaign.steering.SHOWN_EVERY", 0.0)
+    monkeypatch.setattr("hil.campaign.steering.SHOW_PERIOD", 0.0)
     campaign, stop = make(), Stop()
 
     def at_its_begin(status: RunStatus) -> OperatorRequest:

@@ -168,7 +168,7 @@ def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
 ) -> None:
     """A slow disk: nothing has been asked of the controller yet, and nothing is."""
     stop, pressed = Stop(), 0
-    opened = arm.link._open
+    opened = ArchiveSpec.open
 
     def slowly(given: ArchiveSpec) -> ArchiveWriter:
         nonlocal pressed
@@ -182,7 +182,7 @@ def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
         stop.requested = stop.requested or pressed > 5
         return OperatorRequest(held=pressed > 0)
 
-    monkeypatch.setattr(arm.link, "_open", slowly)
+    monkeypatch.setattr(ArchiveSpec, "open", slowly)
     ended = arm.run(Watcher(script), stop)
     assert (ended.outcome, ended.reason, ended.interval) == ("stopped", "it had not begun", -1)
     assert arm.archive.complete
@@ -243,7 +243,7 @@ class Stubborn:
 
 def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm) -> None:
     """And an override is a fraction."""
-    with pytest.raises(ControllerFault, match="knows no override"):
+    with pytest.raises(ControllerFault, match="supports no override"):
         arm.link.run(Stubborn(), spec(arm.cell, arm.path), Stop(), override=0.2)  # type: ignore[arg-type]
     assert not arm.path.exists()
     for override in (-0.1, 1.1, float("nan")):
@@ -290,7 +290,7 @@ def exchange(clock: Clock) -> Exchange:
 @pytest.fixture
 def view(exchange: Exchange) -> ExchangeView:
     view = ExchangeView(exchange)  # type: ignore[arg-type]
-    view.forget_motion()
+    view.reset_motion()
     return view
 
 
@@ -307,9 +307,9 @@ def test_a_motion_that_does_not_begin_is_given_up(
 ) -> None:
     exchange.state = state
     clock.now += waits
-    assert view.not_begun() is None
+    assert view.no_start() is None
     clock.now += 2.0
-    assert words in (view.not_begun() or "")
+    assert words in (view.no_start() or "")
 
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
@@ -317,9 +317,9 @@ def test_a_motion_that_began_or_may_have_is_not_given_up(
     view: ExchangeView, exchange: Exchange, clock: Clock, event: Any
 ) -> None:
     exchange.said.append(event)
-    view.look()
+    view.poll()
     clock.now += 3600.0
-    assert view.not_begun() is None
+    assert view.no_start() is None
     # An end whose event was lost is known from the count.
     assert not view.motion_ended
     exchange.ended_count += 1
@@ -335,7 +335,7 @@ def beats_in(heart: Heartbeat, clock: Clock, given: list[float], seconds: float)
     before, end = len(given), clock.now + seconds
     while clock.now < end:
         clock.now += 0.05
-        heart.look()
+        heart.update()
     return len(given) - before
 
 
@@ -348,8 +348,8 @@ def test_beats_end_where_the_supervising_loop_stands_still() -> None:
     heart.turn()
     beats_in(heart, clock, given, 2.0 * STALL)
     assert clock.now - given[-1] > 0.9 * STALL
-    explained = heart.explained(f"the exchange process ended ({NO_SUPERVISOR})")
-    assert "looks at the motion (show, request) did not return for 2.0 s" in explained
+    explained = heart.with_cause(f"the exchange process ended ({NO_SUPERVISOR})")
+    assert "show or request of the motion's watch did not return for 2.0 s" in explained
     heart.turn()
     assert beats_in(heart, clock, given, 0.5) > 5, "and goes on with the loop"
     heart.rest()
@@ -359,10 +359,10 @@ def test_beats_end_where_the_supervising_loop_stands_still() -> None:
 def test_a_program_that_got_no_processor_is_named() -> None:
     clock = Clock()
     heart = Heartbeat(lambda: None, clock)
-    assert heart.explained(NO_SUPERVISOR) == NO_SUPERVISOR
+    assert heart.with_cause(NO_SUPERVISOR) == NO_SUPERVISOR
     clock.now += 0.7
-    assert "got no processor time for 0.7 s, load average" in heart.explained(NO_SUPERVISOR)
-    assert heart.explained("stopped by the operator") == "stopped by the operator"
+    assert "got no processor time for 0.7 s, load average" in heart.with_cause(NO_SUPERVISOR)
+    assert heart.with_cause("stopped by the operator") == "stopped by the operator"
 
 
 # --- What a run makes of an operator's screen that fails
@@ -445,7 +445,7 @@ def records(
 
 
 @pytest.mark.parametrize(
-    ("portions", "rests"),
+    ("parts", "rests"),
     [
         ([records(0, SECOND)], False),
         ([records(0, SECOND), records(SECOND, 1)], True),
@@ -462,9 +462,9 @@ def records(
     ids=["less than a second", "a second", "creeping", "noise of an encoder", "motion between",
          "a second after motion", "not seen", "another session"],
 )  # fmt: skip
-def test_a_second_without_motion_is_rest(portions: list[NDArray[np.void]], rests: bool) -> None:
+def test_a_second_without_motion_is_rest(parts: list[NDArray[np.void]], rests: bool) -> None:
     still = Standstill(PERIOD)
-    assert [still.take(portion) for portion in portions][-1] is rests
+    assert [still.add(part) for part in parts][-1] is rests
 
 
 def test_noise_recorded_while_the_arm_moved_is_recorded_again(tmp_path: Path) -> None:
