@@ -149,11 +149,10 @@ class MotionChecks:
         except NotSmooth as error:
             return str(error)
         # First what is quick to check: nothing else can be said of a motion that is beyond limits.
-        result = check_motion(trajectory, self.limits)
-        if not result.ok:
-            return self._sentence(result.violations[0])
-        result = check_motion(trajectory, self.limits, checker=self.checker, currents=self.currents)
-        return None if result.ok else self._sentence(result.violations[0])
+        violations = check_motion(trajectory, self.limits) or check_motion(
+            trajectory, self.limits, checker=self.checker, currents=self.currents
+        )
+        return self._sentence(violations[0]) if violations else None
 
     def _sentence(self, violation: Violation) -> str:
         text, remedy = violation_text(violation, self.frame), always_so(violation, self.checker)

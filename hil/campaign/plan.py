@@ -22,10 +22,10 @@ from hil.progress import Reporter
 from hil.reading import parse_json, read_text
 from identification.excitation import (
     RESCORE_PERIOD,
-    DrawnMotion,
     Excitation,
     NoFeasibleMotionError,
     Objective,
+    ViaPointMotion,
     random_validation_motions,
 )
 from identification.excitation.excitation import trajectory_from_dict
@@ -219,7 +219,7 @@ def plan_around(
     )
 
 
-def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, ...]:
+def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotion, ...]:
     settings = cell.campaign
     try:
         return random_validation_motions(
@@ -237,7 +237,7 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[DrawnMotion, 
         raise NoExcitationError(f"no motion to test the result with: {reason}") from error
 
 
-def _moves_of(cell: Cell, motion: Excitation | DrawnMotion) -> PlanFile | None:
+def _moves_of(cell: Cell, motion: Excitation | ViaPointMotion) -> PlanFile | None:
     """The moves behind a motion through via points; none behind sines."""
     moves, via_points = motion.moves, motion.via_points
     if moves is None or via_points is None:

@@ -212,9 +212,9 @@ def run_design(
                 journal.close()
         if journal.recalled:
             reporter.say(f"{journal.recalled} motions were known from the journal")
-        if journal.trouble is not None:
+        if journal.error is not None:
             reporter.say(
-                f"the journal lacks the last motions ({journal.trouble.strerror}); a search "
+                f"the journal lacks the last motions ({journal.error.strerror}); a search "
                 "resumed from it scores them anew"
             )
         trajectory = design.excitation.trajectory  # as it is going to be run
@@ -259,10 +259,10 @@ def _searched(
             nonlocal note, troubled
             note = _note(progress)
             scored(progress.evaluated - done)
-            if journal is not None and journal.trouble is not None and not troubled:
+            if journal is not None and journal.error is not None and not troubled:
                 troubled = True
                 reporter.say(
-                    f"the journal cannot be written ({journal.trouble.strerror}); the search goes "
+                    f"the journal cannot be written ({journal.error.strerror}); the search goes "
                     "on, and writes it as soon as there is room"
                 )
 

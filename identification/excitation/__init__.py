@@ -1,4 +1,4 @@
-"""Choosing motions that excite the parameters: criteria, constraints, searches."""
+"""Design of exciting motions: criteria, constraints, searches."""
 
 # ruff: noqa: F401
 import types
@@ -9,7 +9,6 @@ from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
     CurrentModel,
-    MotionCheck,
     check_motion,
     midpoints,
     sampled,
@@ -33,7 +32,7 @@ from identification.excitation.errors import (
     PostureError,
     WorkspaceError,
 )
-from identification.excitation.excitation import DrawnMotion, Excitation
+from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
 from identification.excitation.objective import Objective
 from identification.excitation.searches.journal import Journal

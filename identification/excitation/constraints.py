@@ -1,4 +1,4 @@
-"""What a motion must keep: joint limits, duration, clearance, torque and motor current."""
+"""Constraints of a motion: joint limits, duration, clearance, torque and motor current."""
 
 from __future__ import annotations
 
@@ -16,28 +16,24 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from planner import FourierSeries, JointLimits, PiecewiseCubic, Trajectory
 
-# Checks want both ends of a motion, criteria the middles of the steps: a joint that rests at an end
-# has sgn(qd) = 0 there, or, after rounding, ±1 without moving, and weighs the more the fewer the
-# samples. Judged at 8 instead of 1 ms, log det of random motions of the NS 16 changes by 0.002 with
-# middles (and not to one side), by 0.02 with ends.
+# Checks sample both ends of a motion, criteria the middles of the steps: at rest at an end
+# sgn(qd) is 0 or, after rounding, ±1. From 1 to 8 ms log det of random motions of the NS 16 changes
+# by 0.002 without bias with midpoints, by 0.02 with ends.
 SAMPLE_PERIOD: Final = 0.008
-"""s; motions are looked at this often. A fast arm's tip moves some 4 cm meanwhile."""
+"""Sample period of checks and criteria, s; the tip of a fast arm moves some 4 cm in it."""
 
-# A duration that is a whole number of periods but for its rounding gets no further sample.
+# Relative to a period; a duration of a whole number of periods and less gets no further sample.
 _ROUNDING: Final = 1e-9
 
 
 def sampled(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
-    """Return a motion at the ends of equal steps of at most `period` [s], both ends included."""
+    """Sample a motion at the ends of equal steps of at most `period` [s]."""
     time = np.linspace(0.0, trajectory.duration, _steps(trajectory, period) + 1)
     return Motion(time, *trajectory.sample(time))
 
 
 def midpoints(trajectory: Trajectory, period: float = SAMPLE_PERIOD) -> Motion:
-    """Return a motion in the middle of equal steps of at most `period` [s], neither end included.
-
-    Their number is the N of the criteria.
-    """
+    """Sample a motion in the middle of N equal steps of at most `period` [s] (N of eq. 9)."""
     steps = _steps(trajectory, period)
     time = (np.arange(steps, dtype=np.float64) + 0.5) * (trajectory.duration / steps)
     return Motion(time, *trajectory.sample(time))
@@ -54,8 +50,7 @@ Array = NDArray[np.float64]
 class CurrentModel:
     """Predicts joint torques and motor currents of a motion from nominal parameters.
 
-    Torque of the joints and current of the motors belong together as
-    ``tau = motor_from_joint^T (torque_constant * current)``.
+    Joint torque and motor current: ``tau = motor_from_joint^T (torque_constant * current)``.
     """
 
     model: RobotModel  #: the robot
@@ -63,32 +58,31 @@ class CurrentModel:
     motor_from_joint: Array  #: (n, n) motor rad per joint rad; gears and coupling
     torque_constant: Array  #: (n,) on the motor side [N·m/A]
     current_limit: Array  #: (n,) largest |current| of each motor [A]
-    uncertainty: float = 0.0  #: share by which the real torques may be larger than the nominal ones
-    #: (n,) largest |torque| of each joint [N·m], where one is set besides
-    torque_limit: Array | None = None
-    usable: float = 1.0  #: share of the current limits that a motion may use
+    uncertainty: float = 0.0  #: fraction by which torques may exceed the nominal ones
+    torque_limit: Array | None = None  #: (n,) largest |torque| of each joint [N·m], if any
+    usable: float = 1.0  #: fraction of the current limits that a motion may use
 
     def torque(self, motion: Motion) -> Array:
-        """Return the joint torques (m, n) [N·m] that a motion needs at most, payload included."""
+        """Return the largest expected joint torques (m, n) [N·m], payload included."""
         q, qd, qdd = motion[1:4]
         nominal = self.model.torque(self.values, q, qd, qdd) + self.model.load_torque(q, qd, qdd)
         return (1.0 + self.uncertainty) * nominal
 
     def current(self, torque: Array) -> Array:
-        """Return the motor currents (m, n) [A] that make joint torques (m, n) [N·m]."""
+        """Return the motor currents (m, n) [A] for joint torques (m, n) [N·m]."""
         motor_torque = np.linalg.solve(self.motor_from_joint.T, torque.T).T
         return np.asarray(motor_torque / self.torque_constant, dtype=np.float64)
 
     def check(self, motion: Motion) -> list[Violation]:
-        """Return for each joint and motor its largest excess in the samples, if there is any."""
+        """Return the largest violation of each joint and motor in the samples."""
         torque = self.torque(motion)
         joints = self.model.joint_names
         motors = tuple(f"motor of {name}" for name in joints)
         usable = self.usable * self.current_limit
         found = _beyond("current", motors, self.current(torque), usable, motion)
         if self.usable < 1.0:
-            wanted = f"{self.usable:.0%} of the motor's limit may be used"
-            found = [replace(violation, remedy=wanted) for violation in found]
+            remedy = f"a motion may use {self.usable:.0%} of the motor's limit"
+            found = [replace(violation, remedy=remedy) for violation in found]
         if self.torque_limit is not None:
             found += _beyond("torque", joints, torque, self.torque_limit, motion)
         return found
@@ -100,52 +94,33 @@ def _beyond(
     found = []
     size = np.abs(values)
     for j, k in enumerate(np.argmax(size, axis=0)):
-        if not size[k, j] <= bounds[j]:  # NaN is beyond every bound
+        if not size[k, j] <= bounds[j]:  # NaN as well
             posture, time = tuple(motion.position[k].tolist()), float(motion.time[k])
             most = float(size[k, j]), float(bounds[j])
             found.append(Violation(kind, subjects[j], *most, time, posture))
     return found
 
 
-@dataclass(frozen=True)
-class MotionCheck:
-    """What checking a motion found; an empty list means that it may be sent."""
-
-    violations: tuple[Violation, ...]
-
-    @property
-    def ok(self) -> bool:
-        """Whether every constraint is satisfied."""
-        return not self.violations
-
-
 @dataclass(frozen=True, eq=False)
 class Constraints:
-    """What a motion must keep.
+    """Constraints of a motion; all are evaluated, so that sums of excesses are comparable."""
 
-    Everything is looked at whatever else is broken: only then do the excesses of two motions
-    compare, and a motion that is mended in one respect is not found broken in another.
-    """
-
-    limits: JointLimits  #: joint limits, respected at every instant
+    limits: JointLimits  #: joint limits at every instant
     min_duration: float = 0.0  #: of the motion [s]
     max_duration: float = 20.0  #: of the motion [s]
-    #: floor, walls, boxes and the arm itself; None to look at none of them
-    checker: CollisionChecker | None = None
-    #: nominal torques and currents with their uncertainty; None to look at neither
-    currents: CurrentModel | None = None
-    #: whether a motion must begin and end at rest. A bare series of sines does not: it can be
-    #: designed and looked at, and cannot be run
+    checker: CollisionChecker | None = None  #: floor, walls, boxes and arm; None: not checked
+    currents: CurrentModel | None = None  #: torques and currents; None: not checked
+    #: whether a motion must begin and end at rest, which sines without a ramp do not
     at_rest: bool = True
 
     def violations(
         self, trajectory: PiecewiseCubic | FourierSeries, motion: Motion
     ) -> tuple[Violation, ...]:
-        """Return what a motion breaks: of each kind and subject the worst, of contacts the deepest.
+        """Return the worst violation of each kind and subject, and the deepest contact.
 
-        Joint limits and contacts are looked at between the samples (both ends included) too, the
-        rest at them; contacts of a motion that breaks a joint limit at its samples only, and a
-        motion so violent that its samples are no finite numbers for joint limits alone.
+        `motion` are samples of the trajectory, both ends included. Joint limits and contacts are
+        checked between the samples too; contacts only at them if a joint limit is broken, and not
+        at all if the samples are not finite.
 
         Raises:
             ShapeError: samples of another arm.
@@ -160,7 +135,7 @@ class Constraints:
         if beyond and not all(np.all(np.isfinite(column)) for column in motion[:4]):
             return tuple(found)
         if self.checker is not None:
-            # Rates beyond all limits leave everything open between samples, at any price.
+            # With rates beyond the limits, the bounds between samples are too wide to be of use.
             contact = self.checker.deepest_along(trajectory, motion, between=not beyond)
             found += [] if contact is None else [_collision(self.checker, contact)]
         if self.currents is not None:
@@ -175,18 +150,18 @@ def check_motion(
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
     period: float = SAMPLE_PERIOD,
-) -> MotionCheck:
-    """Check a whole motion, of whatever duration, before it is sent.
+) -> tuple[Violation, ...]:
+    """Return the violations of a motion of any duration, none if it may be sent.
 
-    Limits, rest at both ends and contacts are looked at over all time, torques and currents every
+    Limits, rest at both ends and contacts are checked over all time, torques and currents every
     `period` [s].
     """
     constraints = Constraints(limits, max_duration=np.inf, checker=checker, currents=currents)
-    return MotionCheck(constraints.violations(trajectory, sampled(trajectory, period)))
+    return constraints.violations(trajectory, sampled(trajectory, period))
 
 
 def clearance(checker: CollisionChecker, q: Array, time: Array | None = None) -> Violation | None:
-    """Return the deepest contact in postures (m, n), reached at times (m,), if there is one."""
+    """Return the deepest contact in postures (m, n) at times (m,), if there is one."""
     contact = checker.deepest_contact(q, time)
     return None if contact is None else _collision(checker, contact)
 

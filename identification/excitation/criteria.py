@@ -1,8 +1,7 @@
-r"""How well a trajectory excites the parameters: the paper's two measures and condition numbers.
+r"""Excitation criteria of a trajectory: the paper's two measures and condition numbers.
 
-All read the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, divided by the
-lengths of its columns so that nothing overflows. Of a singular one each measure is the worst there
-is, never an exception, so that a search can rank it last.
+All are functions of the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, scaled
+to unit diagonal against overflow. For a singular matrix each returns its worst value.
 """
 
 from __future__ import annotations
@@ -22,20 +21,20 @@ Array = NDArray[np.float64]
 
 
 def information(factor: Factor) -> Array:
-    """Return the Gram matrix of the stacked regressor, no joint weighted, shape (p, p)."""
+    """Return the Gram matrix (p, p) of the stacked regressor, without joint weights."""
     total: Array = factor.gram.sum(axis=0)
     return total[:-1, :-1]
 
 
 class _Cholesky(NamedTuple):
-    """Column lengths (p,), and the lower factor (p, p) of the Gram with columns of unit length."""
+    """Column norms (p,) and the lower Cholesky factor (p, p) of the Gram of unit columns."""
 
     scale: Array
     lower: Array
 
     @property
     def correlation(self) -> Array:
-        """The lower triangle of the correlation matrix (p, p)."""
+        """Lower triangle of the correlation matrix (p, p)."""
         half, _ = scipy.linalg.lapack.dpotri(self.lower, lower=1)
         deviation = np.sqrt(np.diag(half))
         return np.asarray(np.tril(half) / deviation[:, None] / deviation)
@@ -51,24 +50,24 @@ def _coupling_index(gram: _Cholesky, _: int) -> float:
 
 
 class Criterion(NamedTuple):
-    """A measure that searches weigh."""
+    """An objective of the searches."""
 
-    score: Callable[[_Cholesky, int], float]  # it, of a factorised Gram matrix and N time samples
-    label: str  # its name in messages
-    sense: float  # 1 where more is better, -1 where less is
+    score: Callable[[_Cholesky, int], float]  # of a factorised Gram matrix and N time samples
+    label: str  # name in messages
+    sense: float  # 1 to maximise, -1 to minimise
 
 
 CRITERIA: Final[Mapping[str, Criterion]] = {
     "log10_det": Criterion(_log10_det, "log det", 1.0),
     "coupling_index": Criterion(_coupling_index, "I_c", -1.0),
 }
-"""What a front is made of, by the name of its field in :class:`Criteria`."""
+"""Objectives of the searches by the name of their field in :class:`Criteria`."""
 
 SENSE: Final = np.array([criterion.sense for criterion in CRITERIA.values()])
 
 
 def measures(gram: Array, n_samples: int) -> dict[str, float]:
-    """Return all of `CRITERIA` from one factorisation of a Gram matrix (p, p)."""
+    """Return the values of all `CRITERIA` for a Gram matrix (p, p)."""
     root = _factorised(gram)
     return {
         name: -one.sense * np.inf if root is None else one.score(root, n_samples)
@@ -85,7 +84,7 @@ def log10_det(gram: Array, n_samples: int) -> float:
 
 
 def coupling_index(gram: Array) -> float:
-    """Return I_c of eq. 5, between 0 and :func:`coupling_index_max`; inf for a singular matrix."""
+    """Return I_c (eq. 5), from 0 to :func:`coupling_index_max`; inf for a singular matrix."""
     return measures(gram, 1)["coupling_index"]
 
 
@@ -114,8 +113,7 @@ def fitness_eq7(
 ) -> float:
     r"""Return :math:`\lambda_1 \log_{10}|\det/N^{N_\pi}| + \lambda_2 I_{c,max}/I_c`, as printed.
 
-    Of p parameters. The two terms differ in size by an order of magnitude, so the first one rules;
-    it is the paper's formula nonetheless. -inf for a singular matrix.
+    The first term is larger by an order of magnitude. -inf for a singular matrix.
     """
     if not np.isfinite(log10_det) or not np.isfinite(coupling_index):
         return -np.inf
@@ -124,9 +122,9 @@ def fitness_eq7(
 
 
 def condition_number(gram: Array, *, scaled: bool) -> float:
-    """Return the condition number of Phi (not of its Gram): raw, or with unit columns.
+    """Return the condition number of Phi, with columns scaled to unit length or as they are.
 
-    For information: the raw one depends on units. inf for a singular matrix.
+    Unscaled it depends on units. inf for a singular matrix.
     """
     matrix = np.asarray(gram, dtype=np.float64)
     scale = np.sqrt(np.diag(matrix))
@@ -142,22 +140,20 @@ def condition_number(gram: Array, *, scaled: bool) -> float:
 
 @dataclass(frozen=True)
 class Criteria:
-    """How well a motion excites the parameters (paper, eqs. 5, 7 and 9)."""
+    """Excitation criteria of a motion (paper, eqs. 5, 7 and 9)."""
 
     log10_det: float  #: log10 of det(Phi^T Phi) / N^p; depends on units
-    coupling_index: float  #: I_c, the smaller the better
-    fitness: float  #: eq. 7 as printed, with the paper's weights 0.7 and 0.3
-    #: N of eq. 9, the time samples of the motion. Of a motion that adds to earlier archives it is
-    #: theirs alone, counted every 8 ms: what divides the determinant must not depend on the
-    #: motion then (see :class:`~identification.excitation.Objective`)
+    coupling_index: float  #: I_c, to be minimised
+    fitness: float  #: eq. 7 with the paper's weights 0.7 and 0.3
+    #: N of eq. 9: time samples of the motion; if it adds to earlier archives, theirs, one every
+    #: 8 ms (see :class:`~identification.excitation.Objective`)
     n_samples: int
-    condition: float | None = None  #: condition number of Phi; depends on units
-    #: the same with columns of unit length. Both are None where nobody computed them
-    scaled_condition: float | None = None
+    condition: float | None = None  #: condition number of Phi; depends on units; None: unknown
+    scaled_condition: float | None = None  #: the same with columns of unit length
 
     @property
     def measures(self) -> tuple[float, ...]:
-        """Those of `CRITERIA`, in their order."""
+        """Values of `CRITERIA`, in their order."""
         return tuple(getattr(self, name) for name in CRITERIA)
 
     @classmethod
@@ -165,7 +161,7 @@ class Criteria:
         """Restore what `dataclasses.asdict` returned.
 
         Raises:
-            TypeError, LookupError, ValueError: the data are none, or of no numbers.
+            TypeError, LookupError, ValueError: invalid data.
         """
         given = {name: value for name, value in data.items() if value is not None}
         n_samples = strict(Whole, given.pop("n_samples"))
@@ -173,7 +169,7 @@ class Criteria:
 
     @classmethod
     def of_gram(cls, gram: Array, n_samples: int) -> Self:
-        """Judge a motion by the Gram matrix (p, p) of N time samples."""
+        """Evaluate the criteria for the Gram matrix (p, p) of N time samples."""
         found = measures(gram, n_samples)
         return cls(
             **found,
@@ -185,7 +181,7 @@ class Criteria:
 
 
 def _factorised(gram: Array) -> _Cholesky | None:
-    """Return the factor of a Gram matrix (p, p), None for a singular one."""
+    """Return the factor of a Gram matrix (p, p), None if it is singular."""
     matrix = np.asarray(gram, dtype=np.float64)
     scale = np.sqrt(np.diag(matrix))
     if not np.all(np.isfinite(scale) & (scale > 0.0)):
@@ -197,5 +193,5 @@ def _factorised(gram: Array) -> _Cholesky | None:
 
 
 def _smallest_pivot(p: int) -> float:
-    """Return what rounding can leave of a pivot that should be zero, for unit columns."""
+    """Return the largest pivot that rounding can leave in place of zero, for unit columns."""
     return 4.0 * p * float(np.finfo(np.float64).eps)

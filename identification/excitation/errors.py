@@ -1,4 +1,4 @@
-"""What the design of an excitation can refuse."""
+"""Errors of the design of excitations."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from identification.errors import IdentificationError
 
 
 class CollisionModelError(IdentificationError):
-    """A robot description from which collisions cannot be computed."""
+    """A robot description without usable collision shapes."""
 
 
 class MissingMeshError(CollisionModelError):
-    """A mesh that a robot description names is not to be found.
+    """A mesh file of a robot description was not found.
 
     Attributes:
-        mesh: as the description names it.
+        mesh: file name in the description.
     """
 
     def __init__(self, mesh: str) -> None:
@@ -22,19 +22,19 @@ class MissingMeshError(CollisionModelError):
 
 
 class PostureError(IdentificationError, ValueError):
-    """A posture with a position that is no finite number."""
+    """A posture with a joint position that is not finite."""
 
 
 class WorkspaceError(IdentificationError, ValueError):
-    """Obstacles or a margin that mean nothing."""
+    """Invalid obstacles or margin."""
 
 
 class DesignError(IdentificationError, ValueError):
-    """A setting of a design lies outside its range.
+    """A setting of a design is outside its valid range.
 
     Attributes:
-        name: which setting.
-        value: what it was.
+        name: the setting.
+        value: its value.
     """
 
     def __init__(self, name: str, value: object, valid: str) -> None:
@@ -44,4 +44,4 @@ class DesignError(IdentificationError, ValueError):
 
 
 class JournalError(IdentificationError, ValueError):
-    """A file that is not the journal of this search, or that other software wrote."""
+    """A file that is not the journal of this search with these program versions."""

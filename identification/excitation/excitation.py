@@ -1,4 +1,4 @@
-"""A motion that was chosen because it excites the parameters, and how it was found."""
+"""The motion that a search found, with its criteria and origin."""
 
 from __future__ import annotations
 
@@ -16,59 +16,55 @@ from planner.checked_data import DAMAGED, Whole, numbers, strict
 
 Array = NDArray[np.float64]
 
-# Excitations that were written down without a method came from a random search.
+# Excitations stored without a method came from a random search.
 _FIRST_METHOD: Final = "random"
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnMotion:
-    """A motion, and what it was planned from."""
+class ViaPointMotion:
+    """A motion planned through via points."""
 
     via_points: Array  #: (n_points, n) [rad], home at both ends included
-    speed: Array  #: (n,) share of each joint's velocity limit
-    fly: float  #: how far corners are rounded, 0 to 1
-    trajectory: PiecewiseCubic  #: the motion planned from these
+    speed: Array  #: (n,) fraction of each joint's velocity limit
+    fly: float  #: corner rounding, 0 to 1
+    trajectory: PiecewiseCubic  #: the planned motion
 
     @property
     def moves(self) -> tuple[Move, ...]:
-        """The moves from the first via point on; they plan to the trajectory, bit for bit."""
+        """Moves from the first via point on; they plan to the same trajectory bit for bit."""
         return moves_through(self.via_points, self.speed, self.fly)
 
 
 def moves_through(via_points: Array, speed: Array, fly: float) -> tuple[Move, ...]:
-    """Return one move to each via point but the first, as `planner.plan` makes them."""
+    """Return one move to each via point after the first, as `planner.plan` makes them."""
     passing = FlyPercent(100.0 * fly)
     return tuple(Move(point, joint_speed=speed, fly=passing) for point in via_points[1:])
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """The best motion of a search, and how it was found."""
+    """The best motion of a search."""
 
-    #: the motion; pieces planned through via points, or a sum of sines
-    trajectory: PiecewiseCubic | FourierSeries
-    criteria: Criteria  #: how good it is
-    method: str  #: name of the search that found it
+    trajectory: PiecewiseCubic | FourierSeries  #: planned through via points, or a sum of sines
+    criteria: Criteria  #: its excitation criteria
+    method: str  #: search method
     seed: int  #: of the search
-    tried: int  #: how many motions were looked at
-    rejected: Mapping[str, int]  #: how many of them were not feasible, by kind of constraint
-    #: (n_points, n) [rad], both ends included; None for sines, as the next two
+    tried: int  #: number of evaluated motions
+    rejected: Mapping[str, int]  #: number of infeasible ones by kind of constraint
+    #: (n_points, n) [rad], both ends included; like speed and fly None for sines
     via_points: Array | None = None
-    speed: Array | None = None  #: (n,) share of each joint's velocity limit
-    fly: float | None = None  #: how far corners are rounded, 0 to 1
+    speed: Array | None = None  #: (n,) fraction of each joint's velocity limit
+    fly: float | None = None  #: corner rounding, 0 to 1
 
     @property
     def moves(self) -> tuple[Move, ...] | None:
-        """The moves from the first via point on; they plan to the trajectory, bit for bit.
-
-        None for a motion that was not planned from moves.
-        """
+        """Moves from the first via point on (see `ViaPointMotion.moves`); None for sines."""
         if self.via_points is None or self.speed is None or self.fly is None:
             return None
         return moves_through(self.via_points, self.speed, self.fly)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return data; `from_dict` restores every bit, through JSON too."""
+        """Return data for JSON; `from_dict` restores them bit-identically."""
         planned: dict[str, Any] = {}
         if self.via_points is not None and self.speed is not None:
             planned = {
@@ -90,10 +86,8 @@ class Excitation:
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Restore what `to_dict` returned.
 
-        Data without a method are those of a random search.
-
         Raises:
-            ValueError: the data are no excitation.
+            ValueError: the data are not an excitation.
         """
         try:
             trajectory = trajectory_from_dict(data["trajectory"])
@@ -128,10 +122,10 @@ Name = Annotated[str, AfterValidator(_printable)]
 
 
 def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:
-    """Restore a motion of either kind from its data.
+    """Restore a motion of either kind.
 
     Raises:
-        TypeError, ValueError: the data are no motion.
+        TypeError, ValueError: the data are not a motion.
     """
     if data.get("type") == "fourier_series":
         return FourierSeries.from_dict(data)

@@ -1,4 +1,4 @@
-"""What a search turns its numbers into: motions through via points, and sums of sines."""
+"""Genomes: motions through via points and sums of sines, encoded as numbers from 0 to 1."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from planner.arrays import read_only
 Array = NDArray[np.float64]
 Motion: TypeAlias = PiecewiseCubic | FourierSeries
 
-# Spacing [rad] of the postures at which a way is looked at.
-_LOOK_EVERY: Final = 0.1
-# Draws of one via point before the last one is used as it is.
+# Spacing [rad] of the checked postures of a straight path.
+_PATH_SPACING: Final = 0.1
+# Draws of one via point before the last one is used even if it collides.
 _DRAWS: Final = 50
 
 
@@ -36,13 +36,13 @@ class Genome(Protocol):
 
     @property
     def n_genes(self) -> int:
-        """How many numbers tell a motion."""
+        """Number of genes of a motion."""
         ...
 
     def motions(self, genes: Array) -> Sequence[Motion | PlannerError]:
-        """Return the motion of each row of genes (m, n_genes), or why there is none.
+        """Return the motion of each row of genes (m, n_genes), or its planning error.
 
-        A motion does not depend on its company, to the last bit.
+        A motion does not depend on the other rows, to the last bit.
         """
         ...
 
@@ -50,44 +50,39 @@ class Genome(Protocol):
         """Draw a first population (count, n_genes)."""
         ...
 
-    def recorded(self, genes: Array) -> dict[str, Any]:
-        """Return what the motion of genes (n_genes,) was planned from: fields of `Excitation`."""
+    def source(self, genes: Array) -> dict[str, Any]:
+        """Return the fields of `Excitation` that genes (n_genes,) determine."""
         ...
 
 
-def between(lower: ArrayLike, upper: ArrayLike, genes: Array) -> Array:
-    """Return what genes mean: exactly `lower` at 0, exactly `upper` at 1, never beyond either."""
+def _interpolated(lower: ArrayLike, upper: ArrayLike, genes: Array) -> Array:
+    """Return values from exactly `lower` for gene 0 to exactly `upper` for gene 1."""
     low, high = np.asarray(lower), np.asarray(upper)
     return np.asarray(np.clip((1.0 - genes) * low + genes * high, low, high))
 
 
-def straight_way(start: Array, end: Array) -> Array:
-    """Return postures (m, n) [rad] on the straight line between two, some 0.1 rad apart."""
-    steps = int(np.ceil(np.max(np.abs(end - start)) / _LOOK_EVERY)) + 1
+def straight_path(start: Array, end: Array) -> Array:
+    """Return postures (m, n) [rad] on the straight line between two, at most 0.1 rad apart."""
+    steps = int(np.ceil(np.max(np.abs(end - start)) / _PATH_SPACING)) + 1
     return np.linspace(start, end, steps + 1)
 
 
 @dataclass(frozen=True, eq=False)
 class ViaPointGenome:
-    """Motions through K via points, as the robot's own interpolator runs them (section 3.3, eq. 6).
+    """Motions through K via points as the robot's interpolator runs them (section 3.3, eq. 6).
 
-    Genes are the via points' coordinates, point by point, then one speed for each joint: K n + n
-    numbers.
+    Genes: coordinates of the via points, point by point, then one speed per joint; K n + n in all.
     """
 
-    #: joint limits of the plan; via points reach from one end of a range to the other
-    limits: JointLimits
+    limits: JointLimits  #: joint limits of the plan
     n_via: int  #: K, without home
-    fly: float = 0.5  #: how far corners are rounded, 0 to 1
-    #: share of a joint's velocity limit, above 0, that gene 0 means; gene 1 means 1
-    slowest: float = 0.3
-    #: share of each joint's range, about its middle, that via points lie in
-    range_share: float = 1.0
-    #: posture (n,) [rad] within the limits where the motion begins and ends; None: it leads from
-    #: the first via point to the last
+    fly: float = 0.5  #: corner rounding, 0 to 1
+    slowest: float = 0.3  #: speed of gene 0, fraction of a joint's velocity limit; gene 1 means 1
+    range_share: float = 1.0  #: central fraction of each joint's range that via points lie in
+    #: posture (n,) [rad] where the motion begins and ends; None: from first to last via point
     home: Array | None = None
-    #: clearance that the straight ways between the points of a first population keep; None: its
-    #: points are uniform in the range, as the paper's
+    #: clearance of the straight paths between the points of a first population; None: uniform
+    #: points as in the paper
     checker: CollisionChecker | None = None
 
     def __post_init__(self) -> None:
@@ -96,29 +91,26 @@ class ViaPointGenome:
 
     @property
     def n_genes(self) -> int:
-        """Number of coordinates, K n, and n speeds."""
+        """Number of genes, K n + n."""
         return (self.n_via + 1) * self.limits.n_joints
 
     def decode(self, genes: ArrayLike) -> tuple[Array, Array]:
-        """Return via points (m, n_points, n) [rad], home included, and shares of speed (m, n)."""
+        """Return via points (m, n_points, n) [rad], home included, and speeds (m, n)."""
         rows = np.atleast_2d(genes)
         coordinates, rates = np.split(rows, [self.n_via * self.limits.n_joints], axis=1)
         points = self._points(coordinates.reshape(len(rows), self.n_via, -1))
         if self.home is not None:
             home = np.broadcast_to(self.home, (len(rows), 1, self.limits.n_joints))
             points = np.concatenate((home, points, home), axis=1)
-        return points, between(self.slowest, 1.0, rates)
+        return points, _interpolated(self.slowest, 1.0, rates)
 
     def motions(self, genes: Array) -> Sequence[Motion | PlannerError]:
-        """Plan each row of genes (m, n_genes), all together and in this process.
-
-        The solver can take its process with it: what must not die calls this in a child.
-        """
+        """Plan each row of genes (m, n_genes) in this process, which the solver can crash."""
         points, speed = self.decode(genes)
         return plan_chunk(list(points), speed, self.limits, self.fly)
 
     def sample(self, random: np.random.Generator, count: int) -> Array:
-        """Draw a first population (count, n_genes), uniform where no checker says otherwise."""
+        """Draw a first population (count, n_genes), uniform or with collision-free paths."""
         n = self.limits.n_joints
         genes = random.random((count, self.n_genes))
         if self.checker is None:
@@ -130,8 +122,8 @@ class ViaPointGenome:
             before = self._redraw(random, self.checker, coordinates[:, k], before, after)
         return genes
 
-    def recorded(self, genes: Array) -> dict[str, Any]:
-        """Return via points and speeds of genes (n_genes,), for the record."""
+    def source(self, genes: Array) -> dict[str, Any]:
+        """Return via points, speeds and corner rounding of genes (n_genes,)."""
         points, speed = (each[0] for each in self.decode(genes))
         return {"via_points": points, "speed": speed, "fly": self.fly}
 
@@ -143,7 +135,7 @@ class ViaPointGenome:
         before: Array | None,
         after: Array | None,
     ) -> Array:
-        """Draw points anew, in place (m, n), until the ways before and after them are free."""
+        """Redraw points (m, n) in place until the paths before and after them are free."""
         blocked = np.arange(len(coordinates))
         for draw in range(_DRAWS):
             if draw > 0:
@@ -152,13 +144,13 @@ class ViaPointGenome:
             segments = [
                 np.concatenate(
                     (
-                        point[None] if before is None else straight_way(before[index], point),
-                        point[None] if after is None else straight_way(point, after),
+                        point[None] if before is None else straight_path(before[index], point),
+                        point[None] if after is None else straight_path(point, after),
                     )
                 )
                 for index, point in zip(blocked.tolist(), points, strict=True)
             ]
-            starts = np.cumsum([0, *(len(way) for way in segments[:-1])])
+            starts = np.cumsum([0, *(len(path) for path in segments[:-1])])
             free = np.logical_and.reduceat(checker.clear(np.concatenate(segments)), starts)
             blocked = blocked[~free]
             if len(blocked) == 0:
@@ -166,39 +158,35 @@ class ViaPointGenome:
         return self._points(coordinates)
 
     def _points(self, coordinates: Array) -> Array:
-        """Return the via points [rad] that coordinates (..., n) from 0 to 1 mean."""
+        """Return via points [rad] for coordinates (..., n) from 0 to 1."""
         lower, upper = self.limits.lower, self.limits.upper
         margin = 0.5 * (1.0 - self.range_share) * (upper - lower)
-        return between(lower + margin, upper - margin, coordinates)
+        return _interpolated(lower + margin, upper - margin, coordinates)
 
 
 @dataclass(frozen=True, eq=False)
 class SineGenome:
-    """Sums of W sines for each joint, eq. 8, with a ramp at both ends or, as in the paper, without.
+    """Sums of W sines per joint (eq. 8), with a ramp at both ends or, as in the paper, without.
 
-    Genes are the amplitudes, joint by joint, then the frequencies: 2 n W numbers. Amplitudes
-    reach from -q_max / W to q_max / W, so that the sines stay inside the range together; q_max is
-    the room about the offset on its narrower side. A negative one turns its sine's phase by 180
-    degrees. Velocity and jerk, and with a ramp acceleration too, are not bounded by the genes and
-    have to be checked (appendix; Calafiore et al., 2001).
+    Genes: amplitudes, joint by joint, then frequencies; 2 n W in all. Amplitudes range from
+    -q_max / W to q_max / W, so that the sum stays within the position limits; q_max is the
+    distance from the offset to the nearer limit. Velocity and jerk, and with a ramp acceleration,
+    are not bounded by the genes and must be checked (appendix; Calafiore et al., 2001).
 
     Raises:
         DesignError: an offset outside the limits, or a slowest frequency above the fastest.
     """
 
     limits: JointLimits  #: joint limits
-    length: float  #: of the whole motion [s]
+    length: float  #: duration of the motion [s]
     harmonics: int = 3  #: W
-    #: time over which the sines grow and fade [s]; with 0 the motion starts at full speed, and no
-    #: controller can execute it
+    #: duration of fade-in and fade-out [s]; with 0 the motion starts at speed and cannot be run
     ramp: float = 0.0
-    #: posture (n,) [rad] about which the joints swing, and where a motion with a ramp begins and
-    #: ends; None: the middle of each range
+    #: mean posture (n,) [rad], start and end of a motion with a ramp; None: middle of each range
     offset: Array | None = None
-    #: frequencies that gene 0 means (n,) [rad/s]; None: one period in `length`
-    slowest: Array | None = None
-    #: frequencies that gene 1 means (n,) [rad/s]; None: the appendix's sqrt(qdd_max / q_max),
-    #: which keeps the acceleration limit where there is no ramp
+    slowest: Array | None = None  #: frequencies of gene 0 (n,) [rad/s]; None: 2 pi / length
+    #: frequencies of gene 1 (n,) [rad/s]; None: the appendix's sqrt(qdd_max / q_max), which
+    #: satisfies the acceleration limit without a ramp
     fastest: Array | None = None
 
     def __post_init__(self) -> None:
@@ -217,19 +205,19 @@ class SineGenome:
 
     @property
     def n_genes(self) -> int:
-        """Number of amplitudes, n W, and as many frequencies."""
+        """Number of genes, 2 n W."""
         return 2 * self.limits.n_joints * self.harmonics
 
     @property
     def centre(self) -> Array:
-        """Posture (n,) [rad] about which the joints swing."""
+        """Mean posture (n,) [rad]."""
         if self.offset is None:
             return (self.limits.lower + self.limits.upper) / 2.0
         return self.offset
 
     @property
     def frequency_range(self) -> tuple[Array, Array]:
-        """Slowest and fastest frequencies, (n,) each [rad/s]."""
+        """Lowest and highest frequencies, (n,) each [rad/s]."""
         slowest, fastest = self.slowest, self.fastest
         if slowest is None:
             slowest = np.full(self.limits.n_joints, 2.0 * np.pi / self.length)
@@ -243,7 +231,8 @@ class SineGenome:
         shares = rows.reshape(len(rows), 2, self.limits.n_joints, self.harmonics)
         largest = harmonic_bounds(self.limits, self.centre, self.harmonics).amplitude[:, None]
         slowest, fastest = (rate[:, None] for rate in self.frequency_range)
-        return between(-largest, largest, shares[:, 0]), between(slowest, fastest, shares[:, 1])
+        amplitude = _interpolated(-largest, largest, shares[:, 0])
+        return amplitude, _interpolated(slowest, fastest, shares[:, 1])
 
     def motions(self, genes: Array) -> Sequence[Motion | PlannerError]:
         """Return the series of each row of genes (m, n_genes)."""
@@ -253,9 +242,9 @@ class SineGenome:
         ]
 
     def sample(self, random: np.random.Generator, count: int) -> Array:
-        """Draw a first population (count, n_genes), uniform."""
+        """Draw a uniform first population (count, n_genes)."""
         return random.random((count, self.n_genes))
 
-    def recorded(self, genes: Array) -> dict[str, Any]:  # noqa: ARG002  the series says it all
-        """Return nothing: a sum of sines was planned from nothing else."""
+    def source(self, genes: Array) -> dict[str, Any]:  # noqa: ARG002
+        """Return no fields: the series itself has all parameters."""
         return {}

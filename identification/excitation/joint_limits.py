@@ -1,7 +1,7 @@
-"""Whether a motion keeps the joint limits between its samples too, and rests at both ends.
+"""Joint limits over all time, and rest at both ends.
 
-A table of cubics has its extremes at roots. Of a sum of sines the samples decide where they can,
-which swings between them by M h²/8 at most (M the largest second derivative); the rest is exact.
+The extrema of piecewise cubics are exact. A sum of sines deviates between samples by at most
+M h²/8 (M: largest second derivative); where that bound does not suffice, its extrema are computed.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ from planner.piecewise_cubic import Extrema
 
 Array = NDArray[np.float64]
 
-# Samples within a ramp that is shorter than the motion's own.
-_IN_RAMP = 17
+_IN_RAMP = 17  # samples within a short ramp
 _RATES = ("velocity", "acceleration", "jerk")
 
 
 def limit_violations(
     trajectory: PiecewiseCubic | FourierSeries, limits: JointLimits, motion: Motion
 ) -> list[Violation]:
-    """Return for each quantity and joint the largest excess over its limit, if there is any.
+    """Return the largest violation of each quantity and joint.
 
-    Samples of the motion, both ends included, say when the excess is.
+    Its time is that of one of the samples of the motion, which include both ends.
     """
     if isinstance(trajectory, FourierSeries):
         for samples in (motion, *_short_ramps(trajectory, motion)):
@@ -41,7 +40,7 @@ def limit_violations(
 def rest_violations(
     trajectory: PiecewiseCubic | FourierSeries, limits: JointLimits
 ) -> list[Violation]:
-    """Return what is left of a rate where the motion begins or ends, if anything is."""
+    """Return the largest rate at the start or end of a motion, if it is not zero."""
     try:
         check_rest(trajectory, limits)
     except NotSmooth as jump:
@@ -55,8 +54,7 @@ def rest_violations(
                 0.0,
                 jump.time,
                 scale=float(getattr(limits, jump.quantity)[jump.joint]),
-                remedy="a bare series of sines starts and ends at speed; give it a ramp over "
-                "which the sines grow and fade"
+                remedy="a sum of sines without a ramp starts and ends at speed; set a ramp"
                 if bare
                 else "a motion must start and end at rest",
             )
@@ -65,21 +63,23 @@ def rest_violations(
 
 
 def _beyond(extrema: Extrema, limits: JointLimits, motion: Motion) -> list[Violation]:
-    slack, room = position_rounding(limits), limits.upper - limits.lower
-    # Of each quantity: what it reaches, its bound, the sign of an excess, rounding, and its scale.
+    rounding, span = position_rounding(limits), limits.upper - limits.lower
+    # Quantity, extremum, bound, sign of an excess, tolerance, scale.
     rows = [
-        ("position", extrema.lower, limits.lower, -1.0, slack, room),
-        ("position", extrema.upper, limits.upper, 1.0, slack, room),
+        ("position", extrema.lower, limits.lower, -1.0, rounding, span),
+        ("position", extrema.upper, limits.upper, 1.0, rounding, span),
     ]
     for name in _RATES:
         bound = getattr(limits, name)
         rows.append((name, getattr(extrema, name), bound, 1.0, 0.0 * bound, bound))
     found = []
-    for quantity, value, bound, sign, rounding, scale in rows:
-        broken = np.flatnonzero(~(sign * value <= sign * bound + rounding)).tolist()  # NaN as well
+    for quantity, value, bound, sign, tolerance, scale in rows:
+        broken = np.flatnonzero(~(sign * value <= sign * bound + tolerance)).tolist()  # NaN as well
         for joint in broken:
-            place = quantity == "position"
-            size = sign * motion.position if place else _rates(motion)[_RATES.index(quantity)]
+            if quantity == "position":
+                size = sign * motion.position
+            else:
+                size = _rates(motion)[_RATES.index(quantity)]
             k = int(np.argmax(size[:, joint]))
             found.append(
                 Violation(
@@ -96,7 +96,7 @@ def _beyond(extrema: Extrema, limits: JointLimits, motion: Motion) -> list[Viola
 
 
 def _rates(motion: Motion) -> tuple[Array, Array, Array]:
-    """Return |qd|, |qdd| at the samples and the mean |jerk| between them, which is attained."""
+    """Return |qd|, |qdd| at the samples and the mean |jerk| between them."""
     jerk = np.diff(motion.acceleration, axis=0) / np.diff(motion.time)[:, None]
     return np.abs(motion.velocity), np.abs(motion.acceleration), np.abs(jerk)
 
@@ -107,7 +107,7 @@ def _attained(motion: Motion) -> Extrema:
 
 
 def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
-    """Return samples within ramps that are too short for the motion's own samples to show them."""
+    """Return samples within the ramps if these are shorter than three sample periods."""
     step = float(np.max(np.diff(motion.time)))
     if not 0.0 < series.ramp < 3.0 * step:
         return []
@@ -119,11 +119,11 @@ def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
 
 
 def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool:
-    """Whether the samples are farther from all limits than the series swings between them."""
+    """Whether the samples are farther from all limits than the series deviates between them."""
     step = float(np.max(np.diff(motion.time)))
     second, third, fourth = (series.derivative_bound(order) for order in (2, 3, 4))
-    # Where sines stop growing or begin to fade the jerk jumps. A neighbouring pair of samples on
-    # the same side of that knows it to two steps' time, if each part lasts three.
+    # The jerk jumps at the ends of the ramps. If each part of the motion lasts three steps, a pair
+    # of samples on the same side gives the jerk with an error of two steps.
     parts = [series.ramp, series.length - 2.0 * series.ramp]
     long_enough = all(part == 0.0 or part >= 3.0 * step for part in parts)
     reached = _attained(motion)
@@ -143,22 +143,19 @@ def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool
 def rate_bounds(
     trajectory: PiecewiseCubic | FourierSeries, start: Array, stop: Array
 ) -> tuple[Array, Array, Array]:
-    """Return bounds of velocity, acceleration and jerk in parts of a motion, (n, g) each.
+    """Return upper bounds of velocity, acceleration and jerk in parts of a motion, (n, g) each.
 
-    From `start` to `stop` (g,) [s] each; sound and quick rather than tight.
+    The parts are from `start` to `stop` (g,) [s].
     """
     if isinstance(trajectory, FourierSeries):
         ramp, length = trajectory.ramp, trajectory.length
-        between = (start >= ramp) & (stop <= length - ramp)
+        between_ramps = (start >= ramp) & (stop <= length - ramp)
 
         def bound(order: int) -> Array:
-            calm = trajectory.derivative_bound(order, ramps=False)[:, None]
-            return np.where(between, calm, trajectory.derivative_bound(order)[:, None])
+            without = trajectory.derivative_bound(order, ramps=False)[:, None]
+            return np.where(between_ramps, without, trajectory.derivative_bound(order)[:, None])
 
         return bound(1), bound(2), bound(3)
-    extrema, everywhere = trajectory.extrema(), np.ones(len(start))
-    return (
-        extrema.velocity[:, None] * everywhere,
-        extrema.acceleration[:, None] * everywhere,
-        extrema.jerk[:, None] * everywhere,
-    )
+    extrema, parts = trajectory.extrema(), np.ones(len(start))
+    velocity, acceleration, jerk = (np.outer(getattr(extrema, name), parts) for name in _RATES)
+    return velocity, acceleration, jerk

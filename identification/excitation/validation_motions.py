@@ -1,8 +1,4 @@
-"""Random motions to validate on: wide ones, which the parameters are never fitted to.
-
-A motion leads from a home posture through random via points back to it, as the robot's own
-interpolator runs it, and keeps all constraints.
-"""
+"""Random validation motions from home through random via points and back."""
 
 from __future__ import annotations
 
@@ -15,13 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.constraints import (
-    CurrentModel,
-    check_motion,
-    clearance,
-)
-from identification.excitation.excitation import DrawnMotion
-from identification.excitation.genomes import straight_way
+from identification.excitation.constraints import CurrentModel, check_motion, clearance
+from identification.excitation.excitation import ViaPointMotion
+from identification.excitation.genomes import straight_path
 from identification.excitation.violation import NoFeasibleMotionError, Violation
 from planner import (
     JointLimits,
@@ -33,19 +25,12 @@ from planner import (
 
 Array = NDArray[np.float64]
 
-# Via points drawn at one place before a path is given up.
-_DRAWS_PER_POINT: Final = 50
-# Motions tried for each one that is wanted.
+_DRAWS_PER_POINT: Final = 50  # of one via point before a path is given up
 _TRIES_PER_MOTION: Final = 100
-# A stream of random numbers that no search draws from, whatever the seeds.
-_VALIDATION: Final = 2
-
-
-# Range that each joint's share of its velocity limit is drawn from, share of each joint's range,
-# about its middle, that via points lie in, and the longest motion [s].
-_SPEED: Final = (0.5, 1.0)
-_RANGE_SHARE: Final = 0.98
-_LONGEST: Final = 60.0
+_VALIDATION: Final = 2  # first seed of a random stream that no search uses
+_SPEED: Final = (0.5, 1.0)  # range of the speeds, fraction of the velocity limits
+_RANGE_SHARE: Final = 0.98  # central fraction of each joint's range that via points lie in
+_LONGEST: Final = 60.0  # s
 
 
 def random_validation_motions(
@@ -58,29 +43,29 @@ def random_validation_motions(
     fly: float = 0.5,
     checker: CollisionChecker | None = None,
     currents: CurrentModel | None = None,
-) -> tuple[DrawnMotion, ...]:
-    """Return wide random motions to predict torques on, never to fit parameters to.
+) -> tuple[ViaPointMotion, ...]:
+    """Return random motions across the joint ranges to validate predictions on.
 
-    They run through the same interpolator under the same constraints as an excitation, and come
-    from other random numbers than any excitation, whatever the seeds.
+    They satisfy the same constraints as an excitation; their random numbers are independent of
+    those of any search.
 
     Args:
         limits: joint limits of the plan.
-        home: posture (n,) [rad] within the limits where each motion begins and ends.
-        seed: the same seed gives the same motions, to the last bit.
-        count: how many; the first ones do not depend on it.
+        home: start and end posture (n,) [rad], within the limits.
+        seed: the same seed gives the same motions bit for bit.
+        count: number of motions; the first ones do not depend on it.
         n_via: via points between the two ends.
-        fly: how far corners are rounded, 0 to 1.
-        checker: clearance that every motion must keep.
-        currents: torque and current limits that every motion must keep.
+        fly: corner rounding, 0 to 1.
+        checker: clearance of every motion.
+        currents: torque and current limits of every motion.
 
     Raises:
-        NoFeasibleMotionError: a hundred tries in a row did not give one feasible motion.
+        NoFeasibleMotionError: 100 attempts in a row without a feasible motion.
     """
     rejected, nearest = Counter[str](), dict[str, Violation]()
 
     def reject(violations: Sequence[Violation]) -> None:
-        """Count a motion once per kind of constraint it breaks, and note the mildest of each."""
+        """Count a motion once per kind of constraint it breaks; update the smallest violations."""
         for kind in dict.fromkeys(violation.kind for violation in violations):
             rejected[kind] += 1
             worst = max((v for v in violations if v.kind == kind), key=lambda v: v.excess)
@@ -94,13 +79,13 @@ def random_validation_motions(
     middle = (limits.upper + limits.lower) / 2.0
 
     def next_point(random: np.random.Generator, before: Array, *, last: bool) -> Array | Violation:
-        """Draw until the path is free; return what was in it when patience ends."""
+        """Draw a point with a free path to it, or return a contact after too many draws."""
         draws = 0
         while True:
             point = random.uniform(middle - half, middle + half)
-            path = straight_way(before, point)
+            path = straight_path(before, point)
             if last:
-                path = np.concatenate((path, straight_way(point, home)))
+                path = np.concatenate((path, straight_path(point, home)))
             if checker is None or checker.clear(path).all():
                 return point
             draws += 1
@@ -108,8 +93,8 @@ def random_validation_motions(
             if blocked is not None:
                 return blocked
 
-    def draw(random: np.random.Generator) -> DrawnMotion | Sequence[Violation]:
-        """Return a feasible motion, or why there is none."""
+    def draw(random: np.random.Generator) -> ViaPointMotion | Sequence[Violation]:
+        """Return a feasible motion, or the violations of an infeasible one."""
         speed = random.uniform(*_SPEED, limits.n_joints)
         points = [home]
         while len(points) <= n_via:
@@ -119,20 +104,20 @@ def random_validation_motions(
             points.append(point)
         via_points = np.array([*points, home])
         try:
-            # The solver can take its process with it; that individual is infeasible, no more.
+            # in a child, because the solver can crash its process
             trajectory = plan_in_child(via_points, limits, speed=speed, fly=fly)
         except (PlannerCrashed, PlanningError, PlanningTimedOut) as error:
             return [Violation("planning", f"the motion ({error})", 1.0, 0.0, None)]
         if trajectory.duration > _LONGEST:
             return [Violation("duration", "the motion", trajectory.duration, _LONGEST, None)]
-        check = check_motion(trajectory, limits, checker=checker, currents=currents)
-        return check.violations or DrawnMotion(via_points, speed, fly, trajectory)
+        violations = check_motion(trajectory, limits, checker=checker, currents=currents)
+        return violations or ViaPointMotion(via_points, speed, fly, trajectory)
 
     motions = []
     for k in range(count):
         for attempt in range(_TRIES_PER_MOTION):
             motion = draw(np.random.default_rng([_VALIDATION, seed, k, attempt]))
-            if isinstance(motion, DrawnMotion):
+            if isinstance(motion, ViaPointMotion):
                 motions.append(motion)
                 break
             reject(motion)

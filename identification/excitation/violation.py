@@ -1,4 +1,4 @@
-"""What a motion breaks, where, and by how much."""
+"""Violated constraints of a motion: where and by how much."""
 
 from __future__ import annotations
 
@@ -23,31 +23,29 @@ _UNITS: Final[dict[Kind, str]] = {
     "current": " A",
 }
 KINDS: Final[tuple[Kind, ...]] = tuple(_UNITS)
-"""Kinds of constraints; "planning" stands for a motion that there is not."""
+"""Kinds of constraints; "planning": the motion could not be planned."""
 
 
 @dataclass(frozen=True)
 class Violation:
-    """One constraint that a motion breaks, at its worst instant."""
+    """A violated constraint of a motion at its worst instant."""
 
-    kind: Kind  #: which constraint
-    subject: str  #: joint, motor ("motor of joint_3"), or the pair that comes too close
-    value: float  #: what it reaches (a distance for a collision), SI
-    #: what it may reach at most (for a collision and a too short motion: at least), SI
-    bound: float
-    time: float | None  #: when [s]; None where no instant is to blame
-    posture: tuple[float, ...] = ()  #: joint positions there [rad]; empty where they play no part
-    #: how far beyond the bound counts as an excess of 1, SI; None for the bound's own size
-    scale: float | None = None
-    remedy: str = ""  #: what to do about it, where that is known
+    kind: Kind  #: of the constraint
+    subject: str  #: joint, motor ("motor of joint_3"), or pair of bodies
+    value: float  #: reached value (a distance for a collision), SI
+    bound: float  #: largest allowed value (smallest for a collision or a short motion), SI
+    time: float | None  #: of the worst instant [s], if there is one
+    posture: tuple[float, ...] = ()  #: joint positions there [rad]; empty if irrelevant
+    scale: float | None = None  #: deviation from the bound that means an excess of 1; None: bound
+    remedy: str = ""  #: empty if unknown
 
     @property
     def excess(self) -> float:
-        """How far beyond the bound (> 0), in shares of the scale, comparable between kinds.
+        """Deviation from the bound (> 0) relative to the scale, comparable between kinds.
 
-        A share of the limit for rates, torques, currents and durations, of the joint's range for
-        positions, of the arm's length for collisions; infinite for what is no number. Absolute
-        where there is no scale and the bound is zero.
+        The scale is the limit for rates, torques, currents and durations, the joint's range for
+        positions, the arm's length for collisions. Infinite if not finite; absolute if neither
+        scale nor bound are nonzero.
         """
         scale = abs(self.bound) if self.scale is None else self.scale
         excess = abs(self.value - self.bound) / (scale or 1.0)
@@ -58,24 +56,22 @@ class Violation:
         return self.sentence(f"({joints}) rad" if joints else "")
 
     def sentence(self, joints: str, unit: str | None = None) -> str:
-        """In words.
+        """Return a message with the joint positions as given, unless empty.
 
-        Args:
-            joints: where the joints are, in words; empty to leave that out.
-            unit: of value and bound, with a space before it, where they are not in SI.
+        `unit` of value and bound starts with a space; None for SI.
         """
         unit = _UNITS[self.kind] if unit is None else unit
         text = f"{self.kind} of {self.subject}"
-        if self.kind != "planning":  # where there is no motion, there are no numbers either
+        if self.kind != "planning":
             side = "least" if self.value < self.bound else "most"
-            text += f": {self.value:.4g}{unit}, at {side} {self.bound:.4g}{unit} is wanted"
+            text += f": {self.value:.4g}{unit}, must be at {side} {self.bound:.4g}{unit}"
         text += "" if self.time is None else f", at {self.time:.3f} s"
         text += f", joints at {joints}" if joints else ""
         return f"{text}; {self.remedy}" if self.remedy else text
 
 
 def excess_by_kind(violations: Iterable[Violation]) -> Array:
-    """Return the largest excess of each kind of constraint, (len(KINDS),); 0 where satisfied."""
+    """Return the largest excess by kind of constraint, (len(KINDS),); 0 if satisfied."""
     excess = np.zeros(len(KINDS))
     for violation in violations:
         kind = KINDS.index(violation.kind)
@@ -84,14 +80,14 @@ def excess_by_kind(violations: Iterable[Violation]) -> Array:
 
 
 class NoFeasibleMotionError(IdentificationError):
-    """Every motion that was tried breaks a constraint.
+    """No evaluated motion satisfies all constraints.
 
     Attributes:
-        rejected: how many break it, by kind of constraint; a motion may count for several.
-        nearest: of each kind the violation that came closest to being none.
-        closest: all violations of the motion that came closest to being feasible, by their sum.
-        tried: how many motions there were.
-        unexciting: how many satisfied every constraint, but left a parameter without excitation.
+        rejected: number of motions by kind of violated constraint.
+        nearest: smallest violation of each kind.
+        closest: all violations of the motion with the smallest sum of excesses.
+        tried: number of evaluated motions.
+        unexciting: number of feasible motions that leave a parameter without excitation.
         stopped: whether the search was stopped before its end.
     """
 
@@ -114,20 +110,21 @@ class NoFeasibleMotionError(IdentificationError):
         super().__init__(self.sentence())
 
     def sentence(self, text_of: Callable[[Violation], str] = str) -> str:
-        """In words; `text_of` puts a violation into the words and units of the reader."""
+        """Return a message; `text_of` formats a violation."""
         reasons = [
-            f"{kind} forbids {count}, the mildest: {text_of(self.nearest[kind])}"
+            f"{kind} excludes {count}, smallest violation: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
         ]
         worst: dict[str, Violation] = {}
         for violation in sorted(self.closest, key=lambda violation: -violation.excess):
             worst.setdefault(violation.kind, violation)
         if len(self.closest) > 1:
-            breaks = " and ".join(map(text_of, worst.values()))
-            reasons.append(f"the motion that comes closest breaks {breaks}")
+            broken = " and ".join(map(text_of, worst.values()))
+            reasons.append(f"the motion closest to feasible violates {broken}")
         if self.unexciting:
             reasons.append(
-                f"{self.unexciting} keep every constraint but leave a parameter without excitation"
+                f"{self.unexciting} satisfy all constraints but leave a parameter without "
+                "excitation"
             )
         if self.stopped:
             reasons.append("the search was stopped before its end")

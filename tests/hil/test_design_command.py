@@ -266,14 +266,14 @@ def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
     assert f"warning: not checked: {unchecked}" in output
 
 
-def test_no_feasible_motion_says_what_forbids_it_where_and_what_to_change(
+def test_no_feasible_motion_names_constraints_and_remedies(
     invoke, settings, tmp_path
 ):
     settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
     with pytest.raises(NoExcitationError) as caught:
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
     said = str(caught.value)
-    assert "duration forbids 16" in said and "0.5" in said
+    assert "duration excludes 16" in said and "0.5" in said
     lasts = r"the shortest motion tried lasts [\d.]+ s, where 0 to 0.5 s are asked for: allow more "
     assert re.search(lasts + r"time \(\[constraints\] max_duration\)", said)
     assert "search longer" not in said

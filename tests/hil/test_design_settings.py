@@ -342,7 +342,7 @@ def test_a_duration_is_reported_with_what_is_asked_for(cell, value, asked, words
 def test_the_closest_motion_has_one_violation_of_each_kind(cell):
     rejected, closest = {"collision": 1000, "current": 1000}, (CONTACT, DEEPER, CURRENT)
     sentence = said(cell, VIA, rejected, [CONTACT, CURRENT], closest=closest)
-    breaks = sentence.partition("comes closest breaks ")[2]
+    breaks = sentence.partition("closest to feasible violates ")[2]
     assert breaks.count("collision of") == 1 and "link_1 and link_6" in breaks
     assert breaks.count("current of") == 1
 
@@ -351,7 +351,7 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
     limits = cell.drive_train.current_limit.tolist()
     limits[1] = 0.1
     weak = cell.with_values({"drive_train.current_limit": limits})
-    words = r"begin at home: at rest there, current of motor of joint_2: [\d.]+ A, at most 0\.08 A"
+    words = r"begin at home: at rest there, current of motor of joint_2: [\d.]+ A, must be at most 0\.08 A"
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))
@@ -391,7 +391,7 @@ def test_margins_name_the_motor_and_the_pair(cell):
         limited = type(checks.currents)(
             **{**vars(checks.currents), "current_limit": factor * checks.currents.current_limit}
         )
-        assert check_motion(motion, cell.joint_limits, currents=limited).ok is ok
+        assert (not check_motion(motion, cell.joint_limits, currents=limited)) is ok
 
 
 def test_the_nearest_pair_is_no_contact_even_where_the_margin_is_narrow(cell):

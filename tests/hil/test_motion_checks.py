@@ -78,16 +78,16 @@ def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
         "joint limit", "position of joint 2", beyond[2], limits.upper[2], 1.0, tuple(beyond)
     )
     text = violation_text(position, frame)
-    assert "position of J3: -175 deg, at least -170 deg is wanted, at 1.000 s" in text
+    assert "position of J3: -175 deg, must be at least -170 deg, at 1.000 s" in text
     assert "J3 -175.0" in text
     fast = Violation("joint limit", "velocity of joint 1", 3.0, np.radians(155.0), 0.5)
-    assert "velocity of J2: 171.9 deg/s, at most 155 deg/s is wanted" in violation_text(fast, frame)
+    assert "velocity of J2: 171.9 deg/s, must be at most 155 deg/s" in violation_text(fast, frame)
     # A rate is told as its size, also of J3, which the teach pendant counts the other way round.
     assert frame.sign[2] == -1.0
     backwards = Violation("joint limit", "velocity of joint 2", 6.9726, np.radians(155.0), 0.5)
     told = violation_text(backwards, frame)
-    assert "velocity of J3: 399.5 deg/s, at most 155 deg/s is wanted" in told
-    assert str(fast) == "joint limit of velocity of joint 1: 3, at most 2.705 is wanted, at 0.500 s"
+    assert "velocity of J3: 399.5 deg/s, must be at most 155 deg/s" in told
+    assert str(fast) == "joint limit of velocity of joint 1: 3, must be at most 2.705, at 0.500 s"
 
 
 def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
@@ -202,7 +202,7 @@ def test_standing_at_home_is_refused_where_gravity_is_beyond_the_limit(
     assert (told is not None) == refused
     if told is not None:
         assert told.startswith("torque of joint_3: ")
-        assert f"N·m, at most {torque[HELD]:.4g} N·m is wanted" in told
+        assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in told
 
 
 def test_a_design_keeps_the_limit_too(cell: Cell) -> None:

@@ -68,8 +68,8 @@ class MoodyGenome:
     def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
         return self.inner.sample(random, count)
 
-    def recorded(self, *args: Any) -> dict[str, Any]:
-        return self.inner.recorded(*args)
+    def source(self, *args: Any) -> dict[str, Any]:
+        return self.inner.source(*args)
 
     @staticmethod
     def within(genes: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:

@@ -162,7 +162,7 @@ def checker():
 def feasible(genome, genes, checker) -> float:
     """Share of genes whose whole motion keeps the clearance, rounded corners and all."""
     motions = genome.motions(genes)
-    return float(np.mean([check_motion(m, LIMITS, checker=checker).ok for m in motions]))
+    return float(np.mean([not check_motion(m, LIMITS, checker=checker) for m in motions]))
 
 
 @pytest.mark.parametrize("home", [HOME, None], ids=["closed", "open"])

@@ -108,13 +108,13 @@ def test_what_waits_for_a_full_disk_is_written_later():
     file.room = False
     for seed in (1, 2):
         journal.record(*generation(seed))
-        assert journal.trouble is not None and journal.trouble.errno == errno.ENOSPC
+        assert journal.error is not None and journal.error.errno == errno.ENOSPC
     assert known(io.BytesIO(file.getvalue())) == 1
     journal.close()
-    assert journal.trouble is not None
+    assert journal.error is not None
     file.room = True
     journal.record(*generation(3))
-    assert journal.trouble is None
+    assert journal.error is None
     assert known(io.BytesIO(file.getvalue())) == 4
     file.room = False
     journal.record(*generation(4))

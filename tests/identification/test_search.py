@@ -199,7 +199,7 @@ def _room_under(front: Front) -> float:
 def test_the_result_keeps_the_constraints_and_plans_from_its_moves(population):
     design = search(population, settings("front"))
     excitation = design.excitation
-    assert check_motion(excitation.trajectory, LIMITS).ok
+    assert not check_motion(excitation.trajectory, LIMITS)
     assert excitation.moves is not None
     again = plan_moves(excitation.via_points[0], excitation.moves, LIMITS).trajectory
     assert again.to_dict() == excitation.trajectory.to_dict()
@@ -214,7 +214,7 @@ def test_sums_of_sines_are_searched_like_via_points():
         design = search(population, settings("a"))
     assert isinstance(design.excitation.trajectory, FourierSeries)
     assert design.excitation.method == "a"
-    assert check_motion(design.excitation.trajectory, LIMITS).ok
+    assert not check_motion(design.excitation.trajectory, LIMITS)
 
 
 class Finer(Watched):
@@ -224,11 +224,11 @@ class Finer(Watched):
         super().__init__(problem())
         self._best, self._measure = best, measure
 
-    def judged(self, genes, period):
+    def evaluate(self, genes, period):
         if self._measure is None:
-            return super().judged(self._best, period)
-        trajectory, criteria = super().judged(genes, period)
-        _, best = super().judged(self._best, period)
+            return super().evaluate(self._best, period)
+        trajectory, criteria = super().evaluate(genes, period)
+        _, best = super().evaluate(self._best, period)
         if genes.tobytes() != self._best.tobytes():
             worse = {"log10_det": best.log10_det - 0.01, "coupling_index": best.coupling_index + 1}
             criteria = replace(criteria, **{self._measure: worse[self._measure]})
@@ -553,12 +553,12 @@ def test_genes_without_a_motion_are_worst_and_say_why(scorers):
 
 def test_a_process_ended_from_outside_changes_nothing(scorers):
     rows = genes(2)
-    expected = scorers.score(rows[:1]), scorers.judged(rows[0], 0.01)[1]
+    expected = scorers.score(rows[:1]), scorers.evaluate(rows[0], 0.01)[1]
     for pid in (child.pid for child in scorers._children):
         os.kill(pid, signal.SIGKILL)
     assert same(scorers.score(rows[:1]), expected[0])
     os.kill(scorers._children[0].pid, signal.SIGKILL)
-    assert scorers.judged(rows[0], 0.01)[1] == expected[1]
+    assert scorers.evaluate(rows[0], 0.01)[1] == expected[1]
     os.kill(scorers._children[0].pid, signal.SIGKILL)
     assert scorers.violations(rows[0]) == ()
 
@@ -586,7 +586,7 @@ def test_excess_is_that_of_the_violations_by_kind(scorers):
         assert {each.kind for each in asked.violations(rows[k])} == {
             KINDS[j] for j in np.flatnonzero(scores.excess[k])
         }
-        last = check_motion(motion, slower, currents=asked.constraints.currents).violations
+        last = check_motion(motion, slower, currents=asked.constraints.currents)
         last_excess = excess_by_kind([each for each in last if each.kind != "duration"])
         others = np.array(KINDS) != "duration"
         np.testing.assert_array_equal(scores.excess[k, others], last_excess[others])

@@ -1,5 +1,5 @@
-"""Searching among many motions for the one that excites the parameters best.
+"""Searches for the best excitation.
 
-`Problem` says which motions and how good they are, `Population` scores them in processes of
-their own, `search` decides what is scored next, `Journal` keeps what is known.
+`Problem` defines motions and their scores, `Population` scores them in child processes, `search`
+chooses what to score next, `Journal` stores scores.
 """

@@ -1,8 +1,8 @@
-"""What a search has scored so far, stored so that an interrupted search resumes bit-identically.
+"""Stored scores of a search, from which an interrupted search resumes bit-identically.
 
-Layout: a line that names the format, then frames of length (8 bytes, little endian), CRC-32 (4
-bytes) and that many bytes: first which search it belongs to (JSON), then for each generation its
-genes (m, n_genes) and scores (m, ROW) as two numpy arrays (`.npy`, no pickles).
+Layout: a line with the format, then frames of length (8 bytes, little endian), CRC-32 (4 bytes)
+and content: first the identity of the search (JSON), then for each generation its genes
+(m, n_genes) and scores (m, ROW) as two numpy arrays (`.npy`, no pickles).
 """
 
 from __future__ import annotations
@@ -27,16 +27,15 @@ from identification.excitation.searches.scores import ROW, Scores
 
 Array = NDArray[np.float64]
 
-# Another release of any of these may draw or compute something else.
+# Packages whose release may change the numbers of a search.
 _DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin", "coal")
 _FIRST_LINE: Final = b"hil search journal 2\n"
 _FRAME: Final = struct.Struct("<QI")
-# s; what the operating system has is safe from a crash of ours, what is synced from one of its own.
-_SYNCED_EVERY: Final = 5.0
+_SYNC_PERIOD: Final = 5.0  # s
 
 
 def versions() -> dict[str, str]:
-    """Return the releases installed of everything that a search's numbers come from."""
+    """Return the installed releases of the packages that determine a search's numbers."""
     found = dict.fromkeys(_DISTRIBUTIONS, "not installed")
     for name in _DISTRIBUTIONS:
         with suppress(PackageNotFoundError):
@@ -45,93 +44,90 @@ def versions() -> dict[str, str]:
 
 
 class Journal:
-    """Scores of a search in a file that only ever grows.
+    """Append-only file of the scores of a search, found by their genes.
 
-    Scores are found by their genes. Records from the first damaged one on are scored anew, as is a
-    last one that was cut off while it was written. Where the disk takes no more, records wait in
-    memory and are tried again with the next one: the search goes on.
+    Records after a damaged or truncated one are dropped and scored again. Records that the disk
+    refuses are kept in memory and written with the next one.
 
     Args:
-        file: binary, readable, writable and seekable, best without a buffer of its own; empty or
-            an earlier journal of this search. It stays the caller's to close. One search at a
-            time may use it.
-        search: all that scores and genes depend on, data for JSON by name; releases are added.
+        file: binary, readable, writable, seekable and unbuffered; empty or an earlier journal of
+            this search. The caller closes it. One search at a time may use it.
+        search: tables by name of all that scores depend on, for JSON; package releases are added.
 
     Attributes:
-        recalled: how many motions were read from the file so far.
-        damaged: how many bytes behind the last record that can be read are dropped.
-        trouble: why records wait in memory, None while none do.
+        recalled: number of motions whose scores were read from the file.
+        damaged: number of dropped bytes after the last valid record.
+        error: why records are pending in memory, None if none are.
 
     Raises:
-        JournalError: the file holds something else, or is the journal of another search, or of
-            other software.
-        OSError: it cannot be read, or a new one not be begun.
+        JournalError: the file is not a journal, or is that of another search or software.
+        OSError: it cannot be read or started.
     """
 
     def __init__(self, file: BinaryIO, search: Mapping[str, Any]) -> None:
         self._file = file
         self.recalled = self.damaged = 0
-        self.trouble: OSError | None = None
-        self._known: dict[bytes, Array] = {}
-        self._waiting = b""
+        self.error: OSError | None = None
+        self._rows: dict[bytes, Array] = {}
+        self._pending = b""
         self._synced = monotonic()
         identity = json.dumps({**search, "versions": versions()}, sort_keys=True).encode()
         head = _FIRST_LINE + _framed(identity)
         file.seek(0)
-        there = file.read()
+        stored = file.read()
         self._next = 0
-        if head.startswith(there):  # empty, or cut off at once
+        if head.startswith(stored):  # empty or truncated
             self._append(head)
             return
-        if not there.startswith(_FIRST_LINE):
+        if not stored.startswith(_FIRST_LINE):
             raise JournalError("this file is not the journal of a search")
-        theirs = _content(there, len(_FIRST_LINE))
-        if theirs != identity:
+        other = _content(stored, len(_FIRST_LINE))
+        if other != identity:
             raise JournalError(
-                "this journal belongs to another search: " + _difference(theirs, identity)
+                "this journal belongs to another search: " + _difference(other, identity)
             )
         self._next = len(head)
-        while (content := _content(there, self._next)) is not None:
+        while (content := _content(stored, self._next)) is not None:
             generation = _generation(content)
             if generation is not None:
-                self._known[_key(generation[0])] = generation[1]
+                self._rows[_key(generation[0])] = generation[1]
             self._next += _FRAME.size + len(content)
-        self.damaged = len(there) - self._next
+        self.damaged = len(stored) - self._next
 
     def recall(self, genes: Array) -> Scores | None:
-        """Return the recorded scores of genes (m, n_genes), None where there are none."""
-        rows = self._known.get(_key(genes))
+        """Return the recorded scores of genes (m, n_genes), None if there are none."""
+        rows = self._rows.get(_key(genes))
         if rows is None:
             return None
         self.recalled += len(genes)
         return Scores.of_rows(rows)
 
     def record(self, genes: Array, scores: Scores) -> None:
-        """Append the scores of genes (m, n_genes), as soon as the disk takes them."""
+        """Append the scores of genes (m, n_genes)."""
         content = io.BytesIO()
         for array in (genes, scores.rows):
             np.save(content, np.asarray(array, dtype="<f8"), allow_pickle=False)
-        self._waiting += _framed(content.getvalue())
-        self._write(sync=monotonic() - self._synced >= _SYNCED_EVERY)
+        self._pending += _framed(content.getvalue())
+        self._write(sync=monotonic() - self._synced >= _SYNC_PERIOD)
 
     def close(self) -> None:
-        """Bring all that waits onto the disk, as far as it can be; the file stays open."""
+        """Write pending records and sync; the file stays open."""
         self._write(sync=True)
 
     def _write(self, *, sync: bool) -> None:
         try:
-            self._append(self._waiting)
-            self._waiting = b""
+            self._append(self._pending)
+            self._pending = b""
             if sync:
                 with suppress(io.UnsupportedOperation):  # a file in memory
                     os.fsync(self._file.fileno())
                 self._synced = monotonic()
-            self.trouble = None
+            self.error = None
         except OSError as error:
-            self.trouble = error
+            self.error = error
 
     def _append(self, content: bytes) -> None:
-        """Put bytes where the next record belongs, and nothing behind them."""
+        """Write content after the last valid record and truncate the file there."""
         self._file.seek(self._next)
         self._file.truncate()
         left = memoryview(content)
@@ -141,12 +137,12 @@ class Journal:
         self._next += len(content)
 
 
-def _content(there: bytes, begin: int) -> bytes | None:
-    """Return the content of the frame that begins here, None where there is no whole one."""
-    if begin + _FRAME.size > len(there):
+def _content(stored: bytes, begin: int) -> bytes | None:
+    """Return the content of the frame that begins here, None if it is incomplete."""
+    if begin + _FRAME.size > len(stored):
         return None
-    length, checksum = _FRAME.unpack_from(there, begin)
-    content = there[begin + _FRAME.size : begin + _FRAME.size + length]
+    length, checksum = _FRAME.unpack_from(stored, begin)
+    content = stored[begin + _FRAME.size : begin + _FRAME.size + length]
     return content if len(content) == length and zlib.crc32(content) == checksum else None
 
 
@@ -154,26 +150,24 @@ def _key(genes: Array) -> bytes:
     return sha256(repr(genes.shape).encode() + np.asarray(genes, dtype="<f8").tobytes()).digest()
 
 
-def _difference(theirs: bytes | None, ours: bytes) -> str:
-    """Return the first part in which two searches differ."""
-    try:
-        there, here = json.loads(theirs or b""), json.loads(ours)
-        for part in sorted({*there, *here}):
-            old, new = there.get(part, {}), here.get(part, {})
+def _difference(stored: bytes | None, identity: bytes) -> str:
+    """Return the first difference between the identities of two searches."""
+    with suppress(ValueError, TypeError, AttributeError, RecursionError):  # damaged
+        before, now = json.loads(stored or b""), json.loads(identity)
+        for part in sorted({*before, *now}):
+            old, new = before.get(part, {}), now.get(part, {})
             for name in sorted({*old, *new}):
                 if old.get(name) != new.get(name):
                     return f"{part} {name} was {old.get(name)!r:.80}, is {new.get(name)!r:.80}"
-    except (ValueError, TypeError, AttributeError, RecursionError):
-        pass
-    return "it does not say which"
+    return "its identity is damaged"
 
 
 def _generation(content: bytes) -> tuple[Array, Array] | None:
-    """Return genes and rows of scores, None where a frame holds something else."""
+    """Return genes and rows of scores, None if the frame has other content."""
     stream = io.BytesIO(content)
     try:
         genes, rows = (np.lib.format.read_array(stream, allow_pickle=False) for _ in range(2))
-    except Exception:  # there is little that a forged header does not raise
+    except Exception:  # an invalid header can raise almost anything
         return None
     if genes.ndim != 2 or rows.shape != (len(genes), ROW) or rows.dtype != np.float64:
         return None

@@ -1,4 +1,4 @@
-"""What is searched for, and its motions scored in processes of their own."""
+"""The problem of a search, and its motions scored in child processes."""
 
 from __future__ import annotations
 
@@ -27,44 +27,38 @@ Method = Literal["a", "b", "balanced", "front"]
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """What is sought, and with how much effort."""
+    """Method and effort of a search."""
 
-    #: "a": the largest log10 det (D-optimal, eq. 9); "b": the largest fitness by eq. 7 as
-    #: printed; "balanced": both measures in units of their spread over random motions; "front":
-    #: all compromises between the two at once (NSGA-II), the knee is chosen
+    #: "a": largest log10 det (D-optimal, eq. 9); "b": largest fitness of eq. 7; "balanced": both
+    #: measures in units of their spread over random motions; "front": Pareto front of the two
+    #: (NSGA-II), of which the knee is chosen
     method: Method = "front"
     population: int = 150  #: individuals in a generation
-    #: how many generations are scored, the first, random one among them: 150 x 120 are 18 000
-    #: individuals
-    generations: int = 120
-    #: probability that a pair of parents is crossed (Table 1: "cross-over rate")
-    crossover: float = 0.9
-    mutation: float = 0.01  #: probability that a gene of a child is changed (Table 1: "mutation")
+    generations: int = 120  #: number of generations, the random first one included
+    crossover: float = 0.9  #: probability that two parents are crossed (Table 1)
+    mutation: float = 0.01  #: probability that a gene of a child is mutated (Table 1)
     #: lambda_1 of log10 det and lambda_2 of the coupling index ("b" and "balanced")
     weights: tuple[float, float] = (0.7, 0.3)
-    seed: int = 0  #: the same seed gives the same design, to the last bit
-    polish: int = 0  #: evaluations of a local search from the winner; 0 for none
-    #: how close children stay to their parents (SBX), the larger the closer
-    crossover_eta: float = 15.0
-    #: how close a changed gene stays to what it was, the larger the closer
-    mutation_eta: float = 20.0
+    seed: int = 0  #: the same seed gives the same design bit for bit
+    polish: int = 0  #: evaluations of a local search from the best motion; 0: none
+    crossover_eta: float = 15.0  #: distribution index of SBX; larger: children closer to parents
+    mutation_eta: float = 20.0  #: distribution index of the mutation; larger: smaller changes
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Finds the scores of motions given by genes."""
+    """Genome, objective and constraints of a search."""
 
-    genome: Genome  #: what genes mean
-    objective: Objective  #: how good a motion is
-    constraints: Constraints  #: what it must keep
-    #: motions are sampled this often [s] while searching: in the middle of such steps for the
-    #: objective, at their ends for the constraints
+    genome: Genome  #: decodes genes
+    objective: Objective  #: evaluates excitation
+    constraints: Constraints  #: of every motion
+    #: sample period [s]: midpoints of such steps for the objective, ends for the constraints
     period: float = SAMPLE_PERIOD
 
     def score(self, genes: Array) -> Scores:
-        """Score rows of genes (m, n_genes) in this process, which a solver's crash would end.
+        """Score rows of genes (m, n_genes) in this process, which the solver can crash.
 
-        The scores of a motion do not depend on its company, to the last bit.
+        The scores of a motion do not depend on the other rows, to the last bit.
         """
         rows = []
         for motion in self.genome.motions(genes):
@@ -72,28 +66,29 @@ class Problem:
                 rows.append(unplanned())
             else:
                 measures = self.objective.measures(midpoints(motion, self.period))
-                excess = excess_by_kind(self._broken(motion))
+                excess = excess_by_kind(self._violations(motion))
                 rows.append(np.array((*measures.values(), motion.duration, *excess)))
         return Scores.of_rows(np.array(rows))
 
     def violations(self, genes: Array) -> tuple[Violation, ...]:
-        """Return what the motion of genes (n_genes,) breaks, with place and amount."""
+        """Return the violations of the motion of genes (n_genes,)."""
         (motion,) = self.genome.motions(genes[None])
-        return (_unplannable(motion),) if isinstance(motion, PlannerError) else self._broken(motion)
+        if isinstance(motion, PlannerError):
+            return (_unplannable(motion),)
+        return self._violations(motion)
 
-    def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
+    def evaluate(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
         """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
 
         Raises:
-            PlannerError: there is no motion.
+            PlannerError: the motion cannot be planned.
         """
         (motion,) = self.genome.motions(genes[None])
         if isinstance(motion, PlannerError):
             raise motion
         return motion, self.objective.criteria(motion, period)
 
-    def _broken(self, motion: Motion) -> tuple[Violation, ...]:
-        # Constraints are looked at where the last check before a motion is sent looks.
+    def _violations(self, motion: Motion) -> tuple[Violation, ...]:
         return self.constraints.violations(motion, sampled(motion, self.period))
 
 
@@ -102,29 +97,25 @@ def _unplannable(error: PlannerError) -> Violation:
 
 
 CHUNK: Final = 8
-"""Motions per call to a process, the same for any number of processes.
-
-Few, so that the processes end a generation of a hundred together.
-"""
+"""Motions per call to a child process; few, so that all children finish a generation together."""
 
 
 class Population:
-    """Scores motions of one problem in child processes; keep one for all generations.
+    """Scores motions of one problem in child processes.
 
-    Every motion is scored in a child, each with one thread for linear algebra, so scores are the
-    same to the last bit for any number of workers. Genes whose motion ends its process, alone and
-    twice, or holds it up alone for the whole timeout, are scored as having no motion.
+    Scores do not depend on the number of workers, to the last bit: each child has one thread for
+    linear algebra. A motion that alone crashes its process twice, or exceeds the timeout, is
+    scored as unplannable.
 
     Args:
-        problem: what scores mean.
+        problem: of the search.
         workers: number of processes, at least 1.
-        timeout: longest time [s] for 8 motions, then for each of them alone. Generous, so that
-            a busy machine changes no result. A motion that hangs takes twice as long at most, and
-            nobody can stop the search meanwhile but by an interrupt.
+        timeout: longest time [s] for `CHUNK` motions, then for each of them alone; long enough
+            for a busy computer.
 
     Raises:
         DesignError: no workers.
-        PlannerNotStarted: in `score`, a process could not even be started, several times.
+        PlannerNotStarted: in `score`: a process cannot be started.
     """
 
     def __init__(self, problem: Problem, workers: int = 1, timeout: float = 60.0) -> None:
@@ -141,12 +132,12 @@ class Population:
         self.close()
 
     def close(self) -> None:
-        """End the processes; scoring again starts new ones."""
+        """Stop the processes; scoring again starts new ones."""
         for child in self._children:
             child.close()
 
     def score(self, genes: Array, scored: Callable[[int], None] | None = None) -> Scores:
-        """Return the scores of genes (m, n_genes); `scored` is called with how many more are."""
+        """Return the scores of genes (m, n_genes); call `scored` with each number of new ones."""
         results = map_in_children(
             self._children,
             _score,
@@ -158,26 +149,26 @@ class Population:
         return Scores.of_rows(np.array(rows))
 
     def violations(self, genes: Array) -> tuple[Violation, ...]:
-        """Return what the motion of genes (n_genes,) breaks, with place and amount."""
+        """Return the violations of the motion of genes (n_genes,)."""
         try:
-            found: tuple[Violation, ...] = self._alone("violations", genes)
+            found: tuple[Violation, ...] = self._call("violations", genes)
         except (PlannerCrashed, PlanningTimedOut) as error:
             return (_unplannable(error),)
         return found
 
-    def judged(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
+    def evaluate(self, genes: Array, period: float) -> tuple[Motion, Criteria]:
         """Return the motion of genes (n_genes,) and its criteria, sampled every `period` [s].
 
         Raises:
-            PlannerError: there is no motion, or its planning ended the process.
+            PlannerError: the motion cannot be planned.
         """
-        found: tuple[Motion, Criteria] = self._alone("judged", genes, period)
+        found: tuple[Motion, Criteria] = self._call("evaluate", genes, period)
         return found
 
-    def _alone(self, method: str, *arguments: object) -> Any:
-        """Return what a method of the problem returns; an outside kill is made good."""
+    def _call(self, method: str, *arguments: object) -> Any:
+        """Call a method of the problem in a child, again if another process killed the child."""
         (result,) = map_in_children(
-            self._children[:1], _called, [[0]], lambda _: (self._packed, method, *arguments)
+            self._children[:1], _apply, [[0]], lambda _: (self._packed, method, *arguments)
         )
         if isinstance(result, PlannerCrashed | PlanningTimedOut):
             raise result
@@ -188,12 +179,12 @@ def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _called(packed: bytes, method: str, *arguments: Any) -> list[Any]:
+def _apply(packed: bytes, method: str, *arguments: Any) -> list[Any]:
     return [getattr(_problem(packed), method)(*arguments)]
 
 
 @lru_cache(maxsize=1)
 def _problem(packed: bytes) -> Problem:
-    """Return the problem, unpacked once in each process however often it is sent."""
+    """Return the unpacked problem, cached in each process."""
     problem: Problem = load(packed)
     return problem

@@ -1,7 +1,7 @@
-"""Searching for the motion that excites the parameters best: the paper's methods, and others.
+"""Searches for the best excitation: the paper's methods, a balanced fitness and a Pareto front.
 
-The same seed gives the same design to the last bit, for any number of processes, and whether or not
-it was interrupted and resumed.
+The same seed gives the same design bit for bit, for any number of processes and with any number of
+interruptions.
 """
 
 from __future__ import annotations
@@ -29,75 +29,60 @@ Fitness = Callable[[Scores], Array]
 
 
 class Progress(NamedTuple):
-    """How far a search is."""
+    """Progress of a search."""
 
-    phase: Phase  #: "sample" of random motions that give the scale, "search", "polish"
-    generation: int  #: generations scored so far, of `generations`
-    generations: int  #: of the search
-    evaluated: int  #: motions scored so far in all phases, of `total`
-    total: int  #: how many there are going to be at most
-    feasible: int  #: how many of them keep every constraint
-    #: `CRITERIA` of the best motion so far, nan before there is one. With the method "front" it
-    #: is the knee so far
+    phase: Phase  #: "sample" (random motions for the scale), "search" or "polish"
+    generation: int  #: scored generations
+    generations: int  #: all generations
+    evaluated: int  #: scored motions of all phases
+    total: int  #: largest number of motions to be scored
+    feasible: int  #: scored motions that satisfy all constraints
+    #: `CRITERIA` of the best motion (of the knee for "front"), nan if there is none
     best: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The motion that a search chose, and what it chose from."""
+    """Result of a search."""
 
     settings: SearchSettings  #: of the search
     genes: Array  #: (n_genes,) of the chosen motion
-    #: the motion, with its criteria at 1 ms, and how many motions were scored
-    excitation: Excitation
-    #: the best compromises of everything that the search itself scored, with measures at the
-    #: search's own period. A polish looks for one motion, not for compromises, and is left out
-    front: Front
-    chosen: int | None  #: which motion of the front it is; None where the polish found a better one
-    origin: int  #: which motion of the front it is or, polished, grew from
-    #: those of that motion, at 1 ms as well. The chosen motion is not worse: in its fitness, with
-    #: the method "front" in neither measure. A polished one that is, at 1 ms and against what the
-    #: search saw at its own period, is not chosen
+    excitation: Excitation  #: the motion and its criteria, sampled every `RESCORE_PERIOD`
+    front: Front  #: of all motions before the polish, sampled at the search's period
+    chosen: int | None  #: index of the motion in the front; None if the polish improved it
+    origin: int  #: index in the front of the motion, or of the one that the polish started from
+    #: criteria of that motion, sampled every `RESCORE_PERIOD`; the chosen motion is not worse in
+    #: its fitness or, with "front", in any measure
     origin_criteria: Criteria
-    #: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion so far, nan
-    #: before there is one. With the method "front" the fitness is nan and the measures are the
-    #: best of each, of different motions
+    #: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion, nan if there is
+    #: none; with "front": nan, and the best value of each measure
     history: Array
     complete: bool  #: whether the search ran to its end
-    #: whether that end came before its last generation, as mating brought nothing new
-    exhausted: bool
-    #: units of the balanced fitness and of the knee; None where they play no part
-    scale: Scale | None
+    exhausted: bool  #: whether it ended early because mating gave no new motions
+    scale: Scale | None  #: of the balanced fitness and of the knee; None if not used
 
 
 RESCORE_PERIOD: Final = 0.001
-"""s; the chosen motion is judged once more at the rate of a servo loop."""
+"""Sample period of the criteria of the chosen motion, s."""
 
-# Random numbers that are no other part's, whatever the seeds: of the evolution, of its first
-# generation, and of the motions that give the scale, which are the same for all seeds, so that a
-# balanced fitness is.
+# First seeds of independent random streams: evolution, first generation, and scale (the same for
+# all seeds, so that balanced fitnesses compare).
 _STREAM: Final = 6
 _FIRST: Final = 4
 _SCALE: Final = (5, 0)
-# Added to the excess of a motion that cannot be judged: it ranks behind all that can, however much
-# they exceed, and before those that cannot even be planned, whose excess is infinite.
+# Excess of a motion that leaves a parameter without excitation: it ranks behind all that excite,
+# and before unplannable ones, whose excess is infinite.
 _UNEXCITING: Final = 1e6
 _ALL: Final = "all"
 
 
-# A polish improves a motion by CMA-ES (Hansen 2016, "The CMA Evolution Strategy: A Tutorial"). It
-# looks at ranks alone: whatever satisfies all constraints ranks before whatever breaks one. Its
-# covariance is diagonal (Ros and Hansen 2008): a full one has more entries than a polish has
-# evaluations, and its eigenvectors differ in their last bits with the threads of linear algebra.
-
-# First steps, as a share of each gene's range: the search has left the motion near something good.
-_STEP: Final = 0.03
-# Steps below this change no motion that anybody could tell from the one before.
+# The polish is CMA-ES (Hansen 2016, "The CMA Evolution Strategy: A Tutorial") on ranks; feasible
+# motions rank first. Its covariance is diagonal (Ros and Hansen 2008): a full one has more entries
+# than a polish has evaluations, and its eigenvectors depend on the threads of linear algebra.
+_STEP: Final = 0.03  # first step, fraction of each gene's range
 _SMALLEST_STEP: Final = 1e-7
-# Random numbers that are no other search's, whatever the seeds.
 _POLISH_STREAM: Final = 3
-# How much the largest gain counts where none is a loss.
-_SECOND: Final = 1e-3
+_SECOND: Final = 1e-3  # weight of the largest gain if none is negative
 
 
 def polish(
@@ -110,14 +95,11 @@ def polish(
     seed: int,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Array, Scores]:
-    """Return the best motion found near a start, its genes (n_genes,) and scores (m = 1).
+    """Improve a motion by local search; return genes (n_genes,) and scores (m = 1) of the best.
 
-    Those of the start, two genes or more within [0, 1], bit for bit, where nothing better was
-    found. "Better" is: nearer to keeping the constraints by their summed excess, then the fitness,
-    of which -inf is the worst. The same seed gives the same motion to the last bit, whatever else
-    draws random numbers meanwhile. A whole generation (m, n_genes) is scored at once, `evaluations`
-    motions at most; `stop`, asked before each, ends the polish with the best so far. The start is
-    not scored again: were that to fail for a reason that is not its own, anything would be better.
+    Motions compare by their summed excess, then by fitness, of which -inf is the worst. Without
+    an improvement the start is returned unchanged. Generations (m, n_genes) are scored until
+    `evaluations` motions, or until `stop` is true. The start needs at least two genes.
     """
     best = genes.copy(), scores
     least, most = (float(each[0]) for each in _merits(scores, fitness))
@@ -129,8 +111,7 @@ def polish(
         found = score(asked.copy())
         excess, values = _merits(found, fitness)
         strategy.tell(list(asked), _ranks(excess, values).tolist())
-        # The first of those that are alike.
-        index = int(np.lexsort((-values, excess))[0])
+        index = int(np.lexsort((-values, excess))[0])  # the first of equal ones
         if (excess[index], -values[index]) < (least, -most):
             least, most = float(excess[index]), float(values[index])
             best = asked[index].copy(), found.take(index)
@@ -141,10 +122,10 @@ def polish(
 
 
 def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
-    """Return a fitness that no motion can have above 0 unless it is as good as a reference (m = 1).
+    """Return a fitness above 0 only for motions that dominate a reference (m = 1).
 
-    The smallest of its gains, in units of the scale if there is one, counts (Wierzbicki 1980);
-    where none is a loss the largest one counts a little too.
+    It is the smallest gain, in units of the scale if given (Wierzbicki 1980); if no gain is
+    negative, plus a small share of the largest.
     """
     spread = 1.0 if scale is None else np.array(scale.spread)
 
@@ -158,20 +139,19 @@ def dominating(reference: Scores, scale: Scale | None = None) -> Fitness:
 
 
 def generation_size(n_genes: int) -> int:
-    """Return how many motions make a generation: the usual 4 + 3 ln n, in whole chunks."""
+    """Return the size of a generation: 4 + 3 ln n, rounded up to chunks."""
     return CHUNK * int(np.ceil((4.0 + 3.0 * np.log(n_genes)) / CHUNK))
 
 
 def _merits(scores: Scores, fitness: Fitness) -> tuple[Array, Array]:
-    """Return what motions are ranked by: excess (m,), the less the better, then fitness (m,)."""
+    """Return what motions rank by: summed excess (m,), then fitness (m,); nan is the worst."""
     excess = np.where(scores.feasible, 0.0, np.sum(scores.excess, axis=1))
     values = np.asarray(fitness(scores), dtype=np.float64)
-    # A motion that cannot be judged is the worst of its kind.
     return np.nan_to_num(excess, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
 
 
 def _ranks(excess: Array, fitness: Array) -> Array:
-    """Return ranks from 1 for the best (m,), alike for motions that are alike."""
+    """Return ranks from 1 for the best (m,), equal for equal motions."""
     pairs = np.stack((excess, -fitness))
     _, place = np.unique(pairs, axis=1, return_inverse=True)
     ranks: Array = scipy.stats.rankdata(place.ravel(), method="average")
@@ -179,8 +159,8 @@ def _ranks(excess: Array, fitness: Array) -> Array:
 
 
 def _strategy(start: Array, size: int, seed: int) -> Any:
-    """Return a CMA-ES that draws from a generator of its own and neither prints nor writes."""
-    import cma  # here, because it takes longer to load than many a command to run
+    """Return a CMA-ES with its own random generator, without output."""
+    import cma  # slow to load
 
     random = np.random.default_rng([_POLISH_STREAM, seed])
 
@@ -195,25 +175,22 @@ def _strategy(start: Array, size: int, seed: int) -> Any:
             "popsize": size,
             "CMA_diagonal": True,
             "randn": normal,
-            # nan: the package does not touch numpy's global generator
-            "seed": np.nan,
-            # below -9 nothing is shown, and no file of options is looked for
-            "verbose": -10,
+            "seed": np.nan,  # leaves numpy's global generator unchanged
+            "verbose": -10,  # no output, no options file
             "verb_log": 0,
         },
     )
 
 
 class Evolution:
-    """A GA with one objective, NSGA-II with more; both rank feasible motions before all others.
+    """A GA for one objective, NSGA-II for more, from a first generation of genes (m, n_genes).
 
-    From a first generation of genes (m, n_genes). Infeasible ones are ranked by the sum of their
-    excesses, so constraints need no weights. Crossover is simulated binary, mutation polynomial,
-    selection a binary tournament. Random numbers come from the seed alone.
+    Feasible motions rank first, infeasible ones by the sum of their excesses. Simulated binary
+    crossover, polynomial mutation, binary tournament.
     """
 
     def __init__(self, settings: SearchSettings, first: Array, n_objectives: int) -> None:
-        # Some 0.2 s to load, which only a search needs.
+        # slow to load
         from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
         from pymoo.algorithms.soo.nonconvex.ga import GA, FitnessSurvival, comp_by_cv_and_fitness
         from pymoo.config import Config
@@ -224,7 +201,7 @@ class Evolution:
         from pymoo.operators.selection.tournament import TournamentSelection
         from pymoo.operators.survival.rank_and_crowding import RankAndCrowding
 
-        Config.warnings["not_compiled"] = False  # it would be printed
+        Config.warnings["not_compiled"] = False
         kind, compare, survival = (
             (GA, comp_by_cv_and_fitness, FitnessSurvival())
             if n_objectives == 1
@@ -249,10 +226,9 @@ class Evolution:
         self._asked: Any = None
 
     def ask(self) -> Array | None:
-        """Return the genes (m, n_genes) of the next generation.
+        """Return the genes (m, n_genes) of the next generation, None if mating gives no new ones.
 
-        There may be fewer than a population, as no motion is asked for twice; None where mating
-        brings nothing new at all, which ends the search.
+        No motion comes twice, so there may be fewer than a population.
         """
         self._asked = self._algorithm.infill()
         if self._asked is None or len(self._asked) == 0:
@@ -260,10 +236,10 @@ class Evolution:
         return np.array(self._asked.get("X"), dtype=np.float64)
 
     def tell(self, scores: Scores, objectives: Array) -> None:
-        """Take the scores of what was asked for, and its objectives (m, n_objectives)."""
+        """Record scores and objectives (m, n_objectives) of the generation that `ask` returned."""
         unexciting = np.where(scores.exciting, 0.0, _UNEXCITING)
         excess = np.column_stack((scores.excess, unexciting))
-        # Objectives decide among feasible motions only, and must be finite for their distances.
+        # Crowding distances need finite objectives.
         finite = np.nan_to_num(np.where(scores.usable[:, None], objectives, 0.0))
         self._asked.set("F", finite, "G", excess)
         self._algorithm.advance(infills=self._asked)
@@ -271,26 +247,23 @@ class Evolution:
 
 @dataclass(frozen=True)
 class Goal:
-    """Which of two motions is the better one, or that all measures count (method "front")."""
+    """Order of motions by the method of a search."""
 
     settings: SearchSettings  # of the search
-    p: int  # number of parameters that are judged
-    scale: Scale | None  # units of the measures; None where it plays no part
+    p: int  # number of parameters in the criteria
+    scale: Scale | None  # units of the measures; None if not used
 
     @property
     def single(self) -> bool:
-        """Whether one number decides."""
+        """Whether there is a single objective."""
         return self.settings.method != "front"
 
     def objectives(self, measures: Array) -> Array:
-        """Return what is to be minimised, (m, 1) or (m, d), of measures (m, d)."""
+        """Return the objectives to minimise, (m, 1) or (m, d), for measures (m, d)."""
         return -self.fitness(measures)[:, None] if self.single else -SENSE * measures
 
     def fitness(self, measures: Array) -> Array:
-        """Return the one number of each motion (m,), the larger the better, of measures (m, d).
-
-        -inf for a motion that leaves a parameter without excitation.
-        """
+        """Return the fitness (m,) to maximise for measures (m, d); -inf without excitation."""
         settings = self.settings
         if self.scale is not None:
             return self.scale.fitness(measures, settings.weights)
@@ -304,16 +277,13 @@ class Goal:
         )
 
     def choice(self, front: Front) -> int:
-        """Return which motion of a front (at least one) is the winner.
-
-        No fitness gets worse when all measures get better, so its best motion is on the front.
-        """
+        """Return the index of the best motion of a non-empty front."""
         if self.single:
             return int(np.argmax(self.fitness(front.measures)))
         return front.knee(self.scale)
 
     def best(self, front: Front) -> Array:
-        """Return fitness and measures (1 + d,) of the winner so far; nan without one."""
+        """Return fitness and measures (1 + d,) of the best motion (see `Design.history`)."""
         if len(front) == 0:
             return np.full(1 + len(SENSE), np.nan)
         if not self.single:
@@ -323,11 +293,11 @@ class Goal:
 
     def is_worse(self, one: Criteria, other: Criteria) -> bool:
         """Return whether a motion is worse than another, with "front" in any measure."""
-        ours, theirs = self.objectives(np.array((one.measures, other.measures)))
-        return not bool(np.all(ours <= theirs))
+        first, second = self.objectives(np.array((one.measures, other.measures)))
+        return not bool(np.all(first <= second))
 
-    def polished_by(self, start: Scores) -> Fitness:
-        """Return what a polish from a motion (scores, m = 1) makes larger."""
+    def polish_fitness(self, start: Scores) -> Fitness:
+        """Return the fitness that a polish from a motion (scores, m = 1) maximises."""
         if self.single:
             return lambda scores: self.fitness(scores.measures)
         return dominating(start, self.scale)
@@ -342,35 +312,31 @@ def search(
     scored: Callable[[int], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
-    """Return the best motion of a search.
+    """Search for the best motion.
 
     Args:
-        population: scores motions; its problem says what they are and must keep.
-        settings: how to search, and what for.
-        journal: scores already known, and where new ones are stored.
+        population: scores motions of its problem.
+        settings: method and effort.
+        journal: earlier scores; new ones are appended.
         progress: called after each generation.
-        scored: called with a number of motions whenever so many more of a generation are scored
-            (those that the journal knows are not).
-        stop: asked before each generation; true ends the search with the best so far. The one
-            under way is finished first, which a motion that hangs delays by the population's
-            timeout.
+        scored: called with each number of newly scored motions of a generation.
+        stop: called before each generation; true ends the search with the best motion so far.
 
     Raises:
-        NoFeasibleMotionError: no motion tried keeps every constraint and excites every parameter.
-        PlannerNotStarted: a process could not be started.
-        KeyboardInterrupt: as it comes; the generation under way is lost, no other.
+        NoFeasibleMotionError: no motion satisfies all constraints and excites every parameter.
+        PlannerNotStarted: a process cannot be started.
     """
     return _Search(population, settings, journal, progress, scored, stop).run()
 
 
 def most_evaluations(settings: SearchSettings) -> int:
-    """Return how many motions a search is going to score at most, in all its phases."""
+    """Return the largest number of motions that a search scores in all its phases."""
     sampled = SAMPLE_COUNT if _needs_scale(settings) else 0
     return sampled + settings.population * settings.generations + settings.polish
 
 
 class _Search:
-    """One search under way, and what it has seen so far."""
+    """State of a search."""
 
     def __init__(
         self,
@@ -391,44 +357,44 @@ class _Search:
         self._front = Front.empty(self._genome.n_genes)
         self._tried = self._feasible = 0
         self._rejected: Counter[str] = Counter()
-        # The smallest excess but zero of each kind, and of all together, and whose it is.
-        self._mildest: dict[str, tuple[float, Array]] = {}
+        # Smallest positive excess of each kind and of their sum, with the genes.
+        self._nearest: dict[str, tuple[float, Array]] = {}
 
     def run(self) -> Design:
         settings = self._settings
-        goal = self._goal = self._chosen_goal()
+        goal = self._goal = self._make_goal()
         self._phase = "search"
         random = np.random.default_rng((_FIRST, settings.seed))
         first = self._genome.sample(random, settings.population)
         evolution = Evolution(settings, first, 1 if goal.single else len(SENSE))
-        while len(self._history) < settings.generations and not self._halted():
-            asked = evolution.ask()
-            if asked is None:
+        while len(self._history) < settings.generations and not self._should_stop():
+            children = evolution.ask()
+            if children is None:
                 self._exhausted = True
                 break
-            scores = self._score(asked)
+            scores = self._score(children)
             evolution.tell(scores, goal.objectives(scores.measures))
         front = self._front
         if len(front) == 0:
             raise self._failure()
         winner = goal.choice(front)
         genes = start = front.genes[winner]
-        origin = trajectory, criteria = self._population.judged(start, RESCORE_PERIOD)
-        if settings.polish > 0 and not self._halted():
+        origin = trajectory, criteria = self._population.evaluate(start, RESCORE_PERIOD)
+        if settings.polish > 0 and not self._should_stop():
             self._phase = "polish"
-            known = front.scores(winner)
+            start_scores = front.scores(winner)
             genes, _ = polish(
                 self._score,
                 start,
-                known,
-                goal.polished_by(known),
+                start_scores,
+                goal.polish_fitness(start_scores),
                 evaluations=settings.polish,
                 seed=settings.seed,
-                stop=self._halted,
+                stop=self._should_stop,
             )
         if genes.tobytes() != start.tobytes():
-            trajectory, criteria = self._population.judged(genes, RESCORE_PERIOD)
-            # Better only as the search samples, or other genes of the same motion.
+            trajectory, criteria = self._population.evaluate(genes, RESCORE_PERIOD)
+            # better only at the search's sample period, or other genes of the same motion
             if criteria == origin[1] or goal.is_worse(criteria, origin[1]):
                 genes, (trajectory, criteria) = start, origin
         return Design(
@@ -441,7 +407,7 @@ class _Search:
                 seed=settings.seed,
                 tried=self._tried,
                 rejected=dict(self._rejected),
-                **self._genome.recorded(genes),
+                **self._genome.source(genes),
             ),
             front=front,
             chosen=winner if genes.tobytes() == start.tobytes() else None,
@@ -453,21 +419,20 @@ class _Search:
             scale=goal.scale,
         )
 
-    def _chosen_goal(self) -> Goal:
-        """Return what decides, after a look at random motions where it needs a scale."""
+    def _make_goal(self) -> Goal:
+        """Return the goal, with a scale from random motions if the method needs one."""
         scale, settings = None, self._settings
         if _needs_scale(settings):
             scores = self._score(self._genome.sample(np.random.default_rng(_SCALE), SAMPLE_COUNT))
             try:
                 scale = Scale.of(scores)
-            except DesignError:
-                # Random motions excite hardly anything. A front does without a scale.
+            except DesignError:  # a front can do without a scale
                 if settings.method != "front":
                     raise self._failure() from None
         return Goal(settings, self._population.problem.objective.n_parameters, scale)
 
     def _score(self, genes: Array) -> Scores:
-        """Return the scores of genes (m, n_genes), from the journal where it has them."""
+        """Return the scores of genes (m, n_genes), from the journal if it has them."""
         scores = None if self._journal is None else self._journal.recall(genes)
         if scores is None:
             scores = self._population.score(genes, self._scored)
@@ -482,14 +447,14 @@ class _Search:
                 if kind != _ALL:
                     self._rejected[kind] += len(broken)
                 index = int(broken[np.argmin(excess[broken])])
-                if kind not in self._mildest or excess[index] < self._mildest[kind][0]:
-                    self._mildest[kind] = float(excess[index]), genes[index].copy()
+                if kind not in self._nearest or excess[index] < self._nearest[kind][0]:
+                    self._nearest[kind] = float(excess[index]), genes[index].copy()
         self._front = self._front.merge(Front.of(genes, scores))
         self._report()
         return scores
 
     def _report(self) -> None:
-        """Extend the history and report how far the search is."""
+        """Extend the history and report progress."""
         goal, front = self._goal, self._front
         if self._phase == "search" and goal is not None:
             self._history.append(goal.best(front))
@@ -511,15 +476,15 @@ class _Search:
         )
 
     def _failure(self) -> NoFeasibleMotionError:
-        """Return the error that says what forbids every motion, where, and by how much."""
+        """Return the error with the smallest violations of each kind."""
         broken = {
-            kind: self._population.violations(genes) for kind, (_, genes) in self._mildest.items()
+            kind: self._population.violations(genes) for kind, (_, genes) in self._nearest.items()
         }
 
         def worst(kind: str) -> Violation:
-            # Only a process that ended for other reasons breaks something else the second time.
-            alike = [violation for violation in broken[kind] if violation.kind == kind]
-            return max(alike or broken[kind], key=lambda violation: violation.excess)
+            # empty if a process that was killed from outside was scored as unplannable
+            same = [violation for violation in broken[kind] if violation.kind == kind]
+            return max(same or broken[kind], key=lambda violation: violation.excess)
 
         return NoFeasibleMotionError(
             self._rejected,
@@ -530,7 +495,7 @@ class _Search:
             stopped=self._stopped,
         )
 
-    def _halted(self) -> bool:
+    def _should_stop(self) -> bool:
         self._stopped = self._stopped or self._stop()
         return self._stopped
 

@@ -1,4 +1,4 @@
-"""Scores of motions, what a step in them is worth, and the best compromises between them."""
+"""Scores of motions, their scale, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _NAMES: Final = tuple(CRITERIA)
 _MEASURES: Final = len(_NAMES)
 
 ROW: Final = _MEASURES + 1 + len(KINDS)
-"""Numbers in a row of scores: `CRITERIA`, a duration, one excess for each of `KINDS`."""
+"""Length of a row of scores: `CRITERIA`, duration, one excess for each of `KINDS`."""
 
 
 class Scores(NamedTuple):
-    """Scores of m motions. `len` is that of a tuple: there are `len(scores.duration)` motions."""
+    """Scores of m motions."""
 
-    measures: Array  #: (m, d) each of `CRITERIA`; the worst without excitation or without a motion
-    duration: Array  #: (m,) [s]; nan where there is no motion
-    #: (m, n_kinds) largest excess of each of `KINDS`, 0 where it is satisfied; inf of the first
-    #: one, "planning", without a motion: anything that moves is nearer to feasible
+    measures: Array  #: (m, d) `CRITERIA`; the worst values if unplannable or not exciting
+    duration: Array  #: (m,) [s]; nan if unplannable
+    #: (m, n_kinds) largest excess of each of `KINDS`, 0 if satisfied; inf for "planning" if
+    #: unplannable
     excess: Array
 
     def measure(self, name: str) -> Array:
@@ -36,9 +36,8 @@ class Scores(NamedTuple):
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
-        """Which motions keep every constraint, (m,)."""
-        met: NDArray[np.bool_] = np.all(self.excess == 0.0, axis=1)
-        return met
+        """Which motions satisfy all constraints, (m,)."""
+        return np.asarray(np.all(self.excess == 0.0, axis=1))
 
     @property
     def exciting(self) -> NDArray[np.bool_]:
@@ -47,7 +46,7 @@ class Scores(NamedTuple):
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Which motions keep every constraint and excite every parameter, (m,)."""
+        """Which motions satisfy all constraints and excite every parameter, (m,)."""
         return self.feasible & self.exciting
 
     def take(self, index: int) -> Self:
@@ -56,43 +55,40 @@ class Scores(NamedTuple):
 
     @property
     def rows(self) -> Array:
-        """Return the same as one array, (m, ROW)."""
+        """The scores as one array, (m, ROW)."""
         return np.column_stack(self)
 
     @classmethod
     def of_rows(cls, rows: Array) -> Self:
-        """Return scores of what `rows` gave, (m, ROW)."""
+        """Return the scores in an array (m, ROW)."""
         return cls(rows[:, :_MEASURES], rows[:, _MEASURES], rows[:, _MEASURES + 1 :])
 
 
 def _finite(measures: Array) -> NDArray[np.bool_]:
-    finite: NDArray[np.bool_] = np.all(np.isfinite(measures), axis=-1)
-    return finite
+    return np.asarray(np.all(np.isfinite(measures), axis=-1))
 
 
 def unplanned() -> Array:
-    """Return the row (ROW,) of genes for which there is no motion."""
+    """Return the row (ROW,) of an unplannable motion."""
     excess = np.where(np.array(KINDS) == "planning", np.inf, 0.0)
     return np.concatenate((-SENSE * np.inf, [np.nan], excess))
 
 
 SAMPLE_COUNT: Final = 200
-"""How many random motions to draw for a scale."""
+"""Number of random motions for a scale."""
 
-# Fewer feasible motions than this tell little of a spread; all motions are used then, feasible
-# or not: what a step is worth is a matter of the arm rather than of its surroundings.
+# With fewer feasible motions than this the scale is that of all motions.
 _FEWEST_FEASIBLE: Final = 20
 _FEWEST: Final = 2
 
 
 class Scale(NamedTuple):
-    """What a step in each of `CRITERIA` is worth: its spread over random motions.
+    """Centre and spread of each of `CRITERIA` over random motions.
 
-    Eq. 7 adds two terms of different size (0.7 of the first is about 75 on a six-axis arm, 0.3 of
-    the second about 5), so that its weights decide nothing. Here each measure is counted from its
-    median over random motions of the same genome, in units of their interquartile range: with
-    equal weights all matter alike. Other units of the parameters, or another normalisation by N,
-    add a constant to log10 det, which drops out.
+    The two terms of eq. 7 differ in size (0.7 of the first is about 75 on a six-axis arm, 0.3 of
+    the second about 5), so that its weights have little effect. Here each measure is taken from
+    its median over random motions of the same genome, in units of their interquartile range.
+    Other units of the parameters or of N add a constant to log10 det, which cancels.
     """
 
     centre: tuple[float, ...]  #: medians (d,)
@@ -100,10 +96,10 @@ class Scale(NamedTuple):
 
     @classmethod
     def of(cls, scores: Scores) -> Self:
-        """Measure the scale on scores of random motions, some `SAMPLE_COUNT` of them.
+        """Return the scale of random motions, `SAMPLE_COUNT` of them.
 
         Raises:
-            DesignError: fewer than two different motions that excite all parameters.
+            DesignError: fewer than two different motions excite all parameters.
         """
         chosen = scores.usable
         if np.count_nonzero(chosen) < _FEWEST_FEASIBLE:
@@ -119,33 +115,31 @@ class Scale(NamedTuple):
         )
 
     def gains(self, measures: ArrayLike) -> Array:
-        """Return measures (..., d) above those of the median random motion, in spreads."""
-        gains: Array = SENSE * (np.asarray(measures) - self.centre) / self.spread
-        return gains
+        """Return the improvement of measures (..., d) over the median, in spreads."""
+        return np.asarray(SENSE * (np.asarray(measures) - self.centre) / self.spread)
 
     def fitness(self, measures: ArrayLike, weights: tuple[float, ...]) -> Array:
-        """Return the balanced fitness (...) of measures (..., d), with weights (d,).
+        """Return the balanced fitness (...) of measures (..., d) with weights (d,).
 
-        The larger the better; -inf for a motion that leaves a parameter without excitation.
+        To be maximised; -inf for a motion that leaves a parameter without excitation.
         """
-        given = np.asarray(measures, dtype=np.float64)
-        judged = _finite(given)
-        gains = self.gains(np.where(judged[..., None], given, 0.0))
+        values = np.asarray(measures, dtype=np.float64)
+        finite = _finite(values)
+        gains = self.gains(np.where(finite[..., None], values, 0.0))
         total = sum(weight * gains[..., k] for k, weight in enumerate(weights))
-        return np.where(judged, total, -np.inf)
+        return np.where(finite, total, -np.inf)
 
 
-# Heights of a knee that differ by less are alike (they lie between -1 and 1).
-_ALIKE: Final = 1e-12
+# Distances from the chord, between -1 and 1, that differ by less are equal.
+_EQUAL: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """The k motions that no other one beats in all of `CRITERIA`, by rising last measure (I_c).
+    """Pareto front: the k motions not dominated in `CRITERIA`, by rising last measure (I_c).
 
-    Motions that are alike in every measure are one: the shortest, then the one whose genes come
-    first. It is therefore a function of the set of motions alone: neither their order nor their
-    way into it, all at once or by parts that are merged, changes anything.
+    Of motions with equal measures it has one: the shortest, then the one whose genes come first.
+    So it does not depend on the order in which motions are added.
     """
 
     genes: Array  #: (k, n_genes), within [0, 1]
@@ -154,17 +148,14 @@ class Front:
 
     @classmethod
     def empty(cls, n_genes: int) -> Self:
-        """Return the front of nothing."""
+        """Return the front of no motions."""
         return cls(np.empty((0, n_genes)), np.empty((0, _MEASURES)), np.empty(0))
 
     @classmethod
     def of(cls, genes: Array, scores: Scores) -> Self:
-        """Return the front of motions with `genes` (m, n_genes).
-
-        Left out are those that break a constraint or leave a parameter without excitation.
-        """
-        good = scores.usable
-        return cls(genes[good], scores.measures[good], scores.duration[good])._unbeaten()
+        """Return the front of the usable motions among genes (m, n_genes)."""
+        usable = scores.usable
+        return cls(genes[usable], scores.measures[usable], scores.duration[usable])._nondominated()
 
     def __len__(self) -> int:
         return len(self.measures)
@@ -181,18 +172,16 @@ class Front:
     def merge(self, other: Self) -> Self:
         """Return the front of the motions of both."""
         columns = zip(vars(self).values(), vars(other).values(), strict=True)
-        return type(self)(*map(np.concatenate, columns))._unbeaten()
+        return type(self)(*map(np.concatenate, columns))._nondominated()
 
     def knee(self, scale: Scale | None = None) -> int:
-        """Return the index of the motion where each measure begins to cost much of the others.
+        """Return the index of the knee, the motion farthest beyond the chord between the ends.
 
-        It is the one farthest beyond the plane through the ends (Das 1999, "On characterizing the
-        knee of the Pareto curve based on normal-boundary intersection"; the chord, of two
-        measures), all measured from end to end. An end that nobody would choose, such as a motion
-        that hardly excites anything and is a trifle less coupled for it, must not decide: with
-        `scale` only the part of the front counts that beats the median random motion in all
-        measures, provided any does. Where no motion lies beyond (one or two of them, or a hollow
-        front) it is the end with the better balanced fitness; without `scale`, the least coupled.
+        Das 1999, "On characterizing the knee of the Pareto curve based on normal-boundary
+        intersection". Measures are normalised to the ranges of the front. With `scale` only
+        motions better than the median random motion in all measures count, if there are any. If
+        no motion lies beyond the chord, it is the end with the larger balanced fitness; without
+        `scale`, the first.
 
         Raises:
             ValueError: the front is empty.
@@ -206,17 +195,17 @@ class Front:
         values = self.measures[part]
         span = np.ptp(values, axis=0)
         height = (values - values.min(axis=0)) / np.where(span > 0.0, span, 1.0) @ SENSE
-        highest = part[height >= height.max() - _ALIKE]
+        highest = part[height >= height.max() - _EQUAL]
         if scale is None or len(highest) == 1:
             return int(highest[0])
         balanced = scale.fitness(self.measures[highest], (1.0 / _MEASURES,) * _MEASURES)
         return int(highest[np.argmax(balanced)])
 
-    def _unbeaten(self) -> Self:
+    def _nondominated(self) -> Self:
         cost = -SENSE * self.measures
         left = np.lexsort((*self.genes.T[::-1], self.duration, *cost.T))
         found = []
-        while len(left):  # the first in this order is beaten by none of the others
+        while len(left):  # no other one dominates the first in this order
             found.append(left[0])
             left = left[np.any(cost[left] < cost[left[0]], axis=1)]
         rows = np.array(found, dtype=np.intp)
