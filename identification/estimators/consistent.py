@@ -557,7 +557,7 @@ def consistent_estimate(
         margin=margin(standard[model.layout.links]),
         relative_error=float(np.nan_to_num(factor.relative_error(values))),
         unconstrained_relative_error=float(np.nan_to_num(free)),
-        reference=program.bodies.words,
+        reference=program.bodies.origins,
         status=status,
         solution=solution,
     )

@@ -39,7 +39,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     if kinds:
         lines += [
             f"Torque that friction takes at the speed v of a joint: {_formula(kinds)}",
-            f"with {_joined([kind.words for kind in kinds])}.",
+            f"with {_joined([kind.description for kind in kinds])}.",
             "sgn(v) is 1 forwards, -1 backwards.",
         ]
         slow: dict[tuple[float, str], list[str]] = {}  # joints by standstill and zone

@@ -296,7 +296,7 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
     for kind in model.friction.kinds:
         if kind not in _DRY or kind not in form.friction:
             of_kind = [one.term.label == kind.label and not one.motor for one in terms]
-            yield kind.words, _friction(arm, motion, of_kind), kind in form.friction
+            yield kind.description, _friction(arm, motion, of_kind), kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
     motors = [one.motor and not (form.rotors and one.term.label in _DRY_LABELS) for one in terms]
     yield "rotor inertias", qdd @ diagonal, form.rotors

@@ -241,7 +241,7 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     absent = {
         "rotor inertias": model.rotor_inertia,
         "coupling inertias": bool(model.layout.pairs),
-        **{kind.words: not kind.urdf for kind in model.friction.kinds},
+        **{kind.description: not kind.urdf for kind in model.friction.kinds},
         "friction of coupled motors": bool(model.friction.motors),
         "the payload": model.payload is not None,
         "springs and balancers": bool(model.elements.elements),

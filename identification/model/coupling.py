@@ -1,7 +1,7 @@
-r"""Motors that turn with several joints: the coupled wrists of industrial arms.
+r"""Motors coupled to several joints, as in the wrists of industrial arms.
 
-With motor angles per joint angle K (n, n), rotors with inertias J and friction in the motors act
-on the joints as (Gautier 1997)
+With motor angles per joint angle K (n, n), rotor inertias J and friction in the motors act on the
+joints as (Gautier 1997)
 
 .. math:: \tau = K^T J K \ddot q + \sum_m c_m^T\, f_m(c_m \dot q), \qquad c_m = K_m / K_{mm}
 """
@@ -17,32 +17,29 @@ from identification.errors import ModelError
 
 Array = NDArray[np.float64]
 
-# Of what turns a motor most: a wrist couples by a tenth at least, rounding of a file by much less.
-_UNCOUPLED = 1e-9
+_UNCOUPLED = 1e-9  # relative to the largest entry of a row
 
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """How motors turn with joints, and what of it is to be identified."""
+    """Coupling of motors and joints, and its identified parameters."""
 
-    #: motor angle per joint angle (n, n), gears and signs included or not: only the ratios within
-    #: a row matter
-    motor_from_joint: Array
-    inertia: bool = True  #: give each pair of coupled joints its coupling inertia
-    friction: bool = True  #: give each coupled motor Coulomb and viscous friction of its own
+    motor_from_joint: Array  #: motor angle per joint angle (n, n); only ratios within a row matter
+    inertia: bool = True  #: identify a coupling inertia of each pair of coupled joints
+    friction: bool = True  #: identify Coulomb and viscous friction of each coupled motor
 
     def __post_init__(self) -> None:
         matrix = np.array(self.motor_from_joint, dtype=np.float64)
         if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
             raise ModelError(f"the coupling has shape {matrix.shape}; it must be square")
         if not np.all(np.isfinite(matrix)):
-            raise ModelError("the coupling holds a number that is not finite")
+            raise ModelError("the coupling has an entry that is not finite")
         own, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
         if np.any(own <= _UNCOUPLED * most):
             motor = int(np.argmax(own <= _UNCOUPLED * most)) + 1
             raise ModelError(
-                f"motor {motor} of the coupling does not turn with joint {motor}: order motors so"
-                " that each stands in the row of the joint that it drives"
+                f"motor {motor} of the coupling does not turn with joint {motor}; order the motors"
+                " by the joints that they drive"
             )
         if np.linalg.matrix_rank(self._relative(matrix)) < len(matrix):
             raise ModelError("the coupling is singular: joints cannot be moved independently")
@@ -56,17 +53,17 @@ class Coupling:
 
     @property
     def speeds(self) -> Array:
-        """Speed of each motor per joint speed, one for its own joint (n, n)."""
+        """Speed of each motor per joint speed (n, n), 1 for its own joint."""
         return self._relative(self.motor_from_joint)
 
     @property
     def coupled_motors(self) -> tuple[int, ...]:
-        """Motors, from 0, that turn with other joints than their own."""
+        """Motors, from 0, that turn with several joints."""
         return tuple(np.flatnonzero(np.count_nonzero(self.speeds, axis=1) > 1).tolist())
 
     @property
     def pairs(self) -> tuple[tuple[int, int], ...]:
-        """Joints (i, j), i < j from 0, that some motor turns with both of."""
+        """Joints (i, j), i < j from 0, that share a motor."""
         turns = self.speeds != 0.0
         together = turns.T.astype(np.intp) @ turns.astype(np.intp)
         return tuple((int(i), int(j)) for i, j in np.argwhere(np.triu(together, 1) > 0))

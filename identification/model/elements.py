@@ -1,7 +1,7 @@
-r"""Springs, balancers and gear ripple: torques on a joint beside the rigid body.
+r"""Springs, balancers and torque ripple: torques that depend on the angle q of a joint or motor.
 
-They depend on the angle q of the joint or its motor, and count as what the *drive* has to hold: for
-a tension F between anchors at the distance l, :math:`F\,dl/dq`.
+Signs are those of the torque of the *drive*: :math:`F\,dl/dq` for a tension F between anchors at
+the distance l.
 """
 
 from __future__ import annotations
@@ -20,32 +20,31 @@ from identification.errors import ModelError
 
 Array = NDArray[np.float64]
 
-_SAME_DISTANCE: Final = 1e-6
-"""Share of the distances by which they have to differ: equal ones let the length become zero."""
+_SAME_DISTANCE: Final = 1e-6  # relative; equal distances allow a length of zero
 
 
 class ElementError(ModelError):
-    """An element whose parameters the others stand for already."""
+    """An element whose parameters cannot be separated from others."""
 
 
 class Coefficient(NamedTuple):
-    """A factor of one shape of torque."""
+    """A factor of a torque function."""
 
     symbol: str  # name of the parameter, without the number of the joint
-    unit: str  # its unit
-    value: float | None  # as given; None where it is not
+    unit: str
+    value: float | None  # given value, if any
     identified: bool  # whether it is a parameter
 
 
 @dataclass(frozen=True)
 class Element(ABC):
-    """A torque on one joint: coefficients times shapes, c of them identified, the others known."""
+    """A torque on one joint: k coefficients times functions of an angle, c of them identified."""
 
     joint: str  # name
 
     @property
     def turns(self) -> Mapping[str, float]:
-        """The angle that it depends on, per angle of each joint by name."""
+        """Derivative of the angle by that of each joint, by joint name."""
         return {self.joint: 1.0}
 
     @property
@@ -67,30 +66,30 @@ class Element(ABC):
         return self.shapes(q)[:, [one.identified for one in self.coefficients]]
 
     def known(self, q: Array) -> Array:
-        """Return the part of the torque [N·m] that is known (m,)."""
+        """Return the known part of the torque [N·m] (m,)."""
         known = [0.0 if one.identified else one.value or 0.0 for one in self.coefficients]
         return np.asarray(self.shapes(q) @ np.array(known))
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Two anchors in the plane of a joint, one on the base side and one on the link side.
+    """Two anchors in the plane of a joint.
 
     Raises:
-        ModelError: a distance is not positive, or both are the same.
+        ModelError: a distance is not positive, or they are equal.
     """
 
     base: float  #: distance of the anchor on the base side from the axis [m]
-    link: float  #: that of the anchor on the link side [m]
-    angle: float  #: between the two, seen from the axis, at joint angle zero [rad]
+    link: float  #: distance of the anchor on the link side from the axis [m]
+    angle: float  #: between the two at joint angle zero [rad]
 
     def __post_init__(self) -> None:
         _require_positive("distance of an anchor from the axis", "m", self.base, self.link)
         _require_finite("angle between the anchors", self.angle)
         if abs(self.base - self.link) <= _SAME_DISTANCE * self.base:
             raise ModelError(
-                f"both anchors are {self.base:g} m from the axis: they would meet at one angle;"
-                " give the measured distances"
+                f"both anchors are {self.base:g} m from the axis, so that their distance is zero at"
+                " one angle; give the measured distances"
             )
 
     def length(self, q: Array) -> Array:
@@ -99,21 +98,21 @@ class Anchors:
         return np.sqrt(self.base**2 + self.link**2 - product * np.cos(q + self.angle))
 
     def lever(self, q: Array) -> Array:
-        """Return dl/dq [m/rad] at positions (m,): the lever of a tension."""
+        """Return the lever dl/dq [m/rad] at positions (m,)."""
         moment = self.base * self.link * np.sin(q + self.angle)
         return np.asarray(moment / self.length(q))
 
 
 @dataclass(frozen=True)
 class TorsionSpring(Element):
-    """A spring about the axis; the drive holds ``stiffness (q - rest)``.
+    """A torsion spring; the torque of the drive is ``stiffness (q - rest)``.
 
     Raises:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
     rest: float  #: position without torque [rad]
-    stiffness: float | None = None  #: [N·m/rad]; of an identified spring nominal, if known
+    stiffness: float | None = None  #: [N·m/rad]; nominal, if identified
     identified: bool = False  #: whether the stiffness is a parameter
 
     def __post_init__(self) -> None:
@@ -132,17 +131,16 @@ class TorsionSpring(Element):
 
 @dataclass(frozen=True)
 class ExtensionSpring(Element):
-    """A spring between two anchors, of tension ``stiffness (l - free_length) + preload``.
+    """A spring between two anchors with tension ``stiffness (l - free_length) + preload``.
 
     Raises:
         ModelError: a known spring has no stiffness, or a number is not finite.
     """
 
-    anchors: Anchors  #: where it is fixed
+    anchors: Anchors  #: fixed points
     free_length: float  #: [m]
-    stiffness: float | None = None  #: [N/m]; of an identified spring nominal, if known
-    #: tension at the free length [N]; an identified spring without it gets a parameter for it, a
-    #: known spring none
+    stiffness: float | None = None  #: [N/m]; nominal, if identified
+    #: tension at the free length [N]; None: a parameter of an identified spring, else zero
     preload: float | None = None
     identified: bool = False  #: whether the stiffness is a parameter
 
@@ -167,23 +165,21 @@ class ExtensionSpring(Element):
 
 @dataclass(frozen=True)
 class GasCylinder(Element):
-    """A piston against gas between two anchors, of constant temperature.
+    """An isothermal gas cylinder between two anchors.
 
-    With the stroke s, by which the anchors compress the gas from the length at which pressure and
-    volume are given, the pressure is ``pressure volume / (volume - s area)``.
+    Its pressure is ``pressure volume / (volume - s area)`` after a compression stroke s from
+    `length`.
 
     Raises:
         ModelError: a figure is not positive, or the gas has no volume left at some angle.
     """
 
-    anchors: Anchors  #: where it is fixed
-    length: float  #: distance between the anchors at which pressure and volume are given [m]
+    anchors: Anchors  #: fixed points
+    length: float  #: distance between the anchors at the given pressure and volume [m]
     area: float  #: of the piston, or of a gas spring's rod [m²]
-    pressure: float  #: over that outside [Pa]
+    pressure: float  #: above ambient [Pa]
     volume: float  #: of the gas [m³]
-    #: whether it pulls the anchors together, its gas being compressed as they part (hydraulic
-    #: balancer), or pushes them apart (gas spring)
-    pulls: bool = True
+    pulls: bool = True  #: the anchors together (hydraulic balancer), or apart (gas spring)
     identified: bool = False  #: whether a factor of its torque is a parameter
 
     def __post_init__(self) -> None:
@@ -200,11 +196,11 @@ class GasCylinder(Element):
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """A factor of the stated law."""
+        """A factor of the computed torque."""
         return (Coefficient("balancer" if self.pulls else "gas_spring", "1", 1.0, self.identified),)
 
     def shapes(self, q: Array) -> Array:
-        """Return the torque of the stated law (m, 1) [N·m]."""
+        """Return the computed torque (m, 1) [N·m]."""
         left = self._volume_left(self.anchors.length(q))
         force = self.area * self.pressure * self.volume / left
         torque = (1.0 if self.pulls else -1.0) * self.anchors.lever(q) * force
@@ -218,25 +214,23 @@ class GasCylinder(Element):
 
 @dataclass(frozen=True)
 class TorqueRipple(Element):
-    """A torque that repeats with the turns of the joint's motor: cogging, teeth, wave generators.
+    """A torque periodic in the angle of the joint's motor: cogging, gear teeth, wave generators.
 
-    Each order has a cosine and a sine of the motor's angle, so that amplitude and phase are
-    identified. The phase holds as long as nobody takes the gear apart. That a coupled motor passes
-    some of it on to other joints is left out.
+    Cosine and sine of each order are identified. The effect of a coupled motor on other joints is
+    neglected.
     """
 
-    #: turns of the motor per turn of each joint that turns it, with the joints' names
-    motor: tuple[tuple[str, float], ...]
+    motor: tuple[tuple[str, float], ...]  #: turns of the motor per turn of each joint, by name
     orders: tuple[int, ...]  #: periods per turn of the motor
 
     @property
     def turns(self) -> Mapping[str, float]:
-        """The motor's angle, per angle of each joint."""
+        """Derivative of the motor's angle by that of each joint."""
         return dict(self.motor)
 
     @property
     def coefficients(self) -> tuple[Coefficient, ...]:
-        """``ripple_cos2`` and ``ripple_sin2`` of the second order; no maker states them."""
+        """``ripple_cos2`` and ``ripple_sin2`` of the second order, and so on."""
         return tuple(
             Coefficient(f"ripple_{wave}{order}", "N·m", None, True)
             for order in self.orders
@@ -252,10 +246,10 @@ class TorqueRipple(Element):
 class PlacedElement(NamedTuple):
     """An element among the joints and parameters of an arm."""
 
-    element: Element  # which
+    element: Element
     joint: int  # that it acts on, from 0
-    turns: tuple[float, ...]  # the angle that it depends on, per angle of each joint (n,)
-    part: slice  # where its parameters stand among the e of all elements
+    turns: tuple[float, ...]  # derivative of its angle by that of each joint (n,)
+    part: slice  # of its parameters among the e of all elements
 
     def columns(self, q: Array) -> Array:
         """Return the columns (m, c) at joint positions (m, n)."""
@@ -276,10 +270,10 @@ class JointElements:
     def of(
         cls, elements: Sequence[Element], joint_names: Sequence[str], revolute: Sequence[bool]
     ) -> JointElements:
-        """Find the joints of elements.
+        """Assign elements to joints.
 
         Raises:
-            ModelError: there is no such joint, or it slides.
+            ModelError: there is no such joint, or it is prismatic.
         """
         placed, first = [], 0
         for element in elements:
@@ -291,8 +285,8 @@ class JointElements:
             joint = joint_names.index(element.joint)
             if not revolute[joint]:
                 raise ModelError(
-                    f"joint {element.joint!r} slides; springs and balancers are for joints that"
-                    " turn",
+                    f"joint {element.joint!r} is prismatic; springs and balancers need a revolute"
+                    " joint",
                     joint=element.joint,
                 )
             part = slice(first, first + len(element.symbols))
@@ -308,12 +302,12 @@ class JointElements:
 
     @property
     def identified(self) -> tuple[PlacedElement, ...]:
-        """Those that have parameters."""
+        """Elements with parameters."""
         return tuple(one for one in self.placed if one.element.symbols)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the e parameters: ``spring_2``, then ``spring_2b`` of another on that joint."""
+        """Names of the e parameters: ``spring_2``, ``spring_2b`` for another on that joint."""
         first = [f"{s}_{one.joint + 1}" for one in self.placed for s in one.element.symbols]
         before = [first[:k].count(name) for k, name in enumerate(first)]
         return tuple(
@@ -331,11 +325,11 @@ class JointElements:
 
     @property
     def nominal(self) -> Array:
-        """Values of the e parameters as far as they are given, else zero."""
+        """Given values of the e parameters, else zero."""
         return np.array([one.value or 0.0 for one in self._coefficients], dtype=np.float64)
 
     def torque(self, values: Array, q: Array) -> Array:
-        """Return the torque (m, n) [N·m] for e parameter values, without what is known."""
+        """Return the torque (m, n) [N·m] of e parameter values, without the known part."""
         torque = np.zeros(q.shape)
         for one in self.identified:
             torque[:, one.joint] += one.columns(q) @ values[one.part]

@@ -1,19 +1,18 @@
-r"""Friction of joints, linear in its coefficients: terms, the law of a joint, and that of an arm.
+r"""Friction of joints, linear in its coefficients: terms, law of a joint, friction of an arm.
 
 .. math:: \tau_f = f_0\,\mathrm{sgn}(v) + f_1 v + f_d |v| + f_2\,\mathrm{sgn}(v)\,v^2
                    + f_s\,\mathrm{sgn}(v)\,e^{-(v/v_s)^2} + f_o
 
-with the joint's speed v. Each summand is a :class:`FrictionTerm`, a row of :data:`TERMS`. Dry
-friction does not jump at a reversal: over a displacement of some 1e-4 rad it reverses like a spring
-(presliding). Dahl (1968) describes it by a state z in place of sgn(v),
+with the joint's speed v. Each summand is a :class:`FrictionTerm` in :data:`TERMS`. At a velocity
+reversal dry friction changes elastically over a displacement of some 1e-4 rad (presliding). Dahl
+(1968) describes it by a state z in place of sgn(v),
 
 .. math:: z \leftarrow s + (z - s)\,e^{-|dq| / d}, \qquad s = \mathrm{sgn}(dq)
 
-so that the torque stays linear in the coefficients once the distance d is fixed, and friction at
-rest is what was left of the motion before it.
+so that the torque remains linear in the coefficients for a fixed distance d.
 
-The paper's equation (after its eq. 1: three coefficients per joint) could not be read; the third
-term is quadratic in the same authors' later software, and cubic elsewhere: either may be chosen.
+The paper has three coefficients per joint (after its eq. 1); the third term is quadratic in its
+authors' later software, and cubic elsewhere.
 """
 
 # ruff: noqa: ARG005 - columns of all terms have the same arguments
@@ -42,28 +41,28 @@ _EXPONENT: Final = {1: "", 2: "²", 3: "³"}
 
 @dataclass(frozen=True)
 class FrictionTerm:
-    """A coefficient times a column of speed and direction."""
+    """A coefficient times a column, which is a function of speed and direction."""
 
-    symbol: str  # of the coefficient; terms with the same one exclude each other
-    option: str  # of `FrictionLaw`, and of `[robot.friction]`, that asks for it
-    label: str  # of the term in a list; in lower case its name on the command line
-    words: str  # what it is
-    value: Callable[[Array, Array, float], Array]  # the column, of speeds, directions and `speed`
-    rate: Callable[[Array, Array, float], Array]  # its derivative, of speeds, that of directions
-    asked: Callable[[FrictionLaw], Any] | None = None  # setting, where not that of `option`
-    basis: str = ""  # the column as a formula for people
-    # the column in Python, as a factor of the coefficient; `v` is the speed, `sign` its direction,
-    # `E` Euler's number and `LABEL_SPEED[joint]` the `speed`
+    symbol: str  # of the coefficient; terms with the same symbol exclude each other
+    option: str  # field of `FrictionLaw` and `[robot.friction]` that selects the term
+    label: str  # name in lists; in lower case on the command line
+    description: str
+    value: Callable[[Array, Array, float], Array]  # column, of speeds, directions and `speed`
+    rate: Callable[[Array, Array, float], Array]  # its derivative by the speed
+    selected: Callable[[FrictionLaw], Any] | None = None  # setting, if not that of `option`
+    basis: str = ""  # the column as a formula
+    # the column in Python, as a factor of the coefficient, with the speed `v`, its direction
+    # `sign`, Euler's number `E` and `speed` as `LABEL_SPEED[joint]`
     code: str = ""
     power: int = 0  # of the speed in the denominator of the coefficient's unit
     speed_symbol: str = ""  # of `speed`; empty for a column without it
-    urdf: str = ""  # attribute of `<dynamics>` that holds the coefficient; empty for none
-    of_motor: bool = False  # whether a coupled motor has one beside those of the joints
-    is_friction: bool = True  # whether it cannot be the zero error of a sensor instead
-    # whether only coefficients from zero on take energy; with a `pair` that holds of g, where
-    # (coefficient of the other symbol, this one) = matrix @ g
+    urdf: str = ""  # attribute of `<dynamics>` for the coefficient, if any
+    of_motor: bool = False  # whether coupled motors have this term too
+    is_friction: bool = True  # False if it may be the zero error of a sensor
+    # whether the coefficient must be non-negative for friction to dissipate energy; with a `pair`
+    # (symbol, matrix) this is required of g, (coefficient of symbol, this one) = matrix @ g
     not_negative: bool = False
-    pair: Pair | None = None  # that symbol and matrix
+    pair: Pair | None = None
     speed: float = 1.0  # v_s of a column of v / v_s [rad/s, m/s]
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -71,12 +70,12 @@ class FrictionTerm:
 
     @property
     def formula(self) -> str:
-        """The term for people."""
+        """The term as a formula."""
         return f"{self.symbol} {self.basis}".rstrip()
 
     def of(self, law: FrictionLaw) -> FrictionTerm | None:
-        """Return the term as a law has it, None where it has not."""
-        match self.asked(law) if self.asked else getattr(law, self.option):
+        """Return the term with the settings of a law, None if the law does not have it."""
+        match self.selected(law) if self.selected else getattr(law, self.option):
             case None | False:
                 return None
             case str(label):
@@ -87,15 +86,15 @@ class FrictionTerm:
                 return replace(self, speed=speed)
 
     def column(self, v: Array, s: Array) -> Array:
-        """Return the column (...) for speeds and directions of dry friction (...)."""
+        """Return the column (...) at speeds and directions of dry friction (...)."""
         return self.value(v, s, self.speed)
 
     def slope(self, v: Array, ds: Array) -> Array:
-        """Return its derivative (...) with v, where that of the direction is `ds` (...)."""
+        """Return its derivative (...) by v, with that of the direction, `ds` (...)."""
         return self.rate(v, ds, self.speed)
 
     def unit(self, *, revolute: bool) -> str:
-        """Return the unit of the coefficient of a revolute or a prismatic joint."""
+        """Return the unit of the coefficient of a revolute or prismatic joint."""
         if self.power == 0:
             return "N·m" if revolute else "N"
         power = _EXPONENT[self.power]
@@ -110,12 +109,12 @@ COULOMB: Final = FrictionTerm(
     symbol="f0",
     option="coulomb",
     label="Coulomb",
-    words="Coulomb (dry) friction f0",
+    description="Coulomb (dry) friction f0",
     basis="sgn(v)",
     code=" * sign",
     value=lambda v, s, _: s,
     rate=lambda v, ds, _: ds,
-    asked=lambda law: law.coulomb and law.tanh is None,
+    selected=lambda law: law.coulomb and law.tanh is None,
     urdf="friction",
     of_motor=True,
     not_negative=True,
@@ -124,7 +123,7 @@ TANH: Final = FrictionTerm(
     symbol="f0",
     option="tanh",
     label="tanh",
-    words="Coulomb friction f0 with a smooth sign",
+    description="Coulomb friction f0 with a smooth sign",
     basis="tanh(v/vt)",
     code=" * tanh(v / TANH_SPEED[joint])",
     value=lambda v, s, vt: np.tanh(v / vt),
@@ -138,7 +137,7 @@ VISCOUS: Final = FrictionTerm(
     symbol="f1",
     option="viscous",
     label="viscous",
-    words="viscous friction f1",
+    description="viscous friction f1",
     basis="v",
     code=" * v",
     value=lambda v, s, _: v,
@@ -148,17 +147,17 @@ VISCOUS: Final = FrictionTerm(
     of_motor=True,
     not_negative=True,
 )
-# F1 + fd forwards, f1 - fd backwards.
+# f1 + fd for positive, f1 - fd for negative speed
 ASYMMETRIC: Final = FrictionTerm(
     symbol="fd",
     option="asymmetric",
     label="asymmetric",
-    words="half the difference fd of viscous friction forwards and backwards",
+    description="half the difference fd of viscous friction in the two directions",
     basis="|v|",
     code=" * abs(v)",
     value=lambda v, s, _: np.abs(v),
     rate=lambda v, ds, _: np.sign(v),
-    asked=lambda law: law.asymmetric and law.viscous,
+    selected=lambda law: law.asymmetric and law.viscous,
     power=1,
     not_negative=True,
     pair=("f1", ((0.5, 0.5), (0.5, -0.5))),
@@ -167,7 +166,7 @@ QUADRATIC: Final = FrictionTerm(
     symbol="f2",
     option="third",
     label="quadratic",
-    words="a term f2 with the speed squared",
+    description="a term f2 with the speed squared",
     basis="sgn(v) v²",
     code=" * v * abs(v)",
     value=lambda v, s, _: np.abs(v) * v,
@@ -178,19 +177,19 @@ CUBIC: Final = FrictionTerm(
     symbol="f2",
     option="third",
     label="cubic",
-    words="a term f2 with the third power of the speed",
+    description="a term f2 with the third power of the speed",
     basis="v³",
     code=" * v**3",
     value=lambda v, s, _: v * v * v,
     rate=lambda v, ds, _: 3.0 * v**2,
     power=3,
 )
-# The slope is without the fall with speed, which hardly any step feels.
+# the slope neglects the derivative of the exponential
 STRIBECK: Final = FrictionTerm(
     symbol="fs",
     option="stribeck",
     label="Stribeck",
-    words="additional friction fs at low speed (Stribeck)",
+    description="additional friction fs at low speed (Stribeck)",
     basis="sgn(v) exp(-(v/vs)²)",
     code=" * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
     value=lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s,
@@ -199,49 +198,44 @@ STRIBECK: Final = FrictionTerm(
     not_negative=True,
     pair=("f0", ((1.0, 0.0), (-1.0, 1.0))),
 )
-# Also the zero error of a sensor.
 OFFSET: Final = FrictionTerm(
     symbol="fo",
     option="offset",
     label="offset",
-    words="a constant offset fo",
+    description="a constant offset fo",
     value=lambda v, s, _: np.ones_like(v),
     rate=lambda v, ds, _: np.zeros_like(v),
-    asked=lambda law: law.offset or (law.asymmetric and law.coulomb),
+    selected=lambda law: law.offset or (law.asymmetric and law.coulomb),
     is_friction=False,
 )
 TERMS: Final = (COULOMB, TANH, VISCOUS, ASYMMETRIC, QUADRATIC, CUBIC, STRIBECK, OFFSET)
-"""All terms that a joint can have, in the order of the parameters."""
+"""All terms in the order of the parameters."""
 _SYMBOLS: Final = tuple(dict.fromkeys(kind.symbol for kind in TERMS))
 
 ABSENT: Final[Mapping[str, Any]] = {"third": "none", "stribeck": 0.0, "tanh": 0.0}
-"""How a cell file writes None, by option."""
+"""Values in a cell file that mean None, by option."""
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Which friction terms a joint has."""
+    """Friction terms of a joint."""
 
     coulomb: bool = True  #: ``f0 sgn(v)``
     viscous: bool = True  #: ``f1 v``
     #: ``f2 sgn(v) v**2`` ("quadratic"), ``f2 v**3`` ("cubic") or none
     third: ThirdTerm | None = "quadratic"
     offset: bool = False  #: constant ``fo``, also the zero error of a torque or current measurement
-    #: speed [rad/s, m/s] below which a joint counts as at rest. Stiction can take any value
-    #: there; see `zone`
+    #: speed [rad/s, m/s] below which a joint counts as at rest (undefined stiction); see `zone`
     standstill: float = 0.01
-    #: fixed speed v_s [rad/s, m/s] of a term ``fs sgn(v) exp(-(v / v_s)**2)``, by which friction
-    #: is larger at low speed; none without it
+    #: fixed speed v_s [rad/s, m/s] of ``fs sgn(v) exp(-(v / v_s)**2)``, friction at low speed
     stribeck: float | None = None
-    #: fixed speed v_t [rad/s, m/s] of ``f0 tanh(v / v_t)`` in place of ``f0 sgn(v)``; none for
-    #: the latter
+    #: fixed speed v_t [rad/s, m/s] of ``f0 tanh(v / v_t)`` in place of ``f0 sgn(v)``
     tanh: float | None = None
-    #: friction differs by direction, viscous by a term ``fd |v|``. Coulomb friction is f0 + fo
-    #: forwards and f0 - fo backwards: its asymmetry is the constant column of the offset, which
-    #: is there then too, and the two cannot be distinguished
+    #: friction depends on the direction: a term ``fd |v|``, and an offset fo, so that Coulomb
+    #: friction is f0 + fo and f0 - fo; the zero error of a sensor cannot be distinguished from fo
     asymmetric: bool = False
-    #: what becomes of rows slower than standstill. "exclude": they are not fitted, see
-    #: :meth:`moving`. "linear": they are, with sgn(v) replaced by v / standstill
+    #: rows slower than standstill: "exclude": not fitted, see :meth:`moving`; "linear": fitted
+    #: with v / standstill in place of sgn(v)
     zone: Zone = "exclude"
     #: displacement d [rad, m] over which dry friction reverses; zero for a jump
     presliding: float = 0.0
@@ -249,7 +243,7 @@ class FrictionLaw:
     def __post_init__(self) -> None:
         if self.third not in (None, "quadratic", "cubic"):
             raise ModelError(
-                f'friction term third = {self.third!r}: "quadratic", "cubic" or None are known'
+                f'friction term third = {self.third!r} must be "quadratic", "cubic" or None'
             )
         for name, value in (
             ("standstill speed", self.standstill),
@@ -266,18 +260,16 @@ class FrictionLaw:
                     " positive"
                 )
         if self.zone not in ("exclude", "linear"):
-            raise ModelError(f'friction zone = {self.zone!r}: "exclude" or "linear" are known')
+            raise ModelError(f'friction zone = {self.zone!r} must be "exclude" or "linear"')
         if self.zone == "linear" and self.standstill == 0.0:
-            raise ModelError(
-                "a linear friction zone needs a standstill speed above zero to be as wide as"
-            )
+            raise ModelError("a linear friction zone needs a standstill speed above zero")
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> FrictionLaw:
         """Return the law of a table `[robot.friction]`.
 
         Raises:
-            ModelError: there is no such law.
+            ModelError: invalid settings.
         """
         options: dict[str, Any] = {k: None if v == ABSENT.get(k) else v for k, v in table.items()}
         return cls(**options)
@@ -293,11 +285,11 @@ class FrictionLaw:
 
     @property
     def symbols(self) -> tuple[str, ...]:
-        """Their symbols."""
+        """Symbols of the terms."""
         return tuple(term.symbol for term in self.terms)
 
-    def words(self) -> tuple[str, str]:
-        """The terms, and what dry friction does at a reversal, in words."""
+    def summary(self) -> tuple[str, str]:
+        """Return the terms, and the behaviour of dry friction at a reversal, as texts."""
         joined = ", ".join(
             f"{term.label} ({term.speed:g} rad/s)" if term.speed_symbol else term.label
             for term in self.terms
@@ -308,10 +300,7 @@ class FrictionLaw:
         return joined or "no friction", reversal
 
     def sign(self, velocity: Array, out: Array | None = None) -> Array:
-        """Return the direction of motion: sgn(v), in a linear zone v / standstill.
-
-        Otherwise it has no dead zone: sgn(0) = 0, everything else is ±1.
-        """
+        """Return the direction of motion: sgn(v), or in a linear zone v / standstill."""
         if self.zone == "exclude":
             return np.asarray(np.sign(velocity, out=out))
         scaled = np.divide(velocity, self.standstill, out=out)
@@ -320,9 +309,8 @@ class FrictionLaw:
     def direction(self, time: Array, position: Array, velocity: Array) -> Array:
         """Return the direction of dry friction (m,) along a motion: presliding state, or sign.
 
-        Times [s], positions [rad, m] and velocities [rad/s, m/s] (m,) of joint or motor in joint
-        units. A reversal between two instants divides the step where the velocity, linear between
-        them, is zero.
+        Times [s], positions [rad, m] and velocities [rad/s, m/s] (m,). A reversal between two
+        instants is where the linearly interpolated velocity is zero.
         """
         if self.presliding == 0.0:
             return self.sign(velocity)
@@ -331,27 +319,27 @@ class FrictionLaw:
         turning = np.flatnonzero(before * velocity[1:] < 0.0)
         turned = position[turning] + 0.5 * (before * steps * share)[turning]
         path = np.insert(position, turning + 1, turned)
-        # What was before the first instant is not known: one step at its speed.
+        # assumed before the first instant: one step at its speed
         start = position[0] - velocity[0] * (steps[0] if len(steps) else 0.0)
         state = presliding_state(np.insert(path, 0, start), self.presliding)[1:]
         return np.delete(state, turning + 1 + np.arange(len(turning)))
 
     def columns(self, velocity: Array, direction: Array) -> Array:
-        """Return one row per coefficient (k, ...), for speeds and directions (...)."""
+        """Return the columns of the k coefficients (k, ...) at speeds and directions (...)."""
         rows = [term.column(velocity, direction) for term in self.terms]
         return np.reshape(rows, (len(rows), *np.shape(velocity)))
 
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
-        """Return where this law can be fitted: faster than standstill, or in a linear zone."""
+        """Return which rows can be fitted: faster than standstill, or all in a linear zone."""
         if self.zone == "linear":
             return np.ones(np.shape(velocity), dtype=np.bool_)
         return np.asarray(np.abs(velocity) > self.standstill)
 
 
 def presliding_state(position: Array, distance: float) -> Array:
-    """Return Dahl's state z (m,) of positions (m,), zero at the first of them.
+    """Return Dahl's state z (m,) at positions (m,), zero at the first of them.
 
-    Within a stretch of one direction it is ``s + (z0 - s) exp(-travel / distance)``.
+    In one direction it is ``s + (z0 - s) exp(-travel / distance)``.
     """
     steps = np.diff(position, prepend=position[:1])
     travel = np.cumsum(np.abs(steps))
@@ -365,8 +353,8 @@ def presliding_state(position: Array, distance: float) -> Array:
     stops = np.append(starts[1:], len(position))
     before, value = travel[starts - 1], 0.0
     for start, stop, s, origin in zip(starts, stops, signs, before, strict=True):
-        stretch = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
-        state[start:stop], value = stretch, stretch[-1]
+        part = s + (value - s) * np.exp((origin - travel[start:stop]) / distance)
+        state[start:stop], value = part, part[-1]
     return state
 
 
@@ -374,9 +362,9 @@ class JointTerm(NamedTuple):
     """A term of one joint or motor."""
 
     name: str  # of the parameter: ``f0_3``, or ``f0_m6`` of a motor
-    term: FrictionTerm  # which
-    owner: int  # which joint or motor, from 0
-    motor: bool  # whether it acts on the speed of a motor that several joints turn
+    term: FrictionTerm
+    owner: int  # joint or motor, from 0
+    motor: bool  # whether it depends on the speed of a coupled motor
     unit: str  # at the joint
 
     @property
@@ -390,9 +378,8 @@ class JointFriction:
     """Friction of n joints: k coefficients, term by term (all f0, all f1, ...), then motors."""
 
     laws: tuple[FrictionLaw, ...]  #: of each joint (n,)
-    revolute: tuple[bool, ...]  #: whether each joint turns (n,), for units
-    #: motors that turn with several joints; None where each joint has its own
-    coupling: Coupling | None = None
+    revolute: tuple[bool, ...]  #: whether each joint is revolute (n,), for units
+    coupling: Coupling | None = None  #: of motors and joints, if any
 
     @property
     def n_joints(self) -> int:
@@ -401,7 +388,7 @@ class JointFriction:
 
     @cached_property
     def motors(self) -> tuple[int, ...]:
-        """Motors, from 0, whose friction depends on the speeds of several joints."""
+        """Motors, from 0, with friction that depends on the speeds of several joints."""
         if self.coupling is None or not self.coupling.friction:
             return ()
         coupled = self.coupling.coupled_motors
@@ -423,7 +410,7 @@ class JointFriction:
             for symbol in _SYMBOLS
             for owner, motor in part
             for term in self.laws[owner].terms
-            # A motor's share of any other term cannot be distinguished from that of the joints.
+            # other terms of a motor cannot be distinguished from those of the joints
             if term.symbol == symbol and (term.of_motor or not motor)
         )
 
@@ -444,34 +431,34 @@ class JointFriction:
 
     @property
     def kinds(self) -> tuple[FrictionTerm, ...]:
-        """Kinds of term that any joint has, in order."""
+        """Terms that any joint has, in order."""
         return tuple(kind for kind in TERMS if any(kind.of(law) for law in self.laws))
 
     @property
     def standstill(self) -> Array:
-        """Speed per joint (n,) [rad/s or m/s] below which it counts as at rest."""
+        """Speed of each joint (n,) [rad/s or m/s] below which it counts as at rest."""
         return np.array([law.standstill for law in self.laws])
 
     @property
     def one_law(self) -> FrictionLaw | None:
-        """The law of all joints, None where they differ."""
+        """The law of all joints, None if they differ."""
         return self.laws[0] if len(set(self.laws)) == 1 else None
 
     @property
     def dissipating(self) -> NDArray[np.bool_]:
-        """Which of the k coefficients are friction (k,): all but the offset."""
+        """Which of the k coefficients are friction (k,): all but offsets."""
         return np.array([term.term.is_friction for term in self.terms], dtype=np.bool_)
 
     def motor_speeds(self) -> Array:
-        """Speed of each of `motors` per joint speed, one for its own joint (len(motors), n)."""
+        """Return the speed of each of `motors` per joint speed (len(motors), n)."""
         if self.coupling is None or not self.motors:
             return np.zeros((0, self.n_joints))
         return self.coupling.speeds[list(self.motors)]
 
     def direction(self, time: Array, position: Array, velocity: Array) -> Array:
-        """Return the direction of dry friction (m, n + k), of joints and then of `motors`.
+        """Return the direction of dry friction (m, n + k) of joints, then of `motors`.
 
-        At times (m,) [s], for positions [rad or m] and velocities of the joints (m, n).
+        Times (m,) [s], positions [rad or m] and velocities of the joints (m, n).
         """
         joints = [
             law.direction(time, position[:, j], velocity[:, j]) for j, law in enumerate(self.laws)
@@ -483,9 +470,9 @@ class JointFriction:
         return np.column_stack([*joints, *motors])
 
     def moving(self, velocity: Array) -> NDArray[np.bool_]:
-        """Return where the row of a joint can be fitted (m, n), from joint speeds (m, n).
+        """Return which rows can be fitted (m, n), from joint speeds (m, n).
 
-        The joint, and every motor whose friction it feels, has to be faster than standstill.
+        The joint and every coupled motor that acts on it must be faster than standstill.
         """
         one = self.one_law
         if one is not None:
@@ -499,7 +486,7 @@ class JointFriction:
         return moving
 
     def place(self, term: JointTerm) -> int:
-        """Return the place of a term's joint or motor among the joints, then `motors`."""
+        """Return the index of a term's joint or motor among the joints, then `motors`."""
         return self.n_joints + self.motors.index(term.owner) if term.motor else term.owner
 
     def table(self, coefficients: Array) -> tuple[dict[str, float], ...]:
@@ -518,19 +505,19 @@ class JointFriction:
 
 
 class Dissipation(NamedTuple):
-    """Coefficients ``f = combine @ g``, of which some g may not be negative."""
+    """Coefficients ``f = combine @ g`` with constraints on g."""
 
     combine: Array  # (k, k), invertible
-    not_negative: NDArray[np.bool_]  # which of the g (k,)
+    not_negative: NDArray[np.bool_]  # which g (k,) must not be negative
 
 
 def dissipation(friction: JointFriction) -> Dissipation:
-    """Return what friction needs to take energy in either direction and at low speed.
+    """Return the conditions for friction to dissipate energy.
 
-    - Coulomb friction f0, and with a Stribeck term its value at rest f0 + fs;
-    - viscous friction, by direction f1 + fd and f1 - fd where it is asymmetric.
+    - Coulomb friction f0, and with a Stribeck term its value at rest f0 + fs, are not negative;
+    - nor is viscous friction f1, or f1 + fd and f1 - fd if it is asymmetric.
 
-    Signs of the third term and of the offset, which may be a sensor's, are left open.
+    The third term and the offset, which may be a sensor's, can have any sign.
     """
     place = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
     combine = np.eye(len(place))

@@ -1,4 +1,4 @@
-"""The chain of joints, read from a URDF; links in the frame of their joint, parents first."""
+"""The chain of joints of a URDF; links in the frame of their joint, parents first."""
 
 from __future__ import annotations
 
@@ -16,24 +16,21 @@ from numpy.typing import NDArray
 from identification.errors import ModelError
 from identification.model.urdf_text import XACRO, left_by_xacro, refusal, urdf_tree
 
-# What is wrong with a robot description that cannot be read, in one sentence.
-#
-# The reader prints its findings where a user of ours does not look, and raises a general error.
 _JOINT_TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _WITH_LIMIT: Final = ("revolute", "prismatic")
 
 
 def urdf_fault(text: str) -> str | None:
-    """Return the first fault of URDF text in words, None if it has none of the known ones.
+    """Return a message about the first fault of a URDF that pinocchio cannot read, if found.
 
     Raises:
-        ModelError: it is no XML.
+        ModelError: it is not XML.
     """
     root = urdf_tree(text)
     if any(left_by_xacro(element.tag, element.attrib) for element in root.iter()):
         return XACRO
     if root.tag != "robot":
-        return f"its outermost element is <{root.tag}>, not <robot>"
+        return f"its root element is <{root.tag}>, not <robot>"
     if "name" not in root.attrib:
         return 'its <robot> has no name; write <robot name="...">'
     links = [link.get("name", "") for link in root.findall("link")]
@@ -60,17 +57,17 @@ def _joint_fault(joint: Element, links: list[str]) -> str | None:
         if link is None:
             return f"has no <{end} link=...>"
         if link not in links:
-            return f"has the {end} link {link!r}, which is no link of the description"
+            return f"has the {end} link {link!r}, which the description does not have"
     if kind in _WITH_LIMIT and joint.find("limit") is None:
         return f"is {kind} and has no <limit>; add one, or make it continuous"
     return None
 
 
 def closed_chain(text: str) -> str | None:
-    """Return which link two joints move, which readers take for a tree without a word.
+    """Return a message about a link that is the child of two joints, which pinocchio accepts.
 
     Raises:
-        ModelError: it is no XML.
+        ModelError: it is not XML.
     """
     joints = urdf_tree(text).findall("joint")
     children = Counter(end.get("link", "") for joint in joints for end in joint.findall("child"))
@@ -84,31 +81,31 @@ def _tree_fault(links: list[str], joints: list[Element]) -> str | None:
     if not roots:
         return "every link is the child of a joint: a closed chain"
     if len(roots) > 1:
-        return f"links {', '.join(map(repr, roots))} hang on nothing; one alone may be the base"
+        return f"links {', '.join(map(repr, roots))} have no parent joint; only the base may not"
     return None
 
 
 Array = NDArray[np.float64]
 
-# Where our ten parameters stand in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
+# Indices of `LINK_SYMBOLS` in pinocchio's order m, mcx, mcy, mcz, Ixx, Ixy, Iyy, Ixz, ...
 FROM_PINOCCHIO = (4, 5, 7, 6, 8, 9, 1, 2, 3, 0)
 
 MOST_JOINTS: Final = 64
-"""Time and memory of a model grow faster than their square: a minute and 1.5 GB for 100."""
+"""Largest number of joints; a model of 100 takes a minute and 1.5 GB."""
 
 FARTHEST: Final = 1e6
-"""m; no robot is larger, and squares of such lengths are numbers yet."""
+"""Largest coordinate of joints and shapes, m."""
 
 _LINK = "link "
-_UNIT: Final = 1e-6  # by which the length of an axis, made a unit vector by the reader, may be off
+_UNIT: Final = 1e-6  # tolerance of the length of a unit axis
 
 
 class LinkFrame(NamedTuple):
-    """Where the frame of a link of the description stands."""
+    """Frame of a link of the description."""
 
-    joint: int
-    rotation: Array
-    translation: Array
+    joint: int  # that moves it, -1: none
+    rotation: Array  # axes in the frame of that joint (3, 3)
+    translation: Array  # origin in that frame (3,) [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +117,11 @@ class Chain:
     rotation: Array  # axes of joint frame i at q = 0 in its parent's frame, shape (n, 3, 3)
     translation: Array  # origin of joint frame i in its parent's frame [m], shape (n, 3)
     axis: Array  # unit joint axis in the joint's own frame, shape (n, 3)
-    revolute: NDArray[np.bool_]  # False where the joint is prismatic, shape (n,)
-    # the ten parameters per link (:data:`identification.model.regressor.LINK_SYMBOLS`) about the
-    # joint frame's origin in its axes, as the description gives them (the nominal, CAD values),
-    # shape (n, 10)
+    revolute: NDArray[np.bool_]  # False for prismatic joints, shape (n,)
+    # nominal parameters of each link (:data:`identification.model.regressor.LINK_SYMBOLS`) in the
+    # joint frame, shape (n, 10)
     inertial: Array
-    # by name the links of the description, what is fixed to the base included: the joint that
-    # moves each (-1: none), and its axes (3, 3) and origin (3,) [m] in that joint's frame
+    # of all links of the description by name, fixed ones included
     frames: dict[str, LinkFrame] = field(default_factory=dict, repr=False)
 
     @property
@@ -135,17 +130,17 @@ class Chain:
         return len(self.joint_names)
 
     def frame(self, name: str | None) -> LinkFrame:
-        """Return the frame of a link that moves; that of the last joint without a name.
+        """Return the frame of a moving link, by default that of the last joint.
 
         Raises:
-            ModelError: the description has no such frame, or it is fixed to the base.
+            ModelError: the description has no such link, or it is fixed to the base.
         """
         if name is None:
             return LinkFrame(self.n_joints - 1, np.eye(3), np.zeros(3))
         if name not in self.frames:
             raise ModelError(
-                f"the payload's frame {name!r} is no link of the robot description; it has"
-                f" {', '.join(self.frames)}"
+                f"the payload's frame {name!r} is not a link of the robot description; its links"
+                f" are {', '.join(self.frames)}"
             )
         if self.frames[name].joint < 0:
             raise ModelError(f"the payload's frame {name!r} is fixed to the base")
@@ -160,24 +155,24 @@ class Chain:
 
 
 def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Chain:
-    """Read a chain from URDF text; fixed joints are merged into the link they sit on.
+    """Read a chain from URDF text; links of fixed joints are merged with their parents.
 
     Args:
         urdf: the text of the file.
-        locked: joints held at a position [rad or m], by name; they become fixed joints.
+        locked: positions [rad or m] of joints to be fixed, by name.
 
     Raises:
-        ModelError: the text is no URDF, has no moving joint or more than `MOST_JOINTS`, has a
-            joint that is neither revolute (or continuous) nor prismatic, or no joint of a name
-            in `locked`; the message names the joint.
+        ModelError: the text is not a URDF, has no moving joint or more than `MOST_JOINTS`, a joint
+            of another type than revolute, continuous, prismatic or fixed, or no joint of a name
+            in `locked`.
     """
     model = pinocchio_model(urdf, locked)
     if model.njoints < 2:
         raise ModelError("the robot description has no revolute or prismatic joint")
     if model.njoints > 1 + MOST_JOINTS:
         raise ModelError(
-            f"the robot description has {model.njoints - 1} joints that move; at most "
-            f"{MOST_JOINTS} can be identified together: lock the others"
+            f"the robot description has {model.njoints - 1} moving joints; at most "
+            f"{MOST_JOINTS} can be identified together; lock the others"
         )
     indices = range(1, model.njoints)
     axes, revolute = zip(*(_axis(model, i) for i in indices), strict=True)
@@ -204,12 +199,12 @@ def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Cha
 
 
 def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin.Model:
-    """Return pinocchio's model of URDF text, without the joints that are locked.
+    """Return pinocchio's model of URDF text with locked joints fixed.
 
     Raises:
-        ModelError: the text is no URDF of an open chain or none that may be read
-            (:func:`identification.model.urdf_text.refusal`), has a joint without a direction or
-            beyond `FARTHEST`, or no joint of a name in `locked`.
+        ModelError: the text is not a valid URDF of an open chain
+            (:func:`identification.model.urdf_text.refusal`), has an axis of length zero or a
+            coordinate beyond `FARTHEST`, or no joint of a name in `locked`.
     """
     if (refused := refusal(urdf)) is not None:
         raise ModelError(f"the robot description is not a readable URDF: {refused}")
@@ -220,14 +215,14 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
             f"the robot description is not a readable URDF: {urdf_fault(urdf) or error}"
         ) from error
     if (closed := closed_chain(urdf)) is not None:
-        raise ModelError(f"the robot description is no open chain: {closed}")
+        raise ModelError(f"the robot description is not an open chain: {closed}")
     for index in range(1, model.njoints):
         _require_direction(model, index)
     if not locked:
         _require_near(model)
         return model
     posture = locked_posture(model, locked)
-    # Joints and links may share names, which the reduction takes for one and the same.
+    # the reduction confuses joints and links of the same name
     for frame in model.frames:
         if frame.type == pin.FrameType.BODY:
             frame.name = _LINK + frame.name
@@ -239,10 +234,10 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
 
 
 def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
-    """Return the configuration with joints held at positions [rad or m], others at zero.
+    """Return the configuration with joints at locked positions [rad or m], others at zero.
 
     Raises:
-        ModelError: no joint has such a name, or a position is no number.
+        ModelError: no joint has such a name, or a position is not finite.
     """
     posture = pin.neutral(model)
     names = list(model.names)[1:]
@@ -251,7 +246,9 @@ def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
             known = ", ".join(names) or "none"
             raise ModelError(f"there is no moving joint {name!r} to lock; there are {known}")
         if not math.isfinite(position):
-            raise ModelError(f"joint {name!r} is locked at {position!r}, no number", joint=name)
+            raise ModelError(
+                f"joint {name!r} is locked at {position!r}; give a finite number", joint=name
+            )
         joint = model.joints[model.getJointId(name)]
         if joint.nv == 1:
             step = np.zeros(model.nv)
@@ -259,14 +256,14 @@ def locked_posture(model: pin.Model, locked: Mapping[str, float]) -> Array:
             posture = pin.integrate(model, posture, step)
         elif position != 0.0:
             raise ModelError(
-                f"joint {name!r} has {joint.nv} degrees of freedom; it can be locked at 0 only",
+                f"joint {name!r} has {joint.nv} degrees of freedom; it can only be locked at 0",
                 joint=name,
             )
     return np.asarray(posture)
 
 
 def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
-    """Return the joint axis in the joint frame, and whether the joint turns about it."""
+    """Return the joint axis in the joint frame, and whether the joint is revolute."""
     joint = model.joints[index]
     kind = joint.shortname()
     name = model.names[index]
@@ -283,25 +280,25 @@ def _axis(model: pin.Model, index: int) -> tuple[Array, bool]:
 
 
 def _require_near(model: pin.Model) -> None:
-    """Refuse joints and links that are farther away than any robot reaches."""
+    """Check that all joints and links are within `FARTHEST` of their parents."""
     places = [*zip(model.names, model.jointPlacements, strict=True)]
     places += [(frame.name, frame.placement) for frame in model.frames]
     for name, place in places:
         if not np.abs(place.translation).max() <= FARTHEST:
             raise ModelError(
-                f"{name!r} of the robot description is more than {FARTHEST:g} m away from what "
-                "carries it"
+                f"{name!r} of the robot description is more than {FARTHEST:g} m away from its "
+                "parent"
             )
 
 
 def _require_direction(model: pin.Model, index: int) -> None:
-    """Refuse an axis of length zero: a joint locked at an angle about it has no placement."""
+    """Check that the axis of a joint is not zero."""
     if model.joints[index].nv == 1 and not (
         abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
     ):
         name = model.names[index]
         raise ModelError(
-            f'joint {name!r} has an <axis> without a direction; write one such as xyz="0 0 1"',
+            f'joint {name!r} has an <axis> of length zero; write one such as xyz="0 0 1"',
             joint=name,
         )
 

@@ -1,4 +1,4 @@
-"""Joint motion, as the regressor reads it."""
+"""Sampled joint motion."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ class Motion(NamedTuple):
     position: Array  #: q, shape (m, n)
     velocity: Array  #: qd, shape (m, n)
     acceleration: Array  #: qdd, shape (m, n)
-    #: of dry friction, shape (m, n + k), joints and then k coupled motors, from -1 to 1; None for
-    #: the sign of the velocity. See :meth:`JointFriction.direction`
+    #: of dry friction (:meth:`JointFriction.direction`), shape (m, n + k); None: sign of velocity
     direction: Array | None = None
 
     def rows(self, which: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Motion:
-        """The motion at some of the instants."""
+        """Return the motion at some of the instants."""
         return Motion(*(None if one is None else one[which] for one in self))  # type: ignore[arg-type]
 
     @property

@@ -1,4 +1,4 @@
-"""A body of known mass that the arm carries: its torque is known, not identified."""
+"""A payload with known mass properties, and its torque."""
 
 from __future__ import annotations
 
@@ -14,27 +14,23 @@ from identification.model.regressor import RegressorPlan, joint_arrays
 
 Array = NDArray[np.float64]
 
-_ROUNDING = 1e-9
-"""Share of the largest principal moment."""
-_MOST = 1e9
-"""kg, m, kg m²: no arm carries more, and products of more would overflow."""
+_ROUNDING = 1e-9  # relative to the largest principal moment
+_MOST = 1e9  # kg, m, kg m²; products of larger numbers could overflow
 
 
 @dataclass(frozen=True)
 class Payload:
-    """A body of known mass.
+    """A body with known mass properties.
 
     Raises:
-        ModelError: no body has this mass, or a figure is not finite, or beyond 1e9.
+        ModelError: a negative mass, or a figure that is not finite or beyond 1e9.
     """
 
     mass: float  #: [kg]
-    centre: tuple[float, float, float]  #: its centre of mass in the frame (3,) [m]
-    #: tensor about the centre of mass, in the axes of the frame: xx, xy, xz, yy, yz, zz [kg m²];
-    #: a point without it
+    centre: tuple[float, float, float]  #: centre of mass in the frame (3,) [m]
+    #: tensor about the centre of mass in the axes of the frame: xx, xy, xz, yy, yz, zz [kg m²]
     inertia: tuple[float, float, float, float, float, float] = (0.0,) * 6
-    #: link of the robot description whose frame that is, such as "tool0"; without it the frame of
-    #: the last joint
+    #: link of the robot description, such as "tool0"; None: frame of the last joint
     frame: str | None = None
 
     def __post_init__(self) -> None:
@@ -42,18 +38,18 @@ class Payload:
             raise ModelError(f"the payload weighs {self.mass!r} kg; give its mass, zero or more")
         if not all(abs(value) <= _MOST for value in (*self.centre, *self.inertia)):
             raise ModelError(
-                f"the payload's centre or inertia holds a number that is not finite or beyond"
+                "the payload's centre or inertia has a number that is not finite or beyond"
                 f" {_MOST:g}"
             )
 
     @property
     def tensor(self) -> Array:
-        """Inertia about the centre of mass, in the axes of the frame (3, 3) [kg m²]."""
+        """Inertia tensor about the centre of mass, in the axes of the frame (3, 3) [kg m²]."""
         return tensors(np.array(self.inertia))
 
     @property
     def possible(self) -> bool:
-        """Whether a body can have this inertia.
+        """Whether the inertia is physically consistent.
 
         Principal moments are not negative, and none exceeds the sum of the others.
         """
@@ -62,14 +58,14 @@ class Payload:
 
     @property
     def parameters(self) -> Array:
-        """Inertial parameters about the frame's origin, in its axes (10,), as `LINK_SYMBOLS`."""
+        """Inertial parameters about the frame's origin, in its axes (10,); `LINK_SYMBOLS`."""
         return inertial_parameters(Body(self.mass, np.array(self.centre), self.tensor))
 
     def carried_by(self, chain: Chain) -> tuple[int, Array]:
-        """Return the joint that carries it, from 0, and its parameters about that joint (10,).
+        """Return the joint that carries it, from 0, and its parameters in that joint's frame (10,).
 
         Raises:
-            ModelError: the description has no such frame, or it is fixed to the base.
+            ModelError: the description has no such link, or it is fixed to the base.
         """
         joint, rotation, translation = chain.frame(self.frame)
         centre = rotation @ np.array(self.centre) + translation
@@ -78,10 +74,10 @@ class Payload:
 
 
 class Load:
-    """Torque of a payload on a chain under a gravity (3,) [m/s²], base axes.
+    """Torque of a payload on a chain; gravity (3,) [m/s²] in base axes.
 
     Raises:
-        ModelError: the payload's frame is not one of the robot's.
+        ModelError: the payload's frame is not a moving link of the robot.
     """
 
     def __init__(self, chain: Chain, gravity: Array, payload: Payload) -> None:
@@ -89,6 +85,6 @@ class Load:
         self._plan = RegressorPlan.of_bodies(chain, gravity, self.joint)
 
     def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Return the joint torques (m, n) [N·m or N] that moving it alone takes."""
+        """Return the joint torques (m, n) [N·m or N] that the payload requires."""
         q, qd, qdd = joint_arrays(self._plan.chain.n_joints, q=q, qd=qd, qdd=qdd)
         return self._plan.torque(self.parameters, q, qd, qdd)

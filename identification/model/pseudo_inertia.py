@@ -1,4 +1,4 @@
-r"""The pseudo-inertia of a body: when ten numbers can be those of a distribution of mass.
+r"""The pseudo-inertia of a body, which is positive definite for consistent inertial parameters.
 
 For inertial parameters about a frame (tensor I, first moment h = mc, mass m; in the order of
 :data:`identification.model.regressor.LINK_SYMBOLS`)
@@ -6,8 +6,8 @@ For inertial parameters about a frame (tensor I, first moment h = mc, mass m; in
 .. math:: J = \begin{bmatrix} \Sigma & h \\ h^T & m \end{bmatrix}, \qquad
           \Sigma = \tfrac{1}{2}\,\mathrm{tr}(I)\,1 - I
 
-is linear in the parameters, and positive (semi)definite if and only if some mass density has them
-(Wensing, Kim and Slotine 2018).
+is linear in the parameters, and positive semidefinite if and only if a mass distribution with them
+exists (Wensing, Kim and Slotine 2018).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class NoMassError(IdentificationError, ValueError):
 
 
 class Body(NamedTuple):
-    """A rigid body as drawings give it."""
+    """Mass properties of a rigid body."""
 
     mass: float  # [kg]
     centre: Array  # centre of mass in the frame of the parameters [m], shape (3,)
@@ -68,15 +68,12 @@ def pseudo_inertia_map() -> Array:
 
 
 def margin(inertial: Array) -> Array:
-    """Return the smallest eigenvalue of each pseudo-inertia (...): positive if consistent.
-
-    In SI units (kg, kg m, kg m²), so of links of very different size compare the sign only.
-    """
+    """Return the smallest eigenvalue of each pseudo-inertia (...), positive if consistent."""
     return np.asarray(np.linalg.eigvalsh(pseudo_inertia(inertial))[..., 0])
 
 
 def body(inertial: Array) -> Body:
-    """Return mass, centre of mass and the tensor about it, of inertial parameters (10,).
+    """Return the mass properties of inertial parameters (10,).
 
     Raises:
         NoMassError: the mass is zero.
@@ -84,7 +81,7 @@ def body(inertial: Array) -> Body:
     inertial = np.asarray(inertial, dtype=np.float64)
     mass = float(inertial[9])
     if mass == 0.0:
-        raise NoMassError("a body without mass has no centre of mass")
+        raise NoMassError("the mass is zero, the centre of mass undefined")
     centre = inertial[6:9] / mass
     lever = skew(centre)
     return Body(mass, centre, tensors(inertial[:6]) + mass * lever @ lever)
@@ -110,28 +107,28 @@ AS_GIVEN: Final = "nominal"
 MADE_POSSIBLE: Final = "nominal, made possible"
 ASSUMED: Final = "assumed: the nominal has no mass"
 
-# Variance of the mass in its thinnest direction over that in its widest: a rod of steel tube with
-# a thirtieth of its length as diameter has 1e-3. Thinner than that is a missing figure.
+# Smallest ratio of the variances of the mass in two directions; that of a steel tube with a
+# diameter of 1/30 of its length.
 _THINNEST: Final = 1e-3
-# Without any figure: a ball with a quarter of the mean distance of joints as its radius.
+# Without nominal parameters: a ball with this fraction of the mean joint distance as its radius.
 _BALL: Final = 0.25
-_SMALLEST_BODY: Final = 0.01  # of that radius; smaller is a point, whose figures are missing
+_SMALLEST_BODY: Final = 0.01  # fraction of that radius; smaller nominal bodies are ignored
 _SMALLEST_SIZE: Final = 0.05  # m
 _SOME_MASS: Final = 1.0  # kg
 
 
 class ReferenceBodies(NamedTuple):
-    """Reference of n links."""
+    """Reference bodies of n links."""
 
-    inertial: Array  # parameters, consistent with room to spare (n, 10)
+    inertial: Array  # consistent parameters (n, 10)
     frames: Array  # square roots C of the pseudo-inertias, ``J = C C'`` (n, 4, 4)
-    words: tuple[str, ...]  # where each comes from (n,)
+    origins: tuple[str, ...]  # of each (n,)
 
 
 def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:
-    """Return a possible body per link, from nominal parameters (n, 10) as far as they are possible.
+    """Return a consistent body per link, close to its nominal parameters (n, 10).
 
-    Origins of the joints in their parents' frames (n, 3) [m] give a size.
+    Origins of the joints in their parents' frames (n, 3) [m] give the size of unknown bodies.
     """
     distances = np.linalg.norm(translation[1:], axis=1)
     distances = distances[distances > 0.0]
@@ -143,12 +140,12 @@ def reference_bodies(nominal: Array, translation: Array) -> ReferenceBodies:
     return ReferenceBodies(
         inertial=inertial_from_pseudo(matrices),
         frames=np.linalg.cholesky(matrices),
-        words=tuple(words for _, words in found),
+        origins=tuple(origin for _, origin in found),
     )
 
 
 def _reference(inertial: Array, usual_mass: float, radius: float) -> tuple[Array, str]:
-    """Return the pseudo-inertia (4, 4) of a possible body, and where it comes from."""
+    """Return the pseudo-inertia (4, 4) of a consistent body, and its origin."""
     matrix = pseudo_inertia(inertial)
     mass = matrix[3, 3]
     if not mass > 0.0:

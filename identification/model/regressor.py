@@ -1,8 +1,7 @@
 r"""Inverse dynamics, linear in the parameters: tau = W(q, qd, qdd) pi, vectorised over samples.
 
-The torque of joint j is the power of the wrenches on all links it moves, on their twists per
-unit speed of joint j (:class:`LinkMotion`, :mod:`identification.model.regressor`).
-A column is therefore one dot product per sample, and only the columns asked for are made.
+The torque of joint j is the power of the wrenches of all links that it moves on their twists per
+unit speed of joint j (:class:`LinkMotion`), one dot product per column and sample.
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ Array = NDArray[np.float64]
 #
 # Every entry is a sum, with signs, of twelve quantities per sample, the *primitives*: the three
 # components of a, of alpha, of the squares :math:`\omega_x^2, \omega_y^2, \omega_z^2`, and of the
-# products :math:`\omega_y\omega_z, \omega_z\omega_x, \omega_x\omega_y`. So the wrenches are one
-# constant matrix times the primitives.
+# products :math:`\omega_y\omega_z, \omega_z\omega_x, \omega_x\omega_y`. The wrenches are a constant
+# matrix times the primitives.
 
 # Order of the ten inertial parameters of a link.
 LINK_SYMBOLS = ("Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz", "mcx", "mcy", "mcz", "m")
 N_INERTIA = 6
 N_PRIMITIVES = 12
 
-# Accelerations stand first: moments of inertia do without them.
+# moments of inertia do not need the accelerations, which come first
 _ACCELERATION, _ALPHA, _SQUARE, _PRODUCT = 0, 3, 6, 9
 ROTATIONAL = slice(_ALPHA, N_PRIMITIVES)
 _TENSOR = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -102,24 +101,21 @@ def _add_first_moment(moment: Array, force: Array, c: int) -> None:
 
 Rows = slice | NDArray[np.intp]
 
-# Samples worked on at a time: enough to make the cost of a numpy call small, few enough for the
-# working arrays to stay in the processor's cache. Measured for six joints: 1000 to 2000 are alike,
-# 512 takes a quarter longer, 256 two thirds.
+# Samples per block, so that the working arrays stay in the processor's cache. For six joints 1000
+# to 2000 take the same time, 512 a quarter more, 256 two thirds more.
 CHUNK = 1280
 
-# Arrays reused by the next call: fresh memory costs more than the arithmetic on it. Their sizes
-# are multiples of the grain, so that a search over motions of all durations meets few different
-# ones: the six between half a chunk and a chunk, and some shorter (some 8 kB per sample).
+# Number and granularity of the sizes of reused working arrays (some 8 kB per sample): allocation
+# costs more than the arithmetic.
 _SPARE = 8
 _GRAIN = 128
 
 
 class Regressor(NamedTuple):
-    """Regressor of m samples, joint by joint, without the columns that are zero by structure."""
+    """Regressor of m samples by joint, without the columns that are structurally zero."""
 
-    blocks: tuple[Array, ...]  #: per joint j the columns that act on it, shape (m, c_j)
-    #: per joint the parameter index of each of its columns, shape (c_j,)
-    columns: tuple[NDArray[np.intp], ...]
+    blocks: tuple[Array, ...]  #: per joint j its columns, shape (m, c_j)
+    columns: tuple[NDArray[np.intp], ...]  #: per joint j their parameter indices, shape (c_j,)
 
     def dense(self, p: int) -> Array:
         """Return all p columns with their zeros, shape (m, n, p)."""
@@ -130,13 +126,13 @@ class Regressor(NamedTuple):
 
 
 class RegressorPlan:
-    """Which columns of the regressor to make for a chain, and where they stand.
+    """Layout and computation of the regressor of a chain.
 
-    Per joint `links` are the used :data:`LINK_SYMBOLS` (0..9), rising, `rotors` whether its rotor
-    inertia has a column; `couplings` are pairs of joints whose coupling inertia has one. Gravity is
-    an acceleration in base axes (3,) [m/s²]. `columns` has per joint j the parameter index of each
-    column in its row (c_j,): parameters are numbered link by link (inertial, then rotor), then
-    coupling inertias, then friction, then springs and balancers.
+    Per joint `links` are the used :data:`LINK_SYMBOLS` (0..9), rising, and `rotors` whether its
+    rotor inertia has a column; `couplings` are the pairs of joints with a column for their coupling
+    inertia. Gravity is an acceleration in base axes (3,) [m/s²]. `columns` has the parameter
+    indices of each joint's columns (c_j,); parameters are numbered link by link (inertial, rotor),
+    then coupling inertias, friction, springs and balancers.
     """
 
     def __init__(
@@ -156,10 +152,10 @@ class RegressorPlan:
         self.friction = friction
         self.couplings = tuple(couplings)
         self.elements = elements.identified if elements is not None else ()
-        # Order in the working array: columns of the links, then of the joint's drive: friction,
+        # Rows of the working array: columns of the links, then of the joint's drive: friction,
         # motor friction, rotor, coupling inertias, elements, response.
-        self.first_own = sum(len(symbols) for symbols in links)
-        self.own = tuple(_OwnRows.of(self, joint) for joint in range(chain.n_joints))
+        self.first_drive_row = sum(len(symbols) for symbols in links)
+        self.drive_rows = tuple(_DriveRows.of(self, joint) for joint in range(chain.n_joints))
         self.rows: tuple[Rows, ...]
         self.columns: tuple[NDArray[np.intp], ...]
         self.rows, self.columns = _lay_out(self)
@@ -174,9 +170,9 @@ class RegressorPlan:
 
     @classmethod
     def of_bodies(cls, chain: Chain, gravity: Array, joint: int | None = None) -> RegressorPlan:
-        """Plan of the ten parameters of the link of one joint, or of all links, and no others."""
+        """Return a plan with only the ten parameters of the link of one joint, or of all links."""
         n, ten = chain.n_joints, range(len(LINK_SYMBOLS))
-        links = [ten if joint in (None, own) else [] for own in range(n)]
+        links = [ten if joint in (None, other) else [] for other in range(n)]
         return cls(chain, gravity, links, [False] * n, None)
 
     def chunks(
@@ -188,13 +184,11 @@ class RegressorPlan:
         *,
         response: Array | None = None,
     ) -> Iterator[tuple[slice, list[Array]]]:
-        """Yield the regressor in chunks of samples: (which samples, per joint its rows).
+        """Yield the regressor in chunks of samples: (slice of samples, rows of each joint).
 
-        `direction` is that of dry friction, of joints and coupled motors (m, n + k); without it
-        the sign of their speeds.
-
-        The rows of joint j have shape (c_j, k) for k samples, one more with `response` (m, n)
-        as the last. They are views of a working array: valid until the next chunk.
+        `direction` of dry friction (m, n + k) is that of joints and coupled motors, by default the
+        sign of their speeds. The rows of joint j have shape (c_j, k) for k samples, one more with
+        `response` (m, n) as the last. They are views that are valid until the next chunk.
         """
         m, n = q.shape
         rows = self.rows
@@ -204,8 +198,8 @@ class RegressorPlan:
             for start in range(0, m, work.size):
                 part = slice(start, min(start + work.size, m))
                 k = part.stop - start
-                turned = None if direction is None else direction[part]
-                work.update(q[part], qd[part], qdd[part], turned)
+                given = None if direction is None else direction[part]
+                work.update(q[part], qd[part], qdd[part], given)
                 if response is not None:
                     for joint in range(n):
                         work.rows[joint, self.response_row(joint), :k] = response[part, joint]
@@ -213,7 +207,7 @@ class RegressorPlan:
 
     @contextmanager
     def _borrowed(self, m: int) -> Iterator[_Workspace]:
-        """Lend working arrays that divide m samples evenly, to one user at a time."""
+        """Provide working arrays that divide m samples evenly, to one thread at a time."""
         even = -(-m // max(1, -(-m // CHUNK)))
         size = min(CHUNK, -(-max(even, 1) // _GRAIN) * _GRAIN)
         with self._lock:
@@ -249,52 +243,52 @@ class RegressorPlan:
         return torque
 
     def response_row(self, joint: int) -> int:
-        """Return the row behind all columns of a joint."""
-        return self.own[joint].response
+        """Return the row after all columns of a joint."""
+        return self.drive_rows[joint].response
 
 
-class _OwnRows(NamedTuple):
-    """Rows of one joint, in the working array, that belong to its drive."""
+class _DriveRows(NamedTuple):
+    """Rows of the drive of one joint in the working array."""
 
-    friction: slice  # its own law, term by term
+    friction: slice  # terms of its law
     motors: dict[JointTerm, int]  # of coupled motors
     rotor: int | None
     couplings: dict[int, int]  # by the joint that it is coupled to
-    elements: slice  # those on it, one after the other
+    elements: slice
     response: int
 
     @classmethod
-    def of(cls, plan: RegressorPlan, joint: int) -> _OwnRows:
-        """Lay out the rows of a joint, one behind the other."""
-        row = plan.first_own
+    def of(cls, plan: RegressorPlan, joint: int) -> _DriveRows:
+        """Assign the rows of a joint."""
+        row = plan.first_drive_row
         motors: dict[JointTerm, int] = {}
         if plan.friction is not None:
             row += len(plan.friction.laws[joint].symbols)
             speeds = plan.friction.motor_speeds()[:, joint]
-            felt = {m for m, s in zip(plan.friction.motors, speeds, strict=True) if s != 0.0}
-            acting = [t for t in plan.friction.terms if t.motor and t.owner in felt]
+            coupled = {m for m, s in zip(plan.friction.motors, speeds, strict=True) if s != 0.0}
+            acting = [t for t in plan.friction.terms if t.motor and t.owner in coupled]
             motors = {term: row + k for k, term in enumerate(acting)}
-        friction = slice(plan.first_own, row)
+        friction = slice(plan.first_drive_row, row)
         row += len(motors)
         rotor = row if plan.rotors[joint] else None
         row += plan.rotors[joint]
         others = [sum(pair) - joint for pair in plan.couplings if joint in pair]
         couplings = {other: row + k for k, other in enumerate(others)}
         row += len(others)
-        acting_here = [len(one.element.symbols) for one in plan.elements if one.joint == joint]
-        elements = slice(row, row + sum(acting_here))
+        sizes = [len(one.element.symbols) for one in plan.elements if one.joint == joint]
+        elements = slice(row, row + sum(sizes))
         return cls(friction, motors, rotor, couplings, elements, elements.stop)
 
 
 class _Workspace:
-    """Arrays for one block of samples, and the views of them that the work needs."""
+    """Working arrays for one block of samples, and views of them."""
 
     def __init__(self, plan: RegressorPlan, size: int) -> None:
         n = plan.chain.n_joints
-        self.rows = np.zeros((n, max(own.response for own in plan.own) + 1, size))
+        self.rows = np.zeros((n, max(rows.response for rows in plan.drive_rows) + 1, size))
         self.size = size
-        # Not the plan itself, which keeps this: large memory would wait for the cycle collector.
-        self._own, self._joint_friction = plan.own, plan.friction
+        # without a reference to the plan, which would be a cycle
+        self._drive_rows, self._joint_friction = plan.drive_rows, plan.friction
         self._motion = LinkMotion(plan.chain, plan.gravity, size)
         motors = 0 if plan.friction is None else len(plan.friction.motors)
         self._direction = np.zeros((n + motors, size))
@@ -304,9 +298,9 @@ class _Workspace:
         self._elements = self._element_parts(plan)
         self._contractions: list[_Contraction] = []
         first = 0
-        for link, own in enumerate(plan.links):
-            inertia = [s for s in own if s < N_INERTIA]
-            for symbols, moments_only in ((inertia, True), (own[len(inertia) :], False)):
+        for link, used in enumerate(plan.links):
+            inertia = [s for s in used if s < N_INERTIA]
+            for symbols, moments_only in ((inertia, True), (used[len(inertia) :], False)):
                 if symbols:
                     joints = _as_slice(plan.chain.ancestors(link))
                     self._add(link, joints, symbols, moments_only, first)
@@ -315,7 +309,7 @@ class _Workspace:
     def _add(
         self, link: int, joints: Rows, symbols: Sequence[int], moments_only: bool, first: int
     ) -> None:
-        """Prepare the columns of one link: inertia makes no force, so half the work."""
+        """Prepare the columns of one link; those of moments of inertia have no force."""
         size = self.rows.shape[2]
         twists = self._motion.twists[link]
         part = twists[:, 0] if moments_only else twists.reshape(len(twists), 6, size)
@@ -338,38 +332,38 @@ class _Workspace:
         )
 
     def _friction_parts(self) -> list[tuple[FrictionLaw, Array, Array, Array]]:
-        """Return laws, the speeds and directions that they read, and the rows that they write."""
+        """Return laws with views of speeds, directions and target rows."""
         velocity = self._motion.velocity
         direction = self._direction[: len(velocity)]
         if self._joint_friction is None:
             return []
         if (one := self._joint_friction.one_law) is not None:
-            rows = self.rows[:, self._own[0].friction]
+            rows = self.rows[:, self._drive_rows[0].friction]
             return [(one, velocity, direction, rows.transpose(1, 0, 2))]
         return [
-            (law, velocity[j], direction[j], self.rows[j, self._own[j].friction])
+            (law, velocity[j], direction[j], self.rows[j, self._drive_rows[j].friction])
             for j, law in enumerate(self._joint_friction.laws)
         ]
 
     def _drive_parts(self) -> list[tuple[Array, Array]]:
-        """Return accelerations and the rows of rotors and coupling inertias that they go to."""
+        """Return views of accelerations and target rows of rotors and coupling inertias."""
         acceleration = self._motion.acceleration
-        places = {own.rotor for own in self._own}
+        rotors = {drive.rotor for drive in self._drive_rows}
         parts = []
-        if len(places) == 1 and None not in places:  # one step for all joints
-            parts.append((acceleration, self.rows[:, next(iter(places))]))
+        if len(rotors) == 1 and None not in rotors:  # one step for all joints
+            parts.append((acceleration, self.rows[:, next(iter(rotors))]))
         else:
-            for joint, own in enumerate(self._own):
-                if own.rotor is not None:
-                    parts.append((acceleration[joint], self.rows[joint, own.rotor]))
-        for joint, own in enumerate(self._own):
-            for other, row in own.couplings.items():
+            for joint, drive in enumerate(self._drive_rows):
+                if drive.rotor is not None:
+                    parts.append((acceleration[joint], self.rows[joint, drive.rotor]))
+        for joint, drive in enumerate(self._drive_rows):
+            for other, row in drive.couplings.items():
                 parts.append((acceleration[other], self.rows[joint, row]))
         return parts
 
     def _element_parts(self, plan: RegressorPlan) -> list[tuple[PlacedElement, Array]]:
-        """Return springs and balancers, and the rows that they write."""
-        free = [own.elements.start for own in self._own]
+        """Return springs and balancers with target rows."""
+        free = [drive.elements.start for drive in self._drive_rows]
         parts = []
         for one in plan.elements:
             first = free[one.joint]
@@ -378,14 +372,14 @@ class _Workspace:
         return parts
 
     def _write_motor_friction(self, friction: JointFriction) -> None:
-        """Friction f(c qd) of a motor acts on the joints as c' f(c qd)."""
+        """Write the friction of coupled motors, on the joints c' f(c qd)."""
         directions = self._direction[friction.n_joints :]
         for motor, share, direction in zip(
             friction.motors, friction.motor_speeds(), directions, strict=True
         ):
             speed = share @ self._motion.velocity
             for joint in np.flatnonzero(share):
-                for (_, term, owner, _, _), row in self._own[joint].motors.items():
+                for (_, term, owner, _, _), row in self._drive_rows[joint].motors.items():
                     if owner == motor:
                         column = term.column(speed, direction)
                         np.multiply(share[joint], column, out=self.rows[joint, row])
@@ -406,7 +400,7 @@ class _Workspace:
             friction.laws[motor].sign(share @ velocity, out=out)
 
     def update(self, q: Array, qd: Array, qdd: Array, direction: Array | None = None) -> None:
-        """Make all columns for k <= size samples (k, n); those behind mean nothing."""
+        """Compute all columns for k <= size samples (k, n); the others are undefined."""
         motion = self._motion
         motion.update(q, qd, qdd)
         write_primitives(motion.motion, self._primitives)
@@ -418,8 +412,8 @@ class _Workspace:
                 c.target[c.joints] = np.einsum("jrt,crt->jct", c.twists, c.wrenches)
         if self._joint_friction is not None:
             self._write_direction(self._joint_friction, direction, len(q))
-        for law, velocity, turned, target in self._friction:
-            target[...] = law.columns(velocity, turned)
+        for law, velocity, sign, target in self._friction:
+            target[...] = law.columns(velocity, sign)
         for source, target in self._drives:
             np.copyto(target, source)
         for element, target in self._elements:
@@ -429,7 +423,7 @@ class _Workspace:
 
 
 class _Contraction(NamedTuple):
-    """Some columns of one link, for all a joints that move it: twists times wrenches."""
+    """Columns of one link for all a joints that move it: twists times wrenches."""
 
     matrix: Array  # (columns * r, 12 or 9): wrenches from primitives
     primitives: Array  # (12 or 9, size)
@@ -441,10 +435,10 @@ class _Contraction(NamedTuple):
 
 
 def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
-    """Return arrays of joint values as float64 of one shape (m, n_joints).
+    """Return arrays as float64 of one shape (m, n_joints).
 
     Raises:
-        ShapeError: an array has another shape; the message names it.
+        ShapeError: an array has another shape.
     """
     checked = []
     rows: int | None = None
@@ -459,7 +453,7 @@ def joint_arrays(n_joints: int, **arrays: Array) -> tuple[Array, ...]:
 
 
 def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.intp], ...]]:
-    """Return per joint its rows in the working array, and their parameter indices."""
+    """Return the rows of each joint in the working array, and their parameter indices."""
     chain, n = plan.chain, plan.chain.n_joints
     sizes = [len(symbols) + rotor for symbols, rotor in zip(plan.links, plan.rotors, strict=True)]
     offsets = np.concatenate([[0], np.cumsum(sizes)]).tolist()
@@ -469,7 +463,7 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
     for link, symbols in enumerate(plan.links):
         for position, symbol in enumerate(symbols):
             for joint in chain.ancestors(link):
-                # A sliding joint does not feel moments: it has no inertia columns.
+                # moments do not act on a prismatic joint
                 if chain.revolute[joint] or symbol >= N_INERTIA:
                     rows[joint].append(place)
                     columns[joint].append(offsets[link] + position)
@@ -478,19 +472,19 @@ def _lay_out(plan: RegressorPlan) -> tuple[tuple[Rows, ...], tuple[NDArray[np.in
     terms = plan.friction.terms if plan.friction is not None else ()
     places = {term: first_friction + k for k, term in enumerate(terms)}
     first_element = first_friction + len(terms)
-    for joint, own in enumerate(plan.own):
+    for joint, drive in enumerate(plan.drive_rows):
         columns[joint] += [places[t] for t in terms if not t.motor and t.owner == joint]
-        columns[joint] += [places[term] for term in own.motors]
-        if own.rotor is not None:
+        columns[joint] += [places[term] for term in drive.motors]
+        if drive.rotor is not None:
             columns[joint].append(offsets[joint] + len(plan.links[joint]))
-        for other in own.couplings:
+        for other in drive.couplings:
             pair = (min(joint, other), max(joint, other))
             columns[joint].append(offsets[-1] + plan.couplings.index(pair))
         for one in plan.elements:
             if one.joint == joint:
                 part = one.part
                 columns[joint] += range(first_element + part.start, first_element + part.stop)
-        rows[joint] += range(plan.first_own, own.response)
+        rows[joint] += range(plan.first_drive_row, drive.response)
     return (
         tuple(_as_slice(r) for r in rows),
         tuple(np.array(c, dtype=np.intp) for c in columns),
@@ -504,38 +498,35 @@ def _append(rows: Rows, last: int) -> Rows:
 
 
 def _as_slice(indices: Sequence[int]) -> Rows:
-    """Return a slice where the indices are consecutive: it costs no copy."""
+    """Return consecutive indices as a slice, which needs no copy."""
     if len(indices) > 0 and list(indices) == list(range(indices[0], indices[0] + len(indices))):
         return slice(indices[0], indices[0] + len(indices))
     return np.array(indices, dtype=np.intp)
 
 
-# Direction cosines this close to nothing are rounding of cos(pi/2) and the like.
-_ROUNDING = 1e-15
+_ROUNDING = 1e-15  # of direction cosines
 
-# The two axes beside each axis, as a slice.
-_OTHERS = (slice(1, 3), slice(0, 3, 2), slice(0, 2))
+_OTHERS = (slice(1, 3), slice(0, 3, 2), slice(0, 2))  # the other two axes of each axis
 
 
 class LinkMotion:
     r"""Motion of every link of a chain, vectorised over a block of samples of fixed size.
 
     All vectors of link i are spatial (angular, then linear at the origin of joint frame i, in
-    its axes), so that one linear map carries them from link to link:
+    its axes), with one linear map from link to link:
 
     .. math:: v_i = X v_p + s_i \dot q_i, \qquad
               a_i = X a_p + s_i \ddot q_i + v_i \times s_i \dot q_i
 
-    with the twist s_i of joint i per unit speed, and a_i the *spatial* acceleration, which
-    starts from minus gravity at the base. `motion` is velocity and acceleration of the links
-    (n, 2, 2, 3, size), `twists` per link those of the a joints that move it, base first
-    (a, 2, 3, size), `velocity` and `acceleration` qd and qdd of the joints (n, size).
+    with the twist s_i of joint i per unit speed, and the *spatial* acceleration a_i, minus gravity
+    at the base. `motion` is velocity and acceleration of the links (n, 2, 2, 3, size), `twists`
+    per link those of the a joints that move it, base first (a, 2, 3, size), `velocity` and
+    `acceleration` qd and qdd of the joints (n, size).
     """
 
     def __init__(self, chain: Chain, gravity: Array, size: int) -> None:
         n = chain.n_joints
-        # Slots of a link: velocity, acceleration, then twists; as many as the longest path needs,
-        # so that the motion of all links is one array.
+        # Slots of a link: velocity, acceleration, then twists, as many as the longest path needs.
         slots = np.zeros((n, 2 + n, 2, 3, size))
         self.motion = slots[:, :2]
         self.twists = tuple(slots[i, 2 : 2 + len(chain.ancestors(i))] for i in range(n))
@@ -556,10 +547,7 @@ class LinkMotion:
         self._blend = np.array([step.blend for step in self._steps])
 
     def update(self, q: Array, qd: Array, qdd: Array) -> None:
-        """Compute all links for joint motion given as (k, n) arrays, k <= size.
-
-        Samples behind the first k mean nothing; they are those of a joint at rest.
-        """
+        """Compute all links for joint motion (k, n), k <= size; the other samples are at rest."""
         k = len(q)
         for target, given in zip(self._joints, (q, qd, qdd), strict=True):
             target[:, :k] = given.T
@@ -572,11 +560,10 @@ class LinkMotion:
 
 
 class _Step:
-    """The way over one joint, from slots of its parent (c, 2, 3, size) to its own, one more.
+    """Recursion over one joint, from slots of its parent (c, 2, 3, size) to its own, one more.
 
-    The arrays that it reads and writes, and all views of them, are made once: a view costs as much
-    as the arithmetic on a few hundred samples. `rotation` (3, 3, size) is into the child's axes,
-    `motion` q, qd and qdd of the joint (3, size).
+    All views are created once: a view costs as much as the arithmetic on a few hundred samples.
+    `rotation` (3, 3, size) is into the child's axes, `motion` q, qd and qdd of the joint (3, size).
     """
 
     def __init__(
@@ -598,7 +585,7 @@ class _Step:
         self._plan_rotation(rotation)
 
     def _plan_shift(self, shift: Array, before: Array) -> None:
-        """Prepare the move of the reference point: linear part l + w x p = l - [p]x w."""
+        """Prepare the shift of the reference point: linear part l + w x p = l - [p]x w."""
         self._before = before
         self._shifted = np.empty_like(before) if np.any(shift) else before
         matrix = -skew(shift)
@@ -609,7 +596,7 @@ class _Step:
         self._scratch = np.empty_like(before[:, 0, 0])
 
     def _plan_rotation(self, rotation: Array) -> None:
-        """Prepare the turn of the axes: as a whole, or one axis fixed and two in a plane."""
+        """Prepare the rotation of the axes: as a whole, or one axis fixed and two in a plane."""
         rows = columns = slice(0, 3)
         self._fixed_axis: tuple[Array, float, Array] | None = None
         if (found := _find_fixed_axis(self.blend)) is not None:
@@ -636,7 +623,7 @@ class _Step:
         np.einsum("abt,cxbt->cxat", rotation, source, out=target)
 
     def move(self) -> None:
-        """Add what the joint itself does, in the child's frame."""
+        """Add the joint's own motion in the child's frame."""
         velocity, acceleration, speed = self._velocity, self._acceleration, self._speed
         for a, component in self._axis:
             rate = speed if component == 1.0 else component * speed
@@ -651,10 +638,9 @@ class _Step:
 
 
 def _cos_sin(angle: Array, cosine: Array, sine: Array) -> None:
-    """Write cos and sin from t = tan(angle / 2), several times faster than numpy's own two.
+    """Write cos = r - 1 and sin = r t with t = tan(angle / 2), r = 2 / (1 + t^2).
 
-    cos = (1 - t^2) / (1 + t^2) = r - 1 and sin = 2 t / (1 + t^2) = r t with r = 2 / (1 + t^2):
-    exact to a few units of rounding, also at pi, where t is 1.6e16.
+    Several times faster than numpy's functions, exact to a few units of rounding, also at pi.
     """
     half = np.tan(0.5 * angle)
     np.multiply(half, half, out=cosine)
@@ -677,9 +663,9 @@ def _blend(axis: Array, fixed: Array, revolute: bool) -> Array:
 def _find_fixed_axis(blend: Array) -> tuple[int, int, float] | None:
     """Return (row, column, +1 or -1) of a constant rotation entry that is alone in both."""
     constant = blend[:, 0].reshape(3, 3)
-    felt = np.any(blend, axis=1).reshape(3, 3)
+    nonzero = np.any(blend, axis=1).reshape(3, 3)
     for row, column in np.argwhere(np.abs(constant) == 1.0):
-        alone = felt[row].sum() == 1 and felt[:, column].sum() == 1
+        alone = nonzero[row].sum() == 1 and nonzero[:, column].sum() == 1
         if alone and not np.any(blend[3 * row + column, 1:]):
             return int(row), int(column), float(constant[row, column])
     return None
@@ -693,5 +679,5 @@ def _add_cross(out: Array, left: Array, axis: int, size: Array) -> None:
 
 
 def _clean(values: Array) -> Array:
-    """Return `values` without the remainders of rounding, so that they cost nothing."""
+    """Return `values` with rounding errors of zero removed."""
     return np.where(np.abs(values) < _ROUNDING, 0.0, values)

@@ -29,17 +29,15 @@ _N_SINGLE_DIGITS = 9
 
 @dataclass(frozen=True)
 class StandardLayout:
-    """The s standard parameters: joint by joint ten of the link and a rotor, then couplings.
+    """The s standard parameters: per joint ten of the link and a rotor inertia, then couplings.
 
-    A coupling inertia ``I45`` is the entry (4, 5) of the rotors' inertia matrix in joint
-    coordinates: its column is the acceleration of joint 5 in the row of joint 4, and the other
-    way round. Motors that turn with several joints make it.
+    A coupling inertia ``I45`` is the entry (4, 5) of the inertia matrix of the rotors in joint
+    coordinates, due to motors that turn with several joints.
     """
 
-    revolute: tuple[bool, ...]  # whether each of the n joints turns
+    revolute: tuple[bool, ...]  # whether each of the n joints is revolute
     rotor_inertia: bool  # whether joints have rotor inertias
-    # joints (i, j), i < j from 0, that share a coupling inertia
-    pairs: tuple[tuple[int, int], ...] = ()
+    pairs: tuple[tuple[int, int], ...] = ()  # joints (i, j), i < j from 0, with coupling inertia
 
     @property
     def n_joints(self) -> int:
@@ -58,22 +56,22 @@ class StandardLayout:
 
     @property
     def links(self) -> Places:
-        """Places of the ten inertial parameters of each link (n, 10)."""
+        """Indices of the ten inertial parameters of each link (n, 10)."""
         return self._joint_blocks[:, :_N_LINK]
 
     @property
     def rotors(self) -> Places:
-        """Places of the rotor inertias (n,), or (0,) without."""
+        """Indices of the rotor inertias (n,), or (0,)."""
         return self._joint_blocks[:, _N_LINK:].reshape(-1)
 
     @property
     def couplings(self) -> Places:
-        """Places of the coupling inertias (c,), in the order of `pairs`."""
+        """Indices of the coupling inertias (c,), in the order of `pairs`."""
         return np.arange(self.n_joints * self.width, self.size)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names (s,), the joint's number where the field writes it: I3xy, mc2y, m4, I5m, I45."""
+        """Names (s,): I3xy, mc2y, m4, I5m, I45."""
         symbols = LINK_SYMBOLS + (("Im",) if self.rotor_inertia else ())
         own = [_name(symbol, j) for j in range(1, self.n_joints + 1) for symbol in symbols]
         between = "" if self.n_joints <= _N_SINGLE_DIGITS else "_"
@@ -85,7 +83,7 @@ class StandardLayout:
         return tuple(self._unit(standard) for standard in range(self.size))
 
     def split(self, pivots: Sequence[int]) -> tuple[list[list[int]], list[bool], list[int]]:
-        """Return what of each joint is among `pivots`: link symbols, rotor, and which couplings."""
+        """Return the link symbols and rotors per joint, and the couplings, among `pivots`."""
         first, there = self.n_joints * self.width, set(map(int, pivots))
         joints = range(0, first, self.width)
         links = [[k for k in range(_N_LINK) if start + k in there] for start in joints]
@@ -93,7 +91,7 @@ class StandardLayout:
         return links, rotors, sorted(k - first for k in there if k >= first)
 
     def rotor_matrix(self, standard: Array) -> Array:
-        """Return the rotors' inertia matrix in joint coordinates (n, n): positive if possible."""
+        """Return the inertia matrix of the rotors in joint coordinates (n, n)."""
         values = self.checked(standard)
         matrix = np.zeros((self.n_joints, self.n_joints))
         if self.rotor_inertia:
@@ -135,8 +133,7 @@ def _name(symbol: str, joint: int) -> str:
 
 STANDARD_GRAVITY = (0.0, 0.0, -9.81)
 
-# States that excite every parameter of any arm; more than a few hundred change nothing.
-_N_STATES = 300
+_N_STATES = 300  # random states, enough for any arm
 _SEED = 20140901
 _NO_LAWS: Final[Mapping[str, FrictionLaw]] = MappingProxyType({})
 _NOT_LOCKED: Final[Mapping[str, float]] = MappingProxyType({})
@@ -146,28 +143,26 @@ _NOT_LOCKED: Final[Mapping[str, float]] = MappingProxyType({})
 class RobotModel:
     """Torque of an open chain, tau = W(q, qd, qdd) pi: base parameters and joint friction.
 
-    Build it with :meth:`from_urdf`. Joints are numbered from 1 in parameter names; inertial
-    parameters are about the joint frame's origin, in its axes, ``mc`` is mass times centre of
-    mass, ``I`` the inertia tensor, ``I3m`` the rotor of joint 3 seen from the link side, ``I45``
-    the coupling inertia of joints 4 and 5. A payload is known: its torque is no part of W pi, nor
-    is that of springs and balancers of which the figures are given.
+    Create it with :meth:`from_urdf`. Parameter names number joints from 1. Inertial parameters
+    are about the origin of the joint frame, in its axes: ``mc`` is mass times centre of mass,
+    ``I`` the inertia tensor, ``I3m`` the rotor inertia of joint 3 on the link side, ``I45`` the
+    coupling inertia of joints 4 and 5. The torque of a payload and of known springs and balancers
+    is not part of W pi, see :meth:`load_torque`.
     """
 
-    chain: Chain  #: geometry and nominal inertia as read from the URDF
+    chain: Chain  #: geometry and nominal inertia of the URDF
     gravity: Array  #: acceleration of gravity in base axes [m/s²], shape (3,)
-    layout: StandardLayout  #: where the s standard parameters stand
-    friction: JointFriction  #: of every joint, and of coupled motors
+    layout: StandardLayout  #: of the s standard parameters
+    friction: JointFriction  #: of all joints and coupled motors
     base: BaseParameters  #: the b base parameters and their grouping
-    #: the p parameters: base, then friction (all f0, all f1, ...), then those of springs and
-    #: balancers
+    #: the p parameters: base, friction (all f0, all f1, ...), springs and balancers
     parameter_names: tuple[str, ...]
     units: tuple[str, ...]  #: unit of each parameter, shape (p,)
-    plan: RegressorPlan = field(repr=False)  #: how the regressor is made
-    #: position [rad or m] of joints of the description that are held
+    plan: RegressorPlan = field(repr=False)  #: computes the regressor
+    #: positions [rad or m] of joints of the description that are fixed
     locked: Mapping[str, float] = field(default_factory=dict)
-    #: motors that turn with several joints; None where each joint has its own
-    coupling: Coupling | None = None
-    payload: Payload | None = None  #: what the arm carries; None for nothing
+    coupling: Coupling | None = None  #: of motors and joints, if any
+    payload: Payload | None = None  #: carried by the arm, if any
     elements: JointElements = field(default_factory=JointElements)  #: springs and balancers
     _load: Load | None = field(default=None, repr=False)
 
@@ -185,23 +180,24 @@ class RobotModel:
         payload: Payload | None = None,
         elements: Sequence[Element] = (),
     ) -> RobotModel:
-        """Build the model from URDF text.
+        """Create the model from URDF text.
 
         Args:
-            urdf: the text of the file, not its path.
+            urdf: text of the file.
             gravity: in base axes [m/s²].
-            rotor_inertia: give every joint a rotor inertia.
+            rotor_inertia: identify a rotor inertia of every joint.
             friction: friction law of every joint.
             joint_friction: other laws for some joints, by name.
-            locked: joints held at a position [rad or m], by name: no joints of the model.
-            coupling: motors that turn with several joints, joints in the model's order.
-            payload: a body of known mass that the arm carries.
+            locked: positions [rad or m] of joints to be fixed, by name.
+            coupling: of motors and joints, joints in the model's order.
+            payload: known body that the arm carries.
             elements: springs and balancers.
 
         Raises:
-            ModelError: the text is no open chain of revolute and prismatic joints, gravity is
-                not a finite vector, a name is of no joint, the coupling is of another number of
-                joints, or the torque of an offset or an element is that of other parameters.
+            ModelError: the text is not an open chain of revolute and prismatic joints, gravity is
+                not a finite vector, there is no joint of a name, the coupling is of another
+                number of joints, or an offset or element cannot be separated from other
+                parameters.
         """
         chain = chain_from_urdf(urdf, locked)
         down = np.array(gravity, dtype=np.float64)
@@ -232,30 +228,27 @@ class RobotModel:
         )
 
     def with_friction(self, **changes: Any) -> RobotModel:
-        """Return the model with other friction, as :class:`FrictionLaw` names its parts.
+        """Return the model with changed fields of the :class:`FrictionLaw` of each joint.
 
         Raises:
-            ModelError: some joint's law would be none, see :class:`FrictionLaw`.
+            ModelError: an invalid friction law.
         """
         laws = tuple(replace(law, **changes) for law in self.friction.laws)
         return self._with(replace(self.friction, laws=laws), self.elements)
 
     def with_elements(self, more: Sequence[Element]) -> RobotModel:
-        """Return the model with these elements behind its own, see :meth:`from_urdf`."""
+        """Return the model with more elements, see :meth:`from_urdf`."""
         elements = JointElements.of(
             [*self.elements.elements, *more], self.joint_names, self.friction.revolute
         )
         return self._with(self.friction, elements)
 
     def _with(self, friction: JointFriction, elements: JointElements) -> RobotModel:
-        own = self.chain, self.gravity, self.layout, self.base
-        return replace(self, **_parameters(*own, friction, elements))
+        parts = self.chain, self.gravity, self.layout, self.base
+        return replace(self, **_parameters(*parts, friction, elements))
 
     def of_payload(self) -> RobotModel:
-        """Return the model of what the arm carries: ten parameters about the last joint's frame.
-
-        Everything else is known, and no part of the regressor.
-        """
+        """Return the model of a payload alone: ten parameters in the last joint's frame."""
         return replace(
             self,
             parameter_names=LINK_SYMBOLS,
@@ -270,24 +263,24 @@ class RobotModel:
 
     @property
     def rotor_inertia(self) -> bool:
-        """Whether every joint has a rotor inertia (column: its acceleration)."""
+        """Whether every joint has a rotor inertia."""
         return self.layout.rotor_inertia
 
     @property
     def friction_columns(self) -> NDArray[np.bool_]:
-        """Which of the p parameters are friction (p,): all coefficients but offsets."""
+        """Which of the p parameters are friction (p,), without offsets."""
         columns = np.zeros(self.n_parameters, dtype=np.bool_)
         columns[self.friction_part] = self.friction.dissipating
         return columns
 
     @property
     def friction_part(self) -> slice:
-        """Where the k friction coefficients stand among the p parameters."""
+        """Slice of the k friction coefficients among the p parameters."""
         return slice(self.base.rank, self.base.rank + len(self.friction.terms))
 
     @property
     def element_part(self) -> slice:
-        """Where the e parameters of springs and balancers stand among the p parameters."""
+        """Slice of the e parameters of springs and balancers among the p parameters."""
         return slice(self.friction_part.stop, self.n_parameters)
 
     @property
@@ -307,7 +300,7 @@ class RobotModel:
 
     @property
     def nominal(self) -> Array:
-        """Standard parameters as the URDF gives them, rotors and couplings zero, shape (s,)."""
+        """Standard parameters of the URDF, rotors and couplings zero, shape (s,)."""
         values = np.zeros(self.layout.size)
         values[self.layout.links] = self.chain.inertial
         return values
@@ -317,11 +310,10 @@ class RobotModel:
     ) -> Regressor:
         """Return W for m samples of motion, each array (m, n).
 
-        `direction` (m, n + k) is that of dry friction, see :attr:`Motion.direction`; without it
-        the sign of the velocity.
+        `direction` (m, n + k) of dry friction as in :attr:`Motion.direction`.
 
         Raises:
-            ShapeError: an array does not have that shape.
+            ShapeError: an array has another shape.
         """
         q, qd, qdd = joint_arrays(self.n_joints, q=q, qd=qd, qdd=qdd)
         return self.plan.evaluate(q, qd, qdd, direction)
@@ -334,12 +326,12 @@ class RobotModel:
         qdd: Array,
         direction: Array | None = None,
     ) -> Array:
-        """Return the joint torques [N·m, N] for parameter values (p,), shape (m, n).
+        """Return the joint torques [N·m, N] of parameter values (p,), shape (m, n).
 
-        Without what is known: see :meth:`load_torque`; `direction` as in :meth:`regressor`.
+        Without :meth:`load_torque`; `direction` as in :meth:`regressor`.
 
         Raises:
-            ShapeError: an array does not have the shape it should have.
+            ShapeError: an array has another shape.
         """
         values = np.asarray(values, dtype=np.float64)
         if values.shape != (self.n_parameters,):
@@ -355,20 +347,15 @@ class RobotModel:
     def load_torque(self, q: Array, qd: Array, qdd: Array) -> Array:
         """Return the known torque [N·m, N] of payload, springs and balancers (m, n).
 
-        Zero without any; it is no part of W pi.
-
         Raises:
-            ShapeError: an array does not have the shape it should have.
+            ShapeError: an array has another shape.
         """
         (q,) = joint_arrays(self.n_joints, q=q)
         torque = self.elements.known(q)
         return torque if self._load is None else torque + self._load.torque(q, qd, qdd)
 
     def moving(self, qd: Array) -> NDArray[np.bool_]:
-        """Return where each joint's friction law can be fitted, shape (m, n).
-
-        Faster than its standstill, or anywhere in a linear zone.
-        """
+        """Return which rows can be fitted, shape (m, n); see :meth:`JointFriction.moving`."""
         (qd,) = joint_arrays(self.n_joints, qd=qd)
         return self.friction.moving(qd)
 
@@ -380,7 +367,7 @@ def _laws(
     for name in others:
         if name not in chain.joint_names:
             raise ModelError(
-                f"there is no joint {name!r} to have a friction law of its own; there are"
+                f"there is no joint {name!r} for a friction law; there are"
                 f" {', '.join(chain.joint_names)}"
             )
     return tuple(others.get(name, law) for name in chain.joint_names)
@@ -394,7 +381,7 @@ def _parameters(
     friction: JointFriction,
     elements: JointElements,
 ) -> dict[str, Any]:
-    """What of a model follows from its friction and elements."""
+    """Return the fields of a model that depend on friction and elements."""
     return {
         "friction": friction,
         "elements": elements,
@@ -433,13 +420,13 @@ def _base_parameters(
     plan = _plan(chain, gravity, layout, everything, None)
     rows = plan.evaluate(q, qd, qdd).dense(layout.size).reshape(-1, layout.size)
     base = select_base(rows, layout.names, layout.units)
-    _refuse_weight_as_offset(chain, friction, rows[:, base.pivots])
-    _refuse_known_shape(friction, elements, rows[:, base.pivots], q)
+    _require_separate_offsets(chain, friction, rows[:, base.pivots])
+    _require_separate_elements(friction, elements, rows[:, base.pivots], q)
     return base
 
 
-def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Array) -> None:
-    """Refuse an offset whose column, constant on one joint, the inertial columns contain."""
+def _require_separate_offsets(chain: Chain, friction: JointFriction, columns: Array) -> None:
+    """Check that the column of each offset is independent of the inertial columns."""
     n = chain.n_joints
     if OFFSET not in friction.kinds:
         return
@@ -448,17 +435,17 @@ def _refuse_weight_as_offset(chain: Chain, friction: JointFriction, columns: Arr
         if share <= TOLERANCE and OFFSET.symbol in friction.laws[joint].symbols:
             name = chain.joint_names[joint]
             raise ModelError(
-                f"joint {name!r} slides along gravity and has a rotor inertia: the offset of its "
-                "friction and the weight it carries cannot be distinguished; leave out the offset "
+                f"joint {name!r} is prismatic along gravity and has a rotor inertia: the offset of "
+                "its friction and the carried weight cannot be distinguished; remove the offset "
                 "(asymmetric friction has one) or the rotor inertias",
                 joint=name,
             )
 
 
-def _refuse_known_shape(
+def _require_separate_elements(
     friction: JointFriction, elements: JointElements, columns: Array, q: Array
 ) -> None:
-    """Refuse an element whose column the others contain, such as a weight's or an offset's."""
+    """Check that the columns of elements are independent of all others."""
     m, n = q.shape
     offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
@@ -470,9 +457,9 @@ def _refuse_known_shape(
             column = torque.reshape(-1, 1)
             if share_left(column, columns)[0] <= TOLERANCE:
                 raise ElementError(
-                    f"the torque of {name} on joint {owner!r} has the same form as that of"
-                    " other parameters, such as a weight, and cannot be separated from it; give its"
-                    " figures, with identified = false",
+                    f"the torque of {name} on joint {owner!r} cannot be distinguished from that of"
+                    " other parameters, such as a weight; state its values, with"
+                    " identified = false",
                     joint=owner,
                 )
             columns = np.column_stack([columns, column])

@@ -1,7 +1,7 @@
-"""What a robot description must keep to before its readers see it: it may be anybody's file.
+"""Checks of untrusted URDF text before pinocchio reads it.
 
-Readers written in C++ end the process on some texts, take minutes for others, and leave out the
-inertia of a link where they cannot read one number of it.
+Its C++ reader crashes on some texts, needs minutes for others, and ignores the inertia of a link
+of which it cannot read a number.
 """
 
 from __future__ import annotations
@@ -16,16 +16,8 @@ from xml.parsers import expat
 from identification.errors import ModelError
 
 
-# The elements of a robot description, as its readers in C++ take them.
-#
-# To them a colon is a letter of a name as any other and `xmlns` an attribute without effect,
-# where most libraries for XML put the namespace before every name: a `<link>` that the model has
-# would not be found.
 def urdf_tree(urdf: str, *, comments: bool = False) -> Element:
-    """Return the outermost element of URDF text, with comments if wanted; names are those written.
-
-    `xml.etree.ElementTree.tostring` gives a text with the same names again; the encoding that the
-    text may name counts no longer.
+    """Return the root element of URDF text; like pinocchio, ignore namespaces and encoding.
 
     Raises:
         ModelError: the text is not well-formed XML.
@@ -40,15 +32,15 @@ def urdf_tree(urdf: str, *, comments: bool = False) -> Element:
     try:
         parser.Parse(urdf.encode(), True)
     except (expat.ExpatError, UnicodeEncodeError) as problem:
-        raise ModelError(f"the robot description is no XML: {problem}") from problem
+        raise ModelError(f"the robot description is not XML: {problem}") from problem
     root: Element = builder.close()
     return root
 
 
 LONGEST: Final = 20_000_000
-"""Characters of the longest description that is read; one of a whole cell has some 100 000."""
+"""Largest number of characters; the description of a cell has some 100 000."""
 MOST_LINKS: Final = 1000
-"""A chain of some thousands overflows the stack of the reader, which ends the process."""
+"""Largest number of links; a chain of some thousands overflows the reader's stack."""
 XACRO: Final = "it is a xacro file; expand it with: xacro FILE > robot.urdf"
 _DEEPEST: Final = 50  # a description needs seven
 _MOST_ATTRIBUTES: Final = 100  # of one element; the reader's time grows with their square
@@ -58,8 +50,8 @@ _NUMBERS: Final[Mapping[str, Mapping[str, int]]] = {
     "mass": {"value": 1},
     "inertia": dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 1),
 }
-"""How many numbers there are in the attributes of what an <inertial> holds."""
-# As the reader takes them: it knows no blanks but spaces, and none behind a single number.
+"""Numbers in the attributes of the elements of an <inertial>."""
+# As the reader accepts them: spaces only, and none after a single number.
 _NUMBER: Final = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?"
 _FORMS: Final = {
     1: re.compile(rf" *{_NUMBER}"),
@@ -67,23 +59,20 @@ _FORMS: Final = {
 }
 _TAG: Final = re.compile(rb"""<[^"'>]*(?:(?:"[^"]*"|'[^']*')[^"'>]*)*>""")
 _QUOTED: Final = re.compile(rb""""[^"]*"|'[^']*'""")
-_BLANKS: Final = (b"\t", b"\n", b"\r")
-"""XML makes spaces of them in attributes; the reader does not."""
+_BLANKS: Final = (b"\t", b"\n", b"\r")  # spaces in attributes for XML, but not for the reader
 _USUAL: Final = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-"""What a description means that leaves it out."""
 _UNBOUND: Final = expat.errors.codes[expat.errors.XML_ERROR_UNBOUND_PREFIX]
 
 
 class _RefusedError(Exception):
-    """The description is refused; its argument says why."""
+    """The description is refused, with a reason."""
 
 
 def refusal(text: str) -> str | None:
-    """Return why a robot description is given to no reader, in words; None if it may be.
+    """Return why a robot description is not read, None if it is valid.
 
-    It must be XML without entities of its own, which readers expand differently or without end;
-    of a size, depth and number of links that readers bear; its links and joints must have names
-    that can be printed; and an inertia must have all its numbers, each of which must be one.
+    It must be XML of limited size, depth and number of links, without entities, with printable
+    names, and with complete, finite inertias.
     """
     if len(text) > LONGEST:
         return f"it has {len(text)} characters; at most {LONGEST} are read"
@@ -93,64 +82,68 @@ def refusal(text: str) -> str | None:
     except _RefusedError as refused:
         return str(refused)
     except UnicodeEncodeError as problem:
-        return f"it is no text ({problem.reason})"
+        return f"it is not text ({problem.reason})"
     except expat.ExpatError as problem:
-        return f"it is no XML ({problem})"
+        return f"it is not XML ({problem})"
     return None
 
 
 def left_by_xacro(tag: str, attributes: Mapping[str, str]) -> bool:
-    """Whether an element is one that expanding a xacro file would have replaced."""
+    """Whether an element is part of an unexpanded xacro file."""
     return tag.startswith("xacro:") or any(
         mark in value for value in attributes.values() for mark in ("${", "$(")
     )
 
 
 class _Reading:
-    """One way through the elements."""
+    """Checks during one pass through the elements."""
 
     def __init__(self) -> None:
         self._path: list[str] = []
         self._link = ""
         self._links = 0
-        self._inertial: set[str] = set()  # the elements of the one that is open
-        self._fault = ""  # the first of an inertia
+        self._inertial: set[str] = set()  # elements of the current <inertial>
+        self._fault = ""  # the first one in an <inertial>
         self._data = b""
-        # The text was decoded: whatever encoding it says it has, it has no longer.
-        self._parser = expat.ParserCreate("utf-8")
+        self._parser = expat.ParserCreate("utf-8")  # whatever encoding the text declares
         self._parser.StartElementHandler = self._begin
         self._parser.EndElementHandler = self._end
         self._parser.EntityDeclHandler = self._entity
         self._parser.StartDoctypeDeclHandler = self._doctype
 
     def read(self, text: str) -> None:
-        """Go through all of it."""
+        """Parse a text.
+
+        Raises:
+            _RefusedError: it is refused.
+            expat.ExpatError: it is not XML.
+        """
         self._data = text.encode()
         try:
             self._parser.Parse(self._data, True)
         finally:
-            del self._parser  # it knows this object: both would wait for the cycle collector
+            del self._parser  # a reference cycle
         if self._fault:
             unexpanded = any(left_by_xacro(e.tag, e.attrib) for e in urdf_tree(text).iter())
             raise _RefusedError(XACRO if unexpanded else self._fault)
         self._require_prefixes()
 
     def _require_prefixes(self) -> None:
-        """Some readers take colons for namespaces, and refuse names that others take."""
+        """Check that prefixes of names are declared, which readers with namespaces require."""
         try:
             expat.ParserCreate("utf-8", "}").Parse(self._data, True)
         except expat.ExpatError as problem:
             if problem.code != _UNBOUND:
                 raise
             raise _RefusedError(
-                f"a name in line {problem.lineno} has a prefix that is declared nowhere; declare "
-                'it, as in <robot xmlns:PREFIX="...">, or take out what has it'
+                f"a name in line {problem.lineno} has an undeclared prefix; declare it, as in "
+                '<robot xmlns:PREFIX="...">, or remove the element or attribute'
             ) from problem
 
     def _doctype(self, _: str, system: str | None, *__: object) -> None:
         if system is not None:
             raise _RefusedError(
-                f"its <!DOCTYPE> is described in {system[:40]!r}, which is not read; take it out"
+                f"its <!DOCTYPE> refers to {system[:40]!r}, which is not read; remove it"
             )
 
     def _entity(self, name: str, *_: object) -> None:
@@ -185,7 +178,7 @@ class _Reading:
             raise _RefusedError(f"the name of {tag} {name!r} has characters that cannot be printed")
         if self._has_blanks():
             raise _RefusedError(
-                f"{tag} {name!r} has a tab or line end within its name or type; put a space there"
+                f"{tag} {name!r} has a tab or line end in its name or type; put a space there"
             )
         if tag == "link":
             self._link = name
@@ -204,21 +197,18 @@ class _Reading:
             if text is not None and not (_FORMS[count].fullmatch(text) and _finite(text)):
                 shown = text if len(text) <= 40 else f"{text[:40]}..."
                 wanted = "one number" if count == 1 else f"{count} numbers"
-                return (
-                    f"link {self._link!r} has {key}={shown!r} {place}; "
-                    f"write {wanted}, with nothing before or behind"
-                )
+                return f"link {self._link!r} has {key}={shown!r} {place}; write only {wanted}"
         if tag == "mass" and (mass := float(attributes["value"])) < 0.0:
             return f"link {self._link!r} has a mass of {mass:g} kg; write 0 or more"
         if self._has_blanks():
             return (
-                f"link {self._link!r} has a tab or line end within an attribute of the <{tag}> of "
+                f"link {self._link!r} has a tab or line end in an attribute of the <{tag}> of "
                 "its <inertial>; put spaces there"
             )
         return ""
 
     def _has_blanks(self) -> bool:
-        """Whether an attribute of the element that begins has some that only XML takes as such."""
+        """Whether an attribute of the current element has blanks that the reader rejects."""
         written = _TAG.match(self._data, self._parser.CurrentByteIndex)
         values = [] if written is None else _QUOTED.findall(written[0])
         return any(blank in value for value in values for blank in _BLANKS)

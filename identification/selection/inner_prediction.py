@@ -119,7 +119,7 @@ class Settings:
         return (
             f"{how.rigid_bandwidth:g} Hz",
             "measured velocity" if how.velocity == "measured" else "velocity from positions",
-            *self.model.friction.laws[0].words(),
+            *self.model.friction.laws[0].summary(),
             f"torque ripple, {' and '.join(map(str, self.ripple))} per motor turn"
             if self.ripple
             else "no torque ripple",

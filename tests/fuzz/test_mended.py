@@ -186,8 +186,8 @@ REFUSED: list[tuple[str, Callable[[Path], object], type[Exception], str]] = [
      of_text(lambda path: Rehearsal.load(CampaignFolder(path.parent)), b'{"a": 1}\xff'),
      InputError, r"rehearsal\.json cannot be read"),
     ("robot", of_robot('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'), ModelError,
-     "without a direction"),
-    ("robot", of_robot("<inertial>", '<inertial :="">'), ModelError, "is no XML"),
+     "of length zero"),
+    ("robot", of_robot("<inertial>", '<inertial :="">'), ModelError, "is not XML"),
     *(("cell.toml", of_text(Cell.load, deep), InputError, r"cell\.toml.*nested too deep")
       for deep in (".".join("a" * 400) + " = 1", "a = " + "{b = [" * 60 + "1" + "]}" * 60)),
     *(("payload", lambda _, figures=figures: Payload(*figures), ModelError, "the payload")

@@ -266,9 +266,7 @@ def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
     assert f"warning: not checked: {unchecked}" in output
 
 
-def test_no_feasible_motion_names_constraints_and_remedies(
-    invoke, settings, tmp_path
-):
+def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp_path):
     settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
     with pytest.raises(NoExcitationError) as caught:
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")

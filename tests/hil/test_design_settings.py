@@ -351,7 +351,7 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
     limits = cell.drive_train.current_limit.tolist()
     limits[1] = 0.1
     weak = cell.with_values({"drive_train.current_limit": limits})
-    words = r"begin at home: at rest there, current of motor of joint_2: [\d.]+ A, must be at most 0\.08 A"
+    words = r"at home: at rest there, .* of motor of joint_2: [\d.]+ A, must be at most 0\.08 A"
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))

@@ -212,7 +212,7 @@ class TestRobot:
 
     def test_files_and_urdfs_that_are_none_are_named(self, tmp_path):
         (tmp_path / "bad.urdf").write_text("<robot")
-        with pytest.raises(InputError, match=r"bad\.urdf: the robot description .* is no XML"):
+        with pytest.raises(InputError, match=r"bad\.urdf: the robot description .* is not XML"):
             Robot.from_urdf(tmp_path / "bad.urdf")
         with pytest.raises(InputError, match=r"none\.urdf.*cannot be read"):
             Robot.from_urdf(tmp_path / "none.urdf")

@@ -379,11 +379,11 @@ def test_every_pair_that_can_meet_is_looked_at():
 def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
     assert ("link_0", "link_2") not in wrist.pairs
-    (pair,) = wrist.built_in
+    (pair,) = wrist.unchecked
     assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
     assert pair.nearest <= pair.farthest < 0.0
     assert "link_0_0 and link_2_0" in str(wrist.exceptions)
-    assert checkers(0.05).built_in == ()
+    assert checkers(0.05).unchecked == ()
     assert checkers(0.05).exceptions is None
     # Four joints between base and tip: always touching is a fault, and is reported as one.
     far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
@@ -431,7 +431,7 @@ def test_obstacles_in_the_wrong_place_leave_no_moving_link_unchecked(arm, worksp
     with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
     assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
     # The first link turns in it: no motion can mend that, so it is told and not checked.
-    assert {pair.first[:6] for pair in checker.built_in} == {"link_1"}
+    assert {pair.first[:6] for pair in checker.unchecked} == {"link_1"}
     home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
     contact = checker.deepest_contact(home)
     assert contact is not None and contact.first == "link_2"
@@ -444,7 +444,7 @@ def test_a_first_link_that_swings_towards_the_floor_is_checked():
     for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
         checker = CollisionChecker(urdf, Workspace(floor=floor))
         assert checker.pairs == (("arm", "floor"),)
-        assert checker.built_in == ()
+        assert checker.unchecked == ()
 
 
 def test_limits_and_postures_of_another_arm_are_refused():

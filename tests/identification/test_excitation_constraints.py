@@ -144,7 +144,9 @@ def test_the_deepest_contact_is_reported_with_pair_and_instant():
     # 1 m from shoulder to elbow: that much too close would be an excess of 1
     assert violation.excess == pytest.approx(0.1 - violation.value)
     text = str(violation)
-    assert text.startswith(f"collision of lower and floor: {violation.value:.4g} m, must be at least 0.1 m")
+    assert text.startswith(
+        f"collision of lower and floor: {violation.value:.4g} m, must be at least 0.1 m"
+    )
     assert f"at {violation.time:.3f} s" in text
     assert "joints at (-0." in text
 

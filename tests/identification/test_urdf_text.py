@@ -98,9 +98,9 @@ def xacro(text: str) -> str:
 
 UNEXPANDED = "it is a xacro file; expand it with: xacro FILE"
 FAULTS = {
-    "no xml": "no XML",
-    "": "no XML",
-    "<robot>": "no XML",
+    "no xml": "not XML",
+    "": "not XML",
+    "<robot>": "not XML",
     "<sdf/>": "<sdf>",
     xacro(robot('<xacro:include filename="x"/>')): "expand it with: xacro",
     xacro(arm('value="6"', 'value="${m}"')): UNEXPANDED,
@@ -109,7 +109,7 @@ FAULTS = {
     xacro(arm('type="revolute"', 'type="${kind}"')): UNEXPANDED,
     robot(LINKS, ""): "no name",
     robot(""): "no <link>",
-    robot(LINKS): "'a', 'b' hang on nothing",
+    robot(LINKS): "'a', 'b' have no parent joint",
     robot(LINKS + '<link name="a"/>'): "2 of its links are called 'a'",
     robot(LINKS + joint("revolut", limit=LIMIT)): "'j' is of type 'revolut'",
     robot(LINKS + joint("revolute")): "'j' is revolute and has no <limit>",
@@ -142,9 +142,9 @@ REFUSED = {
         declaring('<!ENTITY % x SYSTEM "http://127.0.0.1:9/x"> %x;'),
         "declares the entity 'x'",
     ),
-    "a control character": (arm("shoulder", "a\x1b[31mb"), "no XML"),
-    "a zero byte": (arm("shoulder", "a\0b"), "no XML"),
-    "half a character": (arm("shoulder", "a\ud800b"), "no text"),
+    "a control character": (arm("shoulder", "a\x1b[31mb"), "not XML"),
+    "a zero byte": (arm("shoulder", "a\0b"), "not XML"),
+    "half a character": (arm("shoulder", "a\ud800b"), "not text"),
     "a name over two lines": (arm("shoulder", "a&#10;b"), "'a\\nb' has characters"),
     "a name that turns its line round": (arm("shoulder", "a\u202eb"), "cannot be printed"),
     "elements in elements": (arm("</robot>", "<a>" * 100 + "</a>" * 100 + "</robot>"), "deep"),
@@ -164,7 +164,7 @@ REFUSED = {
     ),
     "a prefix of nowhere": (
         arm("</robot>", "\n<gazebo:plugin/></robot>"),
-        'line 2 has a prefix that is declared nowhere; declare it, as in <robot xmlns:PREFIX="',
+        'line 2 has an undeclared prefix; declare it, as in <robot xmlns:PREFIX="',
     ),
     "more text than anybody writes": (" " * (LONGEST + 1), "characters"),
     **{text: (text, why) for text, why in FAULTS.items()},
@@ -257,7 +257,7 @@ def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> N
     assert RobotModel.from_urdf(urdf).n_joints == 1  # to an estimate shapes are nothing
 
 
-AWAY = r"more than 1e\+06 m away from what carries it"
+AWAY = r"more than 1e\+06 m away from its parent"
 FAR = '<origin xyz="1e300 0 0"/>'
 
 
@@ -283,14 +283,14 @@ PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collisio
 @pytest.mark.parametrize(
     ("shapes", "why"),
     [
-        (SHAPE + PIPE.format("capsule"), "2 .* 0 could be read.* stand <box>, <capsule>"),
-        (PIPE.format("Box"), "1 .* 0 could be read.* stand <Box>"),
-        (SHAPE + "<collision/>", "2 .* 0 could be read.* stand <box>"),
-        ("<collision><geometry/></collision>", "1 .* 0 could be read.* stand none"),
-        (SHAPE + PIPE.format("cylinder").replace("0.1", "0,1"), "2 .* 0 .* sizes and places"),
-        (SHAPE + PIPE.format("capsule").replace("collision", "visual"), "stand <box>, <capsule>"),
+        (SHAPE + PIPE.format("capsule"), "2 .* 0 could be read.* contain <box>, <capsule>"),
+        (PIPE.format("Box"), "1 .* 0 could be read.* contain <Box>"),
+        (SHAPE + "<collision/>", "2 .* 0 could be read.* contain <box>"),
+        ("<collision><geometry/></collision>", "1 .* 0 could be read.* contain none"),
+        (SHAPE + PIPE.format("cylinder").replace("0.1", "0,1"), "2 .* 0 .* single spaces"),
+        (SHAPE + PIPE.format("capsule").replace("collision", "visual"), "contain <box>, <capsule>"),
         (SHAPE + "<visual/>", "1 .* 0 could be read"),
-        (SHAPE.replace("</geo", '<sphere radius="2"/></geo'), "2 .* 1 .* needs one shape"),
+        (SHAPE.replace("</geo", '<sphere radius="2"/></geo'), "2 .* 1 .* needs one box"),
     ],
 )
 def test_what_is_wrong_with_a_shape_is_told(shapes: str, why: str) -> None:

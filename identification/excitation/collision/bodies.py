@@ -1,4 +1,4 @@
-"""The solid bodies of a scene: shapes on the links of an arm, and what stands around it."""
+"""Collision bodies: shapes on the links of an arm, and the obstacles around it."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ class Box:
 
 @dataclass(frozen=True)
 class Workspace:
-    """Obstacles in the base frame of the URDF, and the distance to keep from them."""
+    """Obstacles in the base frame of the URDF, and the clearance."""
 
-    floor: float | None = 0.0  #: height of the floor [m]; None where there is none
+    floor: float | None = 0.0  #: height of the floor [m]; None: no floor
     walls: tuple[Wall, ...] = ()  #: planes
     boxes: tuple[Box, ...] = ()  #: solid boxes
     margin: float = 0.05  #: least distance [m] between the arm and anything, itself included
@@ -71,12 +71,8 @@ class Workspace:
             raise WorkspaceError(f"margin of {self.margin} m: it must be finite, 0 or more")
 
 
-def lost_shapes(urdf: str, links: Iterable[str]) -> str | None:
-    """Return in words the first link of which not all shapes were read; `links` has that of each.
-
-    Raises:
-        ModelError: the text is no XML.
-    """
+def _unread_shapes(urdf: str, links: Iterable[str]) -> str | None:
+    """Return a message if not all shapes of a link were read; `links` has the link of each."""
     read = Counter(links)
     for link in urdf_tree(urdf).findall("link"):
         name = link.get("name", "")
@@ -87,10 +83,9 @@ def lost_shapes(urdf: str, links: Iterable[str]) -> str | None:
             shapes = [f"<{shape.tag}>" for each in (*collisions, *visuals) for shape in each]
             return (
                 f"of the {written} collision shapes of link {name!r} {read[name]} could be read; "
-                f"in its <collision> and <visual> elements stand {', '.join(shapes) or 'none'}. "
-                "Each element needs one shape of its own, a box, cylinder, sphere or mesh; sizes "
-                "and places are numbers with single spaces between, a mesh has a filename, a "
-                "material a name. Where one cannot be read, all of its link are left out"
+                f"its <collision> and <visual> elements contain {', '.join(shapes) or 'none'}. "
+                "Each element needs one box, cylinder, sphere or mesh, with numbers separated by "
+                "single spaces, a filename for a mesh, and a name for a material"
             )
     return None
 
@@ -100,18 +95,18 @@ def _shapes(element: Element) -> Iterator[Element]:
         yield from geometry
 
 
-_MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # pinocchio's words
+_MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # message of pinocchio
 
 
 class Hull(NamedTuple):
-    """A cylinder swollen by a ball, about a shape; a sphere and a capsule are such themselves."""
+    """Bounding volume of a shape: the Minkowski sum of a cylinder and a ball."""
 
-    centre: Array  # middle of the cylinder, in the frame of the body's joint (3,) [m]
+    centre: Array  # of the cylinder, in the frame of the body's joint (3,) [m]
     axis: Array  # unit vector along it (3,)
     half_length: float  # of the cylinder [m]
     radius: float  # of the cylinder [m]
     ball: float  # radius of the ball [m]
-    exact: bool  # whether this is the shape itself, not only something around it
+    exact: bool  # whether it is the shape itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,36 +114,33 @@ class Body:
     """A convex shape that moves with a link, or an obstacle."""
 
     name: str  # of the link or obstacle
-    shape_name: str  # of this shape; the obstacle's own
-    joint: int  # the joint that moves it, -1 for what stands still
+    shape_name: str  # of the shape; of an obstacle its name
+    joint: int  # the joint that moves it, -1 for fixed bodies
     shape: coal.CollisionGeometry  # its geometry
     pose: coal.Transform3s  # in the frame of that joint
-    hull: Hull  # what holds it
-    normal: Array | None = None  # outward normal of a half-space (3,), None for every other shape
-    # of a box along the axes of the base (3,) [m], None for every other shape
-    half_sides: Array | None = None
+    hull: Hull  # its bounding volume
+    normal: Array | None = None  # outward normal of a half-space (3,), else None
+    half_sides: Array | None = None  # of a box along the base axes (3,) [m], else None
 
 
 def described_shapes(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> pin.GeometryModel:
     """Return the collision shapes of a robot description as pinocchio reads them.
 
     Raises:
-        ValueError, RuntimeError: a mesh is not to be found, or a shape cannot be read.
+        ValueError, RuntimeError: a mesh is missing, or a shape cannot be read.
     """
-    # One that pinocchio 4.1 makes itself it never lets go of, meshes and all.
+    # pinocchio 4.1 leaks a geometry model that it creates itself
     shapes = pin.GeometryModel()
     pin.buildGeomFromUrdfString(model, urdf, pin.GeometryType.COLLISION, shapes, list(mesh_folders))
     return shapes
 
 
 def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> list[Body]:
-    """Return the collision shapes of a robot description, ordered by the joint that moves them.
-
-    Meshes are replaced by their convex hulls.
+    """Return the collision bodies of a robot description by joint, meshes as convex hulls.
 
     Raises:
-        MissingMeshError: a mesh is not to be found.
-        CollisionModelError: a shape cannot be read or is far away, or no moving link has one.
+        MissingMeshError: a mesh is missing.
+        CollisionModelError: a shape is unreadable or too far away, or no moving link has one.
     """
     try:
         shapes = described_shapes(model, urdf, mesh_folders)
@@ -156,20 +148,20 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
         missing = _MISSING_MESH.search(str(error))
         if missing:
             raise MissingMeshError(missing[1]) from error
-        why = " ".join(str(error).split())
-        raise CollisionModelError(f"collision shapes cannot be loaded: {why}") from error
+        reason = " ".join(str(error).split())
+        raise CollisionModelError(f"collision shapes cannot be loaded: {reason}") from error
     names = [model.frames[item.parentFrame].name for item in shapes.geometryObjects]
-    if (lost := lost_shapes(urdf, names)) is not None:
-        raise CollisionModelError(lost)
+    if (unread := _unread_shapes(urdf, names)) is not None:
+        raise CollisionModelError(unread)
     bodies = []
     for item, link in zip(shapes.geometryObjects, names, strict=True):
         rotation, translation = item.placement.rotation, item.placement.translation
         if not np.abs(translation).max() <= FARTHEST:
             raise CollisionModelError(
                 f"collision shape {item.name!r} of the robot description is more than "
-                f"{FARTHEST:g} m away from what carries it"
+                f"{FARTHEST:g} m away from its parent"
             )
-        shape, joint = _body(item.geometry, link), item.parentJoint - 1
+        shape, joint = _convex(item.geometry, link), item.parentJoint - 1
         pose, hull = coal.Transform3s(rotation, translation), _hull(shape, rotation, translation)
         bodies.append(Body(link, item.name, joint, shape, pose, hull))
     if not any(body.joint >= 0 for body in bodies):
@@ -177,16 +169,15 @@ def link_bodies(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> lis
     return sorted(bodies, key=lambda body: body.joint)
 
 
-def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
-    """The shape itself, or the convex hull of a mesh."""
+def _convex(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
+    """Return the shape itself, or the convex hull of a mesh."""
     if isinstance(shape, coal.BVHModelBase):
         if np.all(np.abs(shape.vertices()) <= FARTHEST):
             with suppress(ValueError, RuntimeError):
                 shape.buildConvexHull(True, "Qt")
                 return shape.convex
         raise CollisionModelError(
-            f"a collision mesh of link {link!r} is no body: flat, or its corners no points "
-            f"within {FARTHEST:g} m"
+            f"a collision mesh of link {link!r} has no volume, or vertices beyond {FARTHEST:g} m"
         )
     sides = [getattr(shape, name, 0.0) for name in ("halfSide", "radius", "halfLength")]
     if min(float(np.min(side)) for side in sides) < 0.0:
@@ -199,7 +190,7 @@ def _body(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
 
 
 def obstacles(workspace: Workspace) -> list[Body]:
-    """Return floor, walls and boxes."""
+    """Return floor, walls and boxes as bodies."""
     planes = [("floor", (0.0, 0.0, 1.0), workspace.floor)] if workspace.floor is not None else []
     planes += [(f"wall {i}", wall.normal, wall.offset) for i, wall in enumerate(workspace.walls)]
     bodies = [
@@ -210,15 +201,15 @@ def obstacles(workspace: Workspace) -> list[Body]:
         lower, upper = np.array(box.lower, dtype=float), np.array(box.upper, dtype=float)
         middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
         shape = coal.Box(*(upper - lower))
-        # To separations from it the box itself counts, not something round about it.
+        # separations use the half sides
         hull = Hull(middle, np.array([0.0, 0.0, 1.0]), 0.0, 0.0, 0.0, exact=False)
         pose = coal.Transform3s(np.eye(3), middle)
         bodies.append(Body(f"box {i}", f"box {i}", -1, shape, pose, hull, half_sides=half))
     return bodies
 
 
-def withdrawn(plane: Body, distance: float) -> Body:
-    """Return a floor or wall that stands back by a distance [m]."""
+def moved_back(plane: Body, distance: float) -> Body:
+    """Return a floor or wall moved away from the free space by a distance [m]."""
     assert plane.normal is not None
     offset = float(plane.normal @ plane.hull.centre) - distance
     return _plane(plane.name, plane.normal, offset)
@@ -227,8 +218,7 @@ def withdrawn(plane: Body, distance: float) -> Body:
 def _plane(name: str, normal: Array, offset: float) -> Body:
     length = float(np.linalg.norm(normal))
     normal = normal / length
-    # coal fills the side opposite to the normal.
-    shape = coal.Halfspace(normal, offset / length)
+    shape = coal.Halfspace(normal, offset / length)  # solid on the side opposite to the normal
     hull = Hull(normal * (offset / length), normal, 0.0, 0.0, 0.0, exact=True)
     return Body(
         name, name, -1, shape, coal.Transform3s(np.eye(3), np.zeros(3)), hull, normal=normal
@@ -252,7 +242,7 @@ def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) ->
 
 
 def _around(corners: Array) -> tuple[Array, Array, float, float]:
-    """Return a cylinder that holds points (k, 3), along their longest extent."""
+    """Return a cylinder around points (k, 3), along their longest extent."""
     lower, upper = corners.min(axis=0), corners.max(axis=0)
     centre, half = (lower + upper) / 2.0, (upper - lower) / 2.0
     longest = int(np.argmax(half))
@@ -262,10 +252,9 @@ def _around(corners: Array) -> tuple[Array, Array, float, float]:
 
 
 def _corners(shape: coal.CollisionGeometry) -> Array:
-    """Return points (k, 3) whose convex hull holds a shape, in its own frame."""
+    """Return points (k, 3) whose convex hull contains a shape, in its own frame."""
     if isinstance(shape, coal.ConvexBase):
         return np.asarray(shape.points(), dtype=np.float64).reshape(-1, 3)
     shape.computeLocalAABB()
     box = shape.aabb_local
-    corners: Array = np.array(list(product(*zip(box.min_, box.max_, strict=True))))
-    return corners
+    return np.array(list(product(*zip(box.min_, box.max_, strict=True))))

@@ -1,9 +1,9 @@
-"""Where hulls are at many samples at once, how far apart, and how far they leave straight ways.
+"""Positions, separations and curvature bounds of hulls at many samples.
 
-The samples stand last in every array. Any direction n gives a lower bound of the signed distance of
-two convex bodies, ``n · (c_a - c_b) - h_a(n) - h_b(n)`` with the support function h of each about
-its centre c. A path whose second derivative is at most A stays within A h²/8 of the straight line
-between two points that it passes h apart in time.
+Samples are the last axis of every array. Any direction n gives a lower bound of the signed distance
+of two convex bodies, ``n · (c_a - c_b) - h_a(n) - h_b(n)`` with the support function h of each
+about its centre c. A path with second derivative at most A deviates by at most A h²/8 from the
+straight line between two of its points h apart in time.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from identification.model.kinematics import Chain, skew
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-# Axes closer than this [m] cross: there is no way between them to speak of.
-_CROSSING = 1e-9
+_CROSSING = 1e-9  # axes closer than this [m] intersect
 
 
 class Frames(NamedTuple):
@@ -74,7 +73,7 @@ def joint_poses(chain: Chain, q: Array) -> tuple[Array, Array]:
 
 
 def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
-    """Return where the hulls of bodies are, those that one joint moves next to each other."""
+    """Return the positions of the hulls of bodies, which are sorted by joint."""
     centre, axis = np.empty((2, 3, len(bodies), at.translation.shape[2]))
     joints = np.array([body.joint for body in bodies])
     for joint in dict.fromkeys(joints.tolist()):
@@ -93,10 +92,9 @@ def placed(bodies: Sequence[Body], at: Frames) -> Bodies:
 
 
 def travel(bodies: Sequence[Body], at: Bodies, turning: Array) -> Array:
-    """Bound how far any point of each body has gone since the first sample, (b, m) [m].
+    """Bound the path length of any point of each body since the first sample, (b, m) [m].
 
-    From sample to sample in a straight line: with the centre of its hull, its axis, and about that
-    by the turning of base and links (1 + n, m - 1) at most [rad].
+    From sample to sample in straight lines, with `turning` of base and links (1 + n, m - 1) [rad].
     """
     half = np.array([body.hull.half_length for body in bodies])
     around = np.array([body.hull.radius + body.hull.ball for body in bodies])
@@ -104,13 +102,13 @@ def travel(bodies: Sequence[Body], at: Bodies, turning: Array) -> Array:
     steps = _norm(np.diff(at.centre))
     steps += half[:, None] * _norm(np.diff(at.axis))
     steps += around[:, None] * turning[joints]
-    gone = np.zeros(at.centre.shape[1:])
-    np.cumsum(steps, axis=1, out=gone[:, 1:])
-    return gone
+    total = np.zeros(at.centre.shape[1:])
+    np.cumsum(steps, axis=1, out=total[:, 1:])
+    return total
 
 
 def turning(chain: Chain, q: Array) -> Array:
-    """Bound how far base and links turn between neighbouring postures (m, n), (1 + n, m - 1)."""
+    """Bound the rotation of base and links between postures (m, n), (1 + n, m - 1) [rad]."""
     turned = np.abs(np.diff(q, axis=0)).T * chain.revolute[:, None]
     total = np.zeros((1 + chain.n_joints, len(q) - 1))
     for joint in range(chain.n_joints):
@@ -122,8 +120,8 @@ class Separation:
     """Lower bounds of the signed distances of pairs of bodies, an obstacle always second.
 
     Attributes:
-        first, second: (p,) the two bodies of each pair. Pairs with a moving second body come
-            first, then those with a box, last those with a plane.
+        first, second: (p,) bodies of each pair: first pairs with a moving second body, then those
+            with a box, then those with a plane.
         exact: (p,) whether the bounds are the distances themselves.
         sharp: (p,) whether the hulls are the shapes themselves.
     """
@@ -150,14 +148,14 @@ class Separation:
         self.exact: NDArray[np.bool_] = exact[self.first] & (np.arange(len(pairs)) >= self._planes)
 
     def coarse(self, at: Bodies, samples: Indices) -> Array:
-        """Return a quick lower bound for every pair at some samples (g,), (p, g) [m]."""
+        """Return a coarse lower bound for every pair at samples (g,), (p, g) [m]."""
         centre, axis = at.centre[:, :, samples], at.axis[:, :, samples]
         between = centre[:, self.first] - centre[:, self.second]
         bound = np.empty(between.shape[1:])
         apart = between[:, : self._planes]
         deep = np.zeros(apart.shape[1:])
         if self._planes > self._boxes:
-            # from the nearest point of a box, or how deep inside; half sides of others are zero
+            # from the nearest point of a box, or the depth inside; other half sides are zero
             beyond = np.abs(apart) - self._half_sides[:, self.second[: self._planes], None]
             apart = np.maximum(beyond, 0.0)
             deep = np.minimum(beyond.max(axis=0), 0.0)
@@ -171,7 +169,7 @@ class Separation:
         return bound
 
     def bound(self, at: Bodies, pair: Indices, sample: Indices) -> tuple[Array, Array]:
-        """Return lower bounds (k,) [m] and directions (3, k) of pairs (k,) that never fall."""
+        """Return lower bounds (k,) [m] and directions (3, k) of pairs (k,) in rising order."""
         lower, normal = np.empty(len(pair)), np.empty((3, len(pair)))
         boxes, planes = np.searchsorted(pair, (self._boxes, self._planes)).tolist()
         for part, towards in (
@@ -197,7 +195,7 @@ class Separation:
         return bound
 
     def _support(self, body: Indices, cosine: Array) -> Array:
-        """Return h of hulls at directions that have this cosine with their axes."""
+        """Return h of hulls in directions with this cosine to their axes."""
         across = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
         height: Array = self._half_length[body] * np.abs(cosine)
         height += self._radius[body] * across
@@ -208,10 +206,12 @@ class Separation:
         a, b = self.first[pair], self.second[pair]
         axis_a, axis_b = _at(at.axis, a, sample), _at(at.axis, b, sample)
         between = _at(at.centre, a, sample) - _at(at.centre, b, sample)
-        way = _shortest_way(between, axis_a, self._half_length[a], axis_b, self._half_length[b])
-        length = _norm(way)
+        shortest = _between_segments(
+            between, axis_a, self._half_length[a], axis_b, self._half_length[b]
+        )
+        length = _norm(shortest)
         crossing = length < _CROSSING
-        normal = way / np.where(crossing, 1.0, length)
+        normal = shortest / np.where(crossing, 1.0, length)
         normal[:, crossing] = np.array([[0.0], [0.0], [1.0]])
         bound = _dot(normal, between)
         bound -= self._support(a, _dot(normal, axis_a))
@@ -219,14 +219,14 @@ class Separation:
         return bound, normal
 
     def _from_box(self, at: Bodies, pair: Indices, sample: Indices) -> tuple[Array, Array]:
-        """Take the best of the six faces and of the way from the box to the body's middle."""
+        """Use the best of the six faces and of the direction from the box to the body's centre."""
         a, b = self.first[pair], self.second[pair]
         between = _at(at.centre, a, sample) - _at(at.centre, b, sample)
         sides = self._half_sides[:, b]
-        way = between - np.clip(between, -sides, sides)
-        inside = ~np.any(way, axis=0)
-        way[2, inside] = 1.0
-        best = way / _norm(way)
+        outward = between - np.clip(between, -sides, sides)
+        inside = ~np.any(outward, axis=0)
+        outward[2, inside] = 1.0
+        best = outward / _norm(outward)
         bound = self.along(at, pair, sample, best)
         for face in range(3):
             normal = np.zeros_like(between)
@@ -238,19 +238,19 @@ class Separation:
         return bound, best
 
 
-def _shortest_way(between: Array, u: Array, half_u: Array, v: Array, half_v: Array) -> Array:
-    """Return the shortest way (3, k) from segments along v to segments along u."""
+def _between_segments(between: Array, u: Array, half_u: Array, v: Array, half_v: Array) -> Array:
+    """Return the shortest vectors (3, k) from segments along v to segments along u."""
     cosine, along_u, along_v = _dot(u, v), _dot(u, between), _dot(v, between)
     across = 1.0 - cosine * cosine
     with np.errstate(divide="ignore", invalid="ignore"):
         s = (cosine * along_v - along_u) / across
-    s = np.where(across > 1e-12, s, 0.0)  # parallel ones are everywhere equally far apart
+    s = np.where(across > 1e-12, s, 0.0)  # parallel
     s = np.clip(s, -half_u, half_u)
     t = np.clip(cosine * s + along_v, -half_v, half_v)
     s = np.clip(cosine * t - along_u, -half_u, half_u)
-    way: Array = between + s * u
-    way -= t * v
-    return way
+    shortest: Array = between + s * u
+    shortest -= t * v
+    return shortest
 
 
 def _at(table: Array, body: Indices, sample: Indices) -> Array:
@@ -270,13 +270,12 @@ def _norm(vectors: Array) -> Array:
 
 
 class Curvature:
-    """Bounds of the accelerations of pairs of bodies, seen from a frame of each pair's own.
+    """Bounds of the accelerations of pairs of bodies, seen from a frame of each pair.
 
-    A point's derivative by joint k is z_k x r_k, r_k from the joint to the point, or z_k for a
-    slide; that derived by a revolute joint j before it, or by k itself, is no longer. So its
-    acceleration is bounded by the longest r_k and the rates of the joints, whatever the posture.
-    `first` and `second` are indices of the pairs (p,), `frame` the joint that each is seen from,
-    one that moves both; -1 for the base.
+    A point's derivative by joint k is z_k x r_k (r_k from the joint to the point), or z_k for a
+    prismatic joint; its derivative by k or by a revolute joint before it is no longer. So the
+    longest r_k and the joint rates bound its acceleration in all postures. `first` and `second`
+    are the bodies of the pairs (p,), `frame` a joint that moves both, -1: the base.
     """
 
     def __init__(
@@ -291,13 +290,13 @@ class Curvature:
         hulls = [body.hull for body in bodies]
         reach = [np.hypot(hull.half_length, hull.radius) + hull.ball for hull in hulls]
         radius = np.array([np.linalg.norm(hull.centre) for hull in hulls]) + reach
-        moved = [
+        joints = [
             (bodies[a].joint, bodies[b].joint, int(seen_from))
             for a, b, seen_from in zip(first, second, frame, strict=True)
         ]
-        # Pairs of shapes on the same two links differ in nothing but their radius.
-        links = sorted(set(moved))
-        self._class: Indices = np.array([links.index(pair) for pair in moved], dtype=np.intp)
+        # pairs of shapes on the same two links share the largest radius
+        links = sorted(set(joints))
+        self._class: Indices = np.array([links.index(pair) for pair in joints], dtype=np.intp)
         largest = np.zeros((len(links), 2))
         np.maximum.at(largest, self._class, np.stack((radius[first], radius[second]), axis=1))
         self._frames = [seen_from for _, _, seen_from in links]
@@ -314,23 +313,22 @@ class Curvature:
         self._fixed_arms = self._arms(np.zeros(chain.n_joints))
 
     def bulge(self, velocity: Array, acceleration: Array, q: Array, step: float) -> Array:
-        """Bound how far two bodies leave straight lines between samples together, (p, g) [m].
+        """Bound the deviation of both bodies from straight lines between samples, (p, g) [m].
 
-        From the largest |qd| and |qdd| of the joints in each part of a motion (n, g), its samples
-        (m, n) and the step between them [s].
+        `velocity` and `acceleration` (n, g) are the largest |qd| and |qdd| in each part of a
+        motion, q its samples (m, n), `step` their period [s].
         """
         arms = self._fixed_arms
         if not np.all(self._chain.revolute):
-            # A slide may go beyond its samples by what it can swing between two of them.
-            swing = acceleration.max(axis=1) * step**2 / 8.0
-            arms = self._arms(np.abs(q).max(axis=0) + swing)
+            deviation = acceleration.max(axis=1) * step**2 / 8.0
+            arms = self._arms(np.abs(q).max(axis=0) + deviation)
         own = np.where(self._chain.revolute[:, None], velocity, 0.0)
         turned = velocity * (own + 2.0 * (self._before @ velocity)) + acceleration
         bulges: Array = (arms[:, None] @ turned)[:, 0] * (step**2 / 8.0)
         return bulges[self._class]
 
     def _arms(self, slides: Array) -> Array:
-        """Return how far points are from each joint at most, both bodies' together (c, n)."""
+        """Return the largest distance of points from each joint, sum of both bodies (c, n)."""
         chain = self._chain
         arms = np.zeros((len(self._branches), chain.n_joints))
         for row, branches in enumerate(self._branches):
@@ -345,7 +343,7 @@ class Curvature:
         return arms
 
 
-def carrier(chain: Chain, a: int, b: int) -> int:
+def common_joint(chain: Chain, a: int, b: int) -> int:
     """Return the last joint that moves both links a and b, -1 for the base."""
     if a < 0 or b < 0:
         return -1
@@ -354,7 +352,7 @@ def carrier(chain: Chain, a: int, b: int) -> int:
 
 
 def _before(chain: Chain, frame: int) -> Array:
-    """Return which revolute joints beyond a frame come before each joint, (n, n)."""
+    """Return which revolute joints after a frame are ancestors of each joint, (n, n)."""
     before = np.zeros((chain.n_joints, chain.n_joints))
     inside = chain.ancestors(frame) if frame >= 0 else ()
     for k in range(chain.n_joints):

@@ -1,4 +1,4 @@
-"""An arm among obstacles: its bodies, the pairs that may touch, and where they are."""
+"""An arm and its obstacles: bodies, checked pairs, and their positions along a path."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import Workspace, link_bodies, obstacles, withdrawn
+from identification.excitation.collision.bodies import Workspace, link_bodies, moved_back, obstacles
 from identification.excitation.collision.hulls import (
     Bodies,
     Curvature,
     Frames,
     Indices,
     Separation,
-    carrier,
+    common_joint,
     frames,
     placed,
     travel,
@@ -31,32 +31,27 @@ from planner import JointLimits
 
 Array = NDArray[np.float64]
 
-
-# Shapes that are closer than the margin, and than this [m], in all postures tried are built that
-# way; a wider margin must not check less.
-NEAR: Final = 0.05
-# A foot's distance from what it stands in changes by this [m] at most.
-STILL: Final = 0.002
-# A link that never keeps the margin keeps the farthest distance that was tried, less this [m].
-SLACK: Final = 0.005
+# Pairs closer than this [m] (and than the margin) in all sampled postures are not checked; a wider
+# margin does not exclude more.
+_NEAR: Final = 0.05
+# Largest variation [m] of the distance of a foot from the obstacle that it stands in.
+_CONSTANT: Final = 0.002
+# A link that never has the margin must have the largest sampled distance less this [m].
+_SLACK: Final = 0.005
 _N_POSTURES = 200
 _SEED = 20140901
-# Ranges below this [rad, m] count as ranges that nobody gave.
-_NO_RANGE = 1e-6
+_NO_RANGE = 1e-6  # ranges below this [rad, m] are not limits
 
 
-class BuiltIn(NamedTuple):
-    """Two shapes that are not checked against each other, because they are always too close.
+class ClosePair(NamedTuple):
+    """Two shapes that are closer than the margin in all sampled postures.
 
-    Attributes:
-        first, second: the shapes' names (of a link: those that pinocchio gives them, the link's
-            with a number), or an obstacle's.
-        nearest, farthest: their distance in the postures tried [m], negative where they overlap.
+    Shapes of links have pinocchio's names, the link's with a number.
     """
 
     first: str
     second: str
-    nearest: float
+    nearest: float  # distance in the sampled postures [m], negative if they overlap
     farthest: float
 
     def __str__(self) -> str:
@@ -64,26 +59,29 @@ class BuiltIn(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where everything is at m samples."""
+    """Positions of all bodies at m samples."""
 
-    q: Array  # the postures (m, n)
+    q: Array  # postures (m, n)
     frames: Frames  # of base and links
-    bodies: Bodies  # their hulls
-    gone: Array  # (b, m) how far each body has gone until there at most, in straight lines [m]
+    bodies: Bodies  # hulls
+    travel: Array  # (b, m) upper bound of the path length of each body's points [m]
 
 
 class Scene:
-    """The bodies of an arm and of its workspace, in pairs that are to be clear of each other.
+    """The bodies of an arm and of its workspace, in pairs that must not touch.
 
-    Margins are in m; `separation` is of the p pairs, `carrier` (p,) the last joint that moves both
-    bodies of each (-1: the base), from which and from the base `from_carrier` and `from_base` say
-    how far pairs leave straight lines. `built_in` are shapes too close in every posture, `narrowed`
-    links and planes that keep less than the margin for that reason. `arm_length` is the way along
-    the arm from the base to its last joint [m]; 1 where there is none.
+    Attributes:
+        margin: least distance [m].
+        separation: distance bounds of the p pairs.
+        common_joint: (p,) last joint that moves both bodies of a pair, -1: the base.
+        from_base, from_common_joint: bounds of the curvature of the pairs' motion seen from these.
+        unchecked: pairs that are not checked because they are always too close.
+        reduced: pairs of link and plane that are checked with less than the margin.
+        arm_length: length along the arm from the base to its last joint [m]; 1 if it is zero.
 
     Raises:
         CollisionModelError: the description has no collision shapes, or a mesh is missing.
-        ModelError: the description is no open chain.
+        ModelError: the description is not an open chain.
     """
 
     def __init__(
@@ -110,16 +108,16 @@ class Scene:
         ]
         self.separation = Separation(self._bodies, pairs)
         self._tried = self.path(random_postures(model, limits))
-        self.built_in, self.narrowed = self._leave_out()
+        self.unchecked, self.reduced = self._find_close_pairs()
         first, second = self.separation.first, self.separation.second
         joints = np.array([body.joint for body in self._bodies], dtype=np.intp)
-        self.carrier: Indices = np.array(
-            [carrier(chain, *pair) for pair in zip(joints[first], joints[second], strict=True)],
-            dtype=np.intp,
+        joint_pairs = zip(joints[first], joints[second], strict=True)
+        self.common_joint: Indices = np.array(
+            [common_joint(chain, *pair) for pair in joint_pairs], dtype=np.intp
         )
-        self.from_base, self.from_carrier = (
+        self.from_base, self.from_common_joint = (
             Curvature(chain, self._bodies, first, second, frame)
-            for frame in (np.full_like(self.carrier, -1), self.carrier)
+            for frame in (np.full_like(self.common_joint, -1), self.common_joint)
         )
         self.arm_length = _length(chain)
 
@@ -128,27 +126,29 @@ class Scene:
 
     @property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of what is checked against what, without repetitions."""
+        """Names of the checked pairs of bodies, without repetitions."""
         return tuple(dict.fromkeys(map(self.names, range(len(self.separation.first)))))
 
     @property
     def exceptions(self) -> str | None:
-        """What is not checked, or with less than the margin, in a sentence; None for nothing."""
-        left_out = "not checked for collisions, always too close by the way the arm is built"
-        less = "checked with the largest distance that the mounting leaves instead of the margin"
-        sentences = [
-            f"{words}: {'; '.join(map(str, those))}"
-            for words, those in ((left_out, self.built_in), (less, self.narrowed))
-            if those
+        """Message about pairs checked not at all or with less than the margin, None if none."""
+        messages = {
+            "not checked for collisions, always closer than the margin": self.unchecked,
+            "checked with the largest distance that the mounting allows instead of the margin": (
+                self.reduced
+            ),
+        }
+        parts = [
+            f"{text}: {'; '.join(map(str, pairs))}" for text, pairs in messages.items() if pairs
         ]
-        return "; ".join(sentences) or None
+        return "; ".join(parts) or None
 
     def path(self, q: Array) -> Path:
-        """Return where everything is at postures (m, n).
+        """Return the positions of all bodies at postures (m, n).
 
         Raises:
             ShapeError: postures of another arm.
-            PostureError: a position that is no finite number.
+            PostureError: a joint position is not finite.
         """
         if q.ndim != 2 or q.shape[1] != self._chain.n_joints:
             raise ShapeError("q", q.shape, f"(m, {self._chain.n_joints})")
@@ -177,7 +177,7 @@ class Scene:
         return -np.inf if np.isnan(distance) else distance
 
     def normal(self, second: int) -> Array:
-        """Return the direction of the distance computed last, from second to first body."""
+        """Return the direction of the last computed distance, from second to first body."""
         fixed = self._bodies[second].normal
         normal: Array = -self._result.normal if fixed is None else fixed
         return normal
@@ -191,15 +191,15 @@ class Scene:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _leave_out(self) -> tuple[tuple[BuiltIn, ...], tuple[BuiltIn, ...]]:
-        """Leave out the pairs that are built in; a plane stands back from some others."""
-        # Built in are two links two joints apart at most that are too close in every posture, and
-        # an obstacle and a shape of the first link that are too close at the same distance in every
-        # posture. A plane stands back for one of the two links next to the mounting that can never
-        # keep the margin of it, and does not touch it in some postures.
-        near = min(self.margin, NEAR)
+    def _find_close_pairs(self) -> tuple[tuple[ClosePair, ...], tuple[ClosePair, ...]]:
+        """Remove pairs that are always too close, and move planes back for others."""
+        # Removed: two links at most two joints apart that are too close in all postures, and an
+        # obstacle and a shape of the first link at a constant distance below the margin. A plane
+        # is moved back for one of the first two links that never has the margin from it, but does
+        # not touch it in all postures.
+        near = min(self.margin, _NEAR)
         checked: list[tuple[int, int]] = []
-        left_out, narrowed = list[BuiltIn](), list[BuiltIn]()
+        unchecked, reduced = list[ClosePair](), list[ClosePair]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
             obstacle, plane = b >= self._n_links, self._bodies[b].normal is not None
@@ -209,26 +209,26 @@ class Scene:
                 distances = self._distances(pair)
                 least, most = float(distances.min()), float(distances.max())
             names = self._bodies[a].shape_name, self._bodies[b].shape_name
-            fixed = joints <= 1 and most - least <= STILL if obstacle else True
+            fixed = joints <= 1 and most - least <= _CONSTANT if obstacle else True
             if most < near and fixed:
-                left_out.append(BuiltIn(*names, least, most))
+                unchecked.append(ClosePair(*names, least, most))
                 continue
-            if plane and SLACK < most < near:
-                narrowed.append(BuiltIn(*names, least, most))
-                self._bodies.append(withdrawn(self._bodies[b], self.margin - most + SLACK))
+            if plane and _SLACK < most < near:
+                reduced.append(ClosePair(*names, least, most))
+                self._bodies.append(moved_back(self._bodies[b], self.margin - most + _SLACK))
                 b = len(self._bodies) - 1
             checked.append((a, b))
         self.separation = Separation(self._bodies, checked)
-        return tuple(left_out), tuple(narrowed)
+        return tuple(unchecked), tuple(reduced)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
-        """Return the least and largest distance [m] of a pair (see `pairs`) in random postures.
+        """Return the least and largest distance [m] of one of `pairs` in random postures.
 
         Raises:
-            ValueError: they are no pair.
+            ValueError: it is not one of `pairs`.
         """
         pairs = [k for k in range(len(self.separation.first)) if self.names(k) == (first, second)]
-        self._tried = self.path(self._tried.q)  # planes may have been added since
+        self._tried = self.path(self._tried.q)  # with the planes that were moved back
         distances = np.min([self._distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
 
@@ -241,25 +241,21 @@ class Scene:
         return len(trunks[0] ^ trunks[1])
 
     def _distances(self, pair: int) -> Array:
-        """Return the distances of a pair in the postures tried (k,) [m]."""
+        """Return the distances of a pair in the sampled postures (k,) [m]."""
         return np.array([self.distance(pair, self._tried, k) for k in range(_N_POSTURES)])
 
     def _may_be_near(self, pair: int, near: float) -> bool:
-        """Whether a pair may be closer than so much [m] in every posture tried."""
+        """Whether a pair may be closer than `near` [m] in all sampled postures."""
         samples = np.arange(_N_POSTURES)
         pairs = np.full(_N_POSTURES, pair)
         return bool(np.all(self.separation.bound(self._tried.bodies, pairs, samples)[0] < near))
 
 
 def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
-    """Return postures (k, n) within limits or, without them, those of the description.
-
-    Half a turn to either side where there are none.
-    """
+    """Return postures (k, n) within limits, those of the description if None, or ± half a turn."""
     lower, upper = _described(model) if limits is None else (limits.lower, limits.upper)
     range_ = upper - lower
-    # Written so that what is no number or infinite counts as no limit.
-    limited = (range_ > _NO_RANGE) & (range_ < 2.0 * np.pi)
+    limited = (range_ > _NO_RANGE) & (range_ < 2.0 * np.pi)  # False for nan and infinity
     lower, upper = np.where(limited, lower, -np.pi), np.where(limited, upper, np.pi)
     shares = np.random.default_rng(_SEED).random((_N_POSTURES, model.nv))
     postures: Array = lower + shares * (upper - lower)
@@ -267,10 +263,10 @@ def random_postures(model: pin.Model, limits: JointLimits | None) -> Array:
 
 
 def _described(model: pin.Model) -> tuple[Array, Array]:
-    """Return the limits of a description, (n,) each; 0 for joints that turn without end."""
+    """Return the limits of a description, (n,) each; 0 for continuous joints."""
     lower, upper = np.zeros((2, model.nv))
     for joint in range(1, model.njoints):
-        if model.joints[joint].nq == 1:  # one without end counts as two numbers in pinocchio
+        if model.joints[joint].nq == 1:  # 2 for a continuous joint
             index, limit = model.joints[joint].idx_v, model.joints[joint].idx_q
             lower[index] = model.lowerPositionLimit[limit]
             upper[index] = model.upperPositionLimit[limit]
