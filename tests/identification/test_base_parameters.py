@@ -98,7 +98,7 @@ def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:
     assert base.smallest_pivot < 1e-4
     assert "These are close" in base.explanation()
     weakest = base.names[int(np.argmin(base.shares[base.pivots]))]
-    assert f"whether {weakest} is a parameter of its own" in base.explanation()
+    assert f"whether {weakest} is independent" in base.explanation()
 
 
 def test_an_arm_without_choice_needs_no_decision() -> None:

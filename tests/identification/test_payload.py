@@ -82,7 +82,7 @@ def test_a_payload_changes_no_parameter_and_no_torque_of_theirs() -> None:
 
 
 def test_a_frame_that_is_not_there_is_refused_with_those_that_are() -> None:
-    with pytest.raises(ModelError, match=r"'tool9' is no link .* link_6"):
+    with pytest.raises(ModelError, match=r"'tool9' is not a link .* link_6"):
         RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="tool9"))
     with pytest.raises(ModelError, match="fixed to the base"):
         RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="base_link"))
@@ -316,5 +316,5 @@ class TestFrame:
     def test_a_frame_that_is_not_there_is_refused(self) -> None:
         motion = lively(2)
         samples = as_samples(MODEL, motion, np.zeros_like(motion.position))
-        with pytest.raises(ModelError, match="'tool9' is no link"):
+        with pytest.raises(ModelError, match="'tool9' is not a link"):
             Run.of("a", MODEL, samples, "tool9", loaded=False)

@@ -118,7 +118,7 @@ FAULTS = {
     robot(LINKS + joint("fixed") + joint("fixed", name="k")): "child of 2 joints",
     **{
         arm('xyz="0.2 0 0"', f'xyz="0.2{blank}0 0"'): (
-            "tab or line end within an attribute of the <origin>"
+            "tab or line end in an attribute of the <origin>"
         )
         for blank in "\t\n"
     },
@@ -160,7 +160,7 @@ REFUSED = {
     ),
     "what is described elsewhere": (
         '<!DOCTYPE robot SYSTEM "x.dtd">' + arm("shoulder", "a&b;c"),
-        "described in 'x.dtd'",
+        "refers to 'x.dtd'",
     ),
     "a prefix of nowhere": (
         arm("</robot>", "\n<gazebo:plugin/></robot>"),
