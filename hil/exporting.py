@@ -1,4 +1,4 @@
-"""The identified arm as files for simulators, and ensembles of variants of it."""
+"""Files of the identified arm for simulators, and ensembles of variants."""
 
 from __future__ import annotations
 
@@ -38,8 +38,7 @@ Array = NDArray[np.float64]
 FormatName = Literal["mjcf", "sdf", "urdf"]
 
 ENSEMBLE: Final = "ensemble.npz"
-_MOST_ROWS: Final = 2000
-"""Of the recorded motion: more change no root mean square by a digit that is printed."""
+_MOST_ROWS: Final = 2000  # of the recorded motion, enough for root mean squares
 _SPREAD_ROWS: Final = 200
 
 
@@ -47,22 +46,22 @@ class Spread(NamedTuple):
     """Standard deviation of torque per joint (n,) [N·m or N] over the recorded motion."""
 
     variants: Array  #: of the variants
-    covariance: Array  #: as the covariance of the parameters predicts it
+    covariance: Array  #: predicted by the covariance of the parameters
 
 
 @dataclass(frozen=True, eq=False)
 class Exported:
-    """What was written, in `units` of torque per joint; in words why there is no comparison."""
+    """Summary of a written file."""
 
     path: Path
     joint_names: tuple[str, ...]
-    units: tuple[str, ...]
-    comparison: Comparison | str
+    units: tuple[str, ...]  # of torque per joint
+    comparison: Comparison | str  # or why there is none
     spread: Spread | None
     verdict: str
 
     def lines(self) -> list[str]:
-        """What a person reads."""
+        """Return the summary as lines of text."""
         unit = " or ".join(sorted(set(self.units)))
 
         def row(torque: Array) -> str:
@@ -73,18 +72,18 @@ class Exported:
             lines.append(f"warning: not read back: {self.comparison}")
         else:
             lines += [
-                f"read back: at {STATES} random states what the format holds differs by"
-                f" {self.comparison.difference:.1e} of a joint's largest torque",
+                f"read back: torque error at most {self.comparison.difference:.1e} of the joint's"
+                f" largest torque, at {STATES} random states",
                 *(f"left out: {k}: {row(v)} rms" for k, v in self.comparison.left_out.items()),
-                f"whole torque of the recorded motion: {row(self.comparison.torque)}",
+                f"whole torque of the recorded motion: {row(self.comparison.torque)} rms",
             ]
         if self.spread is not None:
-            lines.append(f"torque of the variants: ± {row(self.spread.variants)} (std);")
-            lines.append(f"as the covariance predicts: ± {row(self.spread.covariance)}")
+            lines.append(f"torque of the variants: ± {row(self.spread.variants)} (std)")
+            lines.append(f"predicted by the covariance: ± {row(self.spread.covariance)} (std)")
         return [*lines, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
-        """The same for JSON."""
+        """Return the summary for JSON."""
         compared = None if isinstance(self.comparison, str) else self.comparison
         return {
             "path": str(self.path),
@@ -99,7 +98,7 @@ class Exported:
 
 
 def consistent_of(found: Identification) -> ConsistentEstimate:
-    """The physically consistent parameters of an identification.
+    """Return the physically consistent parameters of an identification.
 
     Raises:
         InputError: there are none.
@@ -114,27 +113,27 @@ def consistent_of(found: Identification) -> ConsistentEstimate:
 
 
 def arm_of(cell: Cell, consistent: ConsistentEstimate) -> Arm:
-    """The identified arm within the limits of its cell, or those of its URDF."""
-    stated, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
+    """Return the identified arm with the limits of its cell, or of its URDF."""
+    described, efforts = urdf_limits(cell.urdf, cell.joint_names), cell.torque_limit
     if efforts is None:
         found = torque_limits(cell)
-        efforts = stated.effort if found is None else np.nan_to_num(found, nan=np.inf)
-    own = stated if cell.file.limits is None else cell.joint_limits
-    ranges = Ranges(own.lower, own.upper, own.velocity, efforts)
+        efforts = described.effort if found is None else np.nan_to_num(found, nan=np.inf)
+    limits = described if cell.file.limits is None else cell.joint_limits
+    ranges = Ranges(limits.lower, limits.upper, limits.velocity, efforts)
     return Arm(cell.urdf, cell.model, consistent.standard, consistent.estimate.values, ranges)
 
 
 def export_model(
     found: Identification, output: Path, to: FormatName, *, ensemble: int = 0, seed: int = 0
 ) -> Exported:
-    """Write an identified arm, read it back and compare; with an ensemble, its variants too.
+    """Write an identified arm, read it back and compare; with `ensemble`, write variants too.
 
-    The variants are `ensemble.npz` and a file each in a folder that has the name of `output`,
-    without its suffix, with ``_ensemble`` behind it.
+    The variants are `ensemble.npz` and a file each in the folder ``NAME_ensemble``, NAME being
+    `output` without its suffix.
 
     Raises:
-        InputError: there are no physically consistent parameters to write.
-        IdentificationError: the arm cannot be written, or reads back as another.
+        InputError: there are no physically consistent parameters.
+        IdentificationError: the arm cannot be written, or reads back with other parameters.
     """
     form, arm, motion = FORMATS[to], arm_of(found.cell, consistent_of(found)), _motion(found)
     pooled = found.estimate.pooled
@@ -164,13 +163,13 @@ def export_model(
 
 
 def default_output(sources: Sequence[Path], to: FormatName) -> Path:
-    """Where a file goes that nobody named: into the campaign folder, or this one."""
+    """Return the default path: in the campaign folder, or in the working directory."""
     folder = sources[0] if sources[0].is_dir() else Path()
     return folder / f"identified{FORMATS[to].suffix}"
 
 
 def spread_of(arm: Arm, variants: Ensemble, covariance: Array, motion: Motion) -> Spread:
-    """Compare the torque of variants with what the covariance (p, p) of the parameters predicts."""
+    """Return the torque deviation of variants, and that predicted by the covariance (p, p)."""
     part = motion.rows(_some(motion.n_samples, _SPREAD_ROWS))
     torque = np.array([arm.model.torque(values, *part[1:]) for values in variants.values])
     known = np.isfinite(np.diag(covariance))
@@ -185,7 +184,7 @@ def spread_of(arm: Arm, variants: Ensemble, covariance: Array, motion: Motion) -
 def _write_variants(
     output: Path, to: FormatName, arm: Arm, variants: Ensemble, remarks: tuple[str, ...]
 ) -> None:
-    """Write a file of every variant, and all of them in one."""
+    """Write a file for each variant, and one with the parameters of all."""
     folder, form = output.with_name(f"{output.stem}_ensemble"), FORMATS[to]
     make_folder(folder)
     width = len(str(len(variants.values) - 1))
@@ -206,7 +205,7 @@ def _write_variants(
 
 
 def _motion(found: Identification) -> Motion:
-    """Some rows of the motion that was predicted, from all its recordings."""
+    """Return some rows of the predicted motion, from all its recordings."""
     parts = [samples.motion for samples in found.prepared.held_out]
     share = _MOST_ROWS // len(parts)
     some = [motion.rows(_some(motion.n_samples, share)) for motion in parts]

@@ -21,7 +21,7 @@ from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import friction_in_words, friction_source
+from identification.export.friction import friction_source, friction_text
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.export.urdf import write_urdf
 
@@ -226,7 +226,7 @@ def _friction(
     remarks += [f"{key}: {value}" for key, value in origin.items()]
     header = "".join(f"# {line}\n" for line in remarks)
     return {
-        FRICTION_TEXT: header + "\n" + friction_in_words(model, values),
+        FRICTION_TEXT: header + "\n" + friction_text(model, values),
         FRICTION_SOURCE: header + friction_source(model, values),
     }
 

@@ -1,4 +1,4 @@
-"""The identified friction in words, and as Python source that needs no other package."""
+"""The identified friction as text, and as Python source without dependencies."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
 
-# Directions of the sign below standstill, by what was done there.
+# Texts about speeds below standstill.
 _ZONES = {
-    "exclude": "nothing was fitted: there sticking friction can take any value up to the Coulomb"
-    " friction, to either side.",
+    "exclude": "nothing was fitted: static friction can have any value up to the Coulomb"
+    " friction, in both directions.",
     "linear": "sgn(v) is v / standstill, as fitted.",
 }
 
 
-def friction_in_words(model: RobotModel, coefficients: Array) -> str:
+def friction_text(model: RobotModel, coefficients: Array) -> str:
     """Return the friction law and its coefficients (k,) as text, a line per joint.
 
     Raises:
@@ -33,27 +33,26 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
     if not friction.terms:
         return "The joints have no friction.\n"
     names = [_line(name) for name in model.joint_names]
-    # The third term of different joints may be of two kinds.
+    # symbols that mean different terms of different joints
     shared = {symbol for symbol, count in Counter(k.symbol for k in kinds).items() if count > 1}
     lines = []
     if kinds:
         lines += [
-            f"Torque that friction takes at the speed v of a joint: {_formula(kinds)}",
+            f"Friction torque at the speed v of a joint: {_formula(kinds)}",
             f"with {_joined([kind.description for kind in kinds])}.",
-            "sgn(v) is 1 forwards, -1 backwards.",
         ]
         slow: dict[tuple[float, str], list[str]] = {}  # joints by standstill and zone
         for name, law in zip(names, friction.laws, strict=True):
             if law.symbols and law.zone in _ZONES:
                 slow.setdefault((law.standstill, law.zone), []).append(name)
-        for (speed, zone), alike in sorted(slow.items()):
-            whose = "" if len(alike) == n else f" {_joined(alike)}:"
-            lines.append(f"Slower than {speed:g} rad/s (m/s){whose} {_ZONES[zone]}")
+        for (speed, zone), joints in sorted(slow.items()):
+            which = "" if len(joints) == n else f" {_joined(joints)}:"
+            lines.append(f"Slower than {speed:g} rad/s (m/s){which} {_ZONES[zone]}")
         lines.append("")
-    for name, law, own, revolute in zip(
+    for name, law, row, revolute in zip(
         names, friction.laws, table, model.chain.revolute.tolist(), strict=False
     ):
-        values = _values(law, own, revolute)
+        values = _values(law, row, revolute)
         for term in law.terms:
             if term.symbol in shared:
                 values.append(f"{term.symbol} with {term.basis}")
@@ -66,15 +65,15 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
             " distinguished from the zero error of a sensor."
         )
-    for motor, own, share in zip(friction.motors, table[n:], friction.motor_speeds(), strict=True):
-        turning = " + ".join(
+    for motor, row, share in zip(friction.motors, table[n:], friction.motor_speeds(), strict=True):
+        speed_sum = " + ".join(
             ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({names[j]})"
             for j in np.flatnonzero(share)
         )
-        numbers = _values(friction.laws[motor], own, bool(friction.revolute[motor]))
+        numbers = _values(friction.laws[motor], row, bool(friction.revolute[motor]))
         lines.append(
-            f"motor {motor + 1}, at v = {turning}: {', '.join(numbers)}; each of these joints feels"
-            " that torque times its factor"
+            f"motor {motor + 1}, at v = {speed_sum}: {', '.join(numbers)}; this torque times its"
+            " factor acts on each of these joints"
         )
     return "\n".join(lines) + "\n"
 
@@ -82,7 +81,7 @@ def friction_in_words(model: RobotModel, coefficients: Array) -> str:
 _FUNCTIONS = '''
 
 def direction(v, linear):
-    """Return the sign of a speed; slower than `linear`, v / linear."""
+    """Return the sign of a speed, or v / linear for speeds below `linear`."""
     if abs(v) < linear:
         return v / linear
     return 1.0 if v > 0 else -1.0 if v < 0 else 0.0
@@ -91,7 +90,7 @@ def direction(v, linear):
 def friction(joint, v, smooth=0.0):
     """Return {formula} of a joint (0, 1, ...) at speed v, N·m or N.
 
-    Slower than `smooth` (rad/s or m/s) the sign is linear: no jump at zero speed.
+    The sign is linear for speeds below `smooth` (rad/s or m/s), to avoid a jump at zero speed.
     """
     sign = direction(v, max(LINEAR[joint], smooth))
     return {summands}
@@ -109,11 +108,10 @@ def torques(speeds, smooth=0.0):
 
 
 def friction_source(model: RobotModel, coefficients: Array) -> str:
-    """Return Python source of ``friction(joint, v)`` and ``torques(speeds)``; no other package.
+    """Return Python source of ``friction(joint, v)`` and ``torques(speeds)``.
 
-    `friction` is the joint's own law as :meth:`RobotModel.torque` has it, `torques` that of all
-    joints, with what motors that turn with several of them take. Both take a speed below which
-    the sign is made linear, for simulations that must not jump at zero speed.
+    `friction` is the law of one joint, `torques` friction of all joints with that of coupled
+    motors. Both have an option to make the sign linear at low speed, for simulations.
 
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
@@ -128,7 +126,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         f"JOINTS = {_tuple(map(repr, model.joint_names))}",
         f"MOTORS = {_tuple(map(_numbers, friction.motor_speeds()))}  # speed per joint speed",
         "# Of the joints, then of these motors:",
-        f"LINEAR = {_numbers(linear)}  # rad/s or m/s: slower, the sign was fitted as linear",
+        f"LINEAR = {_numbers(linear)}  # rad/s or m/s; the sign was fitted as linear below this",
     ]
     if any(" E " in kind.code for kind in kinds):
         lines.append(f"E = {math.e!r}")
@@ -136,8 +134,8 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
         values, speeds, units = np.zeros(len(laws)), np.ones(len(laws)), set()
         for one in friction.terms:
             if one.term.label == kind.label:
-                place = friction.place(one)
-                values[place], speeds[place] = table[place][one.symbol], one.term.speed
+                index = friction.place(one)
+                values[index], speeds[index] = table[index][one.symbol], one.term.speed
                 units.add(one.unit)
         name = kind.label.upper()
         lines.append(f"{name} = {_numbers(values)}  # {' or '.join(sorted(units))}")
@@ -151,7 +149,7 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
 
 
 def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool) -> list[str]:
-    """Return the coefficients that are given, with their units."""
+    """Return the given coefficients with their units."""
     return [
         f"{term.symbol} = {coefficients[term.symbol]:.5g} {term.unit(revolute=revolute)}"
         for term in law.terms

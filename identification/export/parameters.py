@@ -1,7 +1,7 @@
-"""Identified parameters as JSON and CSV, with units (SI), covariance and where they come from.
+"""Identified parameters as JSON and CSV, with units (SI), covariance and provenance.
 
-Numbers that JSON has not are words, "Infinity" and "NaN"; the standard deviation of a parameter
-that the data do not determine is infinite.
+Numbers that are not finite are texts in JSON, "Infinity" and "NaN"; the standard deviation of an
+undetermined parameter is infinite.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import friction_in_words
+from identification.export.friction import friction_text
 from identification.export.urdf import not_in_urdf
 from identification.factor.factor import Estimate
 from identification.model.regressor import LINK_SYMBOLS
@@ -27,8 +27,8 @@ SCHEMA: Final = "hil-parameters-1"
 CONVENTION: Final = (
     "Link parameters are about the origin of the link's joint frame (URDF), in its axes: I is the"
     " inertia tensor (off-diagonals are minus the products of inertia), mc mass times centre of"
-    " mass, m the mass; Im is the rotor inertia seen from the link side; I45 is the inertia that"
-    " coupled motors add between joints 4 and 5. Joints count from 1, in the order of `joints`."
+    " mass, m the mass; Im is the rotor inertia on the link side; I45 is the coupling inertia of"
+    " joints 4 and 5 by coupled motors. Joints are numbered from 1, in the order of `joints`."
 )
 
 
@@ -40,10 +40,10 @@ def parameters_json(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
-    """Return everything about an estimate as JSON text.
+    """Return an estimate as JSON text.
 
-    With the full standard parameters of a consistent estimate, the names of essential parameters,
-    and what the parameters come from, where given.
+    With the standard parameters of a consistent estimate, the names of essential parameters, and
+    the provenance, if given.
 
     Raises:
         IdentificationError: the estimate is of other parameters.
@@ -53,7 +53,6 @@ def parameters_json(
         "provenance": dict(provenance or {}),
         "joints": list(model.joint_names),
         "locked_joints": {name: float(position) for name, position in model.locked.items()},
-        # Known, and in none of the parameters.
         "payload": None if model.payload is None else dataclasses.asdict(model.payload),
         "elements": [
             {
@@ -71,7 +70,7 @@ def parameters_json(
         "noise_std": estimate.noise_std.tolist(),
         "samples": estimate.samples.tolist(),
         "undetermined": list(estimate.undetermined),
-        "friction_law": friction_in_words(model, estimate.values[model.friction_part]),
+        "friction_law": friction_text(model, estimate.values[model.friction_part]),
         "parameters": [
             {
                 "name": name,
@@ -93,9 +92,9 @@ def parameters_json(
 def parameters_csv(
     model: RobotModel, estimate: Estimate, *, provenance: Mapping[str, str] | None = None
 ) -> str:
-    """Return a table, one row per parameter, its row of the covariance matrix behind it.
+    """Return a table with one row per parameter, its row of the covariance matrix last.
 
-    Lines in front that begin with # say where it comes from (pandas: ``comment="#"``).
+    Provenance is in lines at the beginning that start with # (pandas: ``comment="#"``).
 
     Raises:
         IdentificationError: the estimate is of other parameters.
@@ -115,12 +114,11 @@ def standard_csv(
     *,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
-    """Return a table of the full standard parameters, one row per joint, consistent by link.
+    """Return a table of the consistent standard parameters, one row per joint.
 
-    A name that a spreadsheet would compute has an apostrophe in front.
+    A name that a spreadsheet would take for a formula gets an apostrophe.
     """
     layout, standard = model.layout, consistent.standard
-    # In front of the table: behind it a comment would be a row of its own to some readers.
     remarks = {**(provenance or {}), "convention": CONVENTION}
     remarks |= {
         layout.names[k]: f"{float(standard[k])!r} {layout.units[k]}" for k in layout.couplings
@@ -130,12 +128,12 @@ def standard_csv(
     rows: list[list[object]] = [[*heading]]
     for joint, name in enumerate(model.joint_names):
         numbers = [*inertial[joint], *rotors[joint : joint + 1], float(consistent.margin[joint])]
-        rows.append([_harmless(name), *numbers, _harmless(consistent.reference[joint])])
+        rows.append([_cell_text(name), *numbers, _cell_text(consistent.reference[joint])])
     return _table(remarks, rows)
 
 
 def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
-    """Return CSV with a line in front that begins with # per remark, line ends in it removed."""
+    """Return CSV after one line per remark that starts with #."""
     out = io.StringIO()
     for key, value in remarks.items():
         line = " ".join(f"{key}: {value}".split())
@@ -144,8 +142,8 @@ def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
     return out.getvalue()
 
 
-def _harmless(text: str) -> str:
-    """Return text on one line that no spreadsheet takes for a formula, which can call programs."""
+def _cell_text(text: str) -> str:
+    """Return text on one line that no spreadsheet takes for a formula."""
     line = "".join(c if c.isprintable() else " " for c in text)
     return f"'{line}" if line.lstrip().startswith(("=", "+", "-", "@")) else line
 
@@ -190,13 +188,12 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
         "status": consistent.status,
         "relative_error": consistent.relative_error,
         "unconstrained_relative_error": consistent.unconstrained_relative_error,
-        "covariance": "that of the unconstrained parameters: inequalities have none of their own;"
-        " what the data do not determine is the nominal's",
+        "covariance": "that of the unconstrained parameters; undetermined directions are nominal",
     }
 
 
 def _finite(content: Any) -> Any:
-    """Return what JSON can write: words for numbers that it has not."""
+    """Return the content with texts in place of numbers that are not finite."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):

@@ -1,8 +1,9 @@
-"""The identified arm as simulators read it: MuJoCo's XML (MJCF), SDF, URDF.
+"""The identified arm for simulators: MuJoCo's XML (MJCF), SDF, URDF.
 
-Bodies are those of the physically consistent parameters, with what is fixed to them and a stated
-payload. What each format has room for is in :data:`FORMATS`; :func:`compare` reads a text back and
-says how much torque the rest is (asymmetry, Stribeck, offset, balancers, ripple, reversals).
+Bodies have physically consistent parameters and include fixed links and a stated payload.
+:data:`FORMATS` has the parts of the model that each format supports; :func:`compare` reads a text
+back and computes the torque of the other parts (asymmetry, Stribeck, offset, balancers, ripple,
+velocity reversals).
 """
 
 from __future__ import annotations
@@ -38,20 +39,19 @@ Array = NDArray[np.float64]
 Node = ElementTree.Element
 
 STATES: Final = 1000
-"""Random states at which a text is compared with the model."""
+"""Number of random states at which a text is compared with the model."""
 AGREES: Final = 1e-6
-"""Of the largest torque of a joint: what reading back may differ by."""
+"""Largest difference of a text that is read back, relative to the largest torque of a joint."""
 _SEED: Final = 20140903
-# Where nothing is stated: rad or m, rad/s or m/s, rad/s² or m/s².
+# Default ranges of random states: rad or m, rad/s or m/s, rad/s² or m/s².
 _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
 _BASE: Final = "base"
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
-# s; MuJoCo's dry friction follows a constraint of this time constant: no less than two steps.
-_FRICTION_TIME: Final = 2.0 * _TIMESTEP
-_THICKNESS: Final = 0.03  # m, of the sticks that show the arm
-_SHORTEST: Final = 1e-3  # m, of a stick
+_FRICTION_TIME: Final = 2.0 * _TIMESTEP  # time constant of MuJoCo's dry friction, at least 2 steps
+_THICKNESS: Final = 0.03  # m, radius of the capsules that show the arm
+_SHORTEST: Final = 1e-3  # m, length of a capsule
 
 
 class MissingMujocoError(IdentificationError):
@@ -59,7 +59,7 @@ class MissingMujocoError(IdentificationError):
 
 
 class Ranges(NamedTuple):
-    """Limits of the joints (n,), rad or m, rad/s or m/s, N·m or N; infinite where not known."""
+    """Limits of the joints (n,), rad or m, rad/s or m/s, N·m or N; infinite if unknown."""
 
     lower: Array
     upper: Array
@@ -69,12 +69,12 @@ class Ranges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm with parameters that a machine can have."""
+    """An arm with physically consistent parameters."""
 
-    urdf: str  # the text that the model was made from
-    model: RobotModel  # the robot
-    standard: Array  # standard parameters (s,), every body and rotor possible
-    values: Array  # the parameters (p,) that follow, with friction, springs and balancers
+    urdf: str  # text that the model was created from
+    model: RobotModel
+    standard: Array  # consistent standard parameters (s,)
+    values: Array  # the corresponding parameters (p,) of the model
     ranges: Ranges  # limits of its joints
 
     @property
@@ -84,7 +84,7 @@ class Arm:
 
     @property
     def bodies(self) -> tuple[Body, ...]:
-        """What each joint moves up to the next, the payload included (n,)."""
+        """Body that each joint moves, the payload included (n,)."""
         inertial = self.standard[self.model.layout.links].copy()
         if self.model.payload is not None:
             joint, carried = self.model.payload.carried_by(self.model.chain)
@@ -97,23 +97,23 @@ class Arm:
         return self.model.layout.rotor_matrix(self.standard)
 
     def spring(self, joint: int) -> tuple[float, float]:
-        """Stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint together."""
+        """Return stiffness [N·m/rad] and rest angle [rad] of all torsion springs of a joint."""
         stiffness = moment = 0.0
         for one in self.model.elements.placed:
             if one.joint == joint and isinstance(one.element, TorsionSpring):
-                own = self.values[self.model.element_part][one.part]
-                k = float(own[0]) if len(own) else one.element.stiffness or 0.0
+                found = self.values[self.model.element_part][one.part]
+                k = float(found[0]) if len(found) else one.element.stiffness or 0.0
                 stiffness, moment = stiffness + k, moment + k * one.element.rest
         return stiffness, moment / stiffness if stiffness else 0.0
 
     def link(self, joint: int) -> str:
-        """Name of the link that a joint moves, unlike that of any joint."""
+        """Return the name of the link that a joint moves, different from that of any joint."""
         frames = self.model.chain.frames
         name = next((name for name, frame in frames.items() if frame.joint == joint), "link")
         return f"{name}_link" if name in self.model.joint_names else name
 
     def fixed(self, joint: int) -> dict[str, tuple[Array, Array]]:
-        """Axes (3, 3) and origin (3,) of the other links that move with a joint, by name."""
+        """Return axes (3, 3) and origin (3,) of the links fixed to that of a joint, by name."""
         names = {self.link(joint), *self.model.joint_names}
         return {
             name: (frame.rotation, frame.translation)
@@ -123,7 +123,7 @@ class Arm:
 
 
 def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as MuJoCo's XML. Gravity compensation is off; motors take joint torque."""
+    """Return the arm as MuJoCo's XML; motors are controlled by joint torque."""
     model, ranges, rotors = arm.model, arm.ranges, arm.rotors
     coupled = np.array((rotors != np.diag(np.diag(rotors))).any(axis=1))
     root = Node("mujoco", model=name)
@@ -135,7 +135,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
         parent = places[int(model.chain.parents[j])]
         rotation, translation = model.chain.rotation[j], model.chain.translation[j]
-        if np.linalg.norm(translation) > _SHORTEST:  # a stick shows the arm: no mass, no contact
+        if np.linalg.norm(translation) > _SHORTEST:  # shows the arm, without mass and contact
             line = as_text([0.0, 0.0, 0.0, *translation])
             _add(parent, "geom", type="capsule", fromto=line, size=as_text(_THICKNESS), mass="0",
                  contype="0", conaffinity="0")  # fmt: skip
@@ -145,13 +145,12 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
              fullinertia=as_text(six))  # fmt: skip
         friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
         third = {term.symbol: term for term in model.friction.laws[j].terms}.get("f2")
-        # Of v, v |v| and v³.
-        damping = [
+        damping = [  # of v, v |v| and v³
             friction.get("f1", 0.0),
             *(friction["f2"] if third == kind else 0.0 for kind in (QUADRATIC, CUBIC)),
         ]
         lower, upper, most = ranges.lower[j], ranges.upper[j], ranges.effort[j]
-        known = math.isfinite(lower) and math.isfinite(upper) and lower < upper
+        limited = math.isfinite(lower) and math.isfinite(upper) and lower < upper
         effort = as_text([-most, most]) if math.isfinite(most) else None
         _add(
             link,
@@ -165,7 +164,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
             solreffriction=as_text([_FRICTION_TIME, 1.0]),
             stiffness=as_text(stiffness) if stiffness else None,
             springref=as_text(rest) if stiffness else None,
-            range=as_text([lower, upper]) if known else None,
+            range=as_text([lower, upper]) if limited else None,
             actuatorfrcrange=effort,
         )
         _add(motors, "motor", name=joint_name, joint=joint_name, ctrlrange=effort)
@@ -177,7 +176,7 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
 
 
 def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as a model of SDF 1.9, its base fixed to the world; gravity is the world's."""
+    """Return the arm as a model of SDF 1.9, its base fixed to the world."""
     model = arm.model
     document = Node("sdf", version="1.9")
     _comment(document, remarks)
@@ -217,56 +216,56 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
 
 
 def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the URDF with the arm's bodies and friction, and its own name; see `write_urdf`."""
+    """Return the URDF with the arm's bodies and friction; see `write_urdf`."""
     del name
     friction = arm.values[arm.model.friction_part]
     return write_urdf(arm.urdf, arm.model, arm.standard, friction, remarks)
 
 
 class Format(NamedTuple):
-    """A file format, and what of the model it has room for."""
+    """A file format and the parts of the model that it supports."""
 
     suffix: str  # of its files
-    write: Callable[[Arm, str, Sequence[str]], str]  # an arm, its name and remarks to text
-    # text, arm and motion to the torques (m, n) that its bodies, rotors, springs and speed-
-    # dependent friction take
+    write: Callable[[Arm, str, Sequence[str]], str]  # text of an arm, its name and remarks
+    # torques (m, n) of bodies, rotors, springs and speed-dependent friction, from text, arm, motion
     read: Callable[[str, Arm, Motion], Array]
-    friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)  # kinds of term
+    friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
     rotors: bool = False  # rotor inertias, and inertia and friction of coupled motors
     springs: bool = True  # torsion springs
     payload: bool = True  # a stated payload
 
 
 class Comparison(NamedTuple):
-    """A text read back beside the model."""
+    """Comparison of a text with the model."""
 
-    # largest at `STATES` random states, as a share of the largest torque of its joint, of what
-    # the format has room for
+    # largest torque difference of the supported parts at `STATES` random states, relative to the
+    # largest torque of the joint
     difference: float
     torque: Array  # root mean square of the whole torque over the motion (n,) [N·m or N]
-    left_out: Mapping[str, Array]  # that of each part without a place in the format (n,), by words
+    left_out: Mapping[str, Array]  # that of each unsupported part (n,), by description
 
 
 def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
-    """Read a text of a format back, compare it with the arm, and measure what it leaves out.
+    """Read a text back and compare it with the arm.
 
     Raises:
-        WriteBackError: at some random state the torque is another one.
-        MissingMujocoError: the format is read by MuJoCo, which is not installed.
+        WriteBackError: the torque differs at some random state.
+        MissingMujocoError: the format needs MuJoCo, which is not installed.
     """
     states = random_states(arm)
-    expected = _said(form, arm, states)
+    expected = _supported(form, arm, states)
     error = np.abs(form.read(text, arm, states) - expected).max(axis=0)
     largest = np.abs(expected).max(axis=0)
     difference = float((error / np.where(largest > 0.0, largest, 1.0)).max())
     if not difference <= AGREES:
         joint = arm.model.joint_names[int(np.argmax(error))]
         raise WriteBackError(
-            f"read back, the torque of joint {joint!r} is another one (a share of {difference:.2g})"
+            f"read back, the torque of joint {joint!r} differs by a factor of {difference:.2g} of"
+            " its largest torque"
         )
-    left = {words: _rms(torque) for words, torque in _left_out(form, arm, motion).items()}
+    left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
     if form.read is _mujoco_torque:
-        dry = _mujoco_torque(text, arm, motion, friction=True) - _said(form, arm, motion)
+        dry = _mujoco_torque(text, arm, motion, friction=True) - _supported(form, arm, motion)
         left[_REVERSALS] = _rms(dry - _dry(arm, motion))
     whole = arm.model.torque(arm.values, *motion[1:]) + arm.model.load_torque(*motion[1:4])
     return Comparison(difference, _rms(whole), {k: v for k, v in left.items() if v.any()})
@@ -290,7 +289,7 @@ _REVERSALS: Final = "dry friction between the two directions (velocity reversals
 
 
 def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array, bool]]:
-    """Yield words, torque (m, n) and whether the format has room for it, of each part."""
+    """Yield description and torque (m, n) of each part, and whether the format supports it."""
     model, q, qdd, terms = arm.model, motion.position, motion.acceleration, arm.model.friction.terms
     yield "the links", _rigid(arm, motion), True
     for kind in model.friction.kinds:
@@ -304,30 +303,30 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
     yield "friction of coupled motors", _friction(arm, motion, motors), form.rotors
     yield "the payload", model.load_torque(*motion[1:4]) - model.elements.known(q), form.payload
     for one in model.elements.placed:
-        torque, own = np.zeros(q.shape), arm.values[model.element_part][one.part]
-        torque[:, one.joint] = one.columns(q) @ own + one.known(q)
-        room = form.springs and isinstance(one.element, TorsionSpring)
-        yield f"{type(one.element).__name__} of {one.element.joint}", torque, room
+        torque, values = np.zeros(q.shape), arm.values[model.element_part][one.part]
+        torque[:, one.joint] = one.columns(q) @ values + one.known(q)
+        supported = form.springs and isinstance(one.element, TorsionSpring)
+        yield f"{type(one.element).__name__} of {one.element.joint}", torque, supported
 
 
 def _left_out(form: Format, arm: Arm, motion: Motion) -> dict[str, Array]:
-    """Return the torque (m, n) of each part of the model that a format has no place for."""
+    """Return the torque (m, n) of each part of the model that a format does not support."""
     model, left = arm.model, dict[str, Array]()
-    for words, torque, room in _parts(form, arm, motion):
-        if not room:
-            left[words] = left.get(words, 0.0) + torque
+    for name, torque, supported in _parts(form, arm, motion):
+        if not supported:
+            left[name] = left.get(name, 0.0) + torque
     left[_REVERSALS] = _dry(arm, motion) - _dry(arm, motion, jumps=True)
     base = np.where(np.arange(model.n_parameters) < model.base.rank, arm.values, 0.0)
     whole = model.torque(base, *motion[1:])
     rounded = whole - _rigid(arm, motion) - motion.acceleration @ arm.rotors
     if np.abs(rounded).max() > AGREES * np.abs(whole).max():
-        left["what rounded angles of the URDF make of the base parameters"] = rounded
+        left["effect of rounded angles of the URDF on the base parameters"] = rounded
     return left
 
 
-def _said(form: Format, arm: Arm, motion: Motion) -> Array:
-    """Return the torque (m, n) of what a format has room for, without dry friction."""
-    parts = [torque for _, torque, room in _parts(form, arm, motion) if room]
+def _supported(form: Format, arm: Arm, motion: Motion) -> Array:
+    """Return the torque (m, n) of the parts that a format supports, without dry friction."""
+    parts = [torque for _, torque, supported in _parts(form, arm, motion) if supported]
     return np.asarray(np.sum(parts, axis=0))
 
 
@@ -346,7 +345,7 @@ def _friction(arm: Arm, motion: Motion, chosen: Sequence[bool]) -> Array:
 
 
 def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
-    """Return the torque (m, n) of dry friction, as it is or as one that jumps at zero speed."""
+    """Return the torque (m, n) of dry friction of the model, or with a jump at zero speed."""
     if not jumps:
         terms = arm.model.friction.terms
         return _friction(arm, motion, [one.term.label in _DRY_LABELS for one in terms])
@@ -358,14 +357,14 @@ def _dry(arm: Arm, motion: Motion, *, jumps: bool = False) -> Array:
 
 
 def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
-    """Torques of a URDF's bodies and damping."""
+    """Return the torques of a URDF's bodies and damping."""
     model = pinocchio_model(text, arm.model.locked)
     model.gravity.linear = arm.model.gravity
     return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
 
 
 def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
-    """Torques of the bodies, damping and springs of an SDF model, which this reads anew."""
+    """Return the torques of the bodies, damping and springs of an SDF text."""
     root = ElementTree.fromstring(text).find("model")
     assert root is not None
     model, places = pin.Model(), dict[str | None, int]()
@@ -378,10 +377,10 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
             places[child] = 0
             continue
         kind = "Revolute" if joint.get("type") == "revolute" else "Prismatic"
-        own = getattr(pin, f"JointModel{kind}Unaligned")(_figures(joint, "axis/xyz"))
+        joint_model = getattr(pin, f"JointModel{kind}Unaligned")(_figures(joint, "axis/xyz"))
         x, y, z, *rpy = _figures(links[child], "pose")
-        place = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
-        places[child] = model.addJoint(places[parent], own, place, joint.get("name"))
+        pose = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
+        places[child] = model.addJoint(places[parent], joint_model, pose, joint.get("name"))
         tensor = np.zeros((3, 3))
         for name, (i, j) in TENSOR.items():
             tensor[i, j] = tensor[j, i] = _figures(links[child], f"inertial/inertia/{name}")[0]
@@ -396,7 +395,7 @@ def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
 
 
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
-    """MuJoCo's inverse dynamics."""
+    """Return the torques of MuJoCo's inverse dynamics."""
     mujoco = load_mujoco()
     try:
         model = mujoco.MjModel.from_xml_string(text)
@@ -421,7 +420,7 @@ def load_mujoco() -> Any:
         MissingMujocoError: it is not installed.
     """
     try:
-        import mujoco  # an extra: not everybody needs it
+        import mujoco  # optional dependency
     except ImportError as error:
         raise MissingMujocoError(
             "MuJoCo is not installed; install hil with its extra: pip install 'hil[mujoco]'"
@@ -444,7 +443,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 
 def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
-    """Add inertia and friction of coupled motors, which act on weighted sums of joints."""
+    """Add inertia and friction of coupled motors as fixed tendons."""
     names, friction = arm.model.joint_names, arm.model.friction
     tendons = Node("tendon")
 
@@ -457,8 +456,8 @@ def _tendons(root: Node, arm: Arm, coupled: NDArray[np.bool_]) -> None:
         inertia, directions = np.linalg.eigh(arm.rotors[np.ix_(coupled, coupled)])
         shares = np.zeros((len(inertia), len(names)))
         shares[:, coupled] = directions.T
-        for k, (own, share) in enumerate(zip(inertia, shares, strict=True)):
-            add(f"rotors_{k + 1}", share, armature=as_text(max(0.0, float(own))))
+        for k, (value, share) in enumerate(zip(inertia, shares, strict=True)):
+            add(f"rotors_{k + 1}", share, armature=as_text(max(0.0, float(value))))
     table = arm.friction[len(names) :]
     for motor, share, row in zip(friction.motors, friction.motor_speeds(), table, strict=True):
         add(

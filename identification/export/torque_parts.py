@@ -1,4 +1,4 @@
-"""Predicted torque split: inertia, Coriolis and centrifugal, gravity, friction."""
+"""Parts of a predicted torque: inertia, Coriolis and centrifugal, gravity, friction."""
 
 from __future__ import annotations
 
@@ -16,19 +16,17 @@ Array = NDArray[np.float64]
 SPEEDS: Final = 120
 """Points of a curve in each direction."""
 TRAVELS: Final = 60
-"""Points of a curve after a reversal."""
-# Of the presliding displacement: what is left of the change by then is less than 1 %.
-_TURNED: Final = 6.0
+"""Points of a curve after a velocity reversal."""
+_TURNED: Final = 6.0  # presliding displacements until the change is complete to 1 %
 
 
 class FrictionCurve(NamedTuple):
-    """Friction torque of one joint [N·m or N], offset included, coupled motors left out."""
+    """Friction torque of one joint [N·m or N], with offset, without coupled motors."""
 
     speed: Array  # (2 SPEEDS,) [rad/s or m/s], densest around zero
-    sliding: Array  # torque (2 SPEEDS,) of a joint that slides
-    # displacement since a reversal (TRAVELS,) [rad or m]; NaN where dry friction jumps
-    travel: Array
-    turning: Array  # torque (TRAVELS,) of a joint that creeps forwards after it has gone backwards
+    sliding: Array  # torque at these speeds (2 SPEEDS,)
+    travel: Array  # displacement after a reversal (TRAVELS,) [rad or m]; NaN without presliding
+    turning: Array  # torque there (TRAVELS,), at a small positive speed after a negative one
 
 
 def friction_curve(
@@ -42,8 +40,7 @@ def friction_curve(
     table = model.friction.table(values[model.friction_part])
     coefficients = np.array([*table[joint].values()])
     steps = np.linspace(0.0, 1.0, SPEEDS) ** 2
-    # Never zero itself, where the direction is none: the curve has to show the jump.
-    steps[0] = 1e-6 * steps[1]
+    steps[0] = 1e-6 * steps[1]  # both sides of the jump at zero
     speed = np.concatenate([low * steps[::-1], high * steps])
     sliding = coefficients @ law.columns(speed, law.sign(speed))
     share = np.linspace(0.0, _TURNED, TRAVELS)  # of the presliding displacement
@@ -54,23 +51,23 @@ def friction_curve(
 
 
 def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array:
-    """Measured torque (m, n) less what parameters (p,) predict without the joints' friction."""
+    """Return measured minus predicted torque (m, n) of parameters (p,) without joint friction."""
     without = values.copy()
     without[model.friction_part] *= [term.motor for term in model.friction.terms]
     return samples.torque - samples.predicted_torque(model, without)
 
 
 class TorqueParts(NamedTuple):
-    """What a predicted torque is made of; each (m, n) [N·m or N], together the prediction."""
+    """Parts of a predicted torque, each (m, n) [N·m or N]; their sum is the prediction."""
 
     inertia: Array  # of accelerations at rest
     coriolis: Array  # of velocities, centrifugal torque included
-    gravity: Array  # of positions
+    gravity: Array
     friction: Array  # of joints and coupled motors, offsets included
 
 
 def torque_parts(model: RobotModel, values: Array, samples: Samples) -> TorqueParts:
-    """Take the torque apart that parameters (p,) predict, as the torque channel would record it."""
+    """Return the parts of the predicted torque of parameters (p,), as the channel records it."""
     if samples.whole is not None:
         whole, part = samples.whole
         return TorqueParts(*(one[part] for one in torque_parts(model, values, whole)))

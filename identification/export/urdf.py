@@ -1,10 +1,10 @@
-"""The way back: a URDF with identified inertia and friction, everything else as it was.
+"""Write identified inertia and friction into a URDF, everything else unchanged.
 
-Moving links get mass, centre of mass and tensor in the axes that their ``rpy`` gives,
-``<dynamics>`` viscous friction as ``damping`` and Coulomb friction as ``friction``. The inertia of
-what is fixed to a moving link is contained in that link's and removed, with a comment in its place;
-a locked joint and what it carries stay, if what they leave of the moving link is a possible body.
-The text is read back and its inverse dynamics compared with the regressor's before it is returned.
+Moving links get mass, centre of mass and tensor in the axes of their ``rpy``, ``<dynamics>``
+viscous friction as ``damping`` and Coulomb friction as ``friction``. The inertia of links fixed to
+a moving link is part of that link's and replaced by a comment. Locked joints keep the inertia of
+their links, if the rest of the moving link is consistent. The inverse dynamics of the written text
+are compared with the regressor before it is returned.
 """
 
 from __future__ import annotations
@@ -47,44 +47,42 @@ TENSOR: Final = {
 _DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.urdf}
 _STATES: Final = 50
 _SEED: Final = 20140902
-# Of the largest torque of a joint: what going through centre of mass and decimal text may cost.
-_ROUNDING: Final = 1e-8
+_ROUNDING: Final = 1e-8  # relative to the largest torque of a joint
 
 
 class NotConsistentError(IdentificationError):
-    """Parameters that no machine can have are not written into a robot description."""
+    """Parameters are not physically consistent."""
 
 
 class WriteBackError(IdentificationError):
-    """The description cannot take the parameters, or does not give them back when read again."""
+    """The description does not fit the model, or reads back with other parameters."""
 
 
-# An XML library that writes a tree again loses comments, the order and spacing of attributes, and
-# line ends. Here only the bytes of what changes are replaced.
+# Only changed bytes are replaced; writing a parsed tree would lose comments and formatting.
 
 
 @dataclass(eq=False)
 class Element:
-    """One element and where it stands in the UTF-8 text."""
+    """An element and its position in the UTF-8 text."""
 
     name: str  # of the tag
     attributes: dict[str, str]  # as parsed
     start: int  # first byte of the opening tag
-    inside: int  # first byte behind the opening tag
-    end: int = -1  # first byte behind the whole element
-    children: list[Element] = field(default_factory=list)  # elements directly inside
+    inside: int  # first byte after the opening tag
+    end: int = -1  # first byte after the element
+    children: list[Element] = field(default_factory=list)
 
     def child(self, name: str) -> Element | None:
-        """Return the first child of that name."""
+        """Return the first child with that tag."""
         return next((child for child in self.children if child.name == name), None)
 
     def named(self, name: str) -> dict[str, Element]:
-        """Return the children of that tag by their attribute `name`."""
+        """Return the children with that tag by their attribute `name`."""
         return {e.attributes.get("name", ""): e for e in self.children if e.name == name}
 
 
 class Edit(NamedTuple):
-    """Replace the bytes from `start` to `end` (nothing, if equal) with `text`."""
+    """Replacement of the bytes from `start` to `end`, which may be equal, with `text`."""
 
     start: int
     end: int
@@ -92,7 +90,7 @@ class Edit(NamedTuple):
 
 
 class XmlSource:
-    """An XML text that can be edited in place, and its outermost element `root`.
+    """An XML text for editing in place, with its root element `root`.
 
     Raises:
         ModelError: the text is not well-formed XML.
@@ -102,14 +100,13 @@ class XmlSource:
         self._bytes = data = text.encode("utf-8")
         self._newline = "\r\n" if b"\r\n" in data else "\n"
         parser = expat.ParserCreate("utf-8")
-        # Values may contain '>'.
-        tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")
+        tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")  # values may contain '>'
         open_elements = [Element("", {}, 0, 0)]
 
         def opened(name: str, attributes: dict[str, str]) -> None:
             start = parser.CurrentByteIndex
             found = tag.match(data, start)
-            assert found is not None, "the parser has seen a whole tag here"
+            assert found is not None
             element = Element(name, attributes, start, found.end())
             open_elements[-1].children.append(element)
             open_elements.append(element)
@@ -117,26 +114,26 @@ class XmlSource:
         def closed(_: str) -> None:
             element = open_elements.pop()
             empty = data[element.inside - 2 : element.inside] == b"/>"
-            behind = data.find(b">", parser.CurrentByteIndex) + 1
-            element.end = element.inside if empty else behind
+            after = data.find(b">", parser.CurrentByteIndex) + 1
+            element.end = element.inside if empty else after
 
         parser.StartElementHandler = opened
         parser.EndElementHandler = closed
         try:
             parser.Parse(data, True)
         except expat.ExpatError as error:
-            raise ModelError(f"the robot description is no XML: {error}") from error
+            raise ModelError(f"the robot description is not XML: {error}") from error
         self.root = open_elements[0].children[0]
 
     def edited(self, edits: Iterable[Edit]) -> str:
-        """Return the text with edits applied, which must not overlap."""
+        """Return the text with non-overlapping edits applied."""
         data = self._bytes
         for edit in sorted(edits, reverse=True):
             data = data[: edit.start] + edit.text.encode("utf-8") + data[edit.end :]
         return data.decode("utf-8")
 
     def with_attributes(self, element: Element, values: Mapping[str, str]) -> Edit:
-        """Return the edit that sets attributes; others, and their order, stay."""
+        """Return the edit that sets attributes of an element."""
         tag = self._bytes[element.start : element.inside].decode("utf-8")
         for name, value in values.items():
             written = f'"{escape(value, {chr(34): "&quot;"})}"'
@@ -149,7 +146,7 @@ class XmlSource:
         return Edit(element.start, element.inside, tag)
 
     def with_first_child(self, element: Element, lines: Iterable[str]) -> Edit:
-        """Return the edit that puts lines of XML directly behind the opening tag."""
+        """Return the edit that inserts lines of XML after the opening tag."""
         outer = self._indentation(element)
         children = [self._indentation(child) for child in element.children]
         inner = next((indent for indent in children if indent), outer + "  ")
@@ -161,20 +158,20 @@ class XmlSource:
         return Edit(element.inside, element.inside, block)
 
     def with_comment(self, lines: Iterable[str]) -> Edit:
-        """Return the edit that puts a comment of these lines in front of the outermost element."""
+        """Return the edit that inserts a comment before the root element."""
         inside = comment_text(self._newline.join(f"  {line}" for line in lines))
         at = self.root.start
         return Edit(at, at, self._newline.join(["<!--", inside, "-->", ""]))
 
     def _indentation(self, element: Element) -> str:
-        """Return the white space in front of an element that begins its line, else nothing."""
+        """Return the white space before an element at the start of its line, else nothing."""
         before = self._bytes[: element.start].decode("utf-8")
         line = before[before.rfind("\n") + 1 :]
         return line if not line.strip() else ""
 
 
 def comment_text(text: str) -> str:
-    """Return text that may stand inside a comment, which two dashes in a row would end."""
+    """Return text for a comment, without consecutive dashes."""
     return re.sub("-(?=-)", "- ", text)
 
 
@@ -185,21 +182,21 @@ def write_urdf(
     friction: Array | None = None,
     remarks: Sequence[str] = (),
 ) -> str:
-    """Return the URDF text with other inertial parameters, and friction if given.
+    """Return the URDF text with new inertial parameters, and friction if given.
 
     Args:
-        urdf: the text of the file that the model was made from.
+        urdf: text that the model was created from.
         model: the robot.
-        standard: all standard parameters (s,), as in `model.standard_names`.
-        friction: coefficients (k,), see `RobotModel.friction_part`; none leaves
-            ``<dynamics>`` as it is, NaN leaves that figure.
-        remarks: lines of a comment in front of the robot.
+        standard: all standard parameters (s,), see `RobotModel.standard_names`.
+        friction: coefficients (k,), see `RobotModel.friction_part`; a NaN leaves its attribute,
+            None all of ``<dynamics>`` unchanged.
+        remarks: lines of a comment before the robot.
 
     Raises:
-        NotConsistentError: a link, a rotor or friction is not physically possible.
-        WriteBackError: the text is not of this robot, or reads back as another.
-        ModelError: the text is no URDF.
-        ShapeError: an array does not have the shape it should have.
+        NotConsistentError: a link, a rotor or friction is not physically consistent.
+        WriteBackError: the text is of another robot, or reads back with other parameters.
+        ModelError: the text is not a URDF.
+        ShapeError: an array has the wrong shape.
     """
     standard = model.layout.checked(standard)
     inertial = standard[model.layout.links]
@@ -208,13 +205,13 @@ def write_urdf(
         terms = [*model.friction.table(friction)][: model.n_joints]
     dynamics = [
         {
-            attribute: own[symbol]
+            attribute: values[symbol]
             for symbol, attribute in _DYNAMICS.items()
-            if math.isfinite(own.get(symbol, math.nan))
+            if math.isfinite(values.get(symbol, math.nan))
         }
-        for own in terms
+        for values in terms
     ]
-    _refuse_impossible(model, standard, inertial, dynamics)
+    _require_consistent(model, standard, inertial, dynamics)
     bodies, removed = _without_locked(urdf, model, inertial)
     source = XmlSource(urdf)
     tree = _Tree(source.root, model, removed)
@@ -224,7 +221,6 @@ def write_urdf(
         edits += _inertia_edits(source, link, body(parameters))
         for merged in tree.fixed_to(link):
             if (element := merged.child("inertial")) is not None:
-                # Its mass is counted with the link that it is fixed to.
                 name = comment_text(link.attributes["name"])
                 note = f"<!-- inertia is contained in {name} -->"
                 edits.append(Edit(element.start, element.end, note))
@@ -237,7 +233,7 @@ def write_urdf(
 
 
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
-    """Return in words which of the model's parameters a URDF has no place for."""
+    """Return descriptions of the model's parameters that a URDF cannot represent."""
     absent = {
         "rotor inertias": model.rotor_inertia,
         "coupling inertias": bool(model.layout.pairs),
@@ -246,11 +242,15 @@ def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
         "the payload": model.payload is not None,
         "springs and balancers": bool(model.elements.elements),
     }
-    return tuple(words for words, there in absent.items() if there)
+    return tuple(description for description, present in absent.items() if present)
 
 
 def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Array, frozenset[str]]:
-    """Subtract what locked joints carry from the links (n, 10), where a possible body is left."""
+    """Subtract links of locked joints from moving links (n, 10), if these remain consistent.
+
+    Returns:
+        the parameters (n, 10), and the names of joints whose links were subtracted.
+    """
     if not model.locked:
         return inertial, frozenset()
     arm = pin.buildModelFromXML(urdf)
@@ -258,28 +258,28 @@ def _without_locked(urdf: str, model: RobotModel, inertial: Array) -> tuple[Arra
     pin.forwardKinematics(arm, data, locked_posture(arm, model.locked))
     carried: dict[int, dict[str, Array]] = {}  # by the moving joint, -1 for the base
     for name in model.locked:
-        own = before = arm.getJointId(name)
-        while before > 0 and arm.names[before] in model.locked:
-            before = arm.parents[before]
-        moved = (data.oMi[before].inverse() * data.oMi[own]).act(arm.inertias[own])
-        carrier = model.joint_names.index(arm.names[before]) if before > 0 else -1
-        about = moved.toDynamicParameters()[list(FROM_PINOCCHIO)]
-        carried.setdefault(carrier, {})[name] = about
-    left, removed = inertial.copy(), list(carried.get(-1, {}))
-    for carrier, bodies in carried.items():
-        if carrier >= 0:
-            rest = left[carrier] - sum(bodies.values())
+        joint = parent = arm.getJointId(name)
+        while parent > 0 and arm.names[parent] in model.locked:
+            parent = arm.parents[parent]
+        moved = (data.oMi[parent].inverse() * data.oMi[joint]).act(arm.inertias[joint])
+        index = model.joint_names.index(arm.names[parent]) if parent > 0 else -1
+        parameters = moved.toDynamicParameters()[list(FROM_PINOCCHIO)]
+        carried.setdefault(index, {})[name] = parameters
+    remaining, removed = inertial.copy(), list(carried.get(-1, {}))
+    for index, bodies in carried.items():
+        if index >= 0:
+            rest = remaining[index] - sum(bodies.values())
             if margin(rest) > 0.0:
-                left[carrier] = rest
+                remaining[index] = rest
                 removed += bodies
-    return left, frozenset(removed)
+    return remaining, frozenset(removed)
 
 
 class _Tree:
     """Links and joints of a description by name; locked joints not in `removed` count as fixed."""
 
     def __init__(self, root: Element, model: RobotModel, removed: Collection[str]) -> None:
-        # Not every <joint> is one: a transmission has elements of that name, deeper down.
+        # children only: transmissions have <joint> elements too
         self.links, self.joints = root.named("link"), root.named("joint")
         self._rigid: list[Element] = []
         missing = [name for name in model.joint_names if name not in self.joints]
@@ -292,12 +292,12 @@ class _Tree:
                 self._rigid += [] if name in removed else [joint]
             elif name not in model.joint_names:
                 raise WriteBackError(
-                    f"joint {name!r} moves in the description but not in the model: the inertia"
-                    " of its payload is not known by itself"
+                    f"joint {name!r} moves in the description but not in the model, so that the"
+                    " inertia of its link is unknown"
                 )
 
     def fixed_to(self, link: Element) -> Iterator[Element]:
-        """Yield the links that fixed joints carry on from a link, all the way."""
+        """Yield the links that are fixed to a link, directly or through others."""
         for joint in self._rigid:
             if self.end(joint, "parent") is link:
                 carried = self.end(joint, "child")
@@ -316,15 +316,15 @@ class _Tree:
 
 
 def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]:
-    """Set, or put in, the inertial element of a link."""
+    """Set or insert the inertial element of a link."""
     element = link.child("inertial")
     origin = element and element.child("origin")
-    turn = _rotation(origin.attributes.get("rpy", "")) if origin else np.eye(3)
-    turned = turn.T @ of.inertia @ turn
+    rotation = _rotation(origin.attributes.get("rpy", "")) if origin else np.eye(3)
+    tensor = rotation.T @ of.inertia @ rotation
     parts = {
         "origin": {"xyz": as_text(of.centre)},
         "mass": {"value": as_text(of.mass)},
-        "inertia": {name: as_text(turned[place]) for name, place in TENSOR.items()},
+        "inertia": {name: as_text(tensor[index]) for name, index in TENSOR.items()},
     }
     if element is not None:
         yield from _set(source, element, parts)
@@ -337,7 +337,7 @@ def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]
 def _set(
     source: XmlSource, parent: Element, parts: Mapping[str, Mapping[str, str]]
 ) -> Iterator[Edit]:
-    """Set attributes of an element's children, and put in those that it has not."""
+    """Set attributes of an element's children, and insert missing children."""
     missing = []
     for name, values in parts.items():
         if (child := parent.child(name)) is None:
@@ -353,24 +353,23 @@ def _tag(name: str, values: Mapping[str, str]) -> str:
 
 
 def as_text(values: float | Sequence[float] | Array) -> str:
-    """Return numbers as the shortest text that is read back as the same ones."""
-    # No minus in front of zero.
-    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))
+    """Return numbers as the shortest text that reads back identically."""
+    return " ".join(repr(float(value) + 0.0) for value in np.atleast_1d(values))  # no -0.0
 
 
 def _rotation(rpy: str) -> Array:
-    """Return the rotation of a URDF's roll, pitch and yaw, about fixed axes; none is none."""
+    """Return the rotation of a URDF's roll, pitch and yaw, about fixed axes."""
     angles = [float(angle) for angle in rpy.split()] or [0.0] * 3
     return np.asarray(pin.rpy.rpyToMatrix(np.array(angles)))
 
 
-def _refuse_impossible(
+def _require_consistent(
     model: RobotModel, standard: Array, inertial: Array, dynamics: Sequence[Mapping[str, float]]
 ) -> None:
-    """Raise `NotConsistentError` for what no machine can have."""
-    for place in np.flatnonzero(~np.isfinite(standard)):
-        raise NotConsistentError(f"parameter {model.standard_names[place]} is no number")
-    _refuse_links(model, inertial, "write the physically consistent estimate")
+    """Raise `NotConsistentError` for inconsistent parameters."""
+    for index in np.flatnonzero(~np.isfinite(standard)):
+        raise NotConsistentError(f"parameter {model.standard_names[index]} is not finite")
+    _require_consistent_links(model, inertial, "write the physically consistent estimate")
     rotors = model.layout.rotor_matrix(standard)
     for joint, rotor in zip(model.joint_names, np.diag(rotors), strict=True):
         if not rotor >= 0.0:
@@ -385,43 +384,41 @@ def _refuse_impossible(
         for attribute, value in values.items():
             if value < 0.0:
                 raise NotConsistentError(
-                    f"{attribute} of joint {joint!r} is {value:.3g}; friction takes energy, it is"
-                    " never negative"
+                    f"{attribute} of joint {joint!r} is {value:.3g}; it must not be negative"
                 )
 
 
-def _refuse_links(model: RobotModel, inertial: Array, remedy: str) -> None:
+def _require_consistent_links(model: RobotModel, inertial: Array, remedy: str) -> None:
     for joint, smallest in zip(model.joint_names, margin(inertial), strict=True):
         if not smallest > 0.0:
             raise NotConsistentError(
-                f"the link of joint {joint!r} is no possible body: its pseudo-inertia has the"
-                f" eigenvalue {smallest:.3g}; {remedy}"
+                f"the link of joint {joint!r} is not physically consistent: its pseudo-inertia has"
+                f" the eigenvalue {smallest:.3g}; {remedy}"
             )
 
 
 def _compare(
     text: str, model: RobotModel, inertial: Array, dynamics: Sequence[Mapping[str, float]]
 ) -> None:
-    """Raise `WriteBackError` unless the text is read back as the robot that was meant."""
+    """Raise `WriteBackError` unless the text reads back with the written parameters."""
     chain = chain_from_urdf(text, model.locked)
     if chain.joint_names != model.joint_names:
-        raise WriteBackError("the description is of another robot: its joints are not the model's")
+        raise WriteBackError("the description has other joints than the model")
     motion = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     expected = plan.torque(inertial.reshape(-1), *motion)
     arm = pinocchio_model(text, model.locked)
     arm.gravity.linear = model.gravity
     error = np.abs(rnea(arm, *motion) - expected).max(axis=0)
-    # Links of very different mass share the rounding of the largest.
     allowed = _ROUNDING * max(float(np.abs(expected).max()), 1.0)
     for joint in np.flatnonzero(~(error <= allowed)):
         raise WriteBackError(
-            "the written description gives other torques: joint"
-            f" {model.joint_names[joint]!r} by {error.max():.3g}"
+            f"the torque of joint {model.joint_names[joint]!r} differs by {error.max():.3g} in the"
+            " written description"
         )
     if not np.allclose(chain.inertial, inertial, rtol=0.0, atol=_ROUNDING * np.abs(inertial).max()):
-        raise WriteBackError("the written description gives other inertial parameters")
-    _refuse_links(model, chain.inertial, "rounding makes it that")
+        raise WriteBackError("the written description has other inertial parameters")
+    _require_consistent_links(model, chain.inertial, "by rounding in the written text")
     written = {
         joint.get("name"): joint.find("dynamics") for joint in urdf_tree(text).findall("joint")
     }
@@ -435,10 +432,10 @@ def _compare(
 def rnea(arm: pin.Model, q: Array, qd: Array, qdd: Array) -> Array:
     """Return pinocchio's torques (m, n) of a model, for motion arrays (m, n)."""
     data = arm.createData()
-    still = pin.neutral(arm)  # joints that turn on and on have two coordinates
+    neutral = pin.neutral(arm)  # continuous joints have two coordinates
     return np.array(
         [
-            pin.rnea(arm, data, pin.integrate(arm, still, a), b, c)
+            pin.rnea(arm, data, pin.integrate(arm, neutral, a), b, c)
             for a, b, c in zip(q, qd, qdd, strict=True)
         ]
     )

@@ -189,7 +189,7 @@ def test_possible_parameters_alone_become_a_urdf(arm: IdentifiedArm, tmp_path: P
     broken[arm.cell.model.layout.links[1, 9]] = -1.0
     impossible = replace(arm.consistency.consistent, standard=broken)
     found = write_exports(tmp_path, arm.cell, arm.estimate, impossible)
-    assert "no possible body" in found.withheld["identified.urdf"]
+    assert "not physically consistent" in found.withheld["identified.urdf"]
     assert not (tmp_path / "identified.urdf").exists()
 
 

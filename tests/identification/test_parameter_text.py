@@ -25,7 +25,7 @@ from identification import (
     ShapeError,
 )
 from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
-from identification.export.friction import friction_in_words, friction_source
+from identification.export.friction import friction_source, friction_text
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
@@ -184,14 +184,14 @@ class TestFrictionInWords:
     )
     def test_formula_and_values_of_each_joint(self, third: ThirdTerm, formula: str) -> None:
         values = np.array([4.0, 2.0, 1.5, 0.8, -0.1, 0.2])
-        words = friction_in_words(with_law(FrictionLaw(third=third)), values)
+        words = friction_text(with_law(FrictionLaw(third=third)), values)
         assert f"f0 sgn(v) + f1 v + {formula}" in words
         assert "shoulder: f0 = 4 N·m, f1 = 1.5 N·m·s/rad, f2 = -0.1" in words
         assert "0.01 rad/s" in words
 
     def test_without_friction_it_says_so(self) -> None:
         model = with_law(FrictionLaw(coulomb=False, viscous=False, third=None))
-        assert "no friction" in friction_in_words(model, np.empty(0))
+        assert "no friction" in friction_text(model, np.empty(0))
         assert in_source(model, np.empty(0))["friction"](0, 1.0) == 0.0
 
     def test_what_is_special_about_a_joint_or_motor(self) -> None:
@@ -200,7 +200,7 @@ class TestFrictionInWords:
             joint_friction={"elbow": FrictionLaw(third=None, stribeck=0.4)},
             coupling=Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False),
         )
-        text = friction_in_words(model, np.arange(len(model.friction.terms), dtype=float))
+        text = friction_text(model, np.arange(len(model.friction.terms), dtype=float))
         for words in (
             "Slower than 0.1 rad/s (m/s) shoulder: sgn(v) is v / standstill",
             "Slower than 0.01 rad/s (m/s) elbow: nothing was fitted",
@@ -210,7 +210,7 @@ class TestFrictionInWords:
         ):
             assert words in text
 
-    @pytest.mark.parametrize("write", [friction_in_words, friction_source])
+    @pytest.mark.parametrize("write", [friction_text, friction_source])
     def test_coefficients_of_another_law_are_refused(
         self, write: Callable[[RobotModel, np.ndarray], str]
     ) -> None:
@@ -222,5 +222,5 @@ class TestFrictionInWords:
         model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=DRY)
         values = np.array([1.0, 2.0, 3.0, 4.0])
         assert in_source(model, values)["JOINTS"] == model.joint_names
-        lines = friction_in_words(with_law(), values).splitlines()
-        assert len(friction_in_words(model, values).splitlines()) == len(lines)
+        lines = friction_text(with_law(), values).splitlines()
+        assert len(friction_text(model, values).splitlines()) == len(lines)
