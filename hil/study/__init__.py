@@ -1,4 +1,4 @@
-"""The paper's study: methods A and B designed, executed, identified and compared."""
+"""The paper's study: design, execution, identification and comparison of methods A and B."""
 
 from .results import StudyResults
 from .run import run_study

@@ -31,7 +31,7 @@ from .settings import Effort, StudyFolder, StudySettings
 A, B, B0, AP = "a", "b", "b0", "a-printed"
 LABELS: Final = {A: "A", B: "B", B0: "B, fly 0", AP: "A as printed"}
 OWN_CLASS: Final = {B: "fly-by", B0: "stop-to-stop", A: "sinusoid"}
-"""Class of the held-out motions of each method's campaign, which its excitation is of."""
+"""Class of the excitation and the held-out motions of each method."""
 SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "a-middle": ("about the middle of the ranges, frequencies as printed", {}),
     "a-home": ("about the home posture, frequencies as printed", {"offset": "home"}),
@@ -44,27 +44,24 @@ SINES: Final[dict[str, tuple[str, dict[str, str]]]] = {
         {"offset": "home", "fastest": "from limits"},
     ),
 }
-"""Method A has a search for each choice that the paper leaves open, and uses the best."""
+"""Variants of method A where the paper is not specific; each is searched and the best is used."""
 PRINTED_SINES: Final = ("a-middle", "a-home")
-"""Those with the frequencies of the paper's Table 1, which are for six joints."""
+"""Variants with the frequencies of the paper's Table 1, for six joints."""
 _PRINTED_JOINTS: Final = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """One search: the key names its folder, `words` say what is searched.
+    """One search."""
 
-    `excitation` is None before the search, and where no motion satisfied the constraints.
-    """
-
-    key: str
-    words: str
+    key: str  #: name of its folder
+    words: str  #: description
     settings: DesignSettings
-    excitation: Excitation | None = None
+    excitation: Excitation | None = None  #: None before the search, or if nothing was found
 
     @property
     def notes(self) -> str:
-        """What is searched and how long, as the notes of the paper's Table 1."""
+        """Settings, as in the notes of the paper's Table 1."""
         search, via, sines = self.settings.search, self.settings.via_points, self.settings.sines
         effort = f"{search.population} individuals, {search.generations} generations"
         if via is not None:
@@ -76,13 +73,13 @@ class Search:
 
 
 def searches(settings: StudySettings, n_joints: int) -> list[Search]:
-    """All searches of a study, those that everything rests on first."""
+    """Return all searches of a study, the main ones first."""
 
-    def asked(method: Literal["a", "b"], effort: Effort) -> DesignSettings:
+    def sized(method: Literal["a", "b"], effort: Effort) -> DesignSettings:
         sizes = {"population": effort.population, "generations": effort.generations, "polish": 0}
         return preset(method).replaced(seed=settings.seed, search=sizes)
 
-    a, b = asked("a", settings.effort_a), asked("b", settings.effort_b)
+    a, b = sized("a", settings.effort_a), sized("b", settings.effort_b)
     found = [
         Search(key, f"method A, sines {words}", a.replaced(sines=sines))
         for key, (words, sines) in SINES.items()
@@ -101,7 +98,7 @@ def searches(settings: StudySettings, n_joints: int) -> list[Search]:
 
 
 def variant_key(name: Literal["via", "weight", "fly"], value: float) -> str:
-    """Key of B with one setting varied; that of B itself for its own value."""
+    """Return the key of method B with one setting changed."""
     settings = preset("b")
     via = settings.via_points
     assert via is not None  # method B has via points
@@ -112,10 +109,10 @@ def variant_key(name: Literal["via", "weight", "fly"], value: float) -> str:
 def run_searches(
     folder: StudyFolder, cell: Cell, wanted: Sequence[Search], reporter: Reporter, workers: int
 ) -> dict[str, Search]:
-    """Search what was not found yet; an interrupted search resumes from its journal.
+    """Run the searches that are not complete; an interrupted search resumes from its journal.
 
     Raises:
-        HilError: see :func:`hil.design.run.run_design`; that a search finds nothing is no error.
+        HilError: see :func:`hil.design.run.run_design`, except if a search finds nothing.
     """
     found = {}
     for number, one in enumerate(wanted, 1):
@@ -129,14 +126,14 @@ def run_searches(
                     place, cell, one.settings, reporter, workers=workers, resume=resume
                 ).result
             except NoExcitationError as error:
-                reporter.say(f"no motion was found: {error}")
+                reporter.say(f"no feasible motion: {error}")
                 result = None
         found[one.key] = replace(one, excitation=None if result is None else result.excitation)
     return found
 
 
 def best_sines(found: Mapping[str, Search], keys: Collection[str] = tuple(SINES)) -> str | None:
-    """Key of the sines of largest determinant among some, which is what method A searches."""
+    """Return the key of the sines with the largest determinant, the criterion of method A."""
     known = {
         key: one.excitation.criteria.log10_det
         for key, one in found.items()
@@ -146,10 +143,10 @@ def best_sines(found: Mapping[str, Search], keys: Collection[str] = tuple(SINES)
 
 
 def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionChecks) -> Excitation:
-    """The via points of an excitation run with another fly-by share.
+    """Plan the via points of an excitation with another fly-by share.
 
     Raises:
-        NoExcitationError: the motion must not be sent, or cannot be planned.
+        NoExcitationError: the motion cannot be planned or violates a constraint.
     """
     points, speed = excitation.via_points, excitation.speed
     assert points is not None and speed is not None
@@ -166,36 +163,33 @@ def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionCheck
 T = TypeVar("T")
 
 NO_EFFECTS, EFFECTS, ABLATION = "plain", "effects", "ablation"
-LONGEST: Final = 6 * 3600.0  #: s that one campaign, or one reading of archives, may last
+LONGEST: Final = 6 * 3600.0  #: Time limit of one campaign or one estimation, s
 
-# Streams of random numbers that no search and no other class draws from.
+# Seeds that differ from those of searches and of other classes.
 _STOPS_SEED, _SINES_SEED, _TRIES = 1_000_003, 5, 400
 
 
 class StudyError(HilError):
-    """A part of a study was not completed; starting it again resumes there."""
+    """A study was not completed; a restart resumes it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Execution:
-    """One campaign to be run: its folder, the cell with the number of repetitions, and its plan.
+    """One campaign of the study."""
 
-    With `effects`, the unmodelled effects are switched on.
-    """
-
-    root: Path
+    root: Path  #: its folder
     cell: Cell
     plan: CampaignPlan
-    effects: bool = False
+    effects: bool = False  #: whether unmodelled effects are simulated
 
     @property
     def motions(self) -> int:
-        """Archives that are read later."""
+        """Number of archives."""
         return 1 + self.cell.campaign.repetitions + len(self.plan.validation)
 
     @property
     def complete(self) -> bool:
-        """Whether every one of them exists as it was written."""
+        """Whether all archives exist and are intact."""
         folder, kinds = CampaignFolder(self.root), ("standstill", "excitation", "validation")
         return (self.root / "manifest.json").exists() and (
             sum(len(folder.completed(kind)) for kind in kinds) >= self.motions
@@ -207,22 +201,21 @@ class Plans:
     """All campaigns of a study."""
 
     searched: dict[str, str]
-    """Key of the search that each method's excitation is of; `AP`, the paper's own sines, is there
-    only where these are not those of A."""
+    """Key of each method's search; with `AP` only if the printed sines differ from those of A."""
     executions: dict[str, dict[str, Execution]]  #: By condition and key
-    missing: list[str]  #: What cannot be run, in sentences
+    missing: list[str]  #: Notes on campaigns that cannot be run
 
     @property
     def all(self) -> list[Execution]:
-        """Every campaign, the longest first: several processes then end at about the same time."""
+        """All campaigns, the longest first to balance the load of the workers."""
         every = [one for some in self.executions.values() for one in some.values()]
         return sorted(every, key=lambda one: (one.motions, one.effects), reverse=True)
 
     def without(self, ended: Mapping[Path, str]) -> Plans:
-        """These plans less the campaigns that the controller ended, by folder.
+        """Return the plans without campaigns that the controller ended, given by folder.
 
         Raises:
-            StudyError: A, B or B with fly 0 itself was ended.
+            StudyError: A, B or B with fly 0 was ended.
         """
         missing = list(self.missing)
         for condition, some in self.executions.items():
@@ -231,9 +224,8 @@ class Plans:
                     continue
                 if key == B or (condition != ABLATION and key != AP):
                     raise StudyError(
-                        f"{one.root}: this arm cannot bear the excitation that was found for it:"
-                        f" {ended[one.root]}; another search (--seed, in another folder) finds"
-                        " another one"
+                        f"{one.root}: the controller ended the excitation: {ended[one.root]};"
+                        " search another one with --seed, in another folder"
                     )
                 missing.append(f"{key} could not be run: {ended[one.root]}")
         left = {
@@ -244,19 +236,17 @@ class Plans:
 
 
 def noise_key(method: str, factor: float) -> str:
-    """Key of a method's campaign with so many times the noise."""
+    """Return the key of a method's campaign with `factor` times the noise."""
     return f"{method}-noise-{factor:g}"
 
 
 def plan_study(
     folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Search]
 ) -> Plans:
-    """Plan all campaigns of a study.
-
-    Each method's campaign is a whole one: its excitation, and held-out motions of its own class.
+    """Plan all campaigns of a study, each with held-out motions of its own class.
 
     Raises:
-        NoExcitationError: a method has no motion, or no held-out motion satisfies the constraints.
+        NoExcitationError: no feasible excitation or held-out motion of a method.
     """
     checks, printed = MotionChecks.of(cell), best_sines(found, PRINTED_SINES)
     sines = best_sines(found) or next(key for key in SINES if key in found)
@@ -272,10 +262,10 @@ def plan_study(
             )
         excitations[key] = one
     count, seed, fly = settings.motions, settings.seed, excitations[B].fly
-    assert fly  # of the preset, above 0: its held-out motions are fly-by whatever the cell says
+    assert fly  # of the preset, above 0
 
     def via_motions(key: str, fly: float, seed: int) -> tuple[PlannedMotion, ...]:
-        """Wide random motions through as many via points as the cell's excitation has."""
+        """Return random motions through as many via points as the cell's excitation has."""
         own = {"campaign.fly": fly, "campaign.seed": seed, "campaign.validation_runs": count}
         return plan_around(cell.with_values(own), excitations[key], checks).validation
 
@@ -316,7 +306,7 @@ def _varied(
     own: Excitation,
     checks: MotionChecks,
 ) -> tuple[dict[str, Excitation], list[str]]:
-    """Excitations of the ablations by key, B's own among them; and what there is none of."""
+    """Return the excitations of the ablations by key, including B, and notes on missing ones."""
     varied, missing = {B: own}, list[str]()
     for fly in settings.fly:
         key = variant_key("fly", fly)
@@ -324,7 +314,7 @@ def _varied(
             try:
                 varied[key] = with_fly(cell, own, fly, checks)
             except NoExcitationError as error:
-                missing.append(f"B's via points cannot be run so: {error}.")
+                missing.append(f"B's via points are not feasible with this setting: {error}.")
     wanted = [variant_key("via", n) for n in settings.n_via]
     wanted += [variant_key("weight", weight) for weight in settings.coupling_weight]
     for key in wanted + [key for key in SINES if key in found]:
@@ -387,16 +377,16 @@ def execute_all(
 
 
 def execute(execution: Execution) -> str | None:
-    """Run one campaign, in whatever process this is; complete archives in its folder are reused.
+    """Run or resume one campaign.
 
     Returns:
-        Why the controller ended it, if it did: an arm may not bear what is tried on it.
+        Reason if the controller ended it.
     """
     root = execution.root
     if (root / "manifest.json").exists():
         campaign = Campaign.open(root)
     else:
-        if root.exists():  # killed while the folder was made
+        if root.exists():  # interrupted while it was created
             shutil.rmtree(root)
         campaign = Campaign.create(root, execution.cell, execution.plan)
     try:
@@ -421,12 +411,12 @@ def in_children(
     workers: LocalWorkers,
     of: int,
 ) -> list[T]:
-    """Call a function of a module with the arguments of each place; results in order.
+    """Call a function in child processes with the arguments of each place; results in order.
 
-    `of` is the number of calls of the whole task, those included that are not needed any more.
+    `of` is the number of calls for the progress bar, including those already done.
 
     Raises:
-        StudyError: a call was refused, ended its process, or lasted too long.
+        StudyError: a call failed, crashed or timed out.
     """
     tasks = [ArchiveTask(str(place), function, own) for place, own in calls]
     found: list[T] = []

@@ -1,8 +1,8 @@
-"""Records of the archives that were read, one JSON file each, so that none is read twice.
+"""Estimates and predictions from the archives of a study, cached as JSON records.
 
-The error that parameters leave is linear in them, Phi pi - tau, and so is a low-pass. Its squared
-length is therefore y' G y with y = [-pi; 1] and G the Gram matrix of the low-passed [Phi | tau]:
-one matrix for each motion gives the error of every estimate, without its archive.
+The torque error Phi pi - tau is linear in the parameters pi, also after a low-pass. Its squared
+norm is y' G y with y = [-pi; 1] and G the Gram matrix of the low-passed [Phi | tau], so that one
+matrix per motion gives the error of any estimate.
 """
 
 from __future__ import annotations
@@ -37,43 +37,43 @@ from .campaigns import OWN_CLASS, in_children
 Array = NDArray[np.float64]
 
 VERSION: Final = 7
-"""Counted up when the same archives come to give other numbers, or a record another form."""
-PLANTED: Final = "planted"  #: Name of the planted parameters among the estimates
-SHOWN: Final = 1200  #: Rows of a series that a figure is drawn from, at most
+"""To be incremented when numbers or format of the records change."""
+PLANTED: Final = "planted"  #: Key of the true parameters among the estimates
+SHOWN: Final = 1200  #: Maximum number of rows of a series in a figure
 FIGURE_DIGITS: Final = 5
-_MOVES: Final = 1e-3  # rad/s or m/s: a joint that is faster moves
+_MOVING: Final = 1e-3  # speed above which a joint moves, rad/s or m/s
 
 
 class Record(Frozen):
-    """What one reading of archives gave; `inputs` is a digest of all that it rests on."""
+    """A cached result."""
 
-    inputs: str
+    inputs: str  #: Digest of everything it depends on
 
 
 class Fitted(Frozen):
-    """Estimate from all repetitions of one excitation; lists are in the model's order."""
+    """Estimate from all repetitions of one excitation."""
 
     pooled: list[float]
     pooled_std: list[float]
     undetermined: list[str]
-    log10_det: float  #: Of the motion as it was executed, as the next ones
-    coupling_index: float
-    correlation: list[list[float]]
+    log10_det: float  #: Of the executed motion
+    coupling_index: float  #: Of the executed motion
+    correlation: list[list[float]]  #: Of the executed motion
     time: list[float]
-    position: list[list[float]]  #: Joint by joint, of the first repetition
+    position: list[list[float]]  #: Per joint, of the first repetition
 
 
 class FitRecord(Record, Fitted):
     """Estimates from the repetitions of one excitation."""
 
     repetitions: list[str]
-    values: list[list[float]]  #: Of each repetition by itself (eq. 4).
-    n_samples: int  #: Of one repetition, as it was executed
+    values: list[list[float]]  #: Of each repetition (eq. 4)
+    n_samples: int  #: Of one repetition
     duration: float
 
 
 class ExampleRecord(Frozen):
-    """One motion in time, low-passed for the figure; lists are joint by joint."""
+    """Time series of one motion, low-passed for the figure; lists are per joint."""
 
     archive: str
     time: list[float]
@@ -91,17 +91,16 @@ class MotionForm(Frozen):
 
 
 class ScoreRecord(Record):
-    """The motions of one class, and what of their errors the forms do not give."""
+    """Prediction of the held-out motions of one class."""
 
     durations: list[float]
     left_out: list[float]
-    """Share of the samples, from the first to the last at which a joint moves, that the errors
-    leave out, per joint: at rest, near ends, at reversals."""
+    """Share of the moving samples that the errors exclude (rest, ends, reversals), per joint."""
     forms: list[MotionForm]
     mean_abs: dict[str, list[list[float]]]
-    """By estimate, motion by motion: mean |e| per joint, N·m."""
+    """Mean |e| by estimate, motion and joint, N·m."""
     all_rows: dict[str, list[float]]
-    """By estimate: relative error of each motion, rows that are left out included."""
+    """Relative error over all rows, by estimate and motion."""
     examples: list[ExampleRecord]
 
 
@@ -109,7 +108,7 @@ R = TypeVar("R", bound=Record)
 
 
 def read_record(path: Path, kind: type[R], inputs: str) -> R | None:
-    """The record in a file, if it rests on these inputs."""
+    """Return the record in a file, None if it is absent or of other inputs."""
     try:
         record = kind.model_validate_json(read_text(path))
     except (OSError, ValueError):
@@ -123,25 +122,25 @@ def write_record(path: Path, record: Record) -> None:
     write_output(path, record.model_dump_json() + "\n")
 
 
-# What a motion says of any estimate
+# Errors of estimates on motions
 
 
 class ClassForms(NamedTuple):
-    """The forms of all motions of one class; m motions, n joints, p parameters."""
+    """Gram matrices of the m motions of one class, all joints; p parameters."""
 
-    slow: Array  #: of the low-passed [Phi | tau], all joints together (m, p + 1, p + 1)
-    whole: Array  #: of Phi, likewise (m, p, p)
+    slow: Array  #: of the low-passed [Phi | tau] (m, p + 1, p + 1)
+    whole: Array  #: of Phi (m, p, p)
     torque_squared: Array  #: sum over all joints (m,)
 
     @classmethod
     def of(cls, forms: Sequence[MotionForm]) -> ClassForms:
-        """Arrays of the forms of the motions."""
+        """Stack the matrices of motions."""
         whole = np.array([one.whole for one in forms])
         slow = np.array([one.slow for one in forms])
         return cls(slow, whole, np.array([one.torque_squared for one in forms]))
 
     def torque_kernels(self, values: Array) -> Array:
-        """Inner products (m, r, r) of the low-passed errors that r estimates (r, p) leave.
+        """Return the inner products (m, r, r) of the low-passed errors of r estimates (r, p).
 
         The error of a weighted mean of estimates is the same mean of their errors.
         """
@@ -149,29 +148,29 @@ class ClassForms(NamedTuple):
         return np.asarray(left @ self.slow @ left.T)
 
     def own_kernels(self, values: Array, truth: Array) -> Array:
-        """The same (m, r, r) of Phi (pi - truth), the errors of the estimates themselves."""
+        """Return the inner products (m, r, r) of Phi (pi - truth)."""
         away = values - truth
         return np.asarray(away @ self.whole @ away.T)
 
     def relative(self, kernels: Array, weights: Array) -> Array:
-        """Error over torque (m, s) of weighted means of estimates, weights (s, r), on each motion.
+        """Return the relative errors (m, s) of weighted means of estimates, weights (s, r).
 
-        `kernels` (m, r, r) are of one of the two kinds above.
+        `kernels` (m, r, r) are those of `torque_kernels` or `own_kernels`.
         """
         squared = np.maximum(((weights @ kernels) * weights).sum(axis=2), 0.0)
         return np.asarray(np.sqrt(squared / self.torque_squared[:, None]))
 
     def overall(self, estimate: Array) -> Array:
-        """||e|| / ||tau|| of one estimate (p,) on each motion (m,), low-passed."""
+        """Return ||e|| / ||tau|| of one estimate (p,) on each motion (m,), low-passed."""
         return self.relative(self.torque_kernels(estimate[None]), np.ones((1, 1)))[:, 0]
 
     def own(self, estimate: Array, truth: Array) -> Array:
-        """||Phi (pi - truth)|| / ||tau|| of one estimate (p,) on each motion (m,)."""
+        """Return ||Phi (pi - truth)|| / ||tau|| of one estimate (p,) on each motion (m,)."""
         return self.relative(self.own_kernels(estimate[None], truth), np.ones((1, 1)))[:, 0]
 
 
 def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
-    """Form of one motion; rows that are not usable count as zero, as in the errors."""
+    """Return the Gram matrices of one motion over its usable rows."""
     n = model.n_parameters
     whole, slow = np.zeros((n, n)), np.zeros((n + 1, n + 1))
     for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
@@ -189,10 +188,7 @@ def motion_form(model: RobotModel, archive: str, run: Samples) -> MotionForm:
 
 
 def low_passed(run: Samples, values: Array) -> Array:
-    """Values (m, c) low-passed as the paper's Fig. 4 is, each segment of a recording by itself.
-
-    A segment without a usable row stays zero.
-    """
+    """Low-pass values (m, c) as in the paper's Fig. 4, per segment; zero without usable rows."""
     slow = np.zeros_like(values)
     for part in run.segments:
         if run.usable[part].any():
@@ -200,7 +196,7 @@ def low_passed(run: Samples, values: Array) -> Array:
     return slow
 
 
-# Reading archives
+# Estimation and prediction
 
 
 def fit(inputs: str, archives: Sequence[Path]) -> FitRecord:
@@ -234,10 +230,13 @@ def fit(inputs: str, archives: Sequence[Path]) -> FitRecord:
 def score(
     inputs: str, archives: Sequence[Path], key: str, estimates: Mapping[str, Sequence[float]]
 ) -> ScoreRecord:
-    """Predict held-out motions of a campaign by several estimates (p,).
+    """Predict the held-out motions of a campaign by several estimates (p,).
 
-    `archives` are those of its standstill, too. The motion of median error is predicted in time by
-    the first two estimates.
+    Args:
+        inputs: digest.
+        archives: of the held-out motions and the standstill.
+        key: of the campaign.
+        estimates: by name; the first two also as time series of the motion of median error.
     """
     prepared = _prepared(archives)
     names = [f"{key}/{source.name}" for source in prepared.sources.training]
@@ -262,10 +261,9 @@ def score(
 
 
 def _errors(model: RobotModel, table: Array, run: Samples) -> tuple[Array, Array]:
-    """Low-passed errors of every row of a table of estimates (k, p) on one motion.
+    """Return low-passed errors of estimates (k, p) on one motion.
 
-    Mean |e| per joint over usable rows (k, n), and the relative error over all rows (k,). The
-    regressor and the low-pass, which cost most, are made once for all of them.
+    These are mean |e| per joint over usable rows (k, n) and the relative error over all rows (k,).
     """
     left = np.zeros((*run.torque.shape, len(table)))
     for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
@@ -283,13 +281,13 @@ def _errors(model: RobotModel, table: Array, run: Samples) -> tuple[Array, Array
 
 
 def _motion_rows(run: Samples) -> slice:
-    """Samples from the first to the last at which a joint moves."""
-    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MOVES).any(axis=1))
+    """Return the samples from the first to the last at which a joint moves."""
+    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MOVING).any(axis=1))
     return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
 
 
 def _prepared(archives: Sequence[Path]) -> Prepared:
-    """All archives as they are fitted; nothing is held out of what is asked for."""
+    """Prepare all archives for a fit."""
     options = replace(FIXED, in_sample=True)
     sources = gather_sources(archives, options.split, in_sample=True)
     return prepare_sources(sources, options, Silent())
@@ -325,7 +323,7 @@ def _rounded(values: Array) -> list[float]:
 
 
 def archives_of(root: Path, *kinds: str) -> dict[str, str]:
-    """Checksums of a campaign's whole archives of some kinds, by name."""
+    """Return the checksums of a campaign's complete archives of some kinds, by name."""
     folder = CampaignFolder(root)
     sums = {entry.name: entry.sha256 for entry in folder.manifest()}
     return {path.name: sums[path.name] for kind in kinds for path in folder.completed(kind)}
@@ -333,7 +331,7 @@ def archives_of(root: Path, *kinds: str) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class Reader:
-    """Reads archives in child processes, and keeps what it read as records in a folder."""
+    """Estimates and predicts in child processes, with records cached in a folder."""
 
     fits: Path
     reporter: Reporter
@@ -351,7 +349,7 @@ class Reader:
     def score(
         self, roots: Mapping[str, Path], estimates: Mapping[str, Array]
     ) -> dict[str, ScoreRecord]:
-        """Predict the held-out motions of each class; the first two estimates in time, too."""
+        """Predict the held-out motions of each class, see :func:`score`."""
         values = {name: estimate.tolist() for name, estimate in estimates.items()}
         tasks = [
             (f"{key}-{name}", roots[key], "validation", values, (key, values))
@@ -366,9 +364,9 @@ class Reader:
         tasks: Sequence[tuple[str, Path, str, object, tuple[Any, ...]]],
         title: str,
     ) -> list[R]:
-        """Records of a function by name, root, kind of archives, what else they rest on, and rest.
+        """Return the records of tasks: name, root, kind of archives, other inputs, arguments.
 
-        Archives of the standstill are read as well, for the noise of positions.
+        Archives of the standstill are included, for the noise of positions.
         """
         calls = []
         for name, root, kind, others, arguments in tasks:
@@ -380,7 +378,7 @@ class Reader:
 
 
 def made(place: Path, function: Callable[..., R], inputs: str, *arguments: Any) -> R:
-    """In a child: the record in a file, or a new one, written before anything else can fail."""
+    """Return the record of a file if it is valid, else a new one."""
     kind: type[R] = get_type_hints(function)["return"]
     record = read_record(place, kind, inputs)
     if record is None:

@@ -1,4 +1,4 @@
-"""A study from beginning to end: searches, campaigns, estimates, predictions, tables, page."""
+"""Run of a study: searches, campaigns, estimates, predictions, tables, page."""
 
 from __future__ import annotations
 
@@ -41,25 +41,28 @@ def run_study(
 ) -> StudyResults:
     """Reproduce the paper on a simulated cell, and write results and page into a folder.
 
-    What is complete in the folder is reused: a study that was interrupted resumes there, and of
-    one that is done only the results are written again.
+    An interrupted study resumes; of a complete one only the results are written again. Results do
+    not depend on the number of workers, except for the times.
 
-    The folder is new, empty, or that of a study with the same settings. No number in the results
-    depends on the number of `workers`, processes at work, but the times. The cell is a simulated
-    one; the NS 16 of the paper if left out.
+    Args:
+        root: new or empty folder, or that of a study with the same settings.
+        settings: of the study.
+        reporter: of progress.
+        workers: number of processes.
+        cell: a simulated cell; by default the paper's NS 16.
 
     Raises:
-        CellError: the cell is one of real hardware.
-        InputError: the folder holds something else, or another study is running in it.
-        StudyError: a part was not completed; starting again resumes there.
-        NoExcitationError: a search found no motion.
+        CellError: the cell is not simulated.
+        InputError: the folder contains other files, or another study is running in it.
+        StudyError: a part was not completed; a restart resumes.
+        NoExcitationError: a search found no feasible motion.
         OutputError: the results cannot be written.
     """
     folder, times = StudyFolder(root), dict[str, float]()
     if cell is None:
         cell = Cell.load(CELL_PATH)
     else:
-        simulated_link(cell)  # refuses real hardware before anything is searched
+        simulated_link(cell)  # raises for real hardware
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
     with folder.locked(), LocalWorkers(workers, timeout=campaigns.LONGEST) as processes:
         folder.begin(settings)
@@ -80,7 +83,7 @@ def run_study(
 
 @contextmanager
 def _stage(name: str, times: dict[str, float]) -> Iterator[None]:
-    """Note in `times` how long a stage takes [s]."""
+    """Measure the time of a stage [s]."""
     begin = time.perf_counter()
     yield
     times[name] = round(time.perf_counter() - begin, 1)
@@ -94,7 +97,7 @@ def _simulated(
     found: Mapping[str, campaigns.Search],
     reader: Reader,
 ) -> StudyResults:
-    """Read all archives that were not read before, and make the tables."""
+    """Estimate, predict and tabulate."""
     truth = planted_values(cell)
     parameters, conditions = tables.parameters_of(cell, truth), []
     fits, scores = dict[str, dict[str, FitRecord]](), dict[str, dict[str, ScoreRecord]]()
@@ -138,13 +141,13 @@ def _simulated(
         ablations=varied,
         ranges=ranges,
         missing=plans.missing
-        + ([] if settings.effects else ["The unmodelled effects were not run."]),
+        + ([] if settings.effects else ["The unmodelled effects were not simulated."]),
         times={},
     )
 
 
 def _row(key: str, words: str, excitation: Excitation, record: FitRecord) -> MotionRow:
-    """Row of Table 1, as planned and as executed."""
+    """Return a row of Table 1."""
     return MotionRow.of(
         excitation.criteria,
         key=key,

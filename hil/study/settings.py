@@ -1,4 +1,4 @@
-"""What a study is asked for, and the folder it lies in."""
+"""Settings and folder of a study."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ Count = Annotated[int, Field(strict=True, ge=1)]
 
 
 class Effort(Frozen):
-    """Size of a search: individuals in a generation, and generations."""
+    """Size of a search."""
 
     population: int = Field(ge=4)
     generations: Count
 
     @property
     def tried(self) -> int:
-        """Motions that are scored."""
+        """Number of evaluated motions."""
         return self.population * self.generations
 
 
 class StudySettings(Frozen):
-    """Everything that decides about the numbers of a study, and nothing else."""
+    """Settings that determine the results of a study."""
 
     seed: int = Field(ge=0, description="of searches, held-out motions and the simulated cell")
     repetitions: int = Field(ge=2, description="executions of each excitation")
     motions: int = Field(ge=2, description="held-out motions of each class")
-    effects: bool = Field(description="whether all is run again with the unmodelled effects")
+    effects: bool = Field(description="whether to repeat it with unmodelled effects")
     effort_a: Effort = Field(description="of each search of method A")
-    effort_b: Effort = Field(description="of each search of method B, the ablations' too")
+    effort_b: Effort = Field(description="of each search of method B and the ablations")
     ablation_repetitions: Count
-    fly: tuple[float, ...] = Field(description="fly-by shares of B's via points, run again")
-    n_via: tuple[int, ...] = Field(description="via points K of searches like B's")
-    coupling_weight: tuple[float, ...] = Field(description="lambda_2 of searches like B's")
-    subsets: tuple[int, ...] = Field(description="numbers of repetitions that are fitted")
+    fly: tuple[float, ...] = Field(description="fly-by shares of B's via points")
+    n_via: tuple[int, ...] = Field(description="numbers K of via points of further searches")
+    coupling_weight: tuple[float, ...] = Field(description="lambda_2 of further searches")
+    subsets: tuple[int, ...] = Field(description="numbers of fitted repetitions")
     noise: tuple[float, ...] = Field(description="multiples of the cell's current noise")
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
@@ -53,7 +53,7 @@ FULL: Final = StudySettings(
     repetitions=30,
     motions=30,
     effects=True,
-    # The sizes of the paper's Table 1; method A has them for each of its four searches.
+    # Sizes of the paper's Table 1; for method A, of each of its four searches.
     effort_a=Effort(population=100, generations=120),
     effort_b=Effort(population=150, generations=120),
     ablation_repetitions=3,
@@ -63,7 +63,7 @@ FULL: Final = StudySettings(
     subsets=(1, 2, 5, 10, 20, 30),
     noise=(0.0, 1.0, 4.0, 16.0),
 )
-"""As in the paper: 30 executions, 30 motions, searches of its size."""
+"""Sizes of the paper: 30 executions, 30 motions."""
 
 QUICK: Final = FULL.model_copy(
     update={
@@ -79,7 +79,7 @@ QUICK: Final = FULL.model_copy(
         "noise": (0.0, 1.0, 16.0),
     }
 )
-"""The same procedure in minutes: it shows how the study works, and little about the methods."""
+"""The same procedure in minutes, too small to draw conclusions about the methods."""
 
 
 def study_settings(
@@ -90,7 +90,7 @@ def study_settings(
     seed: int | None = None,
     effects: bool = True,
 ) -> StudySettings:
-    """The full or the quick study with some settings replaced; None leaves a setting as it is."""
+    """Return the settings of the full or quick study, with those replaced that are not None."""
     given = {"repetitions": repetitions, "motions": motions, "seed": seed, "effects": effects}
     changes = {name: value for name, value in given.items() if value is not None}
     return StudySettings.model_validate((QUICK if quick else FULL).model_dump() | changes)
@@ -100,7 +100,7 @@ def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
     """Read a file of the study's folder.
 
     Raises:
-        InputError: it cannot be read, or is not of this kind.
+        InputError: it cannot be read or parsed.
     """
     try:
         return kind.model_validate_json(read_text(path))
@@ -110,51 +110,51 @@ def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
 
 @dataclass(frozen=True)
 class StudyFolder:
-    """Paths below one folder; what is complete in it is never made again."""
+    """Paths in the folder of a study."""
 
     root: Path
 
     def design(self, key: str) -> Path:
-        """Folder of one search."""
+        """Return the folder of one search."""
         return self.root / "designs" / key
 
     def campaign(self, condition: str, key: str) -> Path:
-        """Campaign folder of one excitation under one condition."""
+        """Return the campaign folder of one excitation under one condition."""
         return self.root / "campaigns" / condition / key
 
     @property
     def fits(self) -> Path:
-        """Records of the archives that were read, one file each."""
+        """Folder of the records of estimates and predictions."""
         return self.root / "fits"
 
     @property
     def settings(self) -> Path:
-        """What was asked for."""
+        """File of the settings."""
         return self.root / "study.json"
 
     def locked(self) -> AbstractContextManager[None]:
-        """Make the folder, and keep every other study out of it until this is left."""
+        """Create and lock the folder."""
         return lock_folder(self.root, "study", "--output")
 
     def begin(self, settings: StudySettings) -> None:
-        """Write down what is asked for, or resume a study that was asked for the same.
+        """Write the settings, or check that they are those of the existing study.
 
         Raises:
-            InputError: the folder holds something else, or a study with other settings.
+            InputError: the folder contains other files, or a study with other settings.
         """
-        remedy = "name another folder (--output)"
+        remedy = "use another folder (--output)"
         if not self.settings.exists():
             if any(self.root.iterdir()):
-                raise InputError(self.root, "is not empty and holds no study", remedy=remedy)
+                raise InputError(self.root, "is not empty and contains no study", remedy=remedy)
             write_output(self.settings, settings.to_json())
             return
-        there = load_json(StudySettings, self.settings, "is not the settings of a study", remedy)
+        old = load_json(StudySettings, self.settings, "is not the settings of a study", remedy)
         for name in StudySettings.model_fields:
-            asked, begun = getattr(settings, name), getattr(there, name)
-            if asked != begun:
+            new, existing = getattr(settings, name), getattr(old, name)
+            if new != existing:
                 raise InputError(
                     self.settings,
-                    f"the study in this folder was begun with {begun!s}, not {asked!s}",
+                    f"the study in this folder was started with {existing!s}, not {new!s}",
                     field=name,
-                    remedy=f"ask for the same to resume it, or {remedy}",
+                    remedy=f"use the same settings to resume it, or {remedy}",
                 )

@@ -1,7 +1,7 @@
-"""Statistics of a study: how far the ratio of two errors is known, and what chance explains.
+"""Statistics of a study: intervals of ratios of errors, and ranges over repetitions.
 
-A table of errors on many motions does not say how much of a difference is the noise of the two
-estimates, which is the same on all of these motions: other repetitions would have given others.
+The noise of an estimate acts on all motions that it predicts, so that a scatter over motions alone
+underestimates the uncertainty of a comparison.
 """
 
 from __future__ import annotations
@@ -21,17 +21,16 @@ from .results import ALPHA, SMALL, ChanceRange, ComparisonResult, Quantity, Verd
 Array = NDArray[np.float64]
 
 DRAWS: Final = 4000
-FEWEST: Final = 3
-"""Repetitions, or blocks of them, below which their scatter says too little: with two, A against A
-differs in 1.5 to 3.5 % of cases where 0.6 % is asked for; with three and more, not more often than
-asked."""
+MIN_REPETITIONS: Final = 3
+"""Repetitions, or blocks of them, needed for their scatter: with two, A differs from A in 1.5 to
+3.5 % of cases instead of 0.6 %; with three or more in at most 0.6 %."""
 _CHUNK: Final = 500
 _SUBSETS: Final = 400
 _SEED, _BAND_SEED = 20140901, 20140902
 
 
 def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
-    """Verdict on the second of two estimates: significant where the interval excludes 1."""
+    """Return the verdict on the second of two estimates: significant if the interval excludes 1."""
     if low is None or high is None:
         return "too few"
     if low <= 1.0 <= high:
@@ -44,13 +43,15 @@ def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
 def compared_on(
     motion_class: str, keys: tuple[str, str], inner: tuple[Array, Array], *, drifts: bool
 ) -> ComparisonResult:
-    """Errors with the second estimate over errors with the first, motion by motion; a table of one.
+    """Compare the errors of two estimates on the motions of one class.
 
-    Motions differ in size, and each counts the same. `inner` are the inner products (m, r, r) of
-    the errors that the r repetitions of each estimate leave; with `drifts`, repetitions may
-    resemble their neighbours.
+    Args:
+        motion_class: name.
+        keys: of the two estimates.
+        inner: inner products (m, r, r) of the errors of the r repetitions of each estimate.
+        drifts: whether successive repetitions may be correlated.
     """
-    # The sum of a mean's squared errors: weights 1 / r on either side.
+    # Squared error of the mean estimate: weights 1 / r.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
     logs = np.log(after / before)
     error, freedom = spread(*inner, drifts=drifts, seed=_SEED) or (None, None)
@@ -73,11 +74,7 @@ def compared_on(
 
 
 def corrected(comparisons: Sequence[ComparisonResult]) -> list[ComparisonResult]:
-    """The comparisons of one table with interval and verdict, corrected for their number.
-
-    Intervals by Student's t after Bonferroni, so that all of the table hold together and a verdict
-    is exactly that of its interval.
-    """
+    """Return the comparisons of a table with simultaneous intervals (Bonferroni) and verdicts."""
     level = 1.0 - ALPHA / max(1, len(comparisons))
     found = []
     for one in comparisons:
@@ -92,23 +89,24 @@ def corrected(comparisons: Sequence[ComparisonResult]) -> list[ComparisonResult]
 
 
 def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> tuple[float, float] | None:
-    """Standard error of the mean over motions of log(error with second / error with first).
+    """Return the standard error of the mean over motions of log(error second / error first).
 
-    A hierarchical bootstrap: repetitions of the first, repetitions of the second and motions are
-    resampled together. What is scored is the mean of the repetitions' own estimates (the paper's
-    Table 2), so a resampled estimate is the mean of the resampled repetitions. Of n units n - 1
-    are sampled: a mean of n would scatter by (n - 1) / n too little. With `drifts`, blocks of
-    consecutive repetitions are resampled, which may resemble their neighbours.
+    Hierarchical bootstrap over repetitions of both and motions. An estimate is the mean over
+    repetitions (the paper's Table 2). Of n units n - 1 are sampled, since a mean of n would scatter
+    by (n - 1) / n too little. With `drifts` blocks of successive repetitions are resampled.
 
-    `first` and `second` are inner products of the errors of the repetitions, by motion (m, r, r)
-    and (m, s, s).
+    Args:
+        first: inner products of the errors of the repetitions, by motion (m, r, r).
+        second: likewise (m, s, s).
+        drifts: whether successive repetitions may be correlated.
+        seed: of the bootstrap.
 
     Returns:
-        The standard error and its degrees of freedom; None with fewer than `FEWEST` repetitions,
-        or one motion.
+        The standard error and its degrees of freedom; None with fewer than `MIN_REPETITIONS`
+        repetitions, or one motion.
     """
     motions = len(first)
-    if motions < 2 or min(first.shape[1], second.shape[1]) < FEWEST:
+    if motions < 2 or min(first.shape[1], second.shape[1]) < MIN_REPETITIONS:
         return None
     random = np.random.default_rng(seed)
     before, left_before, units_before = _resampled(first, drifts, random)
@@ -118,7 +116,7 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> tuple[flo
         _logs(one, np.full((1, one.shape[1]), 1.0 / one.shape[1])) for one in (first, second)
     )
     together = ((after - before) * weights).sum(axis=1)
-    # Each by itself with the others as they are: what the degrees of freedom are made from.
+    # Variances of each source alone, for the degrees of freedom.
     single = [float(one.mean(axis=1).var(ddof=1)) for one in (before, after)]
     parts = (
         (max(single[0], left_before), units_before - 1),
@@ -136,14 +134,13 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> tuple[flo
 def _resampled(
     kernels: Array, drifts: bool, random: np.random.Generator
 ) -> tuple[Array, float, int]:
-    """Log errors (draws, m) of resampled means, a jackknife variance, and the number of units.
+    """Return log errors (draws, m) of resampled means, a jackknife variance, the number of units.
 
-    The variance is that of the mean over the motions, leaving out one unit after the other. Where
-    the error is nothing but noise, resampling about an estimate that has its share of it already
-    scatters by an eighth too little; the jackknife is then larger, and elsewhere the same.
+    Where the error is mostly noise, the bootstrap underestimates the scatter by an eighth and the
+    jackknife variance is larger; otherwise they agree.
     """
     count = kernels.shape[1]
-    # The usual order of a block's length is the cube root; fewer than eight stay single.
+    # Block length: cube root of the number, 1 for fewer than eight.
     length = max(1, int(count ** (1.0 / 3.0) + 1e-9)) if drifts else 1
     weights, units = _weights(count, length, random)
     without = np.ones((units, count))
@@ -154,7 +151,7 @@ def _resampled(
 
 
 def _weights(count: int, length: int, random: np.random.Generator) -> tuple[Array, int]:
-    """Weights (draws, count) of resampled units, each row's sum being 1; blocks may wrap round."""
+    """Return weights (draws, count) of resampled units, with unit row sums; blocks are circular."""
     units = count // length
     starts = random.integers(0, count, (DRAWS, units - 1))
     index = (starts[:, :, None] + np.arange(length)).reshape(DRAWS, -1) % count
@@ -164,7 +161,7 @@ def _weights(count: int, length: int, random: np.random.Generator) -> tuple[Arra
 
 
 def _logs(kernels: Array, weights: Array) -> Array:
-    """Log of the error's length (b, m) for each row of weights (b, r)."""
+    """Return the log error norms (b, m) for each row of weights (b, r)."""
     found = np.empty((len(weights), len(kernels)))
     for start in range(0, len(weights), _CHUNK):
         rows = weights[start : start + _CHUNK]
@@ -173,7 +170,7 @@ def _logs(kernels: Array, weights: Array) -> Array:
 
 
 def parameter_error(estimate: Array, base: Array, truth: Array) -> float | None:
-    """Geometric mean over the parameters of distance to the truth, that of `base` being 1 (p,)."""
+    """Return the geometric mean of |estimate - truth| / |base - truth| over parameters (p,)."""
     own, reference = np.abs(estimate - truth), np.abs(base - truth)
     usable = (own > 0.0) & (reference > 0.0)
     return float(np.exp(np.mean(np.log(own[usable] / reference[usable])))) if usable.any() else None
@@ -187,11 +184,15 @@ def ranges_of(
     truth: Array,
     reference: Array,
 ) -> list[ChanceRange]:
-    """Where figures lie for other repetitions of the very same motion.
+    """Return the ranges of errors over subsets of the repetitions of one motion.
 
-    They are of all subsets of so many (`size`) of a method's repetitions (r, p); without more of
-    them there is no range. `reference` (p,) is the estimate whose distance from
-    `truth` is 1.
+    Args:
+        method: key.
+        values: estimates of its repetitions (r, p).
+        size: of the subsets; no ranges unless 1 <= size < r.
+        forms: of the held-out motions, by class.
+        truth: (p,) true parameters.
+        reference: (p,) estimate with a parameter error of 1.
     """
     if not 1 <= size < len(values):
         return []
@@ -211,7 +212,7 @@ def ranges_of(
             repetitions=size,
             quantity=quantity,
             motion_class=name,
-            # Figures that exist: of few subsets the smallest and the largest.
+            # Without interpolation: of few subsets the smallest and the largest.
             low=float(np.percentile(some, 2.5, method="inverted_cdf")),
             high=float(np.percentile(some, 97.5, method="inverted_cdf")),
             subsets=len(some),
@@ -221,7 +222,7 @@ def ranges_of(
 
 
 def _subsets(count: int, size: int) -> Array:
-    """Weights (s, count) of all subsets where they are few, else of a random sample of them."""
+    """Return weights (s, count) of all subsets, or of a random sample if there are many."""
     if comb(count, size) <= _SUBSETS:
         chosen = np.array(list(combinations(range(count), size)), dtype=np.intp)
     else:

@@ -1,4 +1,4 @@
-"""From fits and scores to the tables of a study, beside what the paper prints."""
+"""Tables of a study from estimates and predictions, with the paper's printed values."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ GROUPS: Final = {
     "rows 33 to 40": range(33, 41),
     "rows 41 to 52, friction": range(41, 53),
 }
-"""Groups of rows of Table 2 as section 4.2 of the paper reads them."""
+"""Groups of rows of Table 2 by section 4.2 of the paper."""
 TABLE1: Final = (
     ("a", 2000, 90.5, 127.9, "W = 3, own frequencies; 100 individuals"),
     ("b", 15996, 30.9, 101.2, "K = 6, λ1 = 0.7, λ2 = 0.3; 150 individuals"),
 )
-"""The paper's Table 1: method, N, log det in units that are not named, I_c, notes."""
+"""The paper's Table 1: method, N, log det (units not stated), I_c, notes."""
 
 
 def study_results(root: Path, cell: Cell, truth: Array, **tables: Any) -> StudyResults:
-    """Results of a study with what its numbers say; `tables` are the other fields."""
+    """Return the results of a study with its conclusions; `tables` are the other fields."""
     results = StudyResults(
         name=root.resolve().name,
         cell=cell.name,
@@ -69,12 +69,12 @@ def study_results(root: Path, cell: Cell, truth: Array, **tables: Any) -> StudyR
 
 
 def is_printed(cell: Cell) -> bool:
-    """Whether a cell has the arm of the paper, the NS 16."""
+    """Return whether a cell has the arm of the paper, the NS 16."""
     return cell.urdf == URDF_PATH.read_text(encoding="utf-8")
 
 
 def printed_rows(cell: Cell) -> list[MotionRow]:
-    """The paper's own rows of Table 1; none for another arm than its NS 16."""
+    """Return the printed rows of Table 1; none for another arm than the NS 16."""
     names = ("key", "n_samples", "log10_det", "coupling_index", "words")
     return [
         MotionRow.model_validate(dict(zip(names, row, strict=True)) | {"printed": True})
@@ -83,10 +83,10 @@ def printed_rows(cell: Cell) -> list[MotionRow]:
 
 
 def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
-    """The model's parameters with the print; `truth` (p,) is planted.
+    """Return the parameters with true values (p,) and the printed values of Table 2.
 
-    Rows 41 to 52 are read as interleaved. The print's viscous and third friction terms are read as
-    per degree and per degree², an assumption: per radian the viscous friction would be negligible.
+    Rows 41 to 52 are interleaved. Viscous and third friction terms are assumed to be per degree and
+    per degree²: per radian the viscous friction would be negligible.
     """
     model, printed = cell.model, dict[str, dict[str, Any]]()
     for row in TABLE2 if is_printed(cell) else ():
@@ -106,7 +106,7 @@ def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
 
 
 def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
-    """How to cut the longer of the first two to as much motion; None where nothing is to be cut."""
+    """Return how to shorten the longer of the first two to equal motion time; None if equal."""
     whole = {key: fits[key].duration * len(fits[key].values) for key in [*fits][:2]}
     other, cut = sorted(whole, key=lambda key: whole[key])
     count = max(1, round(whole[other] / fits[cut].duration))
@@ -124,10 +124,7 @@ def equal_data(fits: Mapping[str, FitRecord]) -> EqualDataResult | None:
 
 
 def repetitions_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
-    """Estimates (r, p) of the repetitions of each method.
-
-    Among them those of the longer of the first two with as much motion as the other has.
-    """
+    """Return the estimates (r, p) of the repetitions of each method, with those of `equal_data`."""
     found, equal = {key: np.array(one.values) for key, one in fits.items()}, equal_data(fits)
     if equal is not None:
         found[equal.name] = found[equal.cut][: equal.repetitions]
@@ -135,18 +132,18 @@ def repetitions_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
 
 
 def estimates_of(fits: Mapping[str, FitRecord]) -> dict[str, Array]:
-    """The paper's estimate of each: the mean over the repetitions' own estimates (p,)."""
+    """Return the paper's estimate of each method: the mean over repetitions (p,)."""
     return {key: values.mean(axis=0) for key, values in repetitions_of(fits).items()}
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What a condition is called, and whether its repetitions may resemble their neighbours."""
+    """A simulated condition."""
 
     key: str
-    words: str
+    words: str  #: description
     effects: tuple[str, ...]
-    drifts: bool = True
+    drifts: bool = True  #: whether successive repetitions may be correlated
 
 
 def condition_result(
@@ -156,16 +153,13 @@ def condition_result(
     scores: Mapping[str, ScoreRecord],
     parameters: Sequence[StudyParameter],
 ) -> ConditionResult:
-    """All tables of one condition.
-
-    `fits` of the methods are in the order of the tables, `scores` by class of motion.
-    """
+    """Return all tables of one condition from estimates by method and predictions by class."""
     keys, equal, repetitions = list(fits), equal_data(fits), repetitions_of(fits)
     forms = {name: ClassForms.of(one.forms) for name, one in scores.items()}
     truth = np.array([one.truth for one in parameters], dtype=np.float64)
 
     def pair(name: str, two: tuple[str, str], *, own: bool = False) -> ComparisonResult:
-        """Two estimates by the torque they miss, or by their own error."""
+        """Compare two estimates by torque error, or by their deviation from the truth."""
         first, second = (
             forms[name].own_kernels(repetitions[key], truth)
             if own
@@ -235,7 +229,7 @@ def _class_result(
 
 
 def compared_pairs(keys: Sequence[str]) -> list[tuple[str, str]]:
-    """Pairs of methods: all, but for the printed sines, which the paper compares with B alone."""
+    """Return all pairs of methods; the printed sines are compared with B only."""
     pairs = list(combinations([key for key in keys if key != AP], 2))
     return [*pairs, (AP, B)] if AP in keys and B in keys else pairs
 
@@ -243,7 +237,7 @@ def compared_pairs(keys: Sequence[str]) -> list[tuple[str, str]]:
 def _closeness(
     fits: Mapping[str, FitRecord], keys: Sequence[str], parameters: Sequence[StudyParameter]
 ) -> list[ClosenessResult]:
-    """How often the second of the first two methods comes closer to the manufacturer's column."""
+    """Count the parameters for which the second method is closer to the manufacturer's values."""
     if not any(one.printed_id for one in parameters):
         return []
     factor = np.array([one.printed_factor for one in parameters])
@@ -272,63 +266,62 @@ def _closeness(
 
 _TEXTS: Final = {
     "sines": (
-        "What method A may choose",
+        "Variants of method A",
         "sines of method A",
-        "What the paper leaves open of method A, a search each: sines about the middle of the"
-        " ranges or about the home posture, with the frequencies of Table 1 or with those that the"
-        " appendix's bound allows; each beside B.",
+        "Variants that the paper does not decide, with a search each: sines about the middle of the"
+        " ranges or about the home posture, with the frequencies of Table 1 or up to the bound of"
+        " the appendix; each compared with B.",
     ),
     "fly": (
         "Fly-by share",
         "fly-by share of B's via points",
-        "B's own via points and speeds, planned again with another fly-by share and run: the"
-        " corners change, the search does not.",
+        "The via points and speeds of B with another fly-by share, without a new search.",
     ),
     "n_via": (
         "Number of via points",
         "via points K",
-        "A search like B's, as long as B's, for each number; more of them make a longer motion.",
+        "A search of the same size for each number; more via points make a longer motion.",
     ),
     "weight": (
         "Weight of the coupling index",
         "λ2 of the coupling index in eq. 7",
-        "A search like B's for each weight; λ1 = 1 − λ2 is that of log det.",
+        "A search of the same size for each weight; λ1 = 1 − λ2 is the weight of log det.",
     ),
     "repetitions": (
         "Number of repetitions",
-        "repetitions that are fitted",
-        "The first repetitions of the study itself; nothing is run again.",
+        "fitted repetitions",
+        "The first repetitions of the study.",
     ),
     "noise": (
         "Noise of the currents",
         "multiple of the cell's current noise",
-        "A and B run at each level; the held-out motions stay those of the study.",
+        "A and B executed at each noise level; same held-out motions.",
     ),
 }
-"""Title, name of the setting, and what is done, by key of the ablation."""
+"""Title, name of the setting and description, by key of the ablation."""
 _SINES_LABELS: Final = ("middle, printed", "home, printed", "middle, fast", "home, fast")
 _LABELS: Final = dict(zip(SINES, _SINES_LABELS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What ablations are made from."""
+    """Estimates and predictions of the ablations."""
 
-    fits: Mapping[str, FitRecord]  #: of every executed excitation of the ablations, by key
+    fits: Mapping[str, FitRecord]  #: of the ablations, by key
     main: Mapping[str, FitRecord]  #: of A and B with all repetitions
     scores: Mapping[str, ScoreRecord]  #: of the held-out motions, by class
-    truth: Array  #: planted parameters (p,)
-    sines: str  #: key of the sines that method A is represented by
+    truth: Array  #: true parameters (p,)
+    sines: str  #: key of the sines of method A
 
     @cached_property
     def forms(self) -> dict[str, ClassForms]:
-        """Of the held-out motions, by class: the error of any estimate."""
+        """Of the held-out motions, by class."""
         return {name: ClassForms.of(one.forms) for name, one in self.scores.items()}
 
     def point(
         self, value: float, record: FitRecord, values: Array, reference: Array, **named: Any
     ) -> AblationPoint:
-        """One setting: estimates (r, p) of its repetitions beside a reference (p,)."""
+        """Return the point of one setting from estimates (r, p) and a reference (p,)."""
         estimate, truth, forms = values.mean(axis=0), self.truth, self.forms.items()
         return AblationPoint(
             value=value,
@@ -346,7 +339,7 @@ class Evidence:
 def ablations(
     settings: StudySettings, evidence: Evidence
 ) -> tuple[list[AblationResult], list[ChanceRange]]:
-    """All of a simulated study, and where A and B lie by chance."""
+    """Return all ablations, and the ranges of A and B over repetitions."""
     fits, main = evidence.fits, {key: np.array(evidence.main[key].values) for key in (A, B)}
     values = {key: np.array(one.values) for key, one in fits.items()}
     reference = values[B].mean(axis=0)
@@ -355,7 +348,7 @@ def ablations(
     beside_b = [
         compared_on("fly-by", (key, B), (inner[key], inner[B]), drifts=False) for key in sines
     ]
-    # By ablation: value, method and key of the fit of each setting, and that of the study itself.
+    # By ablation: value, method and key of the fit of each setting; and the study's own setting.
     wanted: dict[str, tuple[list[tuple[float, str, str]], object]] = {
         "sines": ([(float(k), A, key) for k, key in enumerate(sines)], evidence.sines),
         "fly": ([(one, B, variant_key("fly", one)) for one in settings.fly], B),

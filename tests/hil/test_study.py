@@ -53,7 +53,7 @@ from hil.study.results import (
 )
 from hil.study.settings import Effort
 from hil.study.statistics import (
-    FEWEST,
+    MIN_REPETITIONS,
     compared_on,
     corrected,
     parameter_error,
@@ -250,7 +250,9 @@ class TestSpread:
         assert blocks[0] > 1.1 * single[0]
         assert blocks[1] < single[1]
 
-    @pytest.mark.parametrize(("repetitions", "motions"), [(FEWEST - 1, 10), (1, 10), (5, 1)])
+    @pytest.mark.parametrize(
+        ("repetitions", "motions"), [(MIN_REPETITIONS - 1, 10), (1, 10), (5, 1)]
+    )
     def test_too_few_repetitions_or_motions(self, repetitions: int, motions: int) -> None:
         forms = random_forms(motions, 4)
         a, b = (forms.torque_kernels(flagged(k, 4, repetitions, 0.01)) for k in range(2))
@@ -450,7 +452,7 @@ class TestPlans:
         left = plans.without({tmp_path / "plain" / AP: "drive fault"})
         assert left.executions["plain"].keys() == {B}
         for name in keys:
-            with pytest.raises(StudyError, match=rf"{name}/b: this arm cannot bear .* drive fault"):
+            with pytest.raises(StudyError, match=rf"{name}/b: the controller ended .* drive fault"):
                 plans.without({tmp_path / name / B: "drive fault"})
 
     def test_a_refusal_in_a_child_is_one_sentence(self, tmp_path: Path) -> None:
@@ -617,9 +619,11 @@ class TestWhole:
         self, whole: Whole, small: StudySettings, arm: Cell
     ) -> None:
         root, _ = whole
-        with pytest.raises(InputError, match="seed: the study in this folder was begun with 1, no"):
+        with pytest.raises(
+            InputError, match="seed: the study in this folder was started with 1, no"
+        ):
             run_study(root, small.model_copy(update={"seed": 2}), Silent(), workers=1, cell=arm)
-        with pytest.raises(InputError, match="is not empty and holds no study"):
+        with pytest.raises(InputError, match="is not empty and contains no study"):
             run_study(root / "fits", small, Silent(), workers=1, cell=arm)
 
 
