@@ -298,7 +298,7 @@ def _robust(
 
 
 def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> list[str]:
-    far = np.flatnonzero(np.abs(np.nan_to_num(posterior.surprise)) > _MAX_PRIOR_DEVIATION)
+    far = np.flatnonzero(np.abs(np.nan_to_num(posterior.normalized_change)) > _MAX_PRIOR_DEVIATION)
     if not far.size:
         return []
     return [

@@ -1,33 +1,30 @@
-r"""Physically consistent estimates: standard parameters that some machine can have.
+r"""Physically consistent estimates: standard parameters that a robot can have.
 
 Over the standard parameters :math:`\pi_s` and the friction f, one convex program on the torque
-objective itself (never a projection of an estimate, link by link):
+objective (not a projection of an estimate link by link):
 
 .. math:: \min\; \|R\,[G\pi_s;\, f] - z\|^2
           + w \left( \sum_i D(J_i \,\|\, J_i^0) + \ldots \right)
           \quad\text{s.t.}\quad J_i \succ 0,\; I_{im} \ge 0,\; f_0, f_1 \ge 0
 
-R is the square root of the weighted normal equations, G the grouping of the base parameters, J
-the pseudo-inertia of a link (Wensing, Kim and Slotine 2018). D is the log-det divergence from the
-nominal (CAD) bodies (Lee, Wensing and Park 2020), the dots are squares of rotor inertias (from the
-nominal, where there is one) and friction in units that make them small. The data alone leave many
-standard parameters open; there the nominal decides, elsewhere it weighs as much as `prior_weight`
-rows of data: next to nothing. D is infinite at the edge of what is possible, so the result is
-strictly inside: a conic solver comes near it, and Newton's method ends there; where no machine
-fits the data, Newton's method alone on a path of falling prior weights.
+R is the square root of the weighted normal equations, G the grouping of the base parameters, J the
+pseudo-inertia of a link (Wensing, Kim and Slotine 2018). D is the log-det divergence from the
+nominal (CAD) bodies (Lee, Wensing and Park 2020); the dots are squares of rotor inertias (minus
+nominal ones) and friction, scaled to be small. The prior weighs as much as `prior_weight` rows of
+data and determines what the data leave open. D is infinite at the boundary, so the solution is
+strictly inside. It is approximated by a conic solver and refined by Newton's method; if no
+consistent parameters fit the data, Newton's method follows a path of falling prior weights.
 
-Where motors turn with several joints, the rotors' inertia matrix, coupling inertias beside the
-diagonal, has to be positive definite in place of I_im >= 0. What friction needs to take energy says
-:mod:`identification.model.friction`: signs of the third friction term and of the offset are left
-open.
+Where motors turn with several joints, the rotors' inertia matrix with coupling inertias has to be
+positive definite instead of I_im >= 0. Constraints on friction:
+:mod:`identification.model.friction`.
 
-:class:`Shrinkage` draws least squares towards this solution :math:`\pi_c`:
+:class:`Shrinkage` shrinks least squares towards this solution :math:`\pi_c`:
 
 .. math:: \hat\pi = \pi_c + (A + \lambda D)^{-1}\,(b - A\,\pi_c), \qquad D = \mathrm{diag}(A)
 
-the mean of a Gaussian posterior whose prior has the information :math:`\lambda` of each column's
-own. What the motion determines well follows the data, even where no rigid machine would (gains a
-few per cent apart); what it hardly determines follows the machine.
+the mean of a Gaussian posterior whose prior has the share :math:`\lambda` of each column's
+information. Well-determined parameters follow the data, others the consistent solution.
 """
 
 from __future__ import annotations
@@ -69,34 +66,31 @@ Array = NDArray[np.float64]
 
 _STEPS: Final = 200
 _HALVINGS: Final = 40
-# Of all weights on the way together: data that no machine fits have ended after 1400 steps, or in
-# none of 40 000.
+# Over all weights; fits without a solution ended within 1400 steps.
 _PATH_STEPS: Final = 3000
-# Of a variable whose reference is one: on the bound.
+# Tolerance of an active bound, in units of the reference.
 _ON_BOUND: Final = 1e-6
 _CONVERGED: Final = 1e-13
-# How far above the minimum, as a share of the prior's weight and of the objective.
+# Distance to the minimum as a share of the prior's weight, and of the objective.
 _SMALL: Final = 1e-6
-# Ratio of Cholesky pivots at which a matrix counts as singular: its inverse would be rounding.
+# Ratio of Cholesky pivots of a singular matrix.
 _SINGULAR: Final = 1e-7
 _ROUNDING: Final = 1e-12
 _VANISHING: Final = 1e-30
-_ENOUGH: Final = 1e-2  # share of the decrease that a linear model promises
+_ENOUGH: Final = 1e-2  # required share of the predicted decrease
 _WEIGHT_STEP: Final = 10.0
 _SAME_WEIGHT: Final = 1e-9
 _N_LINK: Final = len(LINK_SYMBOLS)
-# Factor of -log det of the rotors' coupled inertia matrix, in units in which all the torque there
-# is makes a one: keeps it positive definite, and moves a rotor that is larger than its standard
-# deviation by less than half a per cent of that.
+# Factor of -log det of the rotors' coupled inertia matrix, in units of the total torque: keeps it
+# positive definite and moves well-determined rotors by less than 0.5 % of their deviation.
 _ROTOR_BARRIER: Final = 1e-2
-# Smallest eigenvalue of a pseudo-inertia in axes in which the reference's is the unit matrix: far
-# more than rounding, so that the result can be relied on to be inside.
+# Smallest eigenvalue of a pseudo-inertia relative to the reference's.
 _INSIDE: Final = 1e-6
-# Rows beyond which the prior's weight no longer falls behind the data's, when no machine fits:
-# a pseudo-inertia at the edge is singular to rounding then.
+# Rows beyond which the prior's weight is constant if no consistent parameters fit: the solution
+# would be singular to rounding.
 _MOST_ROWS: Final = 100_000
-# From a near solution: steps of the weight of the prior; of Newton for each, for where it is not
-# so near the conic solver is quicker; and the change of that weight at which they end.
+# From a similar solution: steps of the prior weight, Newton steps of each, and final relative
+# change of the weight. Otherwise the conic solver is faster.
 _NEAR_STEPS: Final = 10
 _NEAR_NEWTON: Final = 20
 _NEAR_WEIGHT: Final = 0.01
@@ -107,20 +101,12 @@ class SolverError(IdentificationError):
 
 
 class Cone(NamedTuple):
-    """Variables that are entries of symmetric matrices, which have to be positive definite.
+    """Variables that are entries of symmetric matrices, which have to be positive definite."""
 
-    Attributes:
-        places: indices of the d variables of each of b matrices (b, d).
-        entries: symmetric matrices E_k, S_i = sum_k u_k E_k over the variables of matrix i
-            (d, k, k).
-        pull: factor of tr S in the objective.
-        barrier: factor of -log det S.
-    """
-
-    places: NDArray[np.intp]
-    entries: Array
-    pull: float = 1.0
-    barrier: float = 1.0
+    places: NDArray[np.intp]  # indices of the d variables of each of b matrices (b, d)
+    entries: Array  # symmetric E_k (d, k, k): S_i = sum_k u_k E_k over the variables of matrix i
+    trace_weight: float = 1.0  # factor of tr S in the objective
+    barrier_weight: float = 1.0  # factor of -log det S
 
     @property
     def unit(self) -> Array:
@@ -132,7 +118,7 @@ class Cone(NamedTuple):
         return np.asarray(np.tensordot(u[self.places], self.entries, axes=1))
 
     def value(self, u: Array) -> float:
-        """Return ``sum_i pull tr S_i - barrier log det S_i``, infinite outside."""
+        """Return ``sum_i trace_weight tr S_i - barrier_weight log det S_i``, infinite outside."""
         matrices = self.matrices(u)
         try:
             diagonal = np.einsum("ijj->ij", np.linalg.cholesky(matrices))
@@ -141,36 +127,29 @@ class Cone(NamedTuple):
         if np.any(diagonal.min(axis=1) <= _SINGULAR * diagonal.max(axis=1)):
             return np.inf
         trace = np.trace(matrices, axis1=1, axis2=2).sum()
-        return float(self.pull * trace - 2.0 * self.barrier * np.log(diagonal).sum())
+        return float(self.trace_weight * trace - 2.0 * self.barrier_weight * np.log(diagonal).sum())
 
     def add_derivatives(self, u: Array, weight: float, gradient: Array, hessian: Array) -> None:
-        """Add those of ``weight * value`` to gradient (v,) and Hessian (v, v)."""
-        pull = self.pull * self.unit
+        """Add the derivatives of ``weight * value`` to gradient (v,) and Hessian (v, v)."""
+        trace_weight = self.trace_weight * self.unit
         for places, inverse in zip(self.places, np.linalg.inv(self.matrices(u)), strict=True):
-            turned = np.einsum("ab,kbc->kac", inverse, self.entries)
-            gradient[places] += weight * (pull - self.barrier * np.einsum("kaa->k", turned))
-            curvature = np.einsum("kab,lba->kl", turned, turned)
-            hessian[np.ix_(places, places)] += weight * self.barrier * curvature
+            product = np.einsum("ab,kbc->kac", inverse, self.entries)
+            gradient[places] += weight * (
+                trace_weight - self.barrier_weight * np.einsum("kaa->k", product)
+            )
+            curvature = np.einsum("kab,lba->kl", product, product)
+            hessian[np.ix_(places, places)] += weight * self.barrier_weight * curvature
 
 
 class Smooth(NamedTuple):
-    """``||R u - z||² + w (sum over the cones of their values + ||u_rest - centre||²)``.
+    """``||R u - z||² + w (sum over the cones of their values + ||u_rest - centre||²)``."""
 
-    Attributes:
-        R: (r, v).
-        z: (r,).
-        weight: w.
-        cones: matrices that stay positive definite.
-        centre: of the last variables, those behind the links.
-        not_negative: indices of variables behind the links, in no cone.
-    """
-
-    R: Array
-    z: Array
-    weight: float
+    R: Array  # (r, v)
+    z: Array  # (r,)
+    weight: float  # w
     cones: tuple[Cone, ...]
-    centre: Array
-    not_negative: NDArray[np.intp]
+    centre: Array  # of the variables behind those of the links
+    not_negative: NDArray[np.intp]  # indices of non-negative variables, in no cone
 
     def excess(self, u: Array) -> float:
         """Weighted squared error above that of least squares."""
@@ -196,21 +175,15 @@ class Smooth(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Where Newton's method ended.
+    """Result of Newton's method."""
 
-    Attributes:
-        u: (v,).
-        converged: whether the objective can fall no further, but for rounding.
-        steps: of Newton's method.
-    """
-
-    u: Array
-    converged: bool
+    u: Array  # (v,)
+    converged: bool  # whether only rounding is left
     steps: int = 1
 
 
 def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
-    """Return the minimum, by Newton's method from a `start` (v,) inside."""
+    """Minimise by Newton's method from a feasible `start` (v,)."""
     bounded = problem.not_negative
     u = start.copy()
     u[bounded] = np.maximum(u[bounded], 0.0)
@@ -221,16 +194,16 @@ def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
         steps += 1
         try:
             gradient, hessian = problem.derivatives(u)
-            held = bounded[(u[bounded] <= _ON_BOUND) & (gradient[bounded] > 0.0)]
-            u[held] = 0.0
-            step = _newton_step(gradient, hessian, held)
-            # One on its bound that would leave it by itself, but not with the others, stays.
+            fixed = bounded[(u[bounded] <= _ON_BOUND) & (gradient[bounded] > 0.0)]
+            u[fixed] = 0.0
+            step = _newton_step(gradient, hessian, fixed)
+            # Variables on their bound that the step would push outside stay fixed.
             while len(
-                pushed := np.setdiff1d(bounded[(u[bounded] <= 0.0) & (step[bounded] < 0.0)], held)
+                pushed := np.setdiff1d(bounded[(u[bounded] <= 0.0) & (step[bounded] < 0.0)], fixed)
             ):
-                held = np.union1d(held, pushed)
-                step = _newton_step(gradient, hessian, held)
-        except np.linalg.LinAlgError:  # at the edge of what is possible
+                fixed = np.union1d(fixed, pushed)
+                step = _newton_step(gradient, hessian, fixed)
+        except np.linalg.LinAlgError:  # at the boundary
             break
         decrement = -float(gradient @ step)
         moved = _descend(problem, u, step, decrement)
@@ -242,9 +215,9 @@ def polish(problem: Smooth, start: Array, most_steps: int = _STEPS) -> Minimum:
     return Minimum(u, converged=abs(decrement) <= allowed, steps=steps)
 
 
-def _newton_step(gradient: Array, hessian: Array, held: NDArray[np.intp]) -> Array:
-    """Return the step to the minimum of the quadratic model, variables in `held` at rest."""
-    free = np.setdiff1d(np.arange(len(gradient)), held)
+def _newton_step(gradient: Array, hessian: Array, fixed: NDArray[np.intp]) -> Array:
+    """Return the step to the minimum of the quadratic model with variables in `fixed` fixed."""
+    free = np.setdiff1d(np.arange(len(gradient)), fixed)
     diagonal = np.diag(hessian)[free]
     scale = 1.0 / np.sqrt(np.maximum(diagonal, _VANISHING * diagonal.max()))
     step = np.zeros(len(gradient))
@@ -254,7 +227,7 @@ def _newton_step(gradient: Array, hessian: Array, held: NDArray[np.intp]) -> Arr
 
 
 def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array | None:
-    """Return the first of u + step, u + step / 2, ... that is better by enough (Armijo), if any."""
+    """Return the first of u + step, u + step / 2, ... that decreases enough (Armijo), if any."""
     value = problem.value(u)
     for halving in range(_HALVINGS):
         share = 0.5**halving
@@ -266,15 +239,12 @@ def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array 
 
 
 def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float]) -> Minimum:
-    """Return the minimum from far away: the weight of the prior falls in steps (a barrier method).
-
-    With much weight the minimum is near the reference; each of the following is near the one
-    before. The weight to end with may depend on where that is.
+    """Minimise from a distant start with falling weight of the prior (barrier method).
 
     Args:
-        problem: its own weight does not matter.
-        start: inside (v,), as the reference is.
-        weight: the weight to end with, from u.
+        problem: its own weight is ignored.
+        start: feasible (v,), such as the reference.
+        weight: final weight as a function of u.
     """
     found, steps = Minimum(start, converged=False), 0
     now = max(problem.excess(start), weight(start))
@@ -289,7 +259,7 @@ def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float])
 
 
 def _symmetric_basis() -> Array:
-    """Unit entries of a symmetric 4x4 matrix, shape (10, 4, 4)."""
+    """Return the unit entries of a symmetric 4x4 matrix (10, 4, 4)."""
     rows, columns = np.triu_indices(4)
     basis = np.zeros((_N_LINK, 4, 4))
     basis[np.arange(_N_LINK), rows, columns] = 1.0
@@ -302,22 +272,16 @@ _SYMMETRIC: Final = _symmetric_basis()
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """The program in variables u for which the reference is of size one.
+    """Convex program in variables u that are of size one for the reference.
 
-    Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit
-    matrix; then rotors and coupling inertias; then friction, springs and balancers.
-
-    Attributes:
-        bodies: reference of each link.
-        to_standard: physical standard parameters from u (s, v).
-        to_others: parameters of physical friction, springs and balancers from u (k, v).
-        smooth: what is minimised.
+    Per link ten entries of the pseudo-inertia in axes in which the reference's is the unit matrix;
+    then rotors and coupling inertias; then friction, springs and balancers.
     """
 
-    bodies: ReferenceBodies
-    to_standard: Array
-    to_others: Array
-    smooth: Smooth
+    bodies: ReferenceBodies  # reference of each link
+    to_standard: Array  # standard parameters from u (s, v)
+    to_others: Array  # friction, springs and balancers from u (k, v)
+    smooth: Smooth  # objective
 
     @classmethod
     def of(cls, model: RobotModel, rows: Array, target: Array, prior_weight: float) -> Program:
@@ -335,23 +299,23 @@ class Program:
             to_standard[places, span] = inertial_from_pseudo(entries).T
 
         def units(directions: Array) -> Array:
-            """Multiples of directions (p or b, k) that would make all the torque there is.
+            """Return multiples of directions (p or b, k) that would produce all the torque.
 
-            In such units the parameters are far below one: a prior on their squares says little.
+            In these units the parameters are far below one and a prior on their squares is weak.
             """
             columns = np.linalg.norm(rows[:, : len(directions)] @ directions, axis=0)
             whole = float(np.linalg.norm(target))
             usable = (columns > 0.0) & (whole > 0.0)
             return np.where(usable, whole / np.where(usable, columns, 1.0), 1.0)
 
-        # A nominal rotor of zero says that nobody knows it: whatever moves the joint is allowed. A
-        # coupling's unit is the mean of its joints', so that the rotors' matrix is only scaled.
+        # A nominal rotor inertia of zero is unknown. The unit of a coupling is the mean of its
+        # joints', so that the rotors' matrix is only scaled.
         known = nominal[layout.rotors]
         own = np.where(known > 0.0, known, units(model.base.grouping[:, layout.rotors]))
         unit = np.concatenate([own, [np.sqrt(own[i] * own[j]) for i, j in layout.pairs]])
         rotors, rest = np.arange(_N_LINK * n, s), np.arange(s, v)
         to_standard[others, rotors] = unit
-        combine = np.eye(k)  # springs and balancers are free
+        combine = np.eye(k)  # unconstrained springs and balancers
         combine[: len(losses.combine), : len(losses.combine)] = losses.combine
         to_others[:, rest] = combine * units(np.vstack([np.zeros((b, k)), combine]))
         cones = [Cone(np.arange(_N_LINK * n).reshape(n, _N_LINK), _SYMMETRIC)]
@@ -378,15 +342,14 @@ class Program:
         return self.to_standard @ u, self.to_others @ u
 
     def solve(self, n_rows: int, near: Array | None = None) -> tuple[Array, str]:
-        """Return the solution u to rounding, and a status in words.
+        """Return the solution u and its status.
 
-        The prior counts for its weight of rows at their noise. Where no machine fits the data to
-        their noise, the error of the best one is the noise, and the weight grows with it.
+        The prior weighs as many rows as `prior_weight` at the noise of the data. If no consistent
+        parameters fit to the noise, the error of the best ones replaces the noise.
 
         Args:
             n_rows: rows in the weighted normal equations.
-            near: solution of much the same program (v,): Newton's method starts there, and ends
-                when the prior's weight has settled to a hundredth; good for comparisons.
+            near: similar solution (v,) to start from; the prior's weight is then iterated to 1 %.
 
         Raises:
             SolverError: neither the conic solver nor Newton's method found one.
@@ -416,18 +379,18 @@ class Program:
             reference[cone.places] = cone.unit
         found = follow_path(smooth, reference, weight)
         if found.converged:
-            return found.u, "optimal (no machine fits these data to their noise)"
+            return found.u, "optimal (no consistent parameters fit the data to their noise)"
         raise SolverError(
-            f"no solution was found, the conic solver stopped with: {status}; with a prior weight"
-            f" above {smooth.weight:g} there may be one"
+            f"no consistent parameters were found (conic solver: {status}); try a prior weight"
+            f" above {smooth.weight:g}"
         )
 
 
 def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
-    """Return the conic solver's solution u, if it has one, and its word for it."""
-    import cvxpy  # a third of a second to import, and only this estimate needs it
+    """Return the conic solver's solution u or None, and its status."""
+    import cvxpy  # slow import (0.3 s)
 
-    cp: Any = cvxpy  # its names come from star imports, which a type checker does not follow
+    cp: Any = cvxpy  # its star imports are unknown to the type checker
     u = cp.Variable(smooth.R.shape[1])
     prior: Any = cp.sum_squares(u[smooth.R.shape[1] - len(smooth.centre) :] - smooth.centre)
     constraints: list[Any] = [u[smooth.not_negative] >= 0.0]
@@ -436,14 +399,14 @@ def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
         for places in cone.places:
             entries = cone.entries.reshape(-1, size * size).T @ u[places]
             matrix = cp.reshape(entries, (size, size), order="C")
-            prior = prior - cone.barrier * cp.log_det(matrix)
-            if cone.pull:
-                prior = prior + cone.pull * cp.trace(matrix)
+            prior = prior - cone.barrier_weight * cp.log_det(matrix)
+            if cone.trace_weight:
+                prior = prior + cone.trace_weight * cp.trace(matrix)
                 constraints.append(matrix >> _INSIDE * np.eye(size))
     error = cp.sum_squares(smooth.R @ u - smooth.z)
     problem = cp.Problem(cp.Minimize(error + smooth.weight * prior), constraints)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # an inaccurate solution is named by its status
+        warnings.simplefilter("ignore")  # the status reports inaccuracy
         try:
             problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
@@ -453,7 +416,7 @@ def _solve_cone(smooth: Smooth) -> tuple[Array | None, str]:
 
 
 def _coupled_rotors(model: RobotModel, first: int) -> Cone:
-    """Return the inertia matrix of the rotors of coupled joints; variables from `first` on."""
+    """Return the cone of the rotor inertia matrix of coupled joints, variables from `first`."""
     layout = model.layout
     joints = sorted({joint for pair in layout.pairs for joint in pair})
     n, c, size = layout.n_joints, len(layout.pairs), len(joints)
@@ -463,43 +426,28 @@ def _coupled_rotors(model: RobotModel, first: int) -> Cone:
     for k, pair in enumerate(layout.pairs):
         i, j = (joints.index(joint) for joint in pair)
         entries[size + k, i, j] = entries[size + k, j, i] = 1.0
-    return Cone(places[None], entries, pull=0.0, barrier=_ROTOR_BARRIER)
+    return Cone(places[None], entries, trace_weight=0.0, barrier_weight=_ROTOR_BARRIER)
 
 
 @dataclass(frozen=True, eq=False)
 class ConsistentEstimate:
-    """Parameters that a machine can have, and what it cost the fit.
+    """Physically consistent parameters, compared with the unconstrained estimate."""
 
-    Attributes:
-        standard: standard parameters (s,), every pseudo-inertia positive definite, no rotor
-            inertia negative. Where the data leave a choice they are close to the nominal ones.
-        friction: coefficients (k,), see `RobotModel.friction_part`.
-        estimate: the parameters (p,) that follow from them, with springs and balancers. Its
-            covariance is the one of the unconstrained estimate: an inequality that holds has no
-            covariance of its own, and one that binds makes the true spread smaller.
-        unconstrained: the estimate without inequalities.
-        margin: smallest eigenvalue of each link's pseudo-inertia (n,), SI units, positive.
-        relative_error: ||tau - tau_hat|| / ||tau|| over all fitted rows.
-        unconstrained_relative_error: the same of the unconstrained estimate.
-        reference: per link, what stood for its nominal body, in words (n,).
-        status: "optimal", or that no machine fits the data to their noise.
-        solution: in the coordinates of the program (v,).
-    """
-
-    standard: Array
-    friction: Array
+    standard: Array  # standard parameters (s,); close to the nominal ones where undetermined
+    friction: Array  # coefficients (k,), see `RobotModel.friction_part`
+    # parameters (p,) with springs and balancers; the covariance is that of `unconstrained`
     estimate: Estimate
     unconstrained: Estimate
-    margin: Array
-    relative_error: float
+    margin: Array  # smallest eigenvalue of each link's pseudo-inertia (n,), SI units, positive
+    relative_error: float  # ||tau - tau_hat|| / ||tau|| over all fitted rows
     unconstrained_relative_error: float
-    reference: tuple[str, ...]
-    status: str
-    solution: Array
+    reference: tuple[str, ...]  # description of the nominal body of each link (n,)
+    status: str  # "optimal", or that no consistent parameters fit the data to their noise
+    solution: Array  # of the program (v,)
 
     @property
     def shift(self) -> Array:
-        """How far each parameter was moved, in its standard deviations (p,); 0 if infinite."""
+        """Change of each parameter in standard deviations (p,); 0 if they are infinite."""
         moved = self.estimate.values - self.unconstrained.values
         std = self.unconstrained.std
         known = np.isfinite(std) & (std > 0.0)
@@ -520,14 +468,13 @@ def consistent_estimate(
     Args:
         model: the robot.
         factor: the samples.
-        unconstrained: the least-squares estimate of the same samples, to compare with.
+        unconstrained: least-squares estimate of the same samples for comparison.
         weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
-        prior_weight: how many rows of data (each at its noise) the nominal parameters count for.
-        near: `solution` of much the same samples, see :meth:`Program.solve`.
+        prior_weight: rows of data (each at its noise) that the nominal parameters count for.
+        near: `solution` of similar samples, see :meth:`Program.solve`.
 
     Raises:
-        IdentificationError: there are no rows, or the unconstrained estimate is of other
-            parameters.
+        IdentificationError: no rows, or the unconstrained estimate has other parameters.
         SolverError: no such parameters were found.
     """
     if weights is None:
@@ -535,7 +482,7 @@ def consistent_estimate(
     if unconstrained is None:
         unconstrained = estimate(model, factor, weights)
     if unconstrained.names != model.parameter_names:
-        raise IdentificationError("the unconstrained estimate is of other parameters")
+        raise IdentificationError("the unconstrained estimate has other parameters")
     equations = factor.weighted(weights)
     program = Program.of(model, *rows_of(equations), prior_weight)
     solution, status = program.solve(equations.n, near)
@@ -565,19 +512,14 @@ def consistent_estimate(
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How far an estimate is drawn towards the consistent solution.
+    """Strength of the shrinkage towards the consistent solution."""
 
-    Attributes:
-        strength: information of the prior, as a share of the data's in each column; zero for
-            least squares, infinite for the consistent solution itself.
-        prior_weight: rows of data that the nominal bodies count for in the consistent solution.
-    """
-
+    # prior information as a share of the data; 0: least squares, inf: consistent solution
     strength: float = 0.0
-    prior_weight: float = 0.1
+    prior_weight: float = 0.1  # rows of data that the nominal bodies count for
 
     def describe(self) -> str:
-        """The estimator in words."""
+        """Return the name of the estimator."""
         if self.strength == 0.0:
             return "least squares"
         nominal = f"nominal bodies weigh {self.prior_weight:g} rows"
@@ -587,7 +529,7 @@ class Shrinkage:
 
 
 def shrunk_values(equations: NormalEquations, centre: Array, strength: float) -> Array:
-    """Parameters (p,) drawn towards the centre (p,); what has no data stays there."""
+    """Shrink parameters (p,) towards the centre (p,)."""
     if math.isinf(strength):
         return centre
     prior = strength * np.diag(equations.A)
@@ -598,7 +540,7 @@ def shrunk_values(equations: NormalEquations, centre: Array, strength: float) ->
 def fitted_values(
     model: RobotModel, factor: Factor, shrinkage: Shrinkage, centre: Array | None = None
 ) -> Array:
-    """Parameters (p,) of a factor drawn towards a centre, its consistent solution by default.
+    """Return parameters (p,) shrunk towards a centre, by default the consistent solution.
 
     Raises:
         IdentificationError: no consistent parameters were found.
@@ -623,17 +565,17 @@ def fit_shrunk(
     centre: Array | None = None,
     phase: PhaseFactor | None = None,
 ) -> Estimate:
-    """Fit recordings; the covariance is that of least squares, cluster-robust.
+    """Fit recordings with shrinkage; the covariance is that of least squares, cluster-robust.
 
-    The consistent solution comes from the same samples: as a prior it knows no more than they do,
-    and where they leave parameters open the nominal bodies decide, whose errors nobody knows.
+    The consistent solution is estimated from the same samples and adds no information on what they
+    leave open.
 
     Args:
         model: the robot.
         recordings: the samples.
-        shrinkage: how far.
-        centre: what to draw towards (p,), by default the consistent solution of these samples.
-        phase: of the recordings, if it is known.
+        shrinkage: its strength.
+        centre: to shrink to (p,), by default the consistent solution.
+        phase: factor of the recordings if known.
 
     Raises:
         IdentificationError: no usable row, or no consistent parameters were found.
@@ -655,43 +597,36 @@ def fit_shrunk(
     )
 
 
-# Smallest eigenvalue of the covariance in units of standard deviations, over the largest: in
-# directions that are known better the measure is as if they were not, lest it be singular.
+# Smallest relative eigenvalue of the covariance in units of standard deviations, so that it is not
+# singular.
 _BEST_KNOWN: Final = 1e-8
-# So many that the prior's weight stays: the covariance holds the errors of the model already.
+# The prior's weight is constant: the covariance includes model errors.
 _ROWS: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, eq=False)
 class Ensemble:
-    """N variants of an arm.
+    """N sampled parameter sets of an arm."""
 
-    Attributes:
-        standard: standard parameters (N, s), every body and every rotor possible.
-        values: the parameters (N, p) that follow from them, with friction, springs and balancers.
-    """
-
-    standard: Array
-    values: Array
+    standard: Array  # standard parameters (N, s), physically consistent
+    values: Array  # parameters (N, p), with friction, springs and balancers
 
 
 def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int) -> Ensemble:
-    r"""Draw variants of an arm as far apart as its parameters are uncertain, all of them possible.
+    r"""Sample consistent parameter sets that scatter as the estimate is uncertain.
 
-    Least squares knows the parameters up to :math:`\delta \sim N(0, C)`. For each variant one
-    :math:`\delta` is added to the estimate, and the physically consistent parameters nearest to
-    the sum are looked for, in the measure :math:`C^{-1}` (randomise, then optimise). Where all
-    within the intervals is possible the variants have the covariance C; elsewhere they are closer
-    together. What the data say nothing about stays at the prior.
+    Each sample is the consistent solution nearest, in the measure :math:`C^{-1}`, to the estimate
+    plus :math:`\delta \sim N(0, C)` (randomise, then optimise). Samples have the covariance C where
+    constraints are inactive. Undetermined parameters stay at the prior.
 
     Args:
         model: the robot.
-        estimate: of its parameters, with their covariance.
-        count: number N of variants.
-        seed: of the draws; the same one gives the same variants.
+        estimate: parameters with covariance.
+        count: number N of samples.
+        seed: of the random numbers.
 
     Raises:
-        SolverError: no possible parameters were found near some draw.
+        SolverError: no consistent parameters were found for a sample.
     """
     spread, measure = _roots(estimate.covariance)
     program = Program.of(model, measure, measure @ estimate.values, 1.0)

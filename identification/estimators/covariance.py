@@ -1,24 +1,19 @@
-r"""Covariance of a least-squares estimate whose residuals are not white.
+"""Cluster-robust covariance of least-squares estimates with coloured residuals.
 
-What torque models leave over is coloured: ripple, friction that drifts, a servo's limit cycle.
-The classical covariance counts every sample as new information and is then too small, often by
-an order of magnitude. Here the covariance is the cluster-robust sandwich
+The classical covariance counts every sample as independent and is often an order of magnitude too
+small. Here the covariance is the sandwich
 
     A^-1 (sum_b s_b s_b') A^-1,    s_b = (1 - A_b A^-1)^-1 W_b' w e_b
 
-over blocks b of consecutive time, which assumes nothing about what happens inside a block. The
-factor in front of the scores (Bell and McCaffrey 2002, "CR3") gives back what the fit has removed
-from the residuals; the result is that of leaving one block out at a time. A direction that one
-block alone determines takes its variance from the other blocks. The kernel
-estimators that work on scores as they are (Newey and West 1987) were tried on simulated NS 16
-data: with noise correlated over 50 ms their nominal 95 % intervals covered 88 %, these 95 %.
+over blocks b of consecutive time, for any correlation inside a block. The leverage correction (Bell
+and McCaffrey 2002, "CR3") makes it that of leaving out one block at a time. A direction that a
+single block determines takes its variance from the other blocks. On simulated NS 16 data with noise
+correlated over 50 ms nominal 95 % intervals cover 95 %; kernel estimators (Newey and West 1987) 88
+%.
 
-Over R repetitions of one motion, what the model gets wrong is the same every time. It does not
-average out, and treating repetitions as independent would shrink it by sqrt(R). So the blocks of
-all repetitions at equal times of the motion form one: what repeats adds up, noise averages.
-
-Blocks are few, hence Student's factor for intervals, and a covariance matrix of a rank that is
-no higher than their number: good for variances, not to be inverted.
+Model errors repeat in all R repetitions of a motion, so the blocks of all repetitions at equal
+times of the motion are added to one. The few blocks require Student's factor for intervals and
+limit the rank of the covariance: use its variances, do not invert it.
 """
 
 from __future__ import annotations
@@ -47,52 +42,42 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 
-# Errors of a model come and go with the moves of the arm, that is over some tenths of a second.
+# Model errors are correlated over some tenths of a second.
 SHORTEST_BLOCK: Final = 2  # fine blocks
-# Blocks are lengthened until the scores of neighbours hardly correlate (`_sandwich` allows for
-# what is left), ...
+# Correlation of neighbouring scores up to which blocks are lengthened; the rest is corrected in
+# `_sandwich`.
 _CORRELATED: Final = 0.1
-# ... but fewer blocks than this would make the covariance itself too uncertain.
+# Fewer blocks make the covariance itself too uncertain.
 _FEWEST_BLOCKS: Final = 20
-# Leverage up to which a block's own residual tells the variance, and from which on the other
-# blocks' do. On simulated NS 16 data whose joint 6 moves for 0.2 of 16 s, with noise correlated
-# over 50 ms, the nominal 95 % intervals of that joint's friction covered 3 to 80 % without this.
-_OWN: Final = 0.5
-_OTHERS: Final = 0.9
-# Share of a direction's information that other blocks must have for leaving one out to mean
-# anything there.
+# Leverages between which the variance changes from own residual to other blocks. On simulated NS 16
+# data whose joint 6 moves for 0.2 of 16 s the nominal 95 % intervals of its friction covered 3 to
+# 80 % without this.
+_LOW_LEVERAGE: Final = 0.5
+_HIGH_LEVERAGE: Final = 0.9
+# Smallest share of information in the other blocks when one is left out.
 _ALONE: Final = 1e-6
 _AT_ONCE: Final = 8  # blocks whose matrices fit the cache
 
 
 @dataclass(frozen=True, eq=False)
 class Clustered:
-    """Covariance of an estimate, by blocks of time.
+    """Covariance of an estimate by blocks of time."""
 
-    Attributes:
-        covariance: (p, p), infinite variances of what is undetermined.
-        determined: (p,).
-        design_effect: by how much the mean variance is that of white residuals.
-        interval_factor: standard deviations in half a 95 % interval.
-        words: what was done.
-        blocks: of time.
-    """
-
-    covariance: Array
-    determined: NDArray[np.bool_]
-    design_effect: float
-    interval_factor: float
-    words: str
-    blocks: int
+    covariance: Array  # (p, p), infinite variances of undetermined parameters
+    determined: NDArray[np.bool_]  # (p,)
+    design_effect: float  # mean ratio of the variance to that of white residuals
+    interval_factor: float  # standard deviations in half a 95 % interval
+    words: str  # description
+    blocks: int  # number of blocks
 
 
 def block_covariance(
     phase: PhaseFactor, weights: Array, values: Array, prior: Array | None = None
 ) -> Clustered:
-    """Cluster-robust covariance of a weighted least-squares estimate, from its factor alone.
+    """Return the cluster-robust covariance of a weighted least-squares estimate by its factor.
 
-    With a Gaussian prior H = A + diag(prior) takes the place of the information A, and the prior's
-    own part, ``H^-1 diag(prior) H^-1``, counts times the design effect, as the data's does.
+    With a Gaussian prior, H = A + diag(prior) replaces the information A, and the prior adds ``H^-1
+    diag(prior) H^-1`` times the design effect.
 
     Args:
         phase: the samples, of one repetition or of all.
@@ -125,15 +110,15 @@ def cluster_covariance(
     block: float = FINE_BLOCK,
     stretch: int = 1,
 ) -> Clustered:
-    """Cluster-robust covariance of an estimate whose fine blocks are given.
+    """Return the cluster-robust covariance of an estimate with given fine blocks.
 
     Args:
         information: of the blocks (B, p, p).
-        scores: what the blocks' residuals pull with (B, p).
-        solution: of the sum of the information, with the prior's.
+        scores: of the blocks (B, p).
+        solution: of the summed information, with the prior's.
         prior: see :func:`block_covariance`.
         block: length of each [s].
-        stretch: by how much blocks are longer than scores ask for, as far as enough are left.
+        stretch: additional factor of the block length if enough blocks remain.
     """
     used = scores.any(axis=1)
     information, scores = information[used], scores[used]
@@ -150,14 +135,14 @@ def _sandwich(
     duration: float,
     prior: Array | None = None,
 ) -> Clustered:
-    """Covariance from blocks of some seconds: shares of information (B, k, k), scores (B, p).
+    """Return the covariance by shares of information (B, k, k) and scores (B, p) of blocks.
 
-    Scores that correlate by r with those of the next block alone add up to a variance 1 + 2 r times
-    as large; r is the mean over the directions, at least zero. A few blocks may still be too short.
+    A correlation r of neighbouring scores multiplies the variance by 1 + 2 r; r is the mean over
+    directions, at least zero.
     """
     scores = scores @ solution.root
     corrected = leverage_corrected(shares, scores)
-    corrected *= np.sqrt(1.0 + 2.0 * max(0.0, _neighbours(scores)))
+    corrected *= np.sqrt(1.0 + 2.0 * max(0.0, _lag_correlation(scores)))
     moved = corrected @ solution.root.T
     covariance = np.asarray(moved.T @ moved)
     effect = float((corrected**2).sum() / max(1, corrected.shape[1]))
@@ -196,40 +181,39 @@ def with_block_covariance(
 
 
 def block_length(scores: Array) -> int:
-    """Fine blocks per block: as few as leave neighbouring scores (B, p) hardly correlated."""
+    """Return the least number of fine blocks per block with uncorrelated scores (B, p)."""
     longest = max(1, len(scores) // _FEWEST_BLOCKS)
     shortest = min(SHORTEST_BLOCK, longest)
     for length in range(shortest, longest):
-        if _neighbours(merged(scores, length)) < _CORRELATED:
+        if _lag_correlation(merged(scores, length)) < _CORRELATED:
             return length
     return longest
 
 
-def _neighbours(scores: Array) -> float:
-    """Mean correlation of scores (B, k) with those of the next block."""
+def _lag_correlation(scores: Array) -> float:
+    """Return the mean correlation of scores (B, k) with those of the next block."""
     power, both = (scores**2).sum(axis=0), (scores[1:] * scores[:-1]).sum(axis=0)
     return float(np.mean(both[power > 0.0] / power[power > 0.0])) if power.any() else 0.0
 
 
 def spread(information: Array, scores: Array, root: Array, left: Array | None = None) -> Array:
-    """Rows (R, p), R >= B, whose outer products sum to the cluster-robust covariance.
+    """Return rows (R, p), R >= B, whose outer products sum to the cluster-robust covariance.
 
     Args:
-        information: of the blocks (B, p, p); their sum A is what the estimate was solved with.
-        scores: what the blocks' residuals pull with (B, p).
+        information: of the blocks (B, p, p), with sum A.
+        scores: of the blocks (B, p).
         root: S (p, k), with S L' the inverse of A on what is determined.
-        left: L (p, k), by default S, as it is for a symmetric A.
+        left: L (p, k), by default S, for a symmetric A.
     """
     left = root if left is None else left
     return leverage_corrected(_shares(information, root, left), scores @ left) @ root.T
 
 
 def left_out(information: Array, scores: Array, root: Array, left: Array | None = None) -> Array:
-    """How much an estimate moves when one block of its samples is left out (B, p).
+    """Return the change of an estimate when one block of samples is left out (B, p).
 
-    Block by block, to compare two estimates of the same samples; for a covariance see
-    :func:`spread`, whose arguments these are. Nothing moves in a direction that only the block
-    left out determines.
+    For comparing two estimates of the same samples; arguments as for :func:`spread`. Directions
+    that only the block determines do not change.
     """
     left = root if left is None else left
     shares, scores = _shares(information, root, left), scores @ left
@@ -247,13 +231,12 @@ def left_out(information: Array, scores: Array, root: Array, left: Array | None 
 
 
 def leverage_corrected(shares: Array, scores: Array) -> Array:
-    """Rows (R, k), R >= B, whose outer products sum to the covariance for an information of one.
+    """Return rows (R, k), R >= B, whose outer products sum to the covariance for unit information.
 
     Scores (B, k) times (1 - H_b)^-1, with H = `shares` (B, k, k). Where one block alone determines
-    a direction its residual vanishes there, and so would the variance; before that, all depends
-    on the one residual of that block. So between the leverages `_OWN` and `_OTHERS` what the
-    block's residual says gives way to the variance of white residuals, ``h``, times the design
-    effect of the rest, but at least one.
+    a direction its residual vanishes. Between the leverages `_LOW_LEVERAGE` and `_HIGH_LEVERAGE`
+    the residual of the block is replaced by the variance of white residuals, ``h``, times the
+    design effect of the rest, at least one.
     """
     own, dependent = _regular(shares, scores)
     regular = np.ones(len(scores), dtype=np.bool_)
@@ -264,8 +247,10 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
     identity = np.eye(scores.shape[1])
     for b in dependent:
         u, rest, vt = np.linalg.svd(identity - shares[b])
-        trusted = np.clip((rest - (1.0 - _OTHERS)) / (_OTHERS - _OWN), 0.0, 1.0)
-        without_own = (u.T @ scores[b]) / np.maximum(rest, 1.0 - _OTHERS)
+        trusted = np.clip(
+            (rest - (1.0 - _HIGH_LEVERAGE)) / (_HIGH_LEVERAGE - _LOW_LEVERAGE), 0.0, 1.0
+        )
+        without_own = (u.T @ scores[b]) / np.maximum(rest, 1.0 - _HIGH_LEVERAGE)
         squares += float((trusted * without_own**2 * rest).sum())
         leverage += float((trusted * (1.0 - rest)).sum())
         rows.append(((np.sqrt(trusted) * without_own) @ vt)[None])
@@ -276,17 +261,14 @@ def leverage_corrected(shares: Array, scores: Array) -> Array:
 
 
 def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
-    """Corrected scores (B, k), zero for the blocks on which some direction depends by `_OWN`.
-
-    And which blocks those are. One block at a time, in memory that stays in the cache.
-    """
+    """Return corrected scores (B, k), zero for blocks of high leverage, and those blocks."""
     lapack, k = scipy.linalg.lapack, scores.shape[1]
     corrected, dependent = np.zeros_like(scores), []
     work, diagonal = np.empty((k, k), order="F"), np.arange(k)
     for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
         np.add(share, share.T, out=work)
         work *= -0.5
-        work[diagonal, diagonal] += _OWN
+        work[diagonal, diagonal] += _LOW_LEVERAGE
         if lapack.dpotrf(work, overwrite_a=1, clean=0)[1] != 0:
             dependent.append(b)
             continue
@@ -297,15 +279,14 @@ def _regular(shares: Array, scores: Array) -> tuple[Array, list[int]]:
 
 
 def _shares(information: Array, root: Array, left: Array) -> Array:
-    """Information of the blocks where that of all together is 1 (B, k, k)."""
+    """Return the information of the blocks relative to their sum (B, k, k)."""
     blocks, p, _ = information.shape
-    # One large product instead of many small ones.
+    # One large product is faster.
     half = (information.reshape(blocks * p, p) @ root).reshape(blocks, p, -1)
     return np.asarray(left.T @ half)
 
 
-# A direction in which the loss curves less than this share of its weighted squares is flat: the
-# estimate could as well be elsewhere.
+# Curvature relative to the weighted squares below which a direction is undetermined.
 _FLAT: Final = 1e-3
 _PARTICIPATION: Final = 1e-3
 
@@ -317,19 +298,18 @@ def clustered_covariance(
     weights: Array,
     loss: Loss = Loss(),  # noqa: B008 - frozen
 ) -> Clustered:
-    """Covariance of weighted estimates with any loss; samples are read once, one at a time.
+    """Return the covariance of weighted estimates with any loss, reading the samples once.
 
     Args:
         model: the robot.
         recordings: what was fitted.
         solution: the estimate, and the root of its inverse information.
-        weights: per joint (n,): 1/variance, which also says how many standard deviations a
-            residual is.
-        loss: what was minimised.
+        weights: per joint (n,): 1/variance.
+        loss: that was minimised.
     """
     count = max(int(fine_blocks(samples)[-1]) + 1 for samples in recordings)
     k = solution.root.shape[1]
-    information = np.zeros((count, k, k))  # in coordinates in which that of squares sums to 1
+    information = np.zeros((count, k, k))  # information in coordinates with unit sum of squares
     scores, rows = np.zeros((count, model.n_parameters)), np.zeros(count, dtype=np.intp)
     for samples in recordings:
         index = fine_blocks(samples)
@@ -349,7 +329,7 @@ def clustered_covariance(
     information = merged(information[rows > 0], length)
     curvature, vectors = np.linalg.eigh(information.sum(axis=0))
     steep = curvature > _FLAT
-    # In these coordinates all blocks together have the information 1.
+    # Coordinates in which all blocks together have unit information.
     to_unit = vectors[:, steep] / np.sqrt(curvature[steep])
     size = np.maximum(np.linalg.norm(solution.root, axis=1), np.finfo(np.float64).tiny)
     flat = np.abs(solution.root @ vectors[:, ~steep]).max(axis=1, initial=0.0)

@@ -1,19 +1,18 @@
-r"""The constant delay of a torque or current channel behind the positions.
+r"""Constant delay of the torque or current channel relative to the positions.
 
-The torque of axis j was logged d_j later than the position it belongs to:
+The torque of axis j is recorded with delay d_j:
 
 .. math:: \tau_j(t) = W_j\bigl(q, \dot q, \ddot q\bigr)(t - d_j)\,\pi + e_j(t)
 
-One logger writes the torques of all axes, so one delay of all of them is estimated first, from all
-rows at once: a profile of the residual over common delays finds the valley, Gauss-Newton steps on
-parameters and delay together, with the column :math:`-d\tau/dt`, find its floor. An axis gets a
-deviation of its own only where that is significant and predicts blocks of time that were left out
-better. Parameters and delays are estimated jointly because they can be mistaken for one another: a
-delayed acceleration looks like viscous friction when the motion has one frequency only.
+One logger records all torques, so a common delay is estimated first: the minimum of a residual
+profile over common delays is refined by Gauss-Newton steps on parameters and delay together, with
+the column :math:`-d\tau/dt`. An axis gets its own deviation only where that is significant and
+predicts left-out blocks of time better. Parameters and delays are estimated together because they
+correlate: with a single frequency a delayed acceleration is viscous friction.
 
-The motion is read at other times, never the torque: reading noise between its samples would smooth
-it, at some delays more than at others. Rows near a velocity reversal do not count here: dry
-friction that turns round over a displacement looks like a delay.
+The motion is interpolated at other times, not the torque, whose noise interpolation would smooth by
+an amount that depends on the delay. Rows near a velocity reversal are left out: presliding friction
+is similar to a delay.
 """
 
 from __future__ import annotations
@@ -51,17 +50,15 @@ Array = NDArray[np.float64]
 
 
 def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recording:
-    """Return the recording with torque and current brought back to the positions' time.
+    """Return the recording with torque and current shifted to the time of the positions.
 
-    Each channel is read `delays` later, between samples by the cubic through its neighbours, never
-    across a gap;
-    samples at the ends of a segment for which there is nothing to read are left out. Where one
-    delay serves all axes, :attr:`Preprocessing.torque_delay` does the same without touching the
-    torque.
+    Each channel is interpolated `delays` later by cubics between samples, not across gaps; samples
+    without data at the ends of segments are dropped. For a common delay,
+    :attr:`Preprocessing.torque_delay` leaves the torque unchanged.
 
     Args:
         recording: checked.
-        delays: by which torque and current lag the position (n,) [s].
+        delays: of torque and current (n,) [s].
 
     Raises:
         IdentificationError: no sample is left.
@@ -82,20 +79,20 @@ def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recordi
                 at = inside + shift[joint]
                 array[segment, joint] = read_at(inside, array[segment, joint], at)
     if not keep.any():
-        raise IdentificationError("every stretch of the recording is shorter than the delay")
+        raise IdentificationError("every segment of the recording is shorter than the delay")
     changes: dict[str, Any] = {**moved, "gap_before": gap}
     return replace(recording, **changes).rows(keep)
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
-    """Values (m, ...) of one stretch at other times (k,), those of its ends beyond them."""
-    # Local: where Coulomb friction jumps, a global spline would ring.
+    """Interpolate values (m, ...) of one segment at times (k,), constant outside."""
+    # Local, since a global spline oscillates at Coulomb friction steps.
     source = scipy.interpolate.CubicHermiteSpline(time, values, np.gradient(values, time, axis=0))
     return np.asarray(source(np.clip(at, time[0], time[-1])))
 
 
 def predicted_rate(samples: Samples, torque: Array) -> Array:
-    """Time derivative of predicted torques (m, ...), zero in stretches too short for one."""
+    """Return the time derivative of torques (m, ...), zero in segments of one sample."""
     rate = np.zeros_like(torque)
     for segment in samples.segments:
         if segment.stop - segment.start > 1:
@@ -104,7 +101,7 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 
 
 def rate_products(model: RobotModel, samples: Samples) -> Array:
-    """Sums ``W' d[W | t]/dt`` over the usable rows per joint (n, p, p + 1); recordings add up.
+    """Return sums ``W' d[W | t]/dt`` over usable rows per joint (n, p, p + 1), which add up.
 
     The torque t is that of the known payload.
     """
@@ -123,13 +120,12 @@ def with_uncertain_delay(
 ) -> Estimate:
     """Return the estimate with the uncertainty of the delay in its covariance.
 
-    A later delay compares the torque with earlier motion, which is another torque by its rate of
-    change; the parameters move by the fit of that rate.
+    The parameters change by the fit of the torque's rate.
 
     Args:
-        estimate: made with one delay assumed certain.
-        factor: of what was fitted.
-        products: its `rate_products` (n, p, p + 1).
+        estimate: made with one given delay.
+        factor: of the fitted samples.
+        products: their `rate_products` (n, p, p + 1).
         variance: of the delay [s²].
     """
     weights = inverse_variance(estimate.noise_std**2)
@@ -142,61 +138,44 @@ def with_uncertain_delay(
 Rows = NDArray[np.bool_]
 
 LONGEST_DELAY: Final = 0.05  # s, either way
-# Encoder noise goes round a servo's loop and correlates with the torque. On the simulated NS 16 in
-# closed loop (delay 0.2 ms, four seeds) the mean is 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at
-# 40 Hz, where wrist axes seem to deviate by 0.3 ms besides.
+# Encoder noise correlates with the torque through the servo loop. Simulated NS 16, delay 0.2 ms,
+# four seeds: mean 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at 40 Hz, where wrist axes deviate by 0.3
+# ms.
 DELAY_BANDWIDTH: Final = 10.0  # Hz
-# Half a 95 % interval of a delay that is determined: the cycle of the fastest usual controllers.
+# Half a 95 % interval of a determined delay.
 WIDEST_INTERVAL: Final = 1e-3  # s
-# Torques are averaged over bins of so long: planned motion has next to nothing above 10 Hz, of
-# which this takes 2 %, the same before and after the torque's time.
+# Averaging interval of torques, symmetric in time; 2 % loss at 10 Hz.
 _BIN: Final = 0.01  # s
-# Valleys of the profile over delays are wider than this.
+# Minima of the profile are wider.
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
-_CONVERGED, _OF_STD = 1e-6, 0.02  # step: s, or this small beside what noise does
-# Two valleys whose residual variances differ by less are distinguished by what the model gets
-# wrong.
+_CONVERGED, _OF_STD = 1e-6, 0.02  # s, and share of the standard deviation
+# Difference of log variance up to which two minima are equally good.
 _MODEL_ERROR: Final = 0.05
-# Of the smoothing's bandwidth, on either side of a velocity reversal.
+# Periods of the smoothing's bandwidth beside a velocity reversal.
 _REVERSAL_PERIODS: Final = 0.5
 _FOLDS: Final = 5
-# Of the time, at most half as many of the covariance: one delay needs no more.
+# Blocks of time.
 _BLOCKS: Final = 80
-_WORTHWHILE: Final = 0.02  # of the squared error, that a delay of its own has to save
-_CHANCE: Final = 0.005  # of a delay that is found where there is none, each way
+_WORTHWHILE: Final = 0.02  # required reduction of the squared error by a deviation
+_CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 
 @dataclass(frozen=True, eq=False)
 class DelayEstimate:
-    """How long the torque of n axes lags the position.
+    """Delay of the torque of n axes relative to the position."""
 
-    Attributes:
-        joint_names: (n,).
-        common: delay of all axes without a deviation [s].
-        common_std: its standard deviation, cluster-robust [s]; infinite where the motion says
-            nothing about it.
-        deviations: of each axis from the common delay (n,) [s]; zero where prediction does not
-            ask for one.
-        deviation_std: their standard deviations (n,) [s].
-        assumed: delay that the samples were prepared with [s].
-        cycle: the usual step of the clock [s].
-        interval_factor: standard deviations in half a 95 % interval.
-        reason: why the common delay is not determined, None where it is.
-        significant: whether `common` and `deviations` differ from what was assumed by more than
-            chance alone makes in 99 % of recordings, and predict blocks of time that were left
-            out better.
-    """
-
-    joint_names: tuple[str, ...]
-    common: float
-    common_std: float
+    joint_names: tuple[str, ...]  # (n,)
+    common: float  # delay of all axes without own deviation [s]
+    common_std: float  # cluster-robust standard deviation [s]; infinite if undetermined
+    # of each axis from the common delay (n,) [s]; zero if prediction does not improve
     deviations: Array
-    deviation_std: Array
-    assumed: float
-    cycle: float
-    interval_factor: float
-    reason: str | None
+    deviation_std: Array  # standard deviations (n,) [s]
+    assumed: float  # delay with which the samples were prepared [s]
+    cycle: float  # usual step of the clock [s]
+    interval_factor: float  # standard deviations in half a 95 % interval
+    reason: str | None  # why the common delay is undetermined, or None
+    # whether the delays differ from `assumed` at 99 % and predict left-out blocks better
     significant: bool
 
     @property
@@ -206,53 +185,52 @@ class DelayEstimate:
 
     @property
     def determined(self) -> NDArray[np.bool_]:
-        """Whether the delay of each axis is determined (n,): of all or none."""
+        """Whether the delay of each axis is determined (n,); equal for all."""
         return np.full(len(self.joint_names), self.reason is None)
 
     @property
     def delays(self) -> Array:
-        """Delays of the axes (n,) [s], NaN where not determined."""
+        """Delays of the axes (n,) [s], NaN if undetermined."""
         return np.where(self.determined, self.common + self.deviations, np.nan)
 
     @property
     def std(self) -> Array:
-        """Standard deviations of `delays` (n,) [s], infinite where not determined."""
+        """Standard deviations of `delays` (n,) [s], infinite if undetermined."""
         own = np.where(self.deviations != 0.0, self.deviation_std, self.common_std)
         return np.where(self.determined, own, np.inf)
 
     @property
     def agree(self) -> bool:
-        """Whether one delay serves all axes."""
+        """Whether all axes have the common delay."""
         return not self.deviations.any()
 
     @property
     def applied(self) -> Array:
-        """Delays to compensate (n,) [s]: what was assumed where nothing else is significant."""
+        """Delays to compensate (n,) [s]: those assumed unless significant."""
         n = len(self.joint_names)
         return self.common + self.deviations if self.significant else np.full(n, self.assumed)
 
     @property
     def variance(self) -> float:
-        """Variance of the common delay [s²], no more than that of any delay in `LONGEST_DELAY`.
+        """Variance of the common delay [s²], at most that of a uniform one in `LONGEST_DELAY`.
 
-        Where the assumed delay is applied it is within the interval of the common one, and its
-        error of this size.
+        Also the error variance of an assumed delay inside the interval.
         """
         return float(np.fmin(self.common_std**2, LONGEST_DELAY**2 / 3.0))
 
     def describe(self) -> list[str]:
-        """The common delay, then each axis that deviates from it, in words."""
-        who = "all axes" if self.agree else "all other axes"
+        """Return lines on the common delay and each axis that deviates."""
+        axes = "all axes" if self.agree else "all other axes"
         against = f"the {self.assumed * 1e3:.3g} ms assumed"
         if self.reason is None or self.significant:
-            line = f"{self._words(self.common, self.common_std)},"
+            line = f"{self._text(self.common, self.common_std)},"
             line += f" {'' if self.significant else 'not '}significantly different from {against}"
         else:
             line = f"not determined; {self.reason}"
-        lines = [f"{who}: {line}"]
+        lines = [f"{axes}: {line}"]
         lines += [
-            f"{name}: {self._words(self.common + deviation, std)}, which predicts better than the"
-            " delay of the others"
+            f"{name}: {self._text(self.common + deviation, std)}, which predicts better than the"
+            " common delay"
             for name, deviation, std in zip(
                 self.joint_names, self.deviations, self.deviation_std, strict=True
             )
@@ -260,7 +238,7 @@ class DelayEstimate:
         ]
         return lines
 
-    def _words(self, delay: float, std: float) -> str:
+    def _text(self, delay: float, std: float) -> str:
         half = self.interval_factor * std
         return (
             f"{delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
@@ -275,13 +253,13 @@ def estimate_delays(
     noise_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
 ) -> DelayEstimate:
-    """Estimate by how much the torque of a recording lags its position.
+    """Estimate the delay of a recording's torque relative to its position.
 
     Args:
         recording: with torque, joints in the model's order.
         model: the robot.
         noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
-        options: how it is smoothed, what the torque has come through, and the assumed delay.
+        options: smoothing, torque low-pass, and the assumed delay.
 
     Raises:
         RecordingError: see :func:`identification.signals.samples.prepare`.
@@ -297,7 +275,7 @@ def estimate_delays(
     heights, values = reader.profile(grid)
     shift = np.full(n, grid[np.argmin(heights)])
     shift, blocks = _descend(reader, shift, values, _basis(p, n), ends)
-    rival = _rival(grid, heights, float(shift[0]), reader.profile(shift[:1])[0][0])
+    other = _other_minimum(grid, heights, float(shift[0]), reader.profile(shift[:1])[0][0])
     axes = _deviating(blocks, p, n)
     basis = _basis(p, n, axes)
     if axes:
@@ -307,10 +285,10 @@ def estimate_delays(
     _, by_chance = blocks.covariance(basis, solution, _CHANCE)
     std = np.sqrt(np.einsum("jk,kl,jl->j", basis[p:, p:], covariance[p:, p:], basis[p:, p:]))
     own = np.isin(np.arange(n), axes)
-    first = int(np.argmin(own))  # of the axes without a delay of their own
+    first = int(np.argmin(own))  # first axis with the common delay
     common = float(shift[first])
     common_std = float(std[first]) if solution.determined[p] else np.inf
-    at_edge = bool(np.any((shift <= ends[0]) | (shift >= ends[1])))
+    at_limit = bool(np.any((shift <= ends[0]) | (shift >= ends[1])))
     before = reader.linearised(np.zeros(n), solution.values[:p], blocks.weights)
     return DelayEstimate(
         joint_names=model.joint_names,
@@ -321,10 +299,10 @@ def estimate_delays(
         assumed=assumed,
         cycle=reader.cycle,
         interval_factor=factor,
-        reason=_why_not(factor * common_std, at_edge, rival + assumed),
+        reason=_undetermined_reason(factor * common_std, at_limit, other + assumed),
         significant=bool(
-            not at_edge
-            and np.isnan(rival)
+            not at_limit
+            and np.isnan(other)
             and (axes or abs(common) > by_chance * common_std)
             and blocks.predicted(basis) < before.predicted(basis[:, :p])
         ),
@@ -332,7 +310,7 @@ def estimate_delays(
 
 
 def _basis(p: int, n: int, axes: Sequence[int] = ()) -> Array:
-    """Parameters and delays of all axes (p + n, k) by p parameters, one delay, deviations."""
+    """Return parameters and delays (p + n, k) by p parameters, common delay, deviations."""
     return np.column_stack(
         [np.eye(p + n, p), np.repeat([0.0, 1.0], [p, n]), np.eye(p + n)[:, p + np.array(axes, int)]]
     )
@@ -341,7 +319,7 @@ def _basis(p: int, n: int, axes: Sequence[int] = ()) -> Array:
 def _descend(
     reader: _Reader, shift: Array, values: Array, basis: Array, ends: tuple[float, float]
 ) -> tuple[Array, _Blocks]:
-    """Shifts (n,) of least weighted residual by Gauss-Newton, and the linear problem there."""
+    """Refine shifts (n,) by Gauss-Newton; returns the linear problem there, too."""
     p = reader.model.n_parameters
     for _ in range(_ITERATIONS):
         blocks = reader.linearised(shift, values)
@@ -356,7 +334,7 @@ def _descend(
 
 
 def _deviating(blocks: _Blocks, p: int, n: int) -> list[int]:
-    """Axes whose own delay is significant and predicts better, the best first; never all."""
+    """Return axes with a significant own delay that predicts better; never all."""
     axes: list[int] = []
     left = [axis for axis in range(n) if blocks.gram[:, p + axis, p + axis].any()]
     error = blocks.predicted(_basis(p, n))
@@ -375,8 +353,8 @@ def _deviating(blocks: _Blocks, p: int, n: int) -> list[int]:
     return axes
 
 
-def _rival(grid: Array, heights: Array, shift: float, height: float) -> float:
-    """Another valley of the profile than the one at a shift, no less deep; NaN without one."""
+def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> float:
+    """Return another minimum of the profile that is as deep, NaN without one."""
     padded = np.concatenate([[np.inf], heights, [np.inf]])
     valley = (heights <= padded[:-2]) & (heights <= padded[2:])
     other = np.abs(grid - shift) > grid[1] - grid[0]
@@ -384,18 +362,18 @@ def _rival(grid: Array, heights: Array, shift: float, height: float) -> float:
     return float(grid[found[np.argmin(heights[found])]]) if found.size else float("nan")
 
 
-def _why_not(half_interval: float, at_edge: bool, rival: float) -> str | None:
+def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> str | None:
     if not np.isfinite(half_interval):
-        return "the motion does not tell a delay from the other parameters"
-    if at_edge:
-        return "the residual still falls at the longest delay that was tried"
+        return "the motion does not separate a delay from the other parameters"
+    if at_limit:
+        return "the residual decreases up to the longest delay tested"
     if half_interval > WIDEST_INTERVAL:
         return (
-            f"the 95 % interval would be ± {half_interval * 1e3:.2g} ms: the torques change too"
-            " slowly, or have too much noise"
+            f"95 % interval of ± {half_interval * 1e3:.2g} ms: the torques change too slowly, or"
+            " are too noisy"
         )
-    if np.isfinite(rival):
-        return f"a delay of {rival * 1e3:.0f} ms explains the torques as well"
+    if np.isfinite(other):
+        return f"a delay of {other * 1e3:.0f} ms explains the torques as well"
     return None
 
 
@@ -408,13 +386,13 @@ class _Blocks:
     rows: int
 
     def solution(self, basis: Array) -> Solution:
-        """Least squares in the coordinates of a basis (p + n, k)."""
+        """Solve by least squares in the coordinates of a basis (p + n, k)."""
         return _solved(_reduced(self.gram.sum(axis=0), basis))
 
     def covariance(
         self, basis: Array, solution: Solution, share: float = 0.025
     ) -> tuple[Array, float]:
-        """Cluster-robust covariance (k, k), and the limit that chance exceeds with `share`."""
+        """Return the cluster-robust covariance (k, k), and the quantile of `share`."""
         gram = _reduced(self.gram[self.gram[:, -1, -1] > 0.0], basis)
         augmented = np.append(-solution.values, 1.0)
         gram = merged(gram, block_length(gram[:, :-1] @ augmented))
@@ -422,7 +400,7 @@ class _Blocks:
         return np.asarray(moved.T @ moved), float(student_limit(share, max(1, len(gram) - 1)))
 
     def predicted(self, basis: Array) -> float:
-        """Mean weighted squared error of each fifth of the time, predicted from the others."""
+        """Return the mean weighted squared error of each fifth predicted from the others."""
         parts = np.array_split(_reduced(self.gram, basis), _FOLDS)
         folds = np.array([part.sum(axis=0) for part in parts])
         error = 0.0
@@ -433,7 +411,7 @@ class _Blocks:
 
 
 def _reduced(gram: Array, basis: Array) -> Array:
-    """Gram matrices (..., q + 1, q + 1) of [W | y] in the coordinates of a basis (q, k) of W."""
+    """Transform Grams (..., q + 1, q + 1) of [W | y] to a basis (q, k) of W."""
     wide = scipy.linalg.block_diag(basis, 1.0)
     return np.asarray(wide.T @ (gram @ wide))
 
@@ -444,27 +422,18 @@ def _solved(gram: Array) -> Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """A recording with its torque averaged over short bins, whose motion is read at any shift.
-
-    Attributes:
-        model: the robot.
-        samples: as prepared.
-        binned: their torque in bins, a known payload's included; without motion.
-        parts: per stretch its rows of `samples` and of `binned`.
-        clear: bins whose motion is away from standstill and reversals (m, n).
-        cycle: usual step of the clock [s].
-    """
+    """Recording with torque averaged over short bins, and motion at any time shift."""
 
     model: RobotModel
-    samples: Samples
-    binned: Samples
-    parts: tuple[tuple[slice, slice], ...]
-    clear: Rows
-    cycle: float
+    samples: Samples  # as prepared
+    binned: Samples  # torque in bins, with that of known payloads; no motion
+    parts: tuple[tuple[slice, slice], ...]  # per segment its rows of `samples` and of `binned`
+    clear: Rows  # bins away from standstill and reversals (m, n)
+    cycle: float  # usual step of the clock [s]
 
     @classmethod
     def of(cls, model: RobotModel, samples: Samples) -> _Reader:
-        """Reader of a recording."""
+        """Prepare the samples of a recording."""
         motion = samples.motion
         reach = _REVERSAL_PERIODS / samples.position_bandwidth
         clear = model.moving(motion.velocity) & ~near_any_reversal(model, motion, reach)
@@ -478,12 +447,12 @@ class _Reader:
                 start += count
 
         def bins(array: NDArray[Any]) -> NDArray[Any]:
-            """An array (m, ...) cut into (bins, size, ...)."""
+            """Cut an array (m, ...) into (bins, size, ...)."""
             cut = [array[raw][: (b.stop - b.start) * size] for raw, b in parts]
             return np.concatenate([array[:0], *cut]).reshape(-1, size, *array.shape[1:])
 
         def every(rows: Rows) -> Rows:
-            """Bins all of whose rows (m, n) count."""
+            """Return bins whose rows (m, n) are all true."""
             return np.asarray(bins(rows).all(axis=1))
 
         still = np.zeros((start, model.n_joints))
@@ -499,7 +468,7 @@ class _Reader:
         return cls(model, samples, binned, tuple(parts), every(clear), cycle)
 
     def at(self, shift: float) -> Samples:
-        """Bins whose torque belongs to the motion a shift earlier than it was prepared with."""
+        """Return the bins with the motion of an earlier time, by a shift."""
         time, usable = self.binned.motion.time, self.binned.usable.copy()
         fields = [field for field in self.samples.motion[1:] if field is not None]
         moved = [np.zeros((len(time), field.shape[1])) for field in fields]
@@ -514,7 +483,7 @@ class _Reader:
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
     def profile(self, shifts: Array) -> tuple[Array, Array]:
-        """Mean log variance of the residual at common shifts (K,), the parameters of the least.
+        """Return mean log residual variance at common shifts (K,), and the best parameters.
 
         Raises:
             IdentificationError: no usable row.
@@ -533,10 +502,10 @@ class _Reader:
         return heights, best
 
     def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
-        """Normal equations of p parameters and n steps of the delay, by blocks of time.
+        """Return normal equations of p parameters and n delay steps, by blocks of time.
 
-        With each axis at its own shift (n,), the columns of the steps at parameters (p,). Weighted
-        (n,) by default by the inverse variance of the residual there.
+        At a shift of each axis (n,) and parameters (p,), weighted (n,) by default by inverse
+        residual variance.
         """
         n, p, model = self.model.n_joints, self.model.n_parameters, self.model
         rows, tables = np.zeros_like(self.clear), [np.empty((0, 0))] * n

@@ -1,12 +1,12 @@
-r"""Current-to-torque gains of all drives, from a payload whose torque is known or nominal masses.
+r"""Current-to-torque gains of all drives, from a payload of known torque or nominal masses.
 
 Weighted least squares of the measured currents on one
 :func:`identification.factor.phases.gain_factor` (after Gautier and Briot 2014),
 
 .. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
 
-bilinear and solved by Gauss-Newton: least squares of :math:`K_m i_m - W_m \pi = t_m` would shrink
-all gains with the noise of the currents. What is not determined is named, and has no number.
+bilinear and solved by Gauss-Newton; least squares of :math:`K_m i_m - W_m \pi = t_m` would bias
+gains towards zero by current noise.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from identification.signals.masks import SHORTEST_STRETCH
 
 Array = NDArray[np.float64]
 
-# A gain is of use when it is better known than a maker's typical tolerance of a torque constant.
+# Tolerance of a maker's torque constant.
 WORST_RELATIVE_STD: Final = 0.05
-# Share of the payload's own length of column: what is smaller is rounding.
+# Relative length of the payload's column that is rounding.
 _NO_LOAD: Final = 1e-9
 _ITERATIONS: Final = 50
 _VANISHING: Final = 1e-100
-_LEAST_NOISE: Final = 1e-6  # share of a current's length: rounding of the Gram matrix
+_LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the current
 _CONVERGED: Final = 1e-9
 
 
@@ -43,9 +43,9 @@ class Gains:
     """Gains of n motors."""
 
     motor_names: tuple[str, ...]  #: (n,)
-    values: Array  #: torque per current (n,) [N·m/A or N/A], NaN where not determined
+    values: Array  #: torque per current (n,) [N·m/A or N/A], NaN if undetermined
     std: Array  #: standard deviations, cluster-robust (n,); infinite likewise
-    reasons: tuple[str | None, ...]  #: per motor why its gain is not determined, None where it is
+    reasons: tuple[str | None, ...]  #: why the gain is undetermined, or None
     interval_factor: float  #: standard deviations in half a 95 % interval
 
     @property
@@ -64,10 +64,10 @@ def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
     total, rows = grams.sum(axis=0), factor.samples.sum(axis=0)
     p = factor.n_parameters - 1
     if not rows.any():
-        raise IdentificationError("there is not one usable sample to identify gains from")
+        raise IdentificationError("no usable sample to identify gains from")
     if not total[:, p, p].any():
         raise IdentificationError(
-            "no recording has a known payload: gains and parameters can be scaled together"
+            "no recording has a known payload, so gains and parameters have no scale"
         )
     noise, inverses = _motor_by_motor(total, rows)
     unknowns, solution = _gauss_newton(total, noise, inverses)
@@ -89,33 +89,32 @@ def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
 def _reasons(
     total: Array, rows: NDArray[np.intp], found: Array, determined: NDArray[np.bool_], std: Array
 ) -> tuple[str | None, ...]:
-    """Why each motor's gain is not determined, None where it is; from its inverse and std (n,)."""
+    """Return why each motor's gain is undetermined or None, from inverse and std (n,)."""
     p = total.shape[1] - 2
     size = np.abs(found)
     relative = np.divide(std, size, out=np.full_like(size, np.inf), where=size > _VANISHING)
-    # Whether the payload's torque on a motor (of its [W | t | i]) is more than rounding.
+    # Whether the payload's torque on a motor exceeds rounding.
     powers = np.diagonal(total, axis1=1, axis2=2)
     loaded = powers[:, p] > _NO_LOAD**2 * powers[:, :p].max(axis=1, initial=0.0)
     good = determined & (found > 0.0) & (relative <= WORST_RELATIVE_STD)
-    checks = (  # the first that holds
+    checks = (  # first match
         (rows == 0, "the motor has no usable row"),
         (good, None),
-        (~loaded, "the payload does not load it, and nothing else fixes its scale"),
-        (~determined, "the payload's torque on it looks like the robot's own"),
-        (~(found > 0.0), "its best value is not positive: what the payload adds to it is noise"),
+        (~loaded, "the payload does not load it"),
+        (~determined, "the payload's torque is not separable from the robot's own"),
+        (~(found > 0.0), "its estimate is not positive: the payload's torque is below the noise"),
     )
     return tuple(
         next(
             (words for holds, words in checks if holds[m]),
-            f"its relative standard deviation would be {relative[m]:.0%}, more than"
-            f" {WORST_RELATIVE_STD:.0%}",
+            f"its relative standard deviation is {relative[m]:.0%}, limit {WORST_RELATIVE_STD:.0%}",
         )
         for m in range(len(total))
     )
 
 
 def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Noise of each current (n,) and inverse gain (n,), each motor with parameters of its own."""
+    """Return current noise (n,) and inverse gain (n,), estimated separately per motor."""
     n, p = len(total), total.shape[1] - 2
     noise, inverses = np.full((2, n), np.nan)
     for m in np.flatnonzero(rows):
@@ -131,7 +130,7 @@ def _motor_by_motor(total: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]
 
 
 def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, Solution]:
-    """Parameters and inverse gains (p + n,), these from a start (n,); and the last problem."""
+    """Return parameters and inverse gains (p + n,) from a start (n,), and the last problem."""
     p = total.shape[1] - 2
 
     def problem(unknowns: Array) -> tuple[NormalEquations, float]:
@@ -140,7 +139,7 @@ def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, S
 
     unknowns = np.concatenate([np.zeros(p), inverses])
     unknowns[:p] = solve(problem(unknowns)[0].part(np.arange(p))).values
-    # Halved if the sum of squares does not fall: far from determined, steps overshoot.
+    # Steps are halved if the sum of squares increases.
     damping, cost = 1.0, np.inf
     best, step = unknowns, np.zeros_like(unknowns)
     for _ in range(_ITERATIONS):
@@ -160,7 +159,7 @@ def _gauss_newton(total: Array, noise: Array, inverses: Array) -> tuple[Array, S
 
 
 def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Array, Array]:
-    """Information (B, k, k), scores (B, k) and weighted squares (B,) of the predicted currents."""
+    """Return information (B, k, k), scores (B, k) and weighted squares (B,) of the currents."""
     blocks, n, width, _ = gram.shape
     p = width - 2
     information, scores = np.zeros((blocks, p + n, p + n)), np.zeros((blocks, p + n))
@@ -181,23 +180,24 @@ def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Arra
     return information, scores, squares
 
 
-# Where no torque constant is known, from the masses of the description, linear motor by motor:
+# Without known payload: from the nominal masses, linear motor by motor:
+#
 #     i_m = kappa_m [M^-T tau_nominal]_m + J_m qdd_m + c_m sgn(qd_m) + v_m qd_m + o_m
-# for motor angles M q; kappa_m = 1 / K_m is as right as the masses.
+#
+# for motor angles M q; kappa_m = 1 / K_m is as accurate as the masses.
 
 WORST_SCALE_STD: Final = 0.1
-_BLOCKS: Final = 20  # of time, left out one by one
+_BLOCKS: Final = 20  # of time, for the jackknife
 
 
 @dataclass(frozen=True, eq=False)
 class CurrentScale:
-    """Torque per current of n motors, in units of the nominal masses."""
+    """Torque per current of n motors relative to the nominal masses."""
 
-    values: Array  # (n,) [N·m/A or N/A, motor side], 1 where not determined
-    # standard deviations given the masses, by leaving out blocks of time (n,); infinite where not
-    # determined
+    values: Array  # (n,) [N·m/A or N/A, motor side], 1 if undetermined
+    # standard deviations for exact masses (n,); infinite if undetermined
     std: Array
-    # motors whose gain rests on inertia without a rotor's: weight does not load them enough (n,)
+    # motors identified by inertia without rotor, for lack of gravity load (n,)
     inertial: NDArray[np.bool_]
 
     @property
@@ -207,7 +207,7 @@ class CurrentScale:
 
     @property
     def turned(self) -> NDArray[np.bool_]:
-        """Motors whose current has the opposite sign of the torque that the masses need (n,)."""
+        """Motors whose current has the wrong sign (n,)."""
         return self.determined & (self.values < 0.0)
 
 
@@ -217,7 +217,7 @@ def scale_from_nominal(
     currents: Sequence[Array],
     motor_from_joint: Array | None = None,
 ) -> CurrentScale:
-    """Gains of all motors from smoothed motions and currents (m, n) [A] in their rows.
+    """Estimate gains of all motors from smoothed motions and currents (m, n) [A].
 
     `motor_from_joint`: motor angles per joint angle (n, n); identity: gains include the gears.
     """
@@ -242,7 +242,7 @@ def scale_from_nominal(
 
 
 def _columns(model: RobotModel, motion: Motion, turns: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Per motor [nominal torque, acceleration, sign, speed, 1] (m, n, 5), and rows that count."""
+    """Return [nominal torque, acceleration, sign, speed, 1] (m, n, 5), and usable rows."""
     values = np.zeros(model.n_parameters)
     values[: model.base.rank] = model.base.grouping @ model.nominal
     values[model.element_part] = model.elements.nominal
@@ -256,7 +256,7 @@ def _columns(model: RobotModel, motion: Motion, turns: Array) -> tuple[Array, ND
 
 
 def _share(table: Array, current: Array) -> tuple[float, float]:
-    """Coefficient of the first column, and its standard deviation; (0, inf) without any."""
+    """Return the coefficient of the first column and its deviation; (0, inf) without any."""
     scale = np.sqrt(np.mean(table**2, axis=0)) if len(table) else np.zeros(1)
     if len(table) < _BLOCKS * SHORTEST_STRETCH or scale[0] <= _NO_LOAD:
         return 0.0, np.inf
@@ -272,6 +272,6 @@ def _share(table: Array, current: Array) -> tuple[float, float]:
         np.linalg.lstsq(total - gram, right - score, rcond=None)[0][0]
         for gram, score in zip(grams, scores, strict=True)
     ]
-    # Jackknife over blocks: allows for noise that lasts.
+    # Jackknife over blocks, for coloured noise.
     spread = np.sqrt((_BLOCKS - 1.0) / _BLOCKS * np.sum((np.array(without) - best) ** 2))
     return float(best / scale[0]), float(spread / scale[0])

@@ -1,14 +1,13 @@
-r"""Instrumental variables: an estimate that noise in the measured positions does not bias.
+r"""Instrumental variables: estimates without bias by noise in the measured positions.
 
 With instruments Z that correlate with the motion and not with its noise, here the regressor of the
-planned motion column by column, and one weight per joint in Omega,
+planned motion, and one weight per joint in Omega,
 
 .. math:: \hat\pi = (Z^T \Omega W)^{-1} Z^T \Omega y
 
-is consistent whatever that noise is (IDIM-IV: Janot, Vandanjon and Gautier 2014); the standard
-deviation grows by 1/sqrt(R²), the share of a column that instruments alone explain (Shea 1997).
-Instruments cannot mend a smoother that is too narrow, nor noise that turns the sign of a slow
-speed.
+is consistent for any such noise (IDIM-IV: Janot, Vandanjon and Gautier 2014); the standard
+deviation grows by 1/sqrt(R²) of Shea (1997). Not covered: motion removed by a narrow smoother, and
+noise that changes the sign of a slow speed.
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ Array = NDArray[np.float64]
 
 LONGEST_LAG: Final = 0.5  # s; position loops of industrial arms lag 5 to 100 ms
 _LAG_STEP: Final = 0.01  # s
-_ROWS: Final = 4000  # enough for a lag, however long the recording
-# A command is followed as closely as a spline of this bandwidth can: it has no noise.
+_ROWS: Final = 4000  # enough for a lag
+# Commands have no noise.
 _COMMAND_TOLERANCE: Final = 1e-20  # rad² or m²
-# Of a joint's own range: clocks of repetitions start within a cycle of each other.
+# Tolerance as a share of a joint's range: clocks of repetitions differ by up to a cycle.
 _SAME_PLAN: Final = 0.01
 _STILL: Final = 1e-4  # rad or m
 _OVERLAP: Final = 0.9
@@ -55,22 +54,21 @@ _COMPARED: Final = 400  # instants
 
 
 class Instruments(NamedTuple):
-    """Motion to make instruments from, in the rows of some samples."""
+    """Motion for instruments, in the rows of some samples."""
 
     motion: Motion  # m instants of n joints
-    usable: NDArray[np.bool_]  # where it is known (m, n)
-    # by which the measured motion follows the command (n,) [s]; NaN for a joint that does not
-    # move
+    usable: NDArray[np.bool_]  # rows with a command (m, n)
+    # of the measured motion behind the command (n,) [s]; NaN without motion
     lag: Array
 
 
 def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = None) -> Instruments:
-    """Motion commanded by positions (m, n) [rad or m], NaN where none was, shifted by their lag.
+    """Return the motion commanded by positions (m, n) [rad or m] (NaN: none), shifted by lag.
 
-    The lag (n,) [s] is sought unless it is known from the same motion.
+    The lag (n,) [s] is estimated unless given.
 
     Raises:
-        IdentificationError: no row has a commanded position, or no joint is commanded to move.
+        IdentificationError: no commanded position, or no joint is commanded to move.
     """
     measured, time = samples.motion.position, samples.motion.time
     known = np.asarray(np.isfinite(commanded).all(axis=1))
@@ -84,12 +82,12 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
             )
             splines.append((rows, own))
     if not splines:
-        raise IdentificationError("nothing was commanded: there are no instruments to be had")
+        raise IdentificationError("no commanded positions: no instruments")
     if lag is None:
         longest, spline = max(splines, key=lambda pair: len(pair[0]))
         lag = tracking_lag(time[longest], measured[longest], spline)
     if np.isnan(lag).all():
-        raise IdentificationError("no joint is commanded to move: there are no instruments")
+        raise IdentificationError("no joint is commanded to move: no instruments")
     derivatives, usable = np.zeros((3, *measured.shape)), np.zeros(measured.shape, dtype=np.bool_)
     for rows, spline in splines:
         for joint, shift in enumerate(np.nan_to_num(lag)):
@@ -101,10 +99,10 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
-    """Whether two recordings were commanded the same motion, compared where both are known.
+    """Return whether two recordings were commanded the same motion.
 
-    Of each the time since the motion's origin (m,) [s] and commanded positions (m, n), NaN where
-    nothing was commanded.
+    Each is its time since the motion's origin (m,) [s] and commanded positions (m, n), NaN without
+    command.
     """
     (time, one), (other_time, other) = first, second
     if one.shape[1] != other.shape[1]:
@@ -118,7 +116,7 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
     if stop - start < _OVERLAP * longer:
         return False
     at = np.linspace(start, stop, _COMPARED)
-    # Not the largest: across a gap the two are not known.
+    # A quantile, since gaps are interpolated.
     apart = [
         np.quantile(np.abs(np.interp(at, time, a) - np.interp(at, other_time, b)), _OVERLAP)
         for a, b in zip(one.T, other.T, strict=True)
@@ -127,10 +125,10 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
-    """Time by which each axis follows its command (n,) [s], NaN for one that is not moved.
+    """Return the lag of each axis behind its command (n,) [s], NaN for one not commanded to move.
 
-    The shift that leaves the smallest variance of the difference to positions (m, n) [rad or m]
-    measured at times (m,) [s]: a constant one, as gravity makes it, does not count.
+    The lag minimises the variance of the difference to positions (m, n) [rad or m] measured at
+    times (m,) [s].
     """
     thin = slice(None, None, max(1, len(time) // _ROWS))
     time, measured = time[thin], measured[thin]
@@ -155,35 +153,35 @@ def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Arra
     return lags
 
 
-# A first-stage F below 10 leaves more than a tenth of the bias of least squares (Staiger and
-# Stock 1997). Each block of time counts as one independent sample.
+# Below, instruments leave more than a tenth of the bias of least squares (Staiger and Stock 1997);
+# each block counts as one sample.
 WEAK: Final = 10.0
 _PARTICIPATION: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class InstrumentalEstimate:
-    """Estimate with instrumental variables, beside that of least squares on the same rows."""
+    """Estimate by instrumental variables, and by least squares on the same rows."""
 
-    estimate: Estimate  #: by instrumental variables, with cluster-robust covariance
-    least_squares: Estimate  #: of the same rows and weights, likewise
+    estimate: Estimate  #: with cluster-robust covariance
+    least_squares: Estimate  #: with the same rows and weights
     weights: Array  #: per joint (n,)
-    #: names of parameters whose instrument is too weak for the estimate to be trusted
+    #: parameters with weak instruments
     weak: tuple[str, ...]
 
 
 class CrossSolution(NamedTuple):
     """Solution of ``Z^T W pi = Z^T y``."""
 
-    values: Array  # (p,), of least (scaled) norm where the instruments leave a choice
+    values: Array  # (p,), of least (scaled) norm where undetermined
     right: Array  # R (p, k)
     left: Array  # L (p, k): R L^T is the inverse of Z^T W on the k directions determined
-    condition: float  # square root of the scaled condition of Z^T W, comparable to that of W
+    condition: float  # square root of the scaled condition of Z^T W
     determined: NDArray[np.bool_]  # (p,)
 
 
 def solve_cross(total: Array) -> CrossSolution:
-    """Solve the instrumental equations of a Gram matrix of [Z | W | y] (2 p + 1, 2 p + 1)."""
+    """Solve a Gram matrix of [Z | W | y] (2 p + 1, 2 p + 1) for pi."""
     p = len(total) // 2
     length = np.sqrt(np.diag(total)[:-1])
     scale = np.where(length > 0.0, length, 1.0)
@@ -207,15 +205,15 @@ def estimate_instrumental(
 ) -> InstrumentalEstimate:
     """Estimate with instrumental variables, from a factor of :func:`instrument_factor`.
 
-    The covariance is the sandwich over blocks: that of least squares with Z'W for W'W. Weights (n,)
-    are by default the inverse residual variances of an instrumental fit weighted by least squares.
+    The covariance is the sandwich over blocks, with Z'W for W'W. Weights (n,) are by default the
+    inverse residual variances of an instrumental fit weighted by least squares.
 
     Raises:
-        IdentificationError: the factor holds no rows.
+        IdentificationError: the factor has no rows.
     """
     p, names = model.n_parameters, model.parameter_names
     if not factor.samples.any():
-        raise IdentificationError("there is not one row in which samples and instruments move")
+        raise IdentificationError("no row in which samples and instruments move")
     measured = measured_part(factor)
     rows = measured.total
     if weights is None:
@@ -254,10 +252,10 @@ def estimate_instrumental(
 
 
 def partial_r2(total: Array) -> Array:
-    """Shea's partial R² (p,) of a Gram matrix of [Z | W | y] (2 p + 1, 2 p + 1).
+    """Return Shea's partial R² (p,) of a Gram matrix of [Z | W | y] (2 p + 1, 2 p + 1).
 
-    The share of each column of W, apart from what it has in common with the others, that the
-    instruments explain: (W'W)^-1_kk over (W'Z (Z'Z)^-1 Z'W)^-1_kk (Shea 1997).
+    The share of each column of W, apart from the other columns, that the instruments explain:
+    (W'W)^-1_kk over (W'Z (Z'Z)^-1 Z'W)^-1_kk (Shea 1997).
     """
     p = len(total) // 2
     scale = np.sqrt(np.maximum(np.diag(total)[:-1], 1e-300))

@@ -1,4 +1,4 @@
-"""Ordinary (joints alike, in N·m) and weighted (in each joint's own noise, eq. 4) least squares."""
+"""Ordinary and weighted (eq. 4) least squares, of one recording or repetitions."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def fit_least_squares(
     *,
     phase: PhaseFactor | None = None,
 ) -> Estimate:
-    """Fit recordings, by QR where the condition demands it, with cluster-robust covariance.
+    """Fit recordings with cluster-robust covariance, by QR if the condition requires it.
 
-    Joints count alike or by their own noise (eq. 4). Where the factor is known the recordings are
-    read for QR only.
+    "weighted" weights joints by their noise (eq. 4). With a known factor, recordings are read for
+    QR only.
 
     Raises:
-        IdentificationError: no recordings, or not one usable row.
+        IdentificationError: no recordings, or no usable row.
     """
     phase = total_phase(model, recordings) if phase is None else phase
     factor = reduced(model, recordings, phase.total)
@@ -64,31 +64,30 @@ def clustered_fit(
     phase: PhaseFactor,
     weights: Array,
 ) -> tuple[Solution, Clustered]:
-    """Solution with weights (n,), and its cluster-robust covariance; QR reads the samples again."""
+    """Solve with weights (n,) and return the cluster-robust covariance; QR reads the samples."""
     solution = factor.solve(weights)
     if isinstance(factor, QRFactor):
         return solution, clustered_covariance(model, recordings, solution, weights)
     return solution, block_covariance(phase, weights, solution.values)
 
 
-# Share of equal repetitions that scatter by less than what counts as more than chance.
+# Probability that the scatter of equal repetitions is not significant.
 _CERTAIN: Final = 0.99
 
 Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
-"""An estimator: some recordings and their factor to an estimate."""
+"""Estimator: recordings and their factor to an estimate."""
 
 
 @dataclass(frozen=True, eq=False)
 class RepeatedEstimate:
-    """Estimates over R repetitions of one motion."""
+    """Estimates from R repetitions of one motion."""
 
-    #: from all samples at once. This is the result. Its covariance is clustered by time of the
-    #: motion, so that an error of the model that repeats is not averaged away
+    #: result, from all samples, with covariance clustered by time of the motion
     pooled: Estimate
-    repetitions: tuple[Estimate, ...]  #: from each alone, with the covariance of its own blocks
-    phase: PhaseFactor  #: sum of all factors, by time of the motion
-    factor: Factor  #: the same without regard to time
-    classical_std: Array  #: of weighted least squares on all samples if residuals were white (p,)
+    repetitions: tuple[Estimate, ...]  #: from each alone
+    phase: PhaseFactor  #: sum of the factors, by time of the motion
+    factor: Factor  #: the same summed over time
+    classical_std: Array  #: of weighted least squares with white residuals (p,)
 
     @classmethod
     def of(
@@ -98,22 +97,22 @@ class RepeatedEstimate:
         repetitions: Sequence[Estimate],
         phase: PhaseFactor,
     ) -> RepeatedEstimate:
-        """Put an estimate from all beside those from each."""
+        """Combine an estimate from all repetitions with those from each."""
         factor = phase.total
         return cls(pooled, tuple(repetitions), phase, factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
-        """The estimate with intervals no narrower than its repetitions scatter.
+        """Widen the intervals to the scatter of the repetitions.
 
-        Blocks of time are shared by the repetitions, and errors of opposite signs in some of them
-        (a payload in every other one) cancel there.
+        Errors of opposite sign (a payload in every other repetition) cancel in the pooled
+        covariance.
         """
         covariance = no_narrower(self.pooled.covariance, self.values)
         return replace(self, pooled=replace(self.pooled, covariance=covariance))
 
     @property
     def values(self) -> Array:
-        """Of the repetitions (R, p)."""
+        """Parameters of the repetitions (R, p)."""
         return np.array([one.values for one in self.repetitions])
 
     @property
@@ -130,23 +129,23 @@ class RepeatedEstimate:
 
     @property
     def scatter_std(self) -> Array:
-        """Standard deviation of that mean (p,): what noise alone does, NaN for one repetition."""
+        """Standard deviation of that mean (p,), NaN for one repetition."""
         return np.asarray(self.std / np.sqrt(len(self.repetitions)))
 
     @property
     def independent_std(self) -> Array:
-        """Of the pooled estimate if repetitions were independent (p,).
+        """Standard deviation of the pooled estimate for independent repetitions (p,).
 
-        Root mean square of the repetitions' own standard deviations over sqrt(R).
+        RMS of the standard deviations of the repetitions over sqrt(R).
         """
         variances = [np.diag(one.covariance) for one in self.repetitions]
         return np.asarray(np.sqrt(np.mean(variances, axis=0) / len(variances)))
 
 
 def no_narrower(covariance: Array, values: Array) -> Array:
-    """Covariance (p, p) with standard deviations of at least those of a mean of R values (R, p).
+    """Widen a covariance (p, p) to standard deviations of the mean of R values (R, p).
 
-    As far as these are larger beyond chance: a few values scatter by more or less than they should.
+    Only where these are significantly larger.
     """
     freedom = len(values) - 1
     if freedom < 1:
@@ -175,7 +174,7 @@ def estimate_repetitions(
         IdentificationError: no repetitions, or one without a usable row.
     """
     if not recordings:
-        raise IdentificationError("there are no repetitions to estimate from")
+        raise IdentificationError("no repetitions")
 
     def weighted(some: Sequence[Samples], factor: PhaseFactor) -> Estimate:
         return fit_least_squares(model, some, phase=factor)

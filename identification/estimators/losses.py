@@ -1,7 +1,7 @@
-r"""What a residual costs: the square, or less for those that are too large to be noise.
+r"""Loss functions of robust estimation.
 
-A fit reads the weight :math:`u(x) = \psi(x)/x`, a covariance the slope :math:`\psi'(x)`, of
-residuals x in standard deviations.
+For residuals x in standard deviations, a fit uses the weight :math:`u(x) = \psi(x)/x`, a covariance
+the slope :math:`\psi'(x)`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ Array = NDArray[np.float64]
 
 
 class Loss:
-    """The square, and what every loss has."""
+    """Squared loss, and base class."""
 
     @property
     def name(self) -> str:
-        """Name and constant, in words."""
+        """Name and constant."""
         return "squares"
 
     def weight(self, x: Array) -> Array:
@@ -35,15 +35,14 @@ class Loss:
 class Huber(Loss):
     """Square within `tuning` standard deviations, linear beyond (Huber 1964).
 
-    Has one minimum, whatever the start. An outlier counts as much as `tuning` deviations,
-    however far out it is; many of one sign still shift the result a little.
+    Convex; the influence of an outlier is bounded, not zero.
     """
 
     tuning: float = 1.345  #: 1.345 keeps 95 % of the efficiency on Gaussian noise
 
     @property
     def name(self) -> str:
-        """Name and constant, in words."""
+        """Name and constant."""
         return f"Huber's loss (k = {self.tuning:g})"
 
     def weight(self, x: Array) -> Array:
@@ -59,14 +58,14 @@ class Huber(Loss):
 class Tukey(Loss):
     """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974).
 
-    Has more than one minimum and must be started close to the right one, from Huber's.
+    Not convex: start from the solution of Huber's loss.
     """
 
     tuning: float = 4.685  #: 4.685 keeps 95 % of the efficiency on Gaussian noise
 
     @property
     def name(self) -> str:
-        """Name and constant, in words."""
+        """Name and constant."""
         return f"Tukey's bisquare (c = {self.tuning:g})"
 
     def weight(self, x: Array) -> Array:
@@ -79,5 +78,5 @@ class Tukey(Loss):
         return (1.0 - squared) * (1.0 - 5.0 * squared)
 
     def _squared(self, x: Array) -> Array:
-        # Clipped, so that an infinite residual has weight zero and not NaN.
+        # Clipped: an infinite residual has weight zero, not NaN.
         return np.minimum(np.abs(x) / self.tuning, 1.0) ** 2

@@ -1,15 +1,15 @@
-r"""The body on the flange: what an arm carries, from recordings without and with it.
+r"""Payload on the flange, from recordings without and with it.
 
 One weighted least-squares problem over all recordings. The arm's parameters are shared, the ten
-parameters of a body at the flange act in the loaded recordings only, and each recording k has an
-offset and a scale of the friction of every joint, for friction drifts between recordings:
+parameters of a body at the flange act in loaded recordings only, and each recording k has its own
+offset and friction scale of every joint:
 
 .. math:: \tau = W \pi + [\text{loaded}]\, L \beta + \delta_k + \varphi_k \odot f, \qquad
           f = W_f \hat\pi_f
 
-The friction f is that of the solution before; weak priors (:data:`DRIFT`) keep drifts apart from
-it. The covariance is cluster-robust by time of the motion. The body is the closest possible one to
-the estimate; what the motion does not determine of its tensor is a reference body's.
+The friction f is that of the previous iteration, with weak priors (:data:`DRIFT`) on the drifts.
+The covariance is cluster-robust by time of the motion. The result is the physically consistent body
+closest to the estimate; undetermined inertias are those of a reference body.
 """
 
 from __future__ import annotations
@@ -55,48 +55,48 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 DRIFT: Final = 0.1
-"""By how much friction differs between recordings, its standard deviation in the prior."""
-# Of an offset that differs between recordings, as a share of the joint's friction.
+"""Prior standard deviation of the relative change of friction between recordings."""
+# Prior standard deviation of offset changes, as a share of the friction.
 _OFFSET: Final = 1.0
 _BODY: Final = len(LINK_SYMBOLS)
 _WEIGHT: Final = np.arange(6, _BODY)  # mass and first moment
 _INERTIA: Final = np.arange(6)
 _DIAGONAL: Final = [4, 7, 9]  # of a tensor, among `NAMES`
-_ROUNDS: Final = 4  # of weights and friction
+_ROUNDS: Final = 4  # iterations of weights and friction
 _MOST_BLOCKS: Final = 500
-# Scores of neighbouring blocks correlate less in longer ones. On noise correlated over 50 ms
-# nominal 95 % intervals covered 90 and 93 % without this, 93 and 95 % with it.
+# Longer blocks: with noise correlated over 50 ms nominal 95 % intervals cover 93 and 95 %,
+# otherwise 90 and 93 %.
 _STRETCH: Final = 2
-_LEAST_NOISE: Final = 1e-6  # share of a torque's length: rounding of the Gram matrix
+_LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the torque
 _PARTICIPATION: Final = 1e-3
 _ROUNDING: Final = 1e-9
-_LOST: Final = 1e12  # variance of what is not determined, times the share of it squared
-_DENSITY: Final = 1000.0  # kg/m³, of the ball whose size says what is small
-# Two recordings carry different bodies: probability that chance does it, and share of the torque.
-_CHANCE: Final = 1e-4
-_DIFFERENT: Final = 0.1
+_UNDETERMINED: Final = 1e12  # variance of the undetermined part
+_DENSITY: Final = 1000.0  # kg/m³, of the reference ball
+# Different bodies: probability by chance, and share of the torque.
+_LEAST_PROBABILITY: Final = 1e-4
+_LEAST_SHARE: Final = 0.1
 _OFF_DIAGONAL: Final = np.array([1.0, 2.0, 2.0, 1.0, 2.0, 1.0])
 
 NAMES: Final = ("mass", "cx", "cy", "cz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""Figures of a body in this order: mass, centre of mass, tensor about it."""
+"""Figures of a body: mass, centre of mass, inertia tensor about it."""
 
 
 def figures_of(carried: Body) -> Array:
-    """Figures of a body (10,), as `NAMES`."""
+    """Return the figures of a body (10,), as `NAMES`."""
     tensor = carried.inertia[np.triu_indices(3)]
     return np.concatenate([[carried.mass], carried.centre, tensor])
 
 
 class PayloadError(IdentificationError):
-    """There is no payload that these recordings could show."""
+    """The recordings do not determine a payload."""
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One recording, reduced."""
+    """Reduced recording."""
 
-    name: str  # of the recording
-    # over the arm's parameters, those of the body (10) and an offset of each joint (n)
+    name: str
+    # parameters of the arm, of the body (10), and offsets of the joints (n)
     phase: PhaseFactor
     loaded: bool  # whether the arm carried the body
 
@@ -106,7 +106,7 @@ class Run:
     ) -> Run:
         """Reduce a recording of an arm without payload; the body is at the frame of a link.
 
-        That of the last joint for None.
+        None is the frame of the last joint.
 
         Raises:
             ModelError: the description has no such frame, or it is fixed to the base.
@@ -140,32 +140,31 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """A recording that carries something else than the first of its kind."""
+    """Recording with another payload than the first of its kind."""
 
-    run: Run  # the recording
-    reference: Run  # the first one
-    mass: float  # by which it carries more [kg]
+    run: Run
+    reference: Run
+    mass: float  # mass difference [kg]
 
 
 @dataclass(frozen=True, eq=False)
 class PayloadEstimate:
-    """What the arm carries at the frame."""
+    """Payload of the arm at a frame."""
 
-    # about the frame's origin, least squares (10,), as `LINK_SYMBOLS`; a body need not have them
+    # about the frame's origin (10,), as `LINK_SYMBOLS`, unconstrained
     parameters: Array
-    covariance: Array  # of them (10, 10), cluster-robust; infinite variance where not determined
+    covariance: Array  # (10, 10), cluster-robust; infinite variance if undetermined
     interval_factor: float  # standard deviations in half a 95 % interval
-    # the possible body closest to them; None where the mass is not significantly above zero
+    # closest consistent body; None without significant mass
     body: Body | None
-    # 95 %, of the figures `NAMES` (10, 2), with those of `body` inside; infinite where not
-    # determined
+    # 95 % intervals of `NAMES` (10, 2), including `body`; infinite if undetermined
     intervals: Array
-    # mass times distance of the centre from the frame's origin [kg m], and its interval
+    # mass times distance of centre from the frame's origin [kg m], and interval
     moment: tuple[float, float, float]
-    # names of what the motion does not determine: of `body` the reference body's
+    # undetermined figures, taken from the reference body
     undetermined: tuple[str, ...]
-    contradicted: bool  # whether no possible body fits the recordings to their noise
-    method: str  # how the covariance was made, in words
+    contradicted: bool  # whether no consistent body fits the recordings to their noise
+    method: str  # description of the covariance
 
 
 def identify_payload(
@@ -173,31 +172,30 @@ def identify_payload(
 ) -> PayloadEstimate:
     """Estimate the body that the loaded recordings carry and the bare ones do not.
 
-    `box`: edges of the reference body [m], uniform, along the axes of the frame; None: a point.
+    `box`: edges of the uniform reference body [m] along the axes of the frame; None: a point.
 
     Raises:
-        PayloadError: there is no bare or no loaded recording, the motion does not determine the
-            mass, or the bare ones carry more than the loaded.
-        IdentificationError: there is not one usable row.
+        PayloadError: no bare or no loaded recording, undetermined mass, or negative mass.
+        IdentificationError: no usable row.
     """
     found = _body_estimate(model, runs)
     values, factor = found.values, found.factor
     mass, low, high = found.mass
     if not np.isfinite(high):
         raise PayloadError(
-            "the motion does not determine the mass: it is seen only together with other"
-            " parameters; record one in which more axes turn, the wrist in many poses"
+            "the motion does not separate the mass from other parameters; record one that moves"
+            " more axes, with the wrist in many poses"
         )
     if high < 0.0:
         raise PayloadError(
-            f"the bare recordings carry {-mass:.3g} kg more than the loaded ones: they may have"
-            " been exchanged"
+            f"the bare recordings carry {-mass:.3g} kg more than the loaded ones; check whether"
+            " they are interchanged"
         )
     intervals = np.tile([-np.inf, np.inf], (_BODY, 1))
     intervals[0] = max(0.0, low), high
     estimate = PayloadEstimate(
         parameters=values,
-        covariance=found.marked_covariance,
+        covariance=found.full_covariance,
         interval_factor=factor,
         body=None,
         intervals=intervals,
@@ -219,35 +217,34 @@ def identify_payload(
     open_ended = width > np.repeat([np.inf, reference.inertia], [4, 6])
     open_ended[1:4] = np.isinf(width[1:4])
     open_ended[4:] &= (intervals[4:, 0] <= usual) & (usual <= intervals[4:, 1])
-    possible, misfit = _closest_body(found, reference)
-    figures = figures_of(possible)[:, None]
+    consistent, misfit = _closest_body(found, reference)
+    figures = figures_of(consistent)[:, None]
     intervals[:, :1] = np.minimum(intervals[:, :1], figures)
     intervals[:, 1:] = np.maximum(intervals[:, 1:], figures)
-    chance = _chance(misfit, len(found.determined), found.blocks - len(found.determined))
+    chance = _tail_probability(misfit, len(found.determined), found.blocks - len(found.determined))
     return replace(
         estimate,
-        body=possible,
+        body=consistent,
         undetermined=tuple(np.array(NAMES)[open_ended].tolist()),
-        contradicted=chance < _CHANCE,
+        contradicted=chance < _LEAST_PROBABILITY,
     )
 
 
 def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, float, float]:
-    """By how much more the loaded recordings carry [kg], and its 95 % interval.
+    """Return the mass difference of loaded to bare recordings [kg], and its 95 % interval.
 
     Raises:
-        PayloadError: there is no bare or no loaded recording.
-        IdentificationError: there is not one usable row.
+        PayloadError: no bare or no loaded recording.
+        IdentificationError: no usable row.
     """
     return _body_estimate(model, runs).mass
 
 
 def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None:
-    """The recording that carries something else than the first of its kind, if there is one.
+    """Return the recording whose payload differs most from the first of its kind, if any.
 
-    Bare recordings are compared with the first bare one and loaded ones with the first loaded
-    one; the most significant difference in mass and first moment is given. Arguments and errors
-    are those of :func:`mass_difference`.
+    Bare and loaded recordings are compared with the first bare and loaded one by mass and first
+    moment. Arguments and errors as for :func:`mass_difference`.
     """
     first = {kind: next((r for r in runs if r.loaded == kind), None) for kind in (False, True)}
     others = [run for run in runs if run not in first.values()]
@@ -263,14 +260,14 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
         delta, own = fit.values[weight], fit.clustered.covariance[np.ix_(weight, weight)]
         known = np.flatnonzero(np.isfinite(np.diag(own)))
         squares = float(delta[known] @ np.linalg.pinv(own[np.ix_(known, known)]) @ delta[known])
-        chance = _chance(squares, len(known), fit.clustered.blocks - len(known))
+        chance = _tail_probability(squares, len(known), fit.clustered.blocks - len(known))
         share = _torque_share(model, other, delta, fit.values[fit.bodies[0]][_WEIGHT], fit.weights)
-        if chance < _CHANCE / len(others) and share > _DIFFERENT:
+        if chance < _LEAST_PROBABILITY / len(others) and share > _LEAST_SHARE:
             found.append((squares, Difference(other, reference, float(delta[-1]))))
     return max(found, key=lambda one: one[0])[1] if found else None
 
 
-# Of one joint in one run: its index, Gram matrices (B, c + 1, c + 1) and places among the unknowns.
+# Joint index in one run, Gram matrices (B, c + 1, c + 1), and indices of the unknowns.
 _Rows = tuple[int, Array, NDArray[np.intp]]
 
 
@@ -278,14 +275,14 @@ class _Fit(NamedTuple):
     """Solution of the joint problem."""
 
     values: Array  # of all unknowns
-    bodies: list[NDArray[np.intp]]  # places of each body's parameters among them
-    root: Array  # of the inverse of the information, on what is determined
+    bodies: list[NDArray[np.intp]]  # indices of each body's parameters
+    root: Array  # of the inverse information, determined part
     scale: Array  # length of each column
     clustered: Clustered  # covariance
-    weights: Array  # inverse variances of the joints (n,), of white noise
+    weights: Array  # inverse variances of the joints (n,)
 
     def determined(self, part: NDArray[np.intp]) -> Array:
-        """Combinations (r, k) of k unknowns that are determined, in comparable units."""
+        """Return determined combinations (r, k) of k unknowns, in comparable units."""
         scale = np.where(self.scale > 0.0, self.scale, 1.0)
         basis = self.root * scale[:, None]
         basis = basis[part] / np.linalg.norm(basis, axis=0)
@@ -299,7 +296,7 @@ def _fit(
 ) -> _Fit:
     """Solve the joint problem."""
     if not any(run.loaded for run in runs) or all(run.loaded for run in runs):
-        raise PayloadError("a payload is a difference: name recordings without it and with it")
+        raise PayloadError("recordings without and with the payload are required")
     rows = np.sum([run.phase.samples.sum(axis=0) for run in runs], axis=0)
     if not rows.any():
         raise IdentificationError(nothing_usable(model))
@@ -319,7 +316,7 @@ def _fit(
         friction = np.where(model.friction_columns, values[:p], 0.0)
     length = max(1, -(-max(len(run.phase) for run in runs) // _MOST_BLOCKS))
     problem = layout.rows(model, [run.phase.merged(length) for run in runs], friction)
-    # Priors are physical and count as they are; data whose noise is coloured count for less.
+    # The prior is not scaled; the data are, by the design effect of coloured noise.
     effect = 1.0
     for _ in range(2):
         own = weights / effect
@@ -337,18 +334,18 @@ def _fit(
 
 
 class _Layout(NamedTuple):
-    """Where the unknowns stand: the arm's, each body's, then offsets and friction by run."""
+    """Order of the unknowns: arm, bodies, then offsets and friction scales by run."""
 
     width: int  # number of unknowns
     bodies: list[NDArray[np.intp]]  # places of each body's
-    shapes: list[Array]  # the ten parameters of each by its unknowns (10, r)
-    carried: list[list[bool]]  # in which runs each acts
-    drifts: NDArray[np.intp]  # places of offsets and friction scales (R, 2, n)
+    shapes: list[Array]  # ten parameters by unknowns of each (10, r)
+    carried: list[list[bool]]  # runs of each
+    drifts: NDArray[np.intp]  # indices of offsets and friction scales (R, 2, n)
 
     def rows(
         self, model: RobotModel, phases: Sequence[PhaseFactor], friction: Array
     ) -> list[_Rows]:
-        """Gram matrices over the unknowns, with the friction (p,) whose scale drifts."""
+        """Return Gram matrices over the unknowns, with the friction (p,) that is scaled."""
         p, found = model.n_parameters, []
         for k, phase in enumerate(phases):
             for joint, (gram, columns) in enumerate(zip(phase.gram, phase.columns, strict=True)):
@@ -372,7 +369,7 @@ class _Layout(NamedTuple):
         return found
 
     def prior(self, problem: Sequence[_Rows], weights: Array, rows: NDArray[np.intp]) -> Array:
-        """Information on each unknown (width,): of offsets and friction scales."""
+        """Return the information on each unknown (width,), of offsets and friction scales."""
         n = self.drifts.shape[2]
         squares = np.zeros(n)
         for joint, gram, places in problem:
@@ -388,7 +385,7 @@ class _Layout(NamedTuple):
         return prior
 
     def total(self, problem: Sequence[_Rows], weights: Array) -> Array:
-        """Weighted Gram matrices of all joints and runs (B, width + 1, width + 1)."""
+        """Return weighted Gram matrices of all joints and runs (B, width + 1, width + 1)."""
         count = max(len(gram) for _, gram, _ in problem)
         whole = np.zeros((count, self.width + 1, self.width + 1))
         for joint, gram, places in problem:
@@ -401,7 +398,7 @@ def _normal(total: Array, prior: Array) -> NormalEquations:
 
 
 def _weights(problem: Sequence[_Rows], values: Array, rows: NDArray[np.intp]) -> Array:
-    """Inverse variances of the residuals (n,), zero without rows."""
+    """Return inverse variances of the residuals (n,), zero without rows."""
     squares, torque = np.zeros(len(rows)), np.zeros(len(rows))
     augmented = np.append(-values, 1.0)
     for joint, gram, places in problem:
@@ -416,39 +413,39 @@ class _BodyEstimate(NamedTuple):
     """Ten parameters of a body, as far as they are determined."""
 
     values: Array  # (10,)
-    determined: Array  # combinations of them that are (r, 10)
+    determined: Array  # determined combinations (r, 10)
     spread: Array  # covariance of those (r, r)
     factor: float  # standard deviations in half a 95 % interval
-    blocks: int  # of time that the covariance is made of
+    blocks: int  # of time
     words: str  # how
 
     def covariance(self, rows: Array) -> Array:
-        """Covariance of linear functions (k, 10) of the parameters, without what is lost (k, k)."""
+        """Return the covariance of functions (k, 10) of the parameters, determined part (k, k)."""
         own = rows @ np.linalg.pinv(self.determined)
         return np.asarray(own @ self.spread @ own.T)
 
-    def _lost(self, rows: Array) -> tuple[Array, Array]:
-        """What functions (k, 10) have that is not determined, and they, in comparable units."""
+    def _undetermined_part(self, rows: Array) -> tuple[Array, Array]:
+        """Return the undetermined part of functions (k, 10), and the functions, in equal units."""
         scale = np.linalg.norm(self.determined, axis=0)
         scale = np.where(scale > 0.0, scale, 1.0)
         seen = rows @ np.linalg.pinv(self.determined) @ self.determined
         return (rows - seen) / scale, rows / scale
 
     def std(self, rows: Array) -> Array:
-        """Standard deviations of linear functions (k, 10) of the parameters; infinite if lost."""
-        lost, scaled = self._lost(rows)
+        """Return standard deviations of functions (k, 10), infinite if undetermined."""
+        lost, scaled = self._undetermined_part(rows)
         known = np.linalg.norm(lost, axis=1) < _PARTICIPATION * np.linalg.norm(scaled, axis=1)
         return np.where(known, np.sqrt(np.diag(self.covariance(rows))), np.inf)
 
     def principal(self, rows: Array) -> tuple[Array, Array]:
-        """Uncorrelated combinations (k, 10) of k functions, and half their intervals (k,)."""
-        lost, scaled = self._lost(rows)
+        """Return uncorrelated combinations (k, 10) of k functions, and half intervals (k,)."""
+        lost, scaled = self._undetermined_part(rows)
         lost = lost / max(float(np.linalg.norm(scaled)), np.finfo(np.float64).tiny)
-        variance, axes = np.linalg.eigh(self.covariance(rows) + _LOST * lost @ lost.T)
+        variance, axes = np.linalg.eigh(self.covariance(rows) + _UNDETERMINED * lost @ lost.T)
         return axes.T @ rows, self.factor * np.sqrt(np.maximum(variance, 0.0))
 
     @property
-    def marked_covariance(self) -> Array:
+    def full_covariance(self) -> Array:
         """Covariance of the parameters (10, 10), with infinite variances."""
         covariance = self.covariance(np.eye(_BODY))
         mark_undetermined(covariance, np.isfinite(self.std(np.eye(_BODY))))
@@ -456,7 +453,7 @@ class _BodyEstimate(NamedTuple):
 
     @property
     def mass(self) -> tuple[float, float, float]:
-        """Mass and its interval [kg], infinite if not determined; below zero for less."""
+        """Mass and its interval [kg], infinite if undetermined."""
         value, half = float(self.values[9]), self.factor * float(self.std(np.eye(_BODY)[[9]])[0])
         return value, value - half, value + half
 
@@ -472,7 +469,7 @@ class _BodyEstimate(NamedTuple):
 
     @property
     def centre_intervals(self) -> Array:
-        """95 % intervals of the centre (3, 2): of a ratio, after Fieller (1954)."""
+        """95 % intervals of the centre (3, 2), a ratio (Fieller 1954)."""
         known = np.isfinite(self.std(np.eye(_BODY)))
         covariance = self.factor**2 * self.covariance(np.eye(_BODY))
         first, mass = self.values[6:9], self.values[9]
@@ -484,7 +481,7 @@ class _BodyEstimate(NamedTuple):
 
 
 def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
-    """The body of the loaded runs; where the motion leaves a choice, of least parameters."""
+    """Estimate the body of the loaded runs, of least norm where undetermined."""
     carried = [[run.loaded for run in runs]]
     fit = _fit(model, runs, carried, [np.eye(_BODY)])
     determined: Array = fit.determined(fit.bodies[0])
@@ -504,7 +501,7 @@ def _body_estimate(model: RobotModel, runs: Sequence[Run]) -> _BodyEstimate:
 
 
 def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
-    """By how much a tensor may be smaller and larger (6,), (6,): its centre is as far off (3,)."""
+    """Return how much smaller and larger a tensor may be (6,), (6,) by centre errors (3,)."""
     with np.errstate(invalid="ignore"):
         products = mass * np.nan_to_num(np.outer(reach, reach), nan=np.inf, posinf=np.inf)
     xx, xy, xz, yy, yz, zz = products[np.triu_indices(3)]
@@ -512,27 +509,27 @@ def _off_centre(mass: float, reach: Array) -> tuple[Array, Array]:
     return off_diagonal + np.array([yy + zz, 0.0, 0.0, xx + zz, 0.0, xx + yy]), off_diagonal
 
 
-class _Reference(NamedTuple):
-    """A body whose figures stand in for those that the motion does not determine."""
+class _ReferenceBody(NamedTuple):
+    """Body that replaces what the motion does not determine."""
 
     tensor: Array  # about its centre, per kg (6,) [m²]
-    inertia: float  # what counts as large [kg m²]
-    length: float  # likewise [m]
+    inertia: float  # limit [kg m²]
+    length: float  # limit [m]
 
 
-def _reference(mass: float, box: tuple[float, float, float] | None) -> _Reference:
-    """A point is small against a ball of water of its mass, a box is as large as it is."""
+def _reference(mass: float, box: tuple[float, float, float] | None) -> _ReferenceBody:
+    """Return the reference: a point, with limits of a water ball of its mass, or a box."""
     if box is None:
         radius = (3.0 * mass / (4.0 * np.pi * _DENSITY)) ** (1.0 / 3.0)
-        return _Reference(np.zeros(6), 0.4 * mass * radius**2, radius)
+        return _ReferenceBody(np.zeros(6), 0.4 * mass * radius**2, radius)
     x, y, z = (edge**2 / 12.0 for edge in box)
     tensor = np.array([y + z, 0.0, 0.0, x + z, 0.0, x + y])
-    return _Reference(tensor, mass * float(tensor.max()), max(box) / 2.0)
+    return _ReferenceBody(tensor, mass * float(tensor.max()), max(box) / 2.0)
 
 
-def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, float]:
-    """The possible body closest to an estimate, and how far away it is, squared."""
-    import cvxpy  # a third of a second to import
+def _closest_body(found: _BodyEstimate, reference: _ReferenceBody) -> tuple[Body, float]:
+    """Return the consistent body closest to an estimate, and their squared distance."""
+    import cvxpy  # slow import (0.3 s)
 
     cp: Any = cvxpy
     values = found.values
@@ -543,10 +540,10 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
     about = _moved(np.eye(3), -centre)[_INERTIA]
     about[:, 9] -= reference.tensor
     about *= np.sqrt(_OFF_DIAGONAL)[:, None]
-    # As wide as the reference is large, or as the recordings show the body to be beyond chance.
+    # Scaled by the reference, or by what the recordings show significantly.
     along, half = found.principal(about)
     about /= np.sqrt(np.max((along @ values) ** 2 - half**2, initial=reference.inertia**2))
-    # In units of the reference the numbers are near one.
+    # In units of the reference.
     mass, length = values[9], max(reference.length, float(np.linalg.norm(centre)))
     units = mass * np.repeat([length**2, length, 1.0], [6, 3, 1])
     x = cp.Variable(_BODY)
@@ -556,24 +553,24 @@ def _closest_body(found: _BodyEstimate, reference: _Reference) -> tuple[Body, fl
     prior = cp.sum_squares((about * units) @ x)
     problem = cp.Problem(cp.Minimize(error + prior), [matrix >> 0.0, x[9] >= 1e-3])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # its status says whether a solution is inaccurate
+        warnings.simplefilter("ignore")  # the status reports inaccuracy
         try:
             problem.solve(solver=cp.CLARABEL)
         except cp.error.SolverError as failure:
-            raise PayloadError(f"no possible body was found: {failure}") from failure
+            raise PayloadError(f"no consistent body was found: {failure}") from failure
     if problem.status not in ("optimal", "optimal_inaccurate") or x.value is None:
-        raise PayloadError(f"no possible body was found: the solver ended with {problem.status}")
+        raise PayloadError(f"no consistent body was found: the solver ended with {problem.status}")
     near = body(np.asarray(x.value) * units)
     second = pseudo_inertia(inertial_parameters(Body(near.mass, np.zeros(3), near.inertia)))
-    size, axes = np.linalg.eigh(second)  # a solver's tolerance may leave some below zero
+    size, axes = np.linalg.eigh(second)  # within the solver's tolerance some are negative
     inside = inertial_from_pseudo((axes * np.maximum(size, 0.0)) @ axes.T)
-    possible = Body(near.mass, near.centre, body(inside).inertia)
-    miss = rows @ (inertial_parameters(possible) - values)
-    return possible, float(miss @ miss)
+    consistent = Body(near.mass, near.centre, body(inside).inertia)
+    miss = rows @ (inertial_parameters(consistent) - values)
+    return consistent, float(miss @ miss)
 
 
-def _chance(squares: float, dimensions: int, spare: int) -> float:
-    """Probability of so large a squared distance, by Hotelling's T² over few blocks."""
+def _tail_probability(squares: float, dimensions: int, spare: int) -> float:
+    """Return the probability of a larger squared distance, by Hotelling's T² over few blocks."""
     if spare < 1:
         return 1.0
     blocks = spare + dimensions
@@ -581,7 +578,7 @@ def _chance(squares: float, dimensions: int, spare: int) -> float:
 
 
 def _torque_share(model: RobotModel, run: Run, delta: Array, whole: Array, weights: Array) -> float:
-    """RMS torque of the weight of one body over that of another, in the rows of a run."""
+    """Return the RMS torque of the weight of one body over that of another, in a run."""
     p = model.n_parameters
     squares = np.zeros(2)
     for weight, gram, columns in zip(weights, run.phase.gram, run.phase.columns, strict=True):
@@ -593,7 +590,7 @@ def _torque_share(model: RobotModel, run: Run, delta: Array, whole: Array, weigh
 
 
 def _moved(rotation: Array, translation: Array) -> Array:
-    """Map of inertial parameters to another frame (10, 10), in which the old has this pose."""
+    """Return the map of inertial parameters (10, 10) to a frame in which theirs has this pose."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, translation
     return np.asarray(inertial_from_pseudo(pose @ pseudo_inertia_map() @ pose.T).T)

@@ -1,4 +1,4 @@
-r"""Gaussian prior on the parameters, from CAD or zero (ridge), and what the data add to it.
+r"""Estimates with a Gaussian prior on the parameters, from CAD or zero (ridge).
 
 .. math:: \hat\pi = \arg\min \; \sum_j w_j \lVert y_j - W_j \pi \rVert^2
                     + (\pi - \mu)^T C^{-1} (\pi - \mu)
@@ -33,46 +33,46 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 
-# Posterior over prior standard deviation below which a parameter counts as learned from the
-# data: three quarters of what is known about it (inverse variance) come from there.
+# Posterior over prior standard deviation of a parameter that is determined by the data, which then
+# gave three quarters of its information (inverse variance).
 LEARNED: Final = 0.5
-# A prior may be far weaker than the data and still decide where they say nothing.
+# A weak prior still determines what the data leave open.
 _WORST_CONDITION: Final = 1e13
-_FEWEST_ROWS: Final = 2  # per parameter: fewer do not tell noise from fit
+_FEWEST_ROWS: Final = 2  # per parameter, to estimate the noise
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """What is believed before the data: ``root @ (pi - mean)`` is standard Gaussian."""
+    """Gaussian prior: ``root @ (pi - mean)`` is standard normal."""
 
     mean: Array  #: (p,)
-    root: Array  #: (k, p); directions that it does not see are flat: nothing is believed of them
-    words: str  #: where it comes from
+    root: Array  #: (k, p); flat in directions without information
+    words: str  #: origin
 
     @classmethod
     def of_combinations(
         cls, combinations: Array, mean: Array, std: Array, words: str = "given"
     ) -> GaussianPrior:
-        """Prior on ``combinations @ s`` of independent quantities s.
+        """Return the prior on ``combinations @ s`` of independent quantities s.
 
         With the identity and mean zero this is ridge regression in units of `std`.
 
         Args:
             combinations: (p, s), of full rank.
             mean: of the quantities (s,).
-            std: of the quantities (s,), infinite where nothing is believed. Such a quantity
-                makes flat the one direction it acts in, not every parameter it is part of.
-            words: where it comes from.
+            std: of the quantities (s,), infinite if unknown: only the direction on which such a
+                quantity acts is then flat, not every parameter that it is part of.
+            words: origin of the prior.
 
         Raises:
             IdentificationError: a standard deviation is not positive.
         """
         if not np.all(std > 0.0):
-            raise IdentificationError("a prior needs positive deviations")
+            raise IdentificationError("the standard deviations of a prior must be positive")
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
         size = _length(spread, axis=1)
-        seen = _orthogonal_to(combinations[:, flat] / size[:, None])
+        seen = _null_space(combinations[:, flat] / size[:, None])
         seen_spread = seen.T @ (spread / size[:, None])
         covariance = seen_spread @ seen_spread.T
         scale = np.sqrt(np.diag(covariance))
@@ -91,19 +91,19 @@ class GaussianPrior:
 
 @dataclass(frozen=True, eq=False)
 class PosteriorEstimate:
-    """Estimate from prior and data, and who said what."""
+    """Estimate from prior and data."""
 
     estimate: Estimate  #: its covariance is the posterior's
     prior_mean: Array  #: (p,)
-    prior_std: Array  #: (p,), infinite where nothing was believed
-    words: str  #: where the prior comes from
-    design_effect: float  #: by how much coloured residuals make the variance larger than white ones
+    prior_std: Array  #: (p,), infinite where unknown
+    words: str  #: origin of the prior
+    design_effect: float  #: variance ratio of coloured to white residuals
 
     @property
     def ratio(self) -> Array:
         """Posterior over prior standard deviation (p,): 0 all from the data, 1 all from the prior.
 
-        0 as well where nothing was believed before, 1 where still nothing is known.
+        Without prior 0, or 1 if undetermined.
         """
         flat = np.isinf(self.prior_std)
         ratio = self.estimate.std / np.where(flat, 1.0, self.prior_std)
@@ -111,15 +111,14 @@ class PosteriorEstimate:
 
     @property
     def learned(self) -> NDArray[np.bool_]:
-        """Whether each parameter is learned from the data (p,): ratio below `LEARNED`."""
+        """Whether each parameter is determined by the data (p,): ratio below `LEARNED`."""
         return np.asarray(self.ratio < LEARNED)
 
     @property
-    def surprise(self) -> Array:
-        """Change of each learned parameter by the data, in the deviations the prior allows (p,).
+    def normalized_change(self) -> Array:
+        """Change of parameters by the data, in standard deviations that the prior allows (p,).
 
-        If prior and data agree this is standard Gaussian: beyond three or four, CAD is wrong or
-        its uncertainty too small. NaN where nothing was believed or little was learned.
+        Standard normal if prior and data agree. NaN without prior or where little was learned.
         """
         tested = self.learned & np.isfinite(self.prior_std)
         allowed = np.where(tested, self.prior_std**2, 1.0) * (
@@ -136,22 +135,22 @@ def with_prior(
     *,
     design_effect: float = 1.0,
 ) -> PosteriorEstimate:
-    """Estimate from data and prior; without data, the prior; with a flat one, least squares.
+    """Estimate from data and prior; a flat prior gives least squares.
 
-    Weights (n,) are by default those of an ordinary fit without prior. `design_effect`: how many
-    rows say as much as one would if residuals were white (:func:`fit_with_prior`).
+    Weights (n,) are by default those of an ordinary fit without prior. The information of the data
+    is divided by `design_effect` (:func:`fit_with_prior`).
 
     Raises:
-        IdentificationError: some rows, but too few to know the noise from, and no weights.
+        IdentificationError: too few rows to estimate the noise, and no weights.
     """
     if weights is None:
         weights = _weights(factor)
     rows, target = factor.rows(weights)
-    believed = np.sqrt(1.0 / design_effect)
-    # Solved for the change of the prior's mean: what nobody knows anything about stays there.
+    data_weight = np.sqrt(1.0 / design_effect)
+    # Solved for the change of the prior's mean, which unknown directions keep.
     posterior = solve_rows(
-        np.concatenate([believed * rows, prior.root]),
-        np.concatenate([believed * (target - rows @ prior.mean), np.zeros(len(prior.root))]),
+        np.concatenate([data_weight * rows, prior.root]),
+        np.concatenate([data_weight * (target - rows @ prior.mean), np.zeros(len(prior.root))]),
         _WORST_CONDITION,
     )
     solution = posterior._replace(
@@ -160,7 +159,7 @@ def with_prior(
     )
     method = f"weighted least squares with a Gaussian prior ({prior.words}), posterior covariance"
     if design_effect > 1.0:
-        method += f", {design_effect:.3g} rows counted as one for their colour"
+        method += f", design effect {design_effect:.3g}"
     estimate = estimate_of(model.units, factor, solution, weights / design_effect, method)
     return PosteriorEstimate(estimate, prior.mean, prior.std, prior.words, design_effect)
 
@@ -172,14 +171,14 @@ def fit_with_prior(
     *,
     phase: PhaseFactor | None = None,
 ) -> PosteriorEstimate:
-    """Fit recordings with a prior, the data weighing as much as their coloured residuals allow.
+    """Fit recordings with a prior, allowing for coloured residuals.
 
-    Their information is divided by the design effect: the mean ratio, over all directions of the
-    parameter space, of the cluster-robust variance to that of white residuals (Rao and Scott 1981;
-    Pauli, Racugno and Ventura 2011). Where the factor is known they are read for QR only.
+    The information of the data is divided by the design effect, the mean ratio of the
+    cluster-robust variance to that of white residuals (Rao and Scott 1981; Pauli, Racugno and
+    Ventura 2011). With a known factor, recordings are read for QR only.
 
     Raises:
-        IdentificationError: no recordings, or not one usable row.
+        IdentificationError: no recordings, or no usable row.
     """
     phase = total_phase(model, recordings) if phase is None else phase
     factor = reduced(model, recordings, phase.total)
@@ -195,20 +194,20 @@ def _weights(factor: Factor) -> Array:
     rows = int(factor.samples.sum())
     if 0 < rows < _FEWEST_ROWS * factor.n_parameters:
         raise IdentificationError(
-            f"{rows} rows are too few to know the torque's noise from, for {factor.n_parameters}"
-            " parameters; give the weights"
+            f"{rows} rows are too few to estimate the torque noise with {factor.n_parameters}"
+            " parameters; pass the weights"
         )
     return joint_weights(factor) if rows else np.zeros(factor.n_joints)
 
 
 def _length(columns: Array, axis: int) -> Array:
-    """Lengths to divide by: one where there is nothing."""
+    """Return lengths to divide by, one for zero."""
     length = np.linalg.norm(columns, axis=axis)
     return np.where(length > 0.0, length, 1.0)
 
 
-def _orthogonal_to(columns: Array) -> Array:
-    """Orthonormal basis (p, p - r) of what is orthogonal to columns (p, k) of rank r."""
+def _null_space(columns: Array) -> Array:
+    """Return an orthonormal basis (p, p - r) orthogonal to columns (p, k) of rank r."""
     if columns.shape[1] == 0:
         return np.eye(len(columns))
     left, singular, _ = np.linalg.svd(columns / _length(columns, axis=0), full_matrices=True)
@@ -216,8 +215,8 @@ def _orthogonal_to(columns: Array) -> Array:
     return np.asarray(left[:, rank:])
 
 
-# CAD leaves out cables, grease and fasteners, and castings differ from their drawings. Ten per
-# cent is an assumption, to be replaced by what is known of an arm.
+# CAD lacks cables, grease and fasteners, and castings deviate from drawings. Assumed; state it per
+# arm.
 NOMINAL_SHARE: Final = 0.1
 _INERTIA, _MOMENT, _MASS = slice(0, 6), slice(6, 9), 9
 
@@ -227,33 +226,31 @@ def nominal_prior(
     share: float = NOMINAL_SHARE,
     known: Mapping[str, tuple[float, float]] | None = None,
 ) -> GaussianPrior:
-    """Prior from the inertia in the URDF.
+    """Return the prior by the inertias of the URDF.
 
-    The mass of a link is believed to `share` of itself, its first moments and its inertia to
-    `share` of the largest among them, so that a zero in the CAD is no certainty. A link whose
-    first moments are all zero gets those of its radius of gyration, one without inertia the
-    largest on the arm. A URDF says nothing about rotor inertia, friction and springs: of these
-    nothing is believed unless they are known. The belief is in the standard parameters; that in
-    their base groups, and how they correlate, follows.
+    The standard deviation of a mass is `share` of it, that of first moments and inertias `share` of
+    the largest of the link. First moments of zero are replaced by mass times radius of gyration, a
+    missing inertia by the largest of the arm. Rotor inertia, friction and springs are unknown
+    unless given.
 
     Args:
         model: the robot.
-        share: of the nominal value.
-        known: mean and standard deviation by name, of standard parameters (replacing the
-            nominal) and of all others: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
+        share: relative standard deviation.
+        known: mean and standard deviation by name, of standard (replacing nominal) and other
+            parameters: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
 
     Raises:
         IdentificationError: the URDF has no inertia, a name is unknown, the share not positive.
     """
     if not share > 0.0:
         raise IdentificationError(f"the nominal parameters' uncertainty is {share}, not positive")
-    others = model.parameter_names[model.base.rank :]  # friction, springs and balancers
+    others = model.parameter_names[model.base.rank :]
     names = model.standard_names + others
     mean = np.concatenate([model.nominal, np.zeros(len(others))])
     std = np.concatenate([_nominal_std(model, share), np.full(len(others), np.inf)])
     for name, (value, deviation) in (known or {}).items():
         if name not in names:
-            raise IdentificationError(f"the model has no parameter {name!r} to be known")
+            raise IdentificationError(f"the model has no parameter {name!r}")
         mean[names.index(name)], std[names.index(name)] = value, deviation
     combinations = np.zeros((model.n_parameters, len(names)))
     combinations[: model.base.rank, : len(model.standard_names)] = model.base.grouping
@@ -265,7 +262,7 @@ def nominal_prior(
 
 
 def _nominal_std(model: RobotModel, share: float) -> Array:
-    """Standard deviations of the standard parameters (s,), infinite for what turns on motors."""
+    """Return standard deviations of the standard parameters (s,), infinite for rotors."""
     values = np.abs(model.nominal[model.layout.links])
     inertia, mass = values[:, _INERTIA].max(axis=1), values[:, _MASS].copy()
     if not (inertia.any() and mass.any()):

@@ -1,7 +1,7 @@
-"""Least squares that gross errors do not carry away: iteratively reweighted (Holland, Welsch 1977).
+"""Robust estimation by iteratively reweighted least squares (Holland and Welsch 1977).
 
-The scale of each joint's noise is found alongside, from the median absolute residual. Rows whose
-*motion* is wrong, and what the model leaves out everywhere, it does not help against.
+The noise scale of each joint is estimated from the median absolute residual. Errors of the motion
+and of the model are not covered.
 """
 
 from __future__ import annotations
@@ -31,16 +31,14 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 MOST_ITERATIONS: Final = 60
-# Change of the parameters at which the iteration ends, in their standard deviations if noise were
-# white; far below anything that means something.
+# Final change of the parameters, in standard deviations of white noise.
 TOLERANCE: Final = 1e-4
-# Changes, likewise and of the scales (relative), at which the scales are held and another loss may
-# go on. A scale that is a thousandth off changes the fit by far less than its own uncertainty does;
-# to look for it further would double the passes.
-_ROUGH: Final = 0.01
-_SETTLED: Final = 1e-3
+# Changes of parameters (likewise) and scales (relative) at which the scales are fixed and the next
+# loss starts.
+_STEP_TOLERANCE: Final = 0.01
+_SCALE_TOLERANCE: Final = 1e-3
 OUTLYING: Final = 4.0  # scales; one Gaussian row in 16 000
-# Share of outlying rows beyond which they are no gross errors, but what the model leaves out.
+# Share of outlying rows above which the model is wrong.
 MOST_OUTLYING: Final = 0.1
 _MAD: Final = 0.6744897501960817  # median of |x| for a standard Gaussian x
 _SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
@@ -48,35 +46,31 @@ _SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
 
 @dataclass(frozen=True, eq=False)
 class RobustEstimate:
-    """A robust fit and what it made of the rows."""
+    """Robust fit with its outliers."""
 
-    #: values and cluster-robust covariance; `noise_std` is the robust scale per joint
+    #: with cluster-robust covariance; `noise_std` is the robust scale per joint
     estimate: Estimate
-    #: share of a joint's rows more than `OUTLYING` scales off (n,), NaN without rows
+    #: share of rows beyond `OUTLYING` scales (n,), NaN without rows
     outlying: Array
     iterations: int  #: passes over the samples
-    converged: bool  #: whether the last one changed nothing more
+    converged: bool
 
     @property
     def doubtful(self) -> NDArray[np.bool_]:
-        """Joints of which so many rows are outlying that the model is to blame (n,).
-
-        A robust loss then leaves out what the model cannot explain instead of what is wrong,
-        and predicts worse than least squares.
-        """
+        """Joints with so many outlying rows that the model is wrong, not the data (n,)."""
         return np.asarray(self.outlying > MOST_OUTLYING)
 
 
 class _State(NamedTuple):
-    """Where the iteration is."""
+    """State of the iteration."""
 
-    factor: Factor  # of the rows as weighted last
-    solution: Solution  # from it
-    scale: Array  # standard deviation of each joint's good residuals (n,), NaN without rows
-    residuals: tuple[Array, ...] = ()  # per recording (m, n), of the values before the solution's
-    passes: int = 1  # over the samples so far
-    held: bool = False  # whether the scale is not looked for again
-    converged: bool = False  # whether the last pass changed nothing
+    factor: Factor  # of the weighted rows
+    solution: Solution
+    scale: Array  # standard deviation of each joint's inliers (n,), NaN without rows
+    residuals: tuple[Array, ...] = ()  # per recording (m, n), before the last solution
+    passes: int = 1
+    scale_fixed: bool = False
+    converged: bool = False
 
 
 def robust_estimate(
@@ -87,23 +81,23 @@ def robust_estimate(
     gram: Factor | None = None,
     most_iterations: int = MOST_ITERATIONS,
 ) -> RobustEstimate:
-    """Fit recordings with a robust loss; every iteration reads the samples once, one at a time.
+    """Fit recordings with a robust loss; every iteration reads the samples once.
 
-    Only residuals are stored. Tukey's loss starts where Huber's ends, and with its scales (Yohai
-    1987). QR takes the place of Gram matrices where the condition demands it. `gram`, the factor of
-    the recordings, saves a pass; what has not converged after `most_iterations` of a loss says so.
+    Tukey's loss starts from the solution and scales of Huber's (Yohai 1987). QR replaces Gram
+    matrices if the condition requires it. `gram`, the factor of the recordings, saves one pass. See
+    `converged` after `most_iterations` per loss.
 
     Raises:
-        IdentificationError: no recordings, or not one usable row.
+        IdentificationError: no recordings, or no usable row.
     """
     gram = total_phase(model, recordings).total if gram is None else gram
     factor, n = reduced(model, recordings, gram), model.n_joints
     state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
-    stages = [(Huber(), _ROUGH)] if isinstance(loss, Tukey) else []
+    stages = [(Huber(), _STEP_TOLERANCE)] if isinstance(loss, Tukey) else []
     for one, tolerance in [*stages, (loss, TOLERANCE)]:
         state = state._replace(converged=False)
         for _ in range(most_iterations):
-            state = _pass(model, recordings, state, one, tolerance)
+            state = _iterate(model, recordings, state, one, tolerance)
             if state.converged:
                 break
     weights = inverse_variance(state.scale**2)
@@ -129,17 +123,17 @@ def robust_estimate(
     )
 
 
-def _pass(
+def _iterate(
     model: RobotModel, recordings: Sequence[Samples], state: _State, loss: Loss, tolerance: float
 ) -> _State:
-    """Weight all rows by their residuals, solve, and find the scale of those, unless held."""
+    """Weight all rows by their residuals, solve, and update the scale unless fixed."""
     residuals = tuple(np.full(samples.torque.shape, np.nan) for samples in recordings)
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
     factor = state.factor.from_blocks(model, rows, state.factor.samples)
     weights = inverse_variance(state.scale**2)
     solution = factor.solve(weights if weights.any() else np.ones(len(weights)))
-    scale = state.scale if state.held else _scales(recordings, residuals, state.solution)
-    # In standard deviations, root mean square over the parameters.
+    scale = state.scale if state.scale_fixed else _scales(recordings, residuals, state.solution)
+    # RMS over the parameters, in standard deviations.
     change = solution.values - state.solution.values
     squares = float(inverse_variance(scale**2) @ factor.products(change[:, None])[:, 0, 0])
     step = np.sqrt(max(squares, 0.0) / len(change))
@@ -151,8 +145,10 @@ def _pass(
         scale,
         residuals,
         state.passes + 1,
-        held=bool(state.held or (moved <= _SETTLED and step <= _ROUGH)),
-        converged=bool(state.held and step <= tolerance),
+        scale_fixed=bool(
+            state.scale_fixed or (moved <= _SCALE_TOLERANCE and step <= _STEP_TOLERANCE)
+        ),
+        converged=bool(state.scale_fixed and step <= tolerance),
     )
 
 
@@ -164,7 +160,7 @@ def _weighted_rows(
     loss: Loss,
     residuals: Sequence[Array],
 ) -> Iterator[list[Array]]:
-    """Yield rows times the roots of their weights; writes what they leave over to `residuals`."""
+    """Yield rows times the roots of their weights; writes the residuals to `residuals`."""
     for samples, left in zip(recordings, residuals, strict=True):
         for part, blocks in augmented_rows(model, samples):
             for joint, (block, used) in enumerate(zip(blocks, model.plan.columns, strict=True)):
@@ -176,7 +172,7 @@ def _weighted_rows(
 
 
 def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution: Solution) -> Array:
-    """Standard deviation per joint (n,) from the median of |residual|, NaN without rows."""
+    """Return the standard deviation per joint (n,) from the median of |residual|."""
     usable = np.concatenate([samples.usable for samples in recordings])
     torque = np.concatenate([samples.torque for samples in recordings])
     left, rows = np.concatenate(residuals), np.count_nonzero(usable)

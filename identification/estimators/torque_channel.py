@@ -1,4 +1,4 @@
-"""What the torque channel of a log has been through before it was logged."""
+"""Low-pass of the recorded torque, estimated from the recording."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from identification.signals.smoothing import (
 
 Array = NDArray[np.float64]
 
-LOWEST_BANDWIDTH: Final = 0.5  # Hz; below it nothing of a robot's motion would be left
-# The low-pass has to earn its place: residuals smaller by this share, on average over joints.
+LOWEST_BANDWIDTH: Final = 0.5  # Hz
+# Required relative reduction of the residual, mean over joints.
 _WORTHWHILE: Final = 0.05
-# Candidates per factor of ten in bandwidth, before the best one is refined.
+# Candidates per decade of bandwidth, before refinement.
 _COARSE: Final = 4.0
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
 _SHORTEST: Final = 12  # samples
 
 
 def torque_noiseless_above(recording: Recording) -> float | None:
-    """Frequency [Hz] above which the recorded torque has no noise; None where it has."""
+    """Return the frequency [Hz] above which the torque has no noise; None if it has."""
     if recording.torque is None:
         return None
     return noiseless_above(recording.time, recording.torque, recording.segments())
@@ -52,15 +52,14 @@ def possible_low_passes(
     options: Preprocessing = Preprocessing(),  # noqa: B008 - frozen
     undelayed: float | None = None,
 ) -> tuple[Preprocessing, ...]:
-    """Settings with the low-passes that fit a recording with torque best, one of each kind.
+    """Return settings with the best-fitting low-pass of each kind.
 
-    Many controllers log a smoothed effort: Coulomb friction, a step in the regressor, is then a
-    slope in the torque. The kinds are causal ones, whose lag a delay without a low-pass would stand
-    in for, and ones without phase. A kind whose residuals are not clearly smaller than with a delay
-    by itself is left out. The motion is read with a wide bandwidth: a narrow one would itself be a
-    low-pass.
+    Many controllers log a filtered torque, in which Coulomb friction is a slope instead of a step.
+    Kinds are causal filters, compared without a delay, and zero-phase ones. A kind whose residuals
+    are not clearly smaller than with a delay alone is left out. The motion is smoothed with a wide
+    bandwidth.
 
-    `undelayed` is the delay [s] found without a low-pass, that of the options if left out;
+    `undelayed` is the delay [s] without a low-pass, by default that of the options;
     `noise_variance` (n,) as in :func:`identification.signals.samples.smooth`.
     """
     still = options.torque_delay if undelayed is None else undelayed
@@ -69,7 +68,7 @@ def possible_low_passes(
         delay: _Channel.of(recording, model, noise_variance, replace(wide, torque_delay=delay))
         for delay in {still, options.torque_delay}
     }
-    # What a delay by itself explains as well is no low-pass.
+    # A low-pass must be better than a delay alone.
     enough = min(one.misfit() for one in channels.values()) + math.log(1.0 - _WORTHWHILE)
     found = []
     for delays, shapes in ((tuple(channels), WITHOUT_PHASE), ((still,), FORWARDS)):
@@ -86,12 +85,12 @@ def possible_low_passes(
 
 @dataclass(frozen=True, eq=False)
 class _Channel:
-    """Rows of each joint before any low-pass, averaged to a rate of some 250 Hz."""
+    """Unfiltered rows of each joint, averaged to a rate of about 250 Hz."""
 
-    model: RobotModel  # the robot
+    model: RobotModel
     time: Array  # (m,) [s]
     segments: tuple[slice, ...]  # stretches without a gap
-    # per joint the columns of its row and, last, the torque of known loads (m, c + 1)
+    # per joint its columns and, last, the torque of known loads (m, c + 1)
     blocks: tuple[Array, ...]
     torque: Array  # recorded (m, n)
     usable: NDArray[np.bool_]  # (m, n)
@@ -105,7 +104,7 @@ class _Channel:
         options: Preprocessing,
     ) -> _Channel:
         samples = prepare(recording, model, noise_variance=noise_variance, options=options)
-        # The ends that the narrowest filter knows badly count for none.
+        # Without the ends, which filters distort.
         usable = samples.usable & ~torn_rows(recording, LONGEST_END)[:, None]
         load = samples.known_torque(model)
         every = max(1, round(1.0 / (_RATE * float(np.median(np.diff(recording.time))))))
@@ -117,7 +116,7 @@ class _Channel:
         ]
 
         def average(values: Array) -> Array:
-            """Mean of so many rows each: the same for torque and regressor, as a filter is."""
+            """Average rows, equally for torque and regressor."""
             parts = [
                 values[start : start + count * every].reshape(count, every, *values.shape[1:])
                 for start, count in lasting
@@ -138,7 +137,7 @@ class _Channel:
         )
 
     def misfit(self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER) -> float:
-        """Mean log of the joints' residual standard deviations, of those that move."""
+        """Return the mean log standard deviation of the residual of moving joints."""
 
         def rows() -> Iterator[list[Array]]:
             tables = []
@@ -155,7 +154,7 @@ class _Channel:
         return float(np.nanmean(np.log(found.noise_std)))
 
     def best(self, shape: LowPassShape) -> tuple[float, float]:
-        """Misfit with a shape, and the bandwidth [Hz] with which it fits best."""
+        """Return the least misfit of a shape, and its bandwidth [Hz]."""
 
         def misfit(log_bandwidth: float) -> float:
             return self.misfit(math.exp(log_bandwidth), shape)

@@ -221,7 +221,7 @@ class TestConsistentEstimate:
         values[MODEL.parameter_names.index("I2yy")] = -0.3
         found = planted(values, noise, 6)
         assert_possible(MODEL, found)
-        assert "no machine fits" in found.status
+        assert "no consistent parameters fit" in found.status
         assert cost(found) > 0.02
 
     def test_errors_and_covariance_are_those_it_says(self) -> None:

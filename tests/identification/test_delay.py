@@ -155,7 +155,7 @@ class TestCommonDelay:
 
     def test_a_longer_one_than_was_sought_is_not_determined(self) -> None:
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
-        assert found.reason == "the residual still falls at the longest delay that was tried"
+        assert found.reason == "the residual decreases up to the longest delay tested"
         np.testing.assert_array_equal(found.applied, 0.0)
 
     def test_uneven_time_does_not_matter(self) -> None:
@@ -223,8 +223,8 @@ class TestUndeterminedDelay:
 
     def test_the_words_say_why(self, slow: DelayEstimate) -> None:
         (line,) = slow.describe()
-        assert line.startswith("all axes: not determined; the 95 % interval would be ± ")
-        assert line.endswith("the torques change too slowly, or have too much noise")
+        assert line.startswith("all axes: not determined; 95 % interval of ± ")
+        assert line.endswith("the torques change too slowly, or are too noisy")
 
     def test_its_variance_is_at_most_that_of_any_delay(self, slow: DelayEstimate) -> None:
         unknown = replace(slow, common_std=np.inf)
@@ -258,7 +258,7 @@ class TestDeviatingAxes:
         found = estimate_delays(a_recording(MODEL, TRUTH, np.array(planted)), MODEL)
         assert not found.agree and found.significant
         assert found.applied == pytest.approx(planted, abs=3e-4)
-        assert any("predicts better than the delay of the others" in s for s in found.describe())
+        assert any("predicts better than the common delay" in s for s in found.describe())
 
     def test_one_of_six_leaves_the_common_delay_as_it_is(
         self, simulated: tuple[Recording, float]

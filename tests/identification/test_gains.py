@@ -169,7 +169,7 @@ class TestGains:
         assert gains.determined.tolist() == [True, False]
         assert np.isnan(gains.values[1])
         assert np.isinf(gains.std[1])
-        reason = "the payload does not load it, and nothing else fixes its scale"
+        reason = "the payload does not load it"
         assert gains.reasons == (None, reason)
 
     def test_a_payload_beside_that_axis_determines_it(self) -> None:

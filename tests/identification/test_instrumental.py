@@ -345,7 +345,7 @@ def test_rows_without_a_command_and_recordings_without_any() -> None:
     instruments = planned_motion(samples, command)
     assert not instruments.usable[300:340].any()
     assert instruments.usable[400:-400].all()
-    with pytest.raises(IdentificationError, match="nothing was commanded"):
+    with pytest.raises(IdentificationError, match="no commanded positions"):
         planned_motion(samples, np.full_like(command, np.nan))
     with pytest.raises(IdentificationError, match="no joint is commanded to move"):
         planned_motion(samples, np.ones_like(command))

@@ -91,7 +91,7 @@ def test_an_infinite_deviation_is_the_limit_of_a_large_one(seed: int, flat: int)
 
 @pytest.mark.parametrize("std", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])
 def test_a_deviation_that_is_none_is_refused(std: list[float]) -> None:
-    with pytest.raises(IdentificationError, match="positive deviations"):
+    with pytest.raises(IdentificationError, match="must be positive"):
         independent(np.zeros(2), np.array(std))
 
 
@@ -213,7 +213,7 @@ def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_per
         found, white = result.estimate, with_prior(MODEL, Factor.of(MODEL, samples), prior).estimate
         inside.append(np.abs(found.values - values) < found.interval_factor * found.std)
         naive.append(np.abs(white.values - values) < 1.96 * white.std)
-        surprise.append(result.surprise[np.isfinite(result.surprise)])
+        surprise.append(result.normalized_change[np.isfinite(result.normalized_change)])
     assert 0.90 <= np.mean(inside) <= 0.99
     # What the data changed is as much as the prior allowed.
     assert 0.85 < np.std(np.concatenate(surprise)) < 1.15
@@ -229,8 +229,8 @@ def test_a_prior_that_is_wrong_is_seen_to_be() -> None:
     result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=wrong))
     at = result.estimate.names.index("f0_1")
     assert result.learned[at]
-    assert result.surprise[at] < -4.0
-    others = np.delete(result.surprise, at)
+    assert result.normalized_change[at] < -4.0
+    others = np.delete(result.normalized_change, at)
     assert np.nanmax(np.abs(others)) < 4.0
 
 
