@@ -1,29 +1,29 @@
-"""Hardware-in-the-loop identification of an industrial robot's dynamics.
+"""Hardware-in-the-loop identification of the dynamics of industrial robots.
 
-A campaign, from a cell file to a result:
+Campaigns:
 
-- `Cell`: a robot, its drive train, controller and limits, as a cell file describes them.
-- `Campaign`: a folder with one plan on one cell: rehearse, run, identify, report.
-- `simulated_controller`: a controller with the cell's arm, to talk to.
-- `straight_way`, `send`: a straight motion in joint space; send one motion and archive it.
-- `Stop`, `stop_on_interrupt`: bring the arm to rest on its path, also on Ctrl-C.
+- `Cell`: robot, drive train, controller and limits of a cell file.
+- `Campaign`: a folder with one plan for one cell: rehearse, run, identify, report.
+- `simulated_controller`: a simulated controller with the arm of a cell.
+- `straight_way`, `send`: plan a straight motion in joint space; send a motion and archive it.
+- `Stop`, `stop_on_interrupt`: stop the arm on its path, also on Ctrl-C.
 - `reporter`, `Silent`: progress bars, or none.
 
-From archives and other people's recordings:
+Archives and other recordings:
 
-- `open_archive`, `open_recording`: what is in an archive; the same as samples in SI units.
-- `import_log`, `import_rosbag2`: archives from text, arrays and bags of other programs.
-- `Robot`, `ColumnMap`: what an import has to know of the robot, and of the columns.
-- `identify_archives`, `identify_campaign`: estimate, prediction and verdict.
-- `Options`: how to estimate, where that is not to be chosen automatically.
-- `Results`: what `results.json` holds.
-- `reidentify`: every arm below some folders, campaign by campaign.
-- `export_model`, `replay_motions`: the arm for simulators; held-out motions simulated forwards.
-- `run_study`: the paper's comparison of two methods.
-- `errors`: what goes wrong, with file, field and remedy.
+- `open_archive`, `open_recording`: open an archive; read it as samples in SI units.
+- `import_log`, `import_rosbag2`: convert text, arrays and bags to archives.
+- `Robot`, `ColumnMap`: robot and columns of an imported recording.
+- `identify_archives`, `identify_campaign`: estimate, predict and judge.
+- `Options`: settings of the estimation.
+- `Results`: content of `results.json`.
+- `reidentify`: identify all arms and campaigns below some folders.
+- `export_model`, `replay_motions`: export for simulators; forward simulation of held-out motions.
+- `run_study`: comparison of the two methods of the paper.
+- `errors`: exceptions, with file, field and remedy.
 
-A name is imported when it is first used, so that the command line can settle how many threads the
-linear algebra may take before numpy is loaded.
+Names are imported on first use, so that the command line can set the number of threads of linear
+algebra before numpy is loaded.
 """
 
 from __future__ import annotations

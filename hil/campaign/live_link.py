@@ -61,7 +61,7 @@ from hil.archive.supervised import (
     Serving,
 )
 from hil.cell import Cell
-from hil.cell.cell import stays_here
+from hil.cell.cell import is_local
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.terminal_text import plural
 
@@ -399,7 +399,7 @@ class LiveLink(MotionLink):
             if isinstance(error, OSError):
                 raise ControllerFault(f"the archive process cannot be started: {error}") from error
             raise
-        link = cls(cell, exchange, archive, heart, finish, only_simulated=stays_here(spec))
+        link = cls(cell, exchange, archive, heart, finish, only_simulated=is_local(spec))
         if live is not None:
             try:
                 link._serve(live)

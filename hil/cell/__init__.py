@@ -1,4 +1,4 @@
-"""The cell: robot + drive train + controller link + limits, from one TOML file."""
+"""Cell file: robot, drive train, controller link and limits in one TOML file."""
 
 from .cell import AngleFrame, Cell
 from .errors import CellError

@@ -1,4 +1,4 @@
-"""The cell file, checked, the three descriptions built from it, and its frame of angles."""
+"""Cell file with its checks, the descriptions built from it, and its frame of angles."""
 
 from __future__ import annotations
 
@@ -44,15 +44,14 @@ Array = NDArray[np.float64]
 T = TypeVar("T")
 
 _WITHIN_THIS_COMPUTER: Final = frozenset(("virtual", "udp_multicast"))
-"""Interfaces of python-can that need no adapter."""
+"""Interfaces of python-can without an adapter."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cell:
-    """One cell: its file's text, its URDF's text, and what both describe.
+    """A cell: text of its file, text of its URDF, and their content.
 
-    Angles are those of the URDF everywhere above `drivers`; the controller's own angles appear
-    in the file and in `controller_angles` only.
+    Angles are URDF angles, except in the file and in `controller_angles`.
     """
 
     path: Path
@@ -62,10 +61,10 @@ class Cell:
 
     @classmethod
     def load(cls, path: Path | str) -> Cell:
-        """Read and check a cell file and the URDF it names.
+        """Read and check a cell file and its URDF.
 
         Raises:
-            CellError: names file, field, value and remedy.
+            CellError: a field is invalid.
         """
         path = Path(path)
         text = _read(path, path, "", None, "name a TOML file")
@@ -76,7 +75,7 @@ class Cell:
 
     @classmethod
     def from_texts(cls, text: str, urdf: str, path: Path) -> Cell:
-        """The cell from its texts (an archive carries both); `path` only names it in errors."""
+        """Create a cell from its texts (as in an archive); `path` is for errors."""
         cell = cls(path, text, urdf, _parse(path, text))
         _ = cell.model
         _check(cell)
@@ -87,12 +86,12 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """The cell's short name."""
+        """Short name."""
         return self.file.cell.name
 
     @property
     def mesh_folders(self) -> tuple[str, ...]:
-        """Where `package://` paths of the URDF's meshes begin, on this computer."""
+        """Folders that contain the packages of `package://` mesh paths."""
         return tuple(str(self.path.parent / name) for name in self.file.cell.mesh_folders)
 
     @cached_property
@@ -107,10 +106,10 @@ class Cell:
         )
 
     def with_friction(self, **changes: Any) -> Cell:
-        """The cell with other entries of `[robot.friction]` for all joints.
+        """Return the cell with changed entries of `[robot.friction]` for all joints.
 
         Raises:
-            CellError: there is no such law.
+            CellError: the friction law is invalid.
         """
         table = self.file.robot.friction
         joints = {
@@ -122,7 +121,7 @@ class Cell:
         return changed
 
     def without_payload(self) -> Cell:
-        """The cell without what `[robot.payload]` says that the arm carries."""
+        """Return the cell without `[robot.payload]`."""
         return self._with_robot(payload=None)
 
     def _with_robot(self, **changes: Any) -> Cell:
@@ -136,7 +135,7 @@ class Cell:
 
     @property
     def period(self) -> float:
-        """The controller's cycle, s."""
+        """Cycle of the controller, s."""
         return self.controller.cycle_ms / 1000
 
     @property
@@ -151,12 +150,12 @@ class Cell:
 
     @property
     def simulation(self) -> SimulationTable:
-        """`[simulation]`: the planted truth; only a simulated cell has one."""
+        """`[simulation]`: true parameters of a simulated cell."""
         return _required(self, self.file.simulation, "simulation")
 
     @cached_property
     def joint_limits(self) -> JointLimits:
-        """Limits of the plan in URDF angles (rad, rad/s, rad/s², rad/s³)."""
+        """Limits in URDF angles (rad, rad/s, rad/s², rad/s³)."""
         limits = _required(self, self.file.limits, "limits")
         ends = AngleFrame.of(self).urdf(np.array([limits.lower_deg, limits.upper_deg]))
         return JointLimits(
@@ -169,7 +168,7 @@ class Cell:
 
     @property
     def torque_limit(self) -> Array | None:
-        """Largest torque of each joint (n,) [N·m], at the joint; None where the file has none."""
+        """Largest torque of each joint (n,) [N·m]; None if not stated."""
         limits = self.file.limits
         return np.array(limits.torque) if limits is not None and limits.torque else None
 
@@ -191,12 +190,12 @@ class Cell:
 
     @property
     def drive_table(self) -> DriveTrainTable:
-        """`[drive_train]` as written in the file."""
+        """`[drive_train]`."""
         return _required(self, self.file.drive_train, "drive_train")
 
     @property
     def guard_limits(self) -> GuardLimits:
-        """What the guard enforces on every set-point."""
+        """Limits that the guard enforces on every set-point."""
         limits, bounds = self.joint_limits, self.file.bounds
         return GuardLimits(
             lower=limits.lower,
@@ -213,10 +212,10 @@ class Cell:
         )
 
     def transport_spec(self) -> TransportSpec:
-        """What opens the cell's link.
+        """Return the settings that open the link.
 
         Raises:
-            CellError: the cell is a simulated one, or its CAN bus cannot carry the arm.
+            CellError: the cell is simulated, or its CAN bus has too little capacity.
         """
         table = self.controller
         if table.transport == "udp":
@@ -231,15 +230,15 @@ class Cell:
             try:
                 spec.check(table.mode)
             except (DriverError, ValueError) as error:
-                remedy = "name what the bus can carry"
+                remedy = "choose values within the capacity of the bus"
                 raise self.error("controller.can", None, str(error), remedy) from error
             return spec
-        problem = "a simulated controller in virtual time has no link to open"
+        problem = "a simulated controller has no link"
         raise self.error("controller.transport", table.transport, problem, 'write "udp" or "can"')
 
     @property
     def only_simulated(self) -> bool:
-        """Whether nothing but a simulated controller on this computer can be at the far end."""
+        """Whether the link can reach only a simulated controller on this computer."""
         table = self.controller
         if table.transport == "udp":
             return _is_loopback(table.host)
@@ -277,22 +276,20 @@ class Cell:
 
     @property
     def home(self) -> Array:
-        """Start posture of every excitation (n,), URDF angles, rad."""
+        """Start posture of excitations (n,), URDF angles, rad."""
         return AngleFrame.of(self).urdf(np.array(self.campaign.home_deg))
 
     @property
     def initial(self) -> Array:
-        """Where the simulated arm stands at first (n,), URDF angles, rad."""
+        """Initial posture of the simulated arm (n,), URDF angles, rad."""
         return AngleFrame.of(self).urdf(np.array(self.simulation.initial_deg))
 
     def with_values(self, values: Mapping[str, Any]) -> Cell:
-        """This cell with other values in its file, by dotted name, such as "campaign.n_via".
-
-        None keeps what stands there; a table that is not there is added.
+        """Return the cell with changed values in its file, by dotted name; None changes nothing.
 
         Raises:
-            CellError: a value cannot be used.
-            NoTableError: a table is not written as one, with its name in a line of its own.
+            CellError: a value is invalid.
+            NoTableError: a table exists without a header line.
         """
         return Cell.from_texts(with_values(self.text, values), self.urdf, self.path)
 
@@ -303,7 +300,7 @@ class Cell:
         validation_runs: int | None = None,
         simulation_seed: int | None = None,
     ) -> Cell:
-        """This cell with some campaign settings replaced, in its text too; None keeps a setting."""
+        """Return the cell with changed settings of a campaign; None changes nothing."""
         return self.with_values(
             {
                 "campaign.repetitions": repetitions,
@@ -313,13 +310,13 @@ class Cell:
         )
 
     def with_link(self, *, can: CanTable | None = None, **controller: Any) -> Cell:
-        """This cell with another link, in its text too; None keeps an entry."""
+        """Return the cell with changed entries of `[controller]`; None changes nothing."""
         bus = {} if can is None else can.model_dump(exclude_none=True)
         values = {f"controller.{key}": value for key, value in controller.items()}
         return self.with_values(values | {f"controller.can.{k}": v for k, v in bus.items()})
 
     def with_urdf(self, path: Path, name: str) -> Cell:
-        """This cell as a file `path` whose URDF is called `name`; meshes stay where they are."""
+        """Return the cell for a file `path` with the URDF `name`; mesh folders are adapted."""
         moved = [
             folder if Path(folder).is_absolute() else os.path.relpath(place, path.parent)
             for folder, place in zip(self.file.cell.mesh_folders, self.mesh_folders, strict=True)
@@ -333,7 +330,7 @@ class Cell:
         return _required(self, self.file.nominal, "nominal")
 
     def nominal_values(self) -> Array:
-        """The manufacturer's parameter vector (p,): URDF inertias and `[nominal]`."""
+        """Return the nominal parameter vector (p,): URDF inertias and `[nominal]`."""
         table = self.nominal
         return self.parameter_values(
             rotor_inertia=np.array(table.rotor_inertia),
@@ -351,10 +348,10 @@ class Cell:
         third: Array,
         inertia_scale: Array | None = None,
     ) -> Array:
-        """Parameter vector (p,) of the URDF's inertias with these joint-side figures (n,).
+        """Return the parameter vector (p,) of URDF inertias and these joint-side values (n,).
 
-        Links are `inertia_scale` (n,) times as heavy; springs and balancers have the figures of the
-        file; everything else, such as coupling inertias, an offset or a Stribeck term, is zero.
+        Inertias of links are multiplied by `inertia_scale` (n,); springs and balancers are those of
+        the file; other parameters (coupling inertia, offset, Stribeck) are zero.
         """
         model = self.model
         standard = model.nominal
@@ -370,12 +367,12 @@ class Cell:
         return np.concatenate([model.base.grouping @ standard, friction, model.elements.nominal])
 
     def controller_angles(self, urdf_angles: Array) -> Array:
-        """The teach pendant's angles (n,) from those of the URDF, rad."""
+        """Convert URDF angles (n,) to those of the teach pendant, rad."""
         frame = AngleFrame.pendant(self)
         return np.asarray(urdf_angles * frame.sign + frame.offset, dtype=np.float64)
 
     def error(self, field: str, value: object, problem: str, remedy: str) -> CellError:
-        """What is wrong with a field of this cell's file."""
+        """Return an error of a field of this file."""
         return CellError(self.path, field, value, problem, remedy)
 
 
@@ -392,7 +389,7 @@ def _parse(path: Path, text: str) -> CellFile:
 
 
 def _read(file: Path, path: Path, field: str, value: object, remedy: str) -> str:
-    """The text of a file that the cell file `path` names in a field, or of the cell file itself."""
+    """Read the cell file `path`, or a file named in one of its fields."""
     try:
         return read_text(file)
     except (OSError, UnicodeDecodeError) as error:
@@ -406,8 +403,8 @@ def _required(cell: Cell, table: T | None, name: str) -> T:
     return table
 
 
-def stays_here(spec: TransportSpec) -> bool:
-    """Whether a link ends on this computer; of a kind that is not known here it is not assumed."""
+def is_local(spec: TransportSpec) -> bool:
+    """Return whether a link ends on this computer; False for unknown transports."""
     from drivers.transports.can.transport import CanSpec
     from drivers.transports.udp import UdpSpec
 
@@ -425,12 +422,12 @@ def _is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class AngleFrame:
-    """Angles as a cell's `[limits]` are written: shown = sign x URDF angle + offset.
+    """Frame of displayed angles, that of `[limits]`: shown = sign x URDF angle + offset.
 
     Attributes:
         name: "controller" or "urdf".
-        sign: 1 or -1 per joint (n,).
-        offset: (n,) [rad].
+        sign: 1 or -1 of each joint (n,).
+        offset: offset of each joint (n,) [rad].
     """
 
     name: Literal["controller", "urdf"]
@@ -439,7 +436,7 @@ class AngleFrame:
 
     @classmethod
     def of(cls, cell: Cell) -> AngleFrame:
-        """The frame in which the cell's own limits and postures are written."""
+        """Return the frame of the limits and postures of a cell."""
         limits = _required(cell, cell.file.limits, "limits")
         if limits.frame == "controller":
             return cls.pendant(cell)
@@ -448,40 +445,40 @@ class AngleFrame:
 
     @classmethod
     def pendant(cls, cell: Cell) -> AngleFrame:
-        """The frame of the controller's angles, as the teach pendant shows them."""
+        """Return the frame of the teach pendant."""
         table = cell.drive_table
         sign = np.array(table.joint_sign, dtype=np.float64)
         return cls("controller", sign, np.radians(table.joint_offset_deg))
 
     def shown(self, q: Array) -> Array:
-        """Angles to show (..., n) [deg] from URDF angles [rad]."""
+        """Convert URDF angles (..., n) [rad] to displayed angles [deg]."""
         return np.asarray(np.degrees(q * self.sign + self.offset), dtype=np.float64)
 
     def shown_rate(self, rate: Array) -> Array:
-        """Rates to show (..., n) [deg/s, deg/s²] from those of URDF angles [rad]."""
+        """Convert rates of URDF angles (..., n) [rad] to displayed rates [deg/s, deg/s²]."""
         return np.asarray(np.degrees(rate * self.sign), dtype=np.float64)
 
     def text_of_angles(self, q: Array | Sequence[float]) -> str:
-        """One posture (n,) [rad] of URDF angles in words, as a person would set it."""
+        """Format a posture of URDF angles (n,) [rad] in displayed angles."""
         shown = enumerate(self.shown(np.asarray(q)), 1)
         angles = ", ".join(f"J{joint} {angle:z.1f}" for joint, angle in shown)
         return f"{angles} deg, {self.whose}"
 
     @property
     def whose(self) -> str:
-        """Whose angles are shown, in words."""
+        """Name of the displayed angles."""
         return "teach pendant angles" if self.name == "controller" else "angles of the URDF"
 
     def urdf(self, shown: Array) -> Array:
-        """URDF angles (..., n) [rad] from angles shown [deg]."""
+        """Convert displayed angles (..., n) [deg] to URDF angles [rad]."""
         return np.asarray((np.radians(shown) - self.offset) * self.sign, dtype=np.float64)
 
 
 URDF_ROUNDING = 1e-5
-"""Relative; a data sheet's degrees and a URDF's radians are rounded differently."""
+"""Relative tolerance for the rounding of degrees and radians."""
 
 _SAME_NUMBER = 0.01  # relative
-_FULL_TURN = 6.3  # degrees; as radians it is one turn
+_FULL_TURN = 6.3  # 2π, rounded up
 _MAY_BE_EMPTY = {"nominal.third", "limits.torque"} | {
     f"simulation.{name}" for name in ("elasticity", "inertia_scale")
 }
@@ -489,28 +486,28 @@ _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
 def _check(cell: Cell) -> None:
-    """Whatever pydantic cannot see: fields against each other and against the URDF.
+    """Check fields against each other and against the URDF.
 
     Raises:
-        CellError: what does not fit.
+        CellError: they are inconsistent.
     """
     file = cell.file
     _check_assumed(cell)
     tables = [name for name in _TURNING_ONLY if getattr(file, name) is not None]
-    if tables and file.robot.locked:  # a motion is checked with the whole URDF
+    if tables and file.robot.locked:  # motions are checked with all joints of the URDF
         given, fixed = ", ".join(file.robot.locked), 'fix these joints in the URDF (type = "fixed")'
         problem = f"is for arms identified from recordings, but there is a table [{tables[0]}]"
         raise cell.error("robot.locked", given, problem, fixed)
     if tables and not all(cell.model.chain.revolute):
         sliding = cell.joint_names[[*cell.model.chain.revolute].index(False)]
-        problem = f"is in degrees and revolutions, but joint {sliding} slides"
+        problem = f"is in degrees and revolutions, but joint {sliding} is prismatic"
         remedy = (
-            'fix it in the URDF (type = "fixed"); an arm with sliding joints can be identified '
+            'fix it in the URDF (type = "fixed"); arms with prismatic joints can be identified '
             "from recordings, but not moved"
         )
         raise cell.error(tables[0], None, problem, remedy)
     _check_lengths(cell)
-    # What is built from a table later can be built.
+    # Errors of derived objects are reported on loading.
     with_drives = file.drive_train is not None
     placed = file.limits is not None and (with_drives or file.limits.frame == "urdf")
     for table, attribute, wanted in (
@@ -529,20 +526,20 @@ def _check(cell: Cell) -> None:
 
 
 def _check_assumed(cell: Cell) -> None:
-    """What is called assumed stands in the file."""
+    """Check that assumed fields exist."""
     for name in cell.file.cell.assumed:
         table, _, field = name.partition(".")
         entries = getattr(cell.file, table) if table in CellFile.model_fields else ()
         if entries is None:
-            problem = f"is missing, though cell.assumed names {name}"
-            raise cell.error(table, None, problem, f"add a table [{table}], or take that name out")
+            problem = f"is missing, but listed in cell.assumed as {name}"
+            raise cell.error(table, None, problem, f"add a table [{table}], or remove the name")
         if field not in dict(entries):
             remedy = 'name fields as "table.field"'
             raise cell.error("cell.assumed", name, "names no field of this file", remedy)
 
 
 def _check_lengths(cell: Cell) -> None:
-    """Every list that has one entry per joint has as many as the URDF has joints."""
+    """Check that lists with one entry per joint have the length of the URDF."""
     n_joints, names = cell.model.n_joints, ", ".join(cell.joint_names)
     tables = {name: getattr(cell.file, name) for name in ("nominal", *_TURNING_ONLY)}
     if cell.file.simulation is not None:
@@ -558,25 +555,25 @@ def _check_lengths(cell: Cell) -> None:
 
 
 def _check_postures(cell: Cell, table: LimitsTable) -> None:
-    """Postures named in the file lie inside its limits."""
+    """Check that the postures of the file lie inside its limits."""
     limits, file = cell.joint_limits, cell.file
-    remedy = "name a posture that the arm can take"
+    remedy = "choose a posture inside the limits"
     furthest = np.abs([table.lower_deg, table.upper_deg]).max()
     if furthest < _FULL_TURN:
         remedy += (
-            f", or correct the limits: no joint may go further than {furthest:.4g}°; are they in "
-            "rad? 1 rad is 57.2958°"
+            f", or correct the limits, which are at most {furthest:.4g}°; are they in rad? 1 rad "
+            "is 57.2958°"
         )
     postures = {} if file.campaign is None else {"campaign.home_deg": cell.home}
     postures |= {} if file.simulation is None else {"simulation.initial_deg": cell.initial}
     for field, posture in postures.items():
         for joint in np.flatnonzero(~((posture >= limits.lower) & (posture <= limits.upper))):
-            problem = f"{cell.joint_names[joint]} stands outside [limits]"
+            problem = f"{cell.joint_names[joint]} is outside [limits]"
             raise cell.error(field, None, problem, remedy)
 
 
 def _check_limits(cell: Cell, table: LimitsTable) -> None:
-    """No list in degrees holds the URDF's radians, and none is wider than the URDF allows."""
+    """Check that limits are in degrees, and not wider than those of the URDF."""
     limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
     ranges = np.subtract(table.upper_deg, table.lower_deg)
     for field, given, radians, unit, too in (
@@ -585,7 +582,7 @@ def _check_limits(cell: Cell, table: LimitsTable) -> None:
     ):
         stated = np.isfinite(radians)
         if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
-            problem = f"is in degrees, and the URDF has these numbers in {unit}"
+            problem = f"must be in degrees, but has the values of the URDF in {unit}"
             remedy = f"multiply them by 57.2958{too}"
             raise cell.error(f"limits.{field}", getattr(table, field), problem, remedy)
     for field, values, bounds, beyond in (
@@ -597,7 +594,7 @@ def _check_limits(cell: Cell, table: LimitsTable) -> None:
         for joint in np.flatnonzero(wider):
             own, theirs = np.degrees([values[joint], bounds[joint]])
             problem = (
-                f"{cell.joint_names[joint]} may go to {own:.6g}° (URDF angle or speed), beyond the "
-                f"URDF's {theirs:.6g}°"
+                f"{own:.6g}° of {cell.joint_names[joint]} (URDF angle or speed) exceeds the "
+                f"{theirs:.6g}° of the URDF"
             )
             raise cell.error(f"limits.{field}", None, problem, "narrow it, or correct the URDF")

@@ -1,7 +1,6 @@
-"""What a bad cell file gets: one sentence with file, field, value and remedy.
+"""Errors of cell files, with file, field, value and remedy.
 
-`hil new` writes `"?"` where neither the URDF nor the controller says anything. A cell file that
-still has one cannot be used: nothing is assumed in its place.
+`"?"` marks unknown values; a file that contains one is refused.
 """
 
 from __future__ import annotations
@@ -16,12 +15,12 @@ from hil.errors import InputError
 
 
 class CellError(InputError):
-    """The cell file cannot be used.
+    """The cell file is invalid.
 
     Attributes:
         path: the file.
-        field: dotted name of the field, or "" for the file as a whole.
-        value: what stood there (None if nothing did).
+        field: dotted name of the field, or "" for the whole file.
+        value: invalid value, None if missing.
     """
 
     def __init__(self, path: Path, field: str, value: object, problem: str, remedy: str) -> None:
@@ -32,19 +31,19 @@ class CellError(InputError):
 
 
 def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> CellError:
-    """The first complaint of pydantic, in our words."""
+    """Convert the first error of pydantic."""
     detail = error.errors(include_url=False)[0]
     place, value, kind = _place(schema, detail["loc"]), detail["input"], detail["type"]
     if kind.startswith("union_tag"):
         given = value.get("kind") if isinstance(value, dict) else None
-        problem = "is missing" if given is None else "is not a kind that is known here"
+        problem = "is missing" if given is None else "is unknown"
         remedy = f"the list must be {place.description}"
         return CellError(path, f"{place.name}.kind", given, problem, remedy)
     if kind == "missing":
         return CellError(path, place.name, None, "is missing", f"add it: {place.description}")
     if kind == "extra_forbidden":
-        remedy = f"known are: {', '.join(place.siblings)}"
-        return CellError(path, place.name, value, "is not a field that is known here", remedy)
+        remedy = f"valid fields: {', '.join(place.siblings)}"
+        return CellError(path, place.name, value, "is not a field", remedy)
     problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
     problem = problem[0].lower() + problem[1:]
     remedy = remedy or f"it must be {place.description}"
@@ -52,7 +51,7 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
 
 
 class _Place(NamedTuple):
-    """A field by its dotted name, what it must be, and the fields of its table."""
+    """A field: dotted name, valid values, and the fields of its table."""
 
     name: str
     description: str
@@ -60,8 +59,8 @@ class _Place(NamedTuple):
 
 
 def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
-    """Where a location of pydantic leads; its own names of kinds and unions are left out."""
-    name, description = "", "as the documentation of the cell file says"
+    """Convert a location of pydantic, without its names of kinds and unions."""
+    name, description = "", "as described in docs/cell-file.md"
     models, siblings = [schema], list[str]()
     for part in location:
         of_kind = [model for model in models if part in _kinds(model)]
@@ -85,7 +84,7 @@ def _kinds(model: type[BaseModel]) -> tuple[object, ...]:
 
 
 def _models_of(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Every model within an annotation, such as those of a list of several kinds."""
+    """Yield the models in an annotation, such as those of a union."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
@@ -100,44 +99,44 @@ def _short(value: object) -> str:
 UNKNOWN: Final = "?"
 
 WHERE: Final[Mapping[str, str]] = {
-    "cell.mesh_folders": "find the folder in which the package:// paths of the URDF's meshes begin",
+    "cell.mesh_folders": "folder that contains the packages of package:// mesh paths",
     "limits.lower_deg": "data sheet, or the controller's stroke ends ($STRK_END_N)",
     "limits.upper_deg": "data sheet, or the controller's stroke ends ($STRK_END_P)",
     "limits.velocity_deg": "data sheet, largest joint speeds",
-    "limits.acceleration_deg": "data sheet or the maker; rarely published. Full speed in 0.3 s is "
-    "a fair start, and then an assumption: name the field in cell.assumed",
-    "limits.jerk_deg": "the maker; rarely published. Full acceleration in 0.1 s is a fair start, "
-    "and then an assumption: name the field in cell.assumed",
-    "nominal.rotor_inertia": "the motors' data sheet, times the square of the gear ratio",
-    "nominal.coulomb": "the maker; without a figure 5 to 10 % of the joint's largest torque, and "
-    "then an assumption: name the field in cell.assumed",
-    "nominal.viscous": "the maker; without a figure what adds as much again at full speed as "
-    "Coulomb friction, and then an assumption: name the field in cell.assumed",
+    "limits.acceleration_deg": "data sheet or manufacturer; rarely published. Else assume full "
+    "speed in 0.3 s, and list the field in cell.assumed",
+    "limits.jerk_deg": "manufacturer; rarely published. Else assume full acceleration in 0.1 s, "
+    "and list the field in cell.assumed",
+    "nominal.rotor_inertia": "data sheet of the motors, times the square of the gear ratio",
+    "nominal.coulomb": "manufacturer. Else assume 5 to 10 % of the largest torque of the joint, "
+    "and list the field in cell.assumed",
+    "nominal.viscous": "manufacturer. Else assume a value that equals Coulomb friction at full "
+    "speed, and list the field in cell.assumed",
     "drive_train.gear_ratio": "the controller's init packet (hil new --from-controller)",
     "drive_train.calibration": "the controller's init packet (hil new --from-controller)",
-    "drive_train.k54": "the controller's init packet; 0.0 where motors do not turn together",
-    "drive_train.k64": "the controller's init packet; 0.0 where motors do not turn together",
-    "drive_train.k65": "the controller's init packet; 0.0 where motors do not turn together",
-    "drive_train.joint_sign": "jog each joint by a few degrees: 1 where the pendant's angle grows "
-    "while the arm turns about the URDF's axis by the right-hand rule, else -1",
-    "drive_train.joint_offset_deg": "put the arm where all angles of the URDF are zero and read "
-    "the pendant",
-    "drive_train.torque_constant": "the motors' plates or data sheets; or hil gains, with a known "
-    "load",
+    **dict.fromkeys(
+        ("drive_train.k54", "drive_train.k64", "drive_train.k65"),
+        "the controller's init packet; 0.0 without wrist coupling",
+    ),
+    "drive_train.joint_sign": "jog each joint by a few degrees: 1 if the angle of the pendant "
+    "increases for a positive rotation about the axis of the URDF, else -1",
+    "drive_train.joint_offset_deg": "reading of the pendant with all URDF angles at zero",
+    "drive_train.torque_constant": "plates or data sheets of the motors, or hil gains with a known "
+    "payload",
     "drive_train.current_limit": "the controller's init packet (hil new --from-controller)",
     "drive_train.following_error": "the controller's init packet (hil new --from-controller)",
-    "drive_train.encoder_counts_per_revolution": "the motors' data sheets",
-    "controller.cycle_ms": "what the controller's Open option was set to",
-    "controller.host": "the address of the controller's board that sends, 10.2.12.150 as delivered",
-    "workspace.floor": "height of the floor over the robot's base frame, negative on a pedestal",
-    "workspace.walls": "measure all that the arm can reach; [] where there is nothing",
-    "campaign.home_deg": "a posture with room in all directions",
+    "drive_train.encoder_counts_per_revolution": "data sheets of the motors",
+    "controller.cycle_ms": "setting of the Open option of the controller",
+    "controller.host": "address of the sending board of the controller, by default 10.2.12.150",
+    "workspace.floor": "height of the floor above the base frame, negative on a pedestal",
+    "workspace.walls": "measure all obstacles in reach; [] if there are none",
+    "campaign.home_deg": "a posture with clearance in all directions",
 }
-"""Where each figure is found, by field."""
+"""Source of the value of each field."""
 
 
 class UnknownFieldsError(CellError):
-    """A cell file in which values are still to be filled in.
+    """The cell file contains unknown values.
 
     Attributes:
         fields: their dotted names.
@@ -147,16 +146,14 @@ class UnknownFieldsError(CellError):
         self.fields = tuple(fields)
         lines = "".join(f"\n  {name}: {text}" for name, text in fields.items())
         count = f"{len(fields)} fields" if len(fields) > 1 else "one field"
-        super().__init__(
-            path, "", None, f'{count} still unknown ("{UNKNOWN}")', f"fill in what is true:{lines}"
-        )
+        super().__init__(path, "", None, f'{count} unknown ("{UNKNOWN}")', f"fill in:{lines}")
 
 
 def require_known(path: Path, raw: Mapping[str, Any], schema: type[BaseModel]) -> None:
-    """Refuse a file in which a value is `"?"`, by the names of all such fields at once.
+    """Refuse a file with unknown values (`"?"`).
 
     Raises:
-        UnknownFieldsError: each field with what it must be and where that is found.
+        UnknownFieldsError: lists all such fields with their source.
     """
     fields: dict[str, str] = {}
     for location, places in _unknown(raw, ()):
@@ -171,7 +168,7 @@ def require_known(path: Path, raw: Mapping[str, Any], schema: type[BaseModel]) -
 def _unknown(
     table: Mapping[str, Any], above: tuple[str, ...]
 ) -> Iterator[tuple[tuple[str, ...], list[int]]]:
-    """Fields that are unknown, each with the entries of its list that are, from 1; [] for all."""
+    """Yield unknown fields with the unknown entries of a list, from 1; [] for all."""
     for key, value in table.items():
         if isinstance(value, Mapping):
             yield from _unknown(value, (*above, key))

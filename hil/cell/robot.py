@@ -1,4 +1,4 @@
-"""The model that `[robot]` describes."""
+"""Robot model of the table `[robot]`."""
 
 from __future__ import annotations
 
@@ -47,16 +47,16 @@ _GEARED: Final = 10.0  # turns of the motor per turn of the joint
 def robot_model(
     path: Path, urdf_name: str, urdf: str, robot: RobotTable, drive_train: Callable[[], Array]
 ) -> RobotModel:
-    """Build the model of a cell, of a file `path` that calls the URDF `urdf_name`.
+    """Build the model; `path` and `urdf_name` are for errors.
 
-    `drive_train` gives the motor angles per joint angle (n, n) of `[drive_train]`.
+    `drive_train` returns the motor angles per joint angle (n, n) of `[drive_train]`.
 
     Raises:
-        CellError: names the field that is to blame.
+        CellError: a field is invalid.
     """
     friction = robot.friction
-    with _blamed(path, "cell.urdf", urdf_name, "correct the URDF"):
-        if robot.locked:  # joints of any kind may be
+    with _cell_errors(path, "cell.urdf", urdf_name, "correct the URDF"):
+        if robot.locked:  # joints of any type
             _require(path, "robot.locked", robot.locked, tuple(pinocchio_model(urdf).names)[1:])
         chain = chain_from_urdf(urdf, robot.locked)
     _require(path, "robot.friction.joints", friction.joints, chain.joint_names)
@@ -71,8 +71,8 @@ def robot_model(
         laws[name] = _law(path, f"robot.friction.joints.{name}", table)
     common = _law(path, "robot.friction", friction)
     with (
-        _blamed(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"),
-        _blamed(path, "robot.elements", None, "correct that table", ElementError),
+        _cell_errors(path, "cell.urdf", urdf_name, "correct the URDF or [robot]"),
+        _cell_errors(path, "robot.elements", None, "correct that table", ElementError),
     ):
         return RobotModel.from_urdf(
             urdf,
@@ -90,7 +90,7 @@ def robot_model(
 def ripples(
     joints: Sequence[str], motor_from_joint: Array, orders: Sequence[int]
 ) -> list[TorqueRipple]:
-    """Torque ripple of every joint that has a gear: without one it has the form of a weight."""
+    """Return the torque ripple of geared joints; of others it resembles gravity."""
     return [
         TorqueRipple(name, tuple(zip(joints, row, strict=True)), tuple(orders))
         for k, (name, row) in enumerate(zip(joints, motor_from_joint.tolist(), strict=True))
@@ -99,7 +99,7 @@ def ripples(
 
 
 def _law(path: Path, field: str, table: FrictionTable) -> FrictionLaw:
-    with _blamed(path, field, None, "correct that table"):
+    with _cell_errors(path, field, None, "correct that table"):
         return FrictionLaw.from_table(table.model_dump(exclude={"joints", "ripple"}))
 
 
@@ -115,9 +115,9 @@ def _coupling(
         matrix = np.array(given, dtype=np.float64)
     else:
         joints = ", ".join(chain.joint_names)
-        remedy = f"give a row for each motor, in it a figure for each of {joints}"
-        raise CellError(path, field, None, f"is not {n} rows of {n} figures", remedy)
-    with _blamed(path, field, None, "correct that matrix"):
+        remedy = f"give one row per motor with one value for each of {joints}"
+        raise CellError(path, field, None, f"is not {n} rows of {n} values", remedy)
+    with _cell_errors(path, field, None, "correct that matrix"):
         return Coupling(matrix, inertia=table.inertia, friction=table.friction)
 
 
@@ -125,7 +125,7 @@ def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | 
     if table is None:
         return None
     xx, xy, xz, yy, yz, zz = table.inertia
-    with _blamed(path, "robot.payload", None, "correct that table"):
+    with _cell_errors(path, "robot.payload", None, "correct that table"):
         payload = Payload(
             table.mass, table.centre, (xx, xy, xz, yy, yz, zz), frame=table.frame or None
         )
@@ -136,14 +136,14 @@ def _payload(path: Path, table: PayloadTable | None, chain: Chain) -> Payload | 
 def _element(path: Path, place: int, table: ElementTable, chain: Chain) -> Element:
     field = f"robot.elements[{place}]"
     _require(path, f"{field}.joint", [table.joint], chain.joint_names)
-    with _blamed(path, field, table.kind, "correct that table"):
+    with _cell_errors(path, field, table.kind, "correct that table"):
         element = _built(table)
         JointElements.of([element], chain.joint_names, tuple(map(bool, chain.revolute)))
         return element
 
 
 def _built(table: ElementTable) -> Element:
-    """Raises ModelError."""
+    """Create the element of a table (ModelError if invalid)."""
     if isinstance(table, TorsionSpringTable):
         rest = math.radians(table.rest_deg)
         return TorsionSpring(table.joint, rest, table.stiffness, table.identified)
@@ -173,11 +173,11 @@ def _require(path: Path, field: str, named: Iterable[str], joints: Sequence[str]
     for name in named:
         if name not in joints:
             remedy = f"its joints are {', '.join(joints)}"
-            raise CellError(path, field, name, "is no moving joint of the URDF", remedy)
+            raise CellError(path, field, name, "is not a moving joint of the URDF", remedy)
 
 
 @contextmanager
-def _blamed(
+def _cell_errors(
     path: Path, field: str, value: object, remedy: str, kind: type[ModelError] = ModelError
 ) -> Iterator[None]:
     try:

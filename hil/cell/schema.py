@@ -1,8 +1,7 @@
-"""The cell file, field by field: robot + drive train + controller link + limits.
+"""Schema of the cell file, one class per TOML table.
 
-One TOML table per class. The description of a field is also the remedy that an error prints,
-so it says what the value must be, not what the code does with it. Units other than SI stand in
-the field's name.
+The description of a field is printed as remedy in errors, so it states the valid values. Units
+other than SI are in the name of the field.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-# Strict: TOML has numbers and truth values of its own, so "yes" and "3" are slips of the pen.
+# Strict: TOML has types, so "yes" and "3" are errors.
 Number = Annotated[FiniteFloat, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Choice = Annotated[bool, Field(strict=True)]
@@ -36,20 +35,20 @@ GearRatios = Annotated[Vector, AfterValidator(_turning)]
 
 
 def field(description: str, default: Any = ..., **bounds: Any) -> Any:
-    """A field that says what its value must be; without a default it is required."""
+    """Declare a field with its description; without a default it is required."""
     return Field(default, description=description, **bounds)
 
 
 class Table(BaseModel):
-    """A TOML table that refuses what it does not know."""
+    """A TOML table; unknown fields are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class SimulatedDriveTable(Table):
-    """`[simulation.drive_train]`: gears of the simulated robot, known from elsewhere.
+    """`[simulation.drive_train]`: gears of the simulated robot, independent of `[drive_train]`.
 
-    What is left out is as in `[drive_train]`, which a mistake there then goes for as well.
+    Missing fields are those of `[drive_train]`, including their errors.
     """
 
     gear_ratio: GearRatios | None = field(
@@ -67,56 +66,53 @@ class SimulatedDriveTable(Table):
 
 
 class PayloadTable(Table):
-    """`[robot.payload]`: a body of known mass that the arm carries; not identified."""
+    """`[robot.payload]`: known payload, which is not identified."""
 
-    mass: NonNegative = field("its mass in kg")
-    centre: Point = field("its centre of mass in the frame, three figures in m")
+    mass: NonNegative = field("mass in kg")
+    centre: Point = field("centre of mass in the frame, three values in m")
     inertia: Annotated[Vector, Field(min_length=6, max_length=6)] = field(
-        "its tensor about the centre of mass in the axes of the frame: xx, xy, xz, "
+        "inertia about the centre of mass in the axes of the frame: xx, xy, xz, "
         "yy, yz, zz in kg·m²",
         [0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
     )
     frame: str = field(
-        "a link of the URDF whose frame is meant, nothing for that of the last joint", ""
+        "link of the URDF that defines the frame; nothing for that of the last joint", ""
     )
 
 
 class SimulationTable(Table):
-    """`[simulation]`: what the simulated cell really is; ignored on hardware."""
+    """`[simulation]`: true parameters of the simulated cell; ignored on hardware."""
 
-    seed: Whole = field("one seed is one bit-identical run", 1, ge=0)
+    seed: Whole = field("seed; runs with the same seed are identical", 1, ge=0)
     initial_deg: Vector = field(
-        "where the simulated arm stands at first, degrees, in the frame of [limits]"
+        "initial posture of the simulated arm, degrees, in the frame of [limits]"
     )
     inertia_scale: list[Positive] = field(
-        "planted truth: mass, first moment and inertia of the link that each joint "
-        "moves over those of the URDF, or nothing where it is right",
+        "true value: factor on mass, first moment and inertia of each link of the URDF, or nothing",
         [],
     )
-    rotor_inertia: list[NonNegative] = field("planted truth, kg·m² at the joint")
-    coulomb: Vector = field("planted truth, N·m, one per joint")
-    viscous: Vector = field("planted truth, N·m·s/rad, one per joint")
-    third: Vector = field("planted truth of the third friction term, one per joint")
-    current_noise: NonNegative = field("A rms about the target current, each motor")
-    current_resolution: NonNegative = field("step of the target current, A")
+    rotor_inertia: list[NonNegative] = field("true value, kg·m² at the joint")
+    coulomb: Vector = field("true value, N·m, one per joint")
+    viscous: Vector = field("true value, N·m·s/rad, one per joint")
+    third: Vector = field("true value of the third friction term, one per joint")
+    current_noise: NonNegative = field("rms noise of each motor current, A")
+    current_resolution: NonNegative = field("resolution of the target current, A")
     torque_ripple: NonNegative = field(
-        "size of an unmodelled effect: share of the Coulomb torque", 0.0
+        "unmodelled torque ripple, fraction of the Coulomb torque", 0.0
     )
     friction_drift: Annotated[Number, Field(ge=0, lt=1)] = field(
-        "size of an unmodelled effect: fall of the friction from cold to hot", 0.0
+        "unmodelled decrease of friction from cold to hot, fraction", 0.0
     )
     elasticity: list[NonNegative] = field(
-        "size of an unmodelled effect: rad/(N·m) of each gear, or nothing", []
+        "unmodelled elasticity of each gear, rad/(N·m), or nothing", []
     )
-    delay: NonNegative = field(
-        "size of an unmodelled effect: later effect of the target current, s", 0.0
-    )
+    delay: NonNegative = field("unmodelled delay of the target current, s", 0.0)
     drive_train: SimulatedDriveTable = field(
-        "a table of what is known of its gears independently of [drive_train]",
+        "a table of gears of the simulated robot",
         SimulatedDriveTable(),
     )
     payload: PayloadTable | None = field(
-        "a table of the body that `hil run --payload` mounts on it", None
+        "a table of the payload that `hil run --payload` mounts", None
     )
 
 
@@ -127,14 +123,14 @@ ELEMENT_KINDS: Final = '"torsion_spring", "extension_spring", "gas_spring" or "h
 
 
 class CellTable(Table):
-    """`[cell]`: what this cell is called and which of its figures are assumptions."""
+    """`[cell]`: name, URDF and assumed values."""
 
     name: str = field("a short name of the cell", min_length=1, max_length=80)
-    description: str = field("one or two sentences for the reader", "")
+    description: str = field("description, one or two sentences", "")
     urdf: str = field("the URDF file, relative to this cell file")
     assumed: list[str] = field("dotted names of fields whose values are assumed, not measured", [])
     mesh_folders: list[str] = field(
-        "folders, relative to this cell file, in which package:// paths of the URDF's meshes begin",
+        "folders with the packages of package:// mesh paths, relative to this file",
         [],
     )
 
@@ -142,7 +138,7 @@ class CellTable(Table):
 class JointFrictionTable(Table):
     """`[robot.friction.joints.NAME]`: entries of `[robot.friction]` that differ for one joint.
 
-    Only those that were written count (`model_fields_set`).
+    Only fields present in the file apply (`model_fields_set`).
     """
 
     coulomb: Choice = field("true or false: f0 sgn(qd)", True)
@@ -158,36 +154,35 @@ class JointFrictionTable(Table):
         "speed in rad/s (m/s) below which a joint counts as at rest", 0.02
     )
     zone: Literal["exclude", "linear"] = field(
-        '"exclude" (rows below standstill are not used) or "linear" (they are, with '
+        '"exclude" (rows below standstill are not used) or "linear" (used, with '
         "qd / standstill for the sign)",
         "exclude",
     )
     presliding: NonNegative = field(
-        "displacement in rad (m) over which dry friction turns round at a reversal "
-        "(Dahl), 0 for a jump; identification chooses its own unless one is given",
+        "displacement in rad (m) of presliding friction at a reversal (Dahl), 0 for none; "
+        "chosen by identification unless given",
         0.0,
     )
 
 
 class FrictionTable(JointFrictionTable):
-    """`[robot] friction`: which friction columns each joint gets."""
+    """`[robot.friction]`: friction law."""
 
     ripple: list[Annotated[Whole, Field(ge=1, le=24)]] = field(
-        "periods per motor turn of a torque ripple that is identified, such as [1, 2]; "
-        "of every joint with a gear of 10 or more; nothing for none, unless identification finds "
-        "one",
+        "periods per motor turn of an identified torque ripple, such as [1, 2], for joints with a "
+        "gear ratio of 10 or more; nothing for automatic choice",
         [],
     )
     joints: dict[str, JointFrictionTable] = field(
-        "tables of what is different for a joint, by its name", {}
+        "tables of fields that differ for a joint, by its name", {}
     )
 
 
 class CouplingTable(Table):
-    """`[robot.coupling]`: motors that turn with several joints."""
+    """`[robot.coupling]`: motors coupled to several joints."""
 
     motor_from_joint: list[Vector] | Literal["drive_train"] = field(
-        "motor angle per joint angle, one row per motor, each with one figure per "
+        "motor angle per joint angle, one row per motor, each with one value per "
         'joint; or "drive_train" for that of [drive_train]'
     )
     inertia: Choice = field("true or false: an inertia for each pair of coupled joints", True)
@@ -195,10 +190,10 @@ class CouplingTable(Table):
 
 
 class JointElementTable(Table):
-    """What all entries of `[[robot.elements]]` have."""
+    """Fields common to all `[[robot.elements]]`."""
 
-    joint: str = field("name of the joint it acts on, one that turns")
-    identified: Choice = field("true (a parameter is estimated) or false (its figures hold)", False)
+    joint: str = field("name of a revolute joint")
+    identified: Choice = field("true (estimate a parameter) or false (use the given values)", False)
 
 
 class TorsionSpringTable(JointElementTable):
@@ -206,23 +201,17 @@ class TorsionSpringTable(JointElementTable):
 
     kind: Literal["torsion_spring"] = field(ELEMENT_KINDS)
     rest_deg: Number = field("URDF angle of the joint without torque, in degrees")
-    stiffness: NonNegative | None = field(
-        "its stiffness in N·m/rad; nothing if it is identified", None
-    )
+    stiffness: NonNegative | None = field("stiffness in N·m/rad; nothing if identified", None)
 
 
 class AnchoredTable(JointElementTable):
     """An element between two anchors in the plane of a joint."""
 
-    base_distance: Positive = field(
-        "distance in m of the anchor on the base side from the joint's axis"
-    )
-    link_distance: Positive = field(
-        "distance in m of the anchor on the link side from the joint's axis"
-    )
+    base_distance: Positive = field("distance of the base-side anchor from the joint axis in m")
+    link_distance: Positive = field("distance of the link-side anchor from the joint axis in m")
     angle_deg: Number = field(
-        "angle in degrees from the anchor on the base side to the other, about the "
-        "joint's axis, at URDF angle 0"
+        "angle from the base-side to the link-side anchor about the joint axis at URDF angle 0, "
+        "in degrees"
     )
 
 
@@ -230,23 +219,23 @@ class ExtensionSpringTable(AnchoredTable):
     """An entry of `[[robot.elements]]`: a spring between two anchors."""
 
     kind: Literal["extension_spring"] = field(ELEMENT_KINDS)
-    free_length: NonNegative = field("its length in m without load")
-    stiffness: NonNegative | None = field("its stiffness in N/m; nothing if it is identified", None)
+    free_length: NonNegative = field("unloaded length in m")
+    stiffness: NonNegative | None = field("stiffness in N/m; nothing if identified", None)
     preload: Number | None = field(
-        "its tension in N at the free length; nothing for 0, or to identify that too", None
+        "tension in N at the free length; nothing for 0, or to identify it", None
     )
 
 
 class GasTable(AnchoredTable):
-    """An entry of `[[robot.elements]]`: a cylinder of gas that pushes or pulls its anchors."""
+    """An entry of `[[robot.elements]]`: a gas cylinder that pushes or pulls its anchors."""
 
     kind: Literal["gas_spring", "hydraulic_balancer"] = field(ELEMENT_KINDS)
     length: Positive = field(
-        "distance in m between the anchors at which pressure and volume are given"
+        "distance between the anchors for which pressure and volume are given, in m"
     )
-    area: Positive = field("area in m² on which the gas acts")
-    pressure: Positive = field("pressure in Pa over that outside, at `length`")
-    volume: Positive = field("volume in m³ of the gas at `length`")
+    area: Positive = field("piston area in m²")
+    pressure: Positive = field("gauge pressure at `length` in Pa")
+    volume: Positive = field("gas volume at `length` in m³")
 
 
 ElementTable = Annotated[
@@ -256,27 +245,25 @@ ElementTable = Annotated[
 
 
 class RobotTable(Table):
-    """`[robot]`: how the rigid body model is built from the URDF."""
+    """`[robot]`: settings of the model built from the URDF."""
 
     gravity: Annotated[Vector, Field(min_length=3, max_length=3)] = field(
-        "gravity in the base frame, three figures in m/s²", [0.0, 0.0, -9.81]
+        "gravity in the base frame, three values in m/s²", [0.0, 0.0, -9.81]
     )
     rotor_inertia: Choice = field("true or false: one rotor inertia per joint", True)
     locked: dict[str, Number] = field(
-        "joints held at a position, by name, in rad or m: { finger_joint = 0.02 }", {}
+        "joints fixed at a position, by name, in rad or m: { finger_joint = 0.02 }", {}
     )
-    friction: FrictionTable = field("a table of friction columns", FrictionTable())
-    payload: PayloadTable | None = field(
-        "a table of the body of known mass that the arm carries", None
-    )
-    coupling: CouplingTable | None = field("a table of motors that turn with several joints", None)
+    friction: FrictionTable = field("a table of the friction law", FrictionTable())
+    payload: PayloadTable | None = field("a table of the known payload", None)
+    coupling: CouplingTable | None = field("a table of coupled motors", None)
     elements: list[ElementTable] = field(
         f"tables [[robot.elements]], each with a kind: {ELEMENT_KINDS}", []
     )
 
 
 class NominalTable(Table):
-    """`[nominal]`: the manufacturer's figures beside the URDF's inertias (joint side)."""
+    """`[nominal]`: manufacturer's values that a URDF does not contain (joint side)."""
 
     rotor_inertia: list[NonNegative] = field("kg·m² at the joint, one per joint")
     coulomb: list[NonNegative] = field("Coulomb friction in N·m, one per joint")
@@ -288,7 +275,7 @@ class NominalTable(Table):
 
 
 class LimitsTable(Table):
-    """`[limits]`: what the arm may do; degrees, as data sheets give them."""
+    """`[limits]`: limits of motions, in degrees."""
 
     frame: Literal["controller", "urdf"] = field(
         '"controller" (angles as on the teach pendant) or "urdf" (model angles)'
@@ -332,7 +319,7 @@ class BoundsTable(Table):
 
 
 class DriveTrainTable(Table):
-    """`[drive_train]`: motors, gears and wrist coupling (see `drivers.DriveTrain`)."""
+    """`[drive_train]`: motors, gears and wrist coupling (`drivers.DriveTrain`)."""
 
     gear_ratio: GearRatios = field("signed motor revolutions per joint revolution, none of them 0")
     calibration: Vector = field("motor revolutions at controller angle 0")
@@ -350,16 +337,16 @@ class DriveTrainTable(Table):
 
 
 class CanTable(Table):
-    """`[controller.can]`: the CAN adapter, where transport = "can" (`docs/can.md`)."""
+    """`[controller.can]`: CAN adapter for transport = "can" (`docs/can.md`)."""
 
     interface: str = field(
-        'python-can\'s name of the adapter, e.g. "socketcan" or "slcan"', min_length=1
+        'adapter by its python-can name, e.g. "socketcan" or "slcan"', min_length=1
     )
-    channel: str = field('channel of it, e.g. "can0" or "/dev/ttyACM0"', min_length=1)
+    channel: str = field('channel of the adapter, e.g. "can0" or "/dev/ttyACM0"', min_length=1)
     profile: Literal["fd", "classic"] = field('"fd" or "classic"', "fd")
-    bitrate: Whole | None = field("bit/s, where we have to set it", None, gt=0)
+    bitrate: Whole | None = field("bit/s, if the adapter needs it", None, gt=0)
     data_bitrate: Whole | None = field(
-        "bit/s of the data phase, where we have to set it", None, gt=0
+        "bit/s of the data phase, if the adapter needs it", None, gt=0
     )
 
 
@@ -371,19 +358,21 @@ class ControllerTable(Table):
     mode: Literal[4] = field("the open mode of campaigns: 4 (absolute position)", 4)
     host: str = field("address of the controller", "10.2.12.150")
     port: Whole = field("UDP port, 1 to 65535", 1000, gt=0, lt=65536)
-    bind: str = field("address of this PC to listen on, 0.0.0.0 for all of them", "0.0.0.0")
-    can: CanTable | None = field("a table that names the CAN adapter", None)
+    bind: str = field("local address to listen on, 0.0.0.0 for all", "0.0.0.0")
+    can: CanTable | None = field("a table of the CAN adapter", None)
     arm: Whole = field("arm of the controller, 1 to 4", 1, ge=1, le=4)
-    max_gap: Whole = field("packets missed in a row that a motion survives, 0 to 5", 2, ge=0, le=5)
+    max_gap: Whole = field(
+        "consecutive missed packets that a motion tolerates, 0 to 5", 2, ge=0, le=5
+    )
     other_axes: list[ArmAxis] = field(
-        "pairs [arm, axis], both from 1, of axes that may be open though they are no "
-        "joints of this cell, e.g. [[1, 7]]",
+        "pairs [arm, axis], from 1, of axes that are not joints of this cell and may be open, "
+        "e.g. [[1, 7]]",
         [],
     )
     current_delay_cycles: Number = field(
-        "cycles by which the position of a packet is newer than its target current", 0.0
+        "cycles by which the target current of a packet lags its position", 0.0
     )
-    packets: bool = field("whether archives keep the raw packets of both directions", False)
+    packets: bool = field("true or false: archive the raw packets of both directions", False)
 
     @model_validator(mode="after")
     def _adapter_named(self) -> ControllerTable:
@@ -397,20 +386,20 @@ class ControllerTable(Table):
 class BoxTable(Table):
     """A box-shaped obstacle in the base frame."""
 
-    lower: Point = field("its lower corner, three figures in m")
-    upper: Point = field("its upper corner, three figures in m")
+    lower: Point = field("lower corner, three values in m")
+    upper: Point = field("upper corner, three values in m")
 
 
 class WorkspaceTable(Table):
-    """`[workspace]`: what the arm must not touch, in the base frame."""
+    """`[workspace]`: obstacles in the base frame."""
 
     floor: Number | Literal["none"] = field('height of the floor in m, or "none"', 0.0)
     walls: list[BoxTable] = field("boxes {lower = [x, y, z], upper = [x, y, z]} in m", [])
-    margin: NonNegative = field("clearance to keep, in m", 0.05)
+    margin: NonNegative = field("clearance in m", 0.05)
 
 
 class CampaignTable(Table):
-    """`[campaign]`: how the excitation is designed and executed."""
+    """`[campaign]`: design and execution of the excitation."""
 
     repetitions: Whole = field("repetitions, 1 to 1000", 30, ge=1, le=1000)
     validation_runs: Whole = field("validation runs, 1 to 1000", 10, ge=1, le=1000)
@@ -418,32 +407,32 @@ class CampaignTable(Table):
         "start posture of every excitation, in degrees, in the frame of [limits]"
     )
     approach_speed: Annotated[Number, Field(gt=0, le=1)] = field(
-        "fraction of the joint speeds for moves to the start, above 0, at most 1", 0.1
+        "speed of motions to the start, fraction of the joint speeds, above 0, at most 1", 0.1
     )
-    settle_s: NonNegative = field("seconds of rest recorded after each motion", 0.5)
-    standstill_s: Positive = field("seconds of standstill for the noise variance", 5.0)
+    settle_s: NonNegative = field("rest recorded after each motion, s", 0.5)
+    standstill_s: Positive = field("standstill for the noise variance, s", 5.0)
     warmup_drift: Annotated[Number, Field(ge=0, lt=1)] | None = field(
-        "change of a joint's friction from one motion to the next below which it is "
-        "warm, as a share (0.002); 0 for no warm-up",
+        "relative change of friction between motions below which a joint is warm (0.002); 0 for "
+        "no warm-up",
         None,
     )
-    warmup_least: Whole = field("motions that warm up at least, 3 to 1000", 4, ge=3, le=1000)
-    warmup_most: Whole = field("motions that warm up at most, 3 to 1000", 60, ge=3, le=1000)
+    warmup_least: Whole = field("fewest motions of the warm-up, 3 to 1000", 4, ge=3, le=1000)
+    warmup_most: Whole = field("most motions of the warm-up, 3 to 1000", 60, ge=3, le=1000)
     bad_repetitions: Whole = field(
-        "times a motion that fails its quality check is repeated, 0 to 100", 3, ge=0, le=100
+        "repetitions of a motion that fails its quality check, 0 to 100", 3, ge=0, le=100
     )
     n_via: Whole = field("via points of the excitation, 2 to 60", 6, ge=2, le=60)
     fly: Annotated[Number, Field(ge=0, le=1)] = field(
         "fly-by fraction, 0 (stop at every via point) to 1", 0.5
     )
     candidates: Whole = field(
-        "motions that the quick search of a campaign without a design may try", 300, ge=1
+        "motions of the quick search of a campaign without a design", 300, ge=1
     )
     seed: Whole = field("seed of the search and of the validation motions", 1, ge=0)
 
 
 class CellFile(Table):
-    """The whole file. Tables that a use does not need may be left out."""
+    """Cell file; tables that are not needed may be omitted."""
 
     cell: CellTable
     robot: RobotTable = RobotTable()

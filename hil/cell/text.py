@@ -1,4 +1,4 @@
-"""Changing a value in the text of a TOML file."""
+"""Changes of values in the text of a TOML file, and limits in a URDF."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from planner.toml_text import toml_value
 
 
 class NoTableError(InputError, ValueError):
-    """A table that is to be changed is not written as one, with its name in a line of its own."""
+    """A table to change has no header line."""
 
     def __init__(self, table: str) -> None:
         super().__init__(
             None,
-            f"there is no table [{table}] in the cell file, or not as a header",
-            remedy=f"write [{table}] in a line of its own, and its entries below",
+            f"the cell file has no header line [{table}]",
+            remedy=f"write [{table}] on a line of its own, and its entries below",
         )
 
 
 def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
-    """The TOML `text` with `key` of `[table]` set to `value`; comments and order stay.
+    """Set `key` of `[table]` to `value` in a TOML text; comments and order are preserved.
 
     Raises:
-        NoTableError: there is no such table.
+        NoTableError: there is no header line of the table.
     """
     header = rf"^[ \t]*\[[ \t]*{re.escape(table)}[ \t]*\][ \t]*(?:#[^\n]*)?$"
     found = re.search(header, text, re.MULTILINE)
@@ -40,7 +40,7 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
     start = found.end()
     following = re.search(r"^[ \t]*\[", text[start:], re.MULTILINE)
     end = start + following.start() if following else len(text)
-    # A list may go over several lines, and may hold lists.
+    # A list may span several lines, and contain lists.
     a_list = r"\[(?:[^\[\]]|\[[^\[\]]*\])*\]"
     setting = rf"(?m)^([ \t]*{key}[ \t]*=[ \t]*)(?:\"[^\"\n]*\"|{a_list}|[^\n#]*)"
     body, count = re.subn(setting, lambda match: f"{match[1]}{value}", text[start:end], count=1)
@@ -50,12 +50,12 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
 
 
 def with_values(text: str, values: Mapping[str, Any]) -> str:
-    """The TOML `text` with other values, such as ``{"campaign.repetitions": 3}``; None keeps one.
+    """Set values in a TOML text, such as ``{"campaign.repetitions": 3}``; None changes nothing.
 
-    Comments and order stay; a table that is not there is added.
+    Comments and order are preserved; missing tables are added.
 
     Raises:
-        NoTableError: a table is there, and not written as one.
+        NoTableError: a table exists without a header line.
     """
     for name, value in values.items():
         table, _, key = name.rpartition(".")
@@ -74,7 +74,7 @@ Array = NDArray[np.float64]
 
 
 class UrdfLimits(NamedTuple):
-    """Limits per joint (n,), rad, rad/s and N·m; infinite where the URDF states none."""
+    """Limits per joint (n,), rad, rad/s and N·m; infinite if not stated."""
 
     lower: Array
     upper: Array
@@ -83,10 +83,7 @@ class UrdfLimits(NamedTuple):
 
 
 def urdf_limits(urdf: str, joint_names: Sequence[str]) -> UrdfLimits:
-    """Limits of these joints, in their order; a speed or effort of 0 counts as not stated.
-
-    Only the robot's own joints: a transmission names joints of the same name again.
-    """
+    """Read the limits of joints; a speed or effort of 0 means not stated."""
     joints = {joint.get("name"): joint for joint in urdf_tree(urdf).findall("joint")}
     rows = []
     for name in joint_names:

@@ -10,9 +10,8 @@ import typer
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.files import convert_write_errors, make_folder, write_atomically
-from hil.plots import save
+from hil.plots import check_format, save
 from hil.plots.archive_view import archive_page, draw_archive, view_of
-from hil.plots.plan_picture import FORMATS
 from hil.terminal_text import printable
 
 PAGE = ".html"
@@ -49,11 +48,7 @@ def plot(
         )
     target = output or Path(archive.with_suffix(".png").name)
     kind = target.suffix.lower()
-    if kind not in (PAGE, *FORMATS):
-        known = ", ".join((*FORMATS, PAGE))
-        raise InputError(
-            target, f"{target.suffix!r} is not a picture format", remedy=f"use {known}"
-        )
+    check_format(target, PAGE)
     view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
     make_folder(target.parent)
     if kind == PAGE:

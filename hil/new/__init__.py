@@ -1,4 +1,4 @@
-"""A commented cell file for a new arm, from its URDF and what its controller or an archive says."""
+"""Generation of a commented cell file from a URDF, a controller or an archive."""
 
 from .cell_text import NewCell, cell_of_dh, cell_of_urdf, with_clear_home
 from .known import Known, from_archive, from_init, read_init

@@ -1,4 +1,4 @@
-"""The text of a new cell file: what is known is written, what is not is `"?"`."""
+"""Text of a new cell file; unknown values are `"?"`."""
 
 from __future__ import annotations
 
@@ -40,10 +40,7 @@ Array = NDArray[np.float64]
 
 @contextmanager
 def quiet_libraries() -> Iterator[None]:
-    """Drop what is written to file descriptor 2 meanwhile, such as urdfdom's lines of C++.
-
-    Python's own `sys.stderr` is dropped with it: nothing is to be said inside.
-    """
+    """Suppress output to file descriptor 2, such as that of the C++ library urdfdom."""
     sys.stderr.flush()
     saved = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -60,7 +57,7 @@ _OF_MOVING: Final = ("axis", "limit", "mimic", "dynamics", "safety_controller", 
 
 
 def mimics(urdf: str) -> dict[str, tuple[str, float]]:
-    """Joints that follow another one, by name: which, and their offset [rad or m] from it."""
+    """Return the leading joint and offset [rad or m] of each mimic joint."""
     return {
         joint.get("name", ""): (mimic.get("joint", "?"), float(mimic.get("offset", "0")))
         for joint in urdf_tree(urdf).findall("joint")
@@ -69,10 +66,10 @@ def mimics(urdf: str) -> dict[str, tuple[str, float]]:
 
 
 def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:
-    """The URDF with joints held at positions [rad or m], by name; comments stay.
+    """Return the URDF with joints fixed at positions [rad or m]; comments are preserved.
 
     Raises:
-        KeyError: no joint has such a name.
+        KeyError: there is no such joint.
     """
     root = urdf_tree(urdf, comments=True)
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
@@ -112,9 +109,9 @@ _ONE_FOR_ALL: Final = {
     *("drive_train.k54", "drive_train.k64", "drive_train.k65"),
     "drive_train.encoder_counts_per_revolution",
 }
-"""Fields without a list that nobody may have said anything of."""
+"""Unknown fields that are no lists."""
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
-"""What is written though nobody said so."""
+"""Fields whose default is written as an assumption."""
 _MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
 _COLLISION: Final = re.compile(r"<collision\b.*?</collision>", re.DOTALL)
 _ROUND: Final = 3
@@ -122,16 +119,16 @@ _ROUND: Final = 3
 
 @dataclass(frozen=True)
 class NewCell:
-    """A cell that is to be written.
+    """Content of a new cell file.
 
     Attributes:
-        name: of the cell.
-        joint_names: those that move, in the order of all lists.
-        urdf: its text, None where the file that was named is used as it is.
-        urdf_path: of the URDF (or the table of DH parameters) that was read.
-        meshes: the collision shapes' mesh paths that begin with `package://`.
-        known: what is known of it.
-        design_only: whether motions are designed and not run: no drive train, no controller.
+        name: name of the cell.
+        joint_names: moving joints.
+        urdf: changed URDF text, None if the given file is used.
+        urdf_path: URDF (or table of DH parameters) that was read.
+        meshes: `package://` mesh paths of the collision shapes.
+        known: known values.
+        design_only: omit drive train and controller.
     """
 
     name: str
@@ -143,14 +140,14 @@ class NewCell:
     design_only: bool = False
 
     def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
-        """The cell file as it would stand at `path`, and the fields that are unknown in it."""
+        """Return the text of the cell file at `path`, and its unknown fields."""
         path = path.resolve()
         values, origin = self.known.values, self.known.origin
         written: set[str] = set()
         unknown: list[str] = []
 
         def line(name: str, default: Any = None) -> str:
-            """One field: what is known, else the default, else `"?"`."""
+            """Format one field: known value, else default, else `"?"`."""
             written.add(name)
             key = name.partition(".")[2]
             value = values.get(name, default)
@@ -166,7 +163,7 @@ class NewCell:
             return f"{key} = {toml_value(value)}{comment}"
 
         def rest(table: str) -> str:
-            """Fields of a table that were said somewhere and have no line of their own."""
+            """Format the known fields of a table without a line in the template."""
             return "".join(
                 f"{toml_key(name.partition('.')[2])} = {toml_value(value)}\n"
                 for name, value in values.items()
@@ -186,7 +183,7 @@ class NewCell:
         )
         text = environment.get_template("cell.toml.j2").render(
             name=self.name,
-            sources=f"Its figures are {origins}." if origins else "",
+            sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
             urdf=os.path.relpath(urdf, path.parent),
             mesh_folders=self._mesh_folders(path.parent),
@@ -201,7 +198,7 @@ class NewCell:
         return text.rstrip("\n") + "\n", tuple(unknown)
 
     def _assumed(self) -> list[str]:
-        """Fields that are written though nobody said what stands there."""
+        """Return the names of assumed fields."""
         names = [name for name in _ASSUMED if name not in self.known.values]
         if self.design_only:
             names = [name for name in names if not name.startswith("controller.")]
@@ -209,7 +206,7 @@ class NewCell:
         return [*names, *(name for name in found if not name.startswith("campaign."))]
 
     def _mesh_folders(self, folder: Path) -> list[str] | None:
-        """Folders in which the paths of collision meshes begin; None where none is needed."""
+        """Return the folders that contain the packages of collision meshes; None without meshes."""
         if not self.meshes:
             return None
         found: dict[str, None] = {}
@@ -223,7 +220,7 @@ class NewCell:
         return list(found)
 
     def _suggested(self) -> list[str] | None:
-        """Lines of acceleration and jerk to begin with, where every speed is known."""
+        """Return proposed lines of acceleration and jerk if all speeds are known."""
         speeds = self.known.values.get("limits.velocity_deg", [UNKNOWN])
         if "limits.jerk_deg" in self.known.values or UNKNOWN in speeds:
             return None
@@ -233,12 +230,12 @@ class NewCell:
         ]
 
     def for_design(self) -> NewCell:
-        """The same arm, its motions to be designed only; what can be assumed is."""
+        """Return the cell for design only, with assumed values."""
         known = self.known | assumed_for_design(self.known, len(self.joint_names))
         return replace(self, known=known, design_only=True)
 
     def urdf_beside(self, path: Path) -> Path:
-        """Where the URDF is written, if it has to be: beside the cell file, never over its own."""
+        """Return the path of a changed URDF: next to the cell file, different from the original."""
         beside = path.with_suffix(".urdf")
         if beside.resolve() == self.urdf_path.resolve():
             return path.with_name(f"{path.stem}_fixed.urdf")
@@ -246,32 +243,31 @@ class NewCell:
 
 
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
-    """What a table of DH parameters alone says of a cell: geometry; its URDF has to be written.
+    """Return the cell of a table of DH parameters, with a URDF to write.
 
     Raises:
-        InputError: it cannot be read, is no such table, or has no such joint.
+        InputError: the table cannot be read or is invalid, or a fixed joint does not exist.
     """
     text = urdf_of_dh(path, convention)
-    note = "the URDF has the geometry alone, as DH parameters give it: no masses, no limits"
+    note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     made = _cell_of(path, text, fixed)
     return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
 
 
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
-    """What a URDF alone says of a cell.
+    """Return the cell of a URDF.
 
-    Joints in `fixed` are held at positions [rad or m]; those that slide, which this software does
-    not move, at zero (the nearest position in their range); and those that follow another one,
-    which no model of an open chain describes, at their offset. Notes say so.
+    Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
+    nearest position in their range), mimic joints at their offset; notes report this.
 
     Raises:
-        InputError: it cannot be read, or is no URDF of an open chain.
+        InputError: the URDF cannot be read, or is not that of an open chain.
     """
     return _cell_of(path, read_input(path, "name a URDF"), fixed)
 
 
 def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
-    """What the URDF that was read from `path` says of a cell."""
+    """Return the cell of the URDF text read from `path`."""
     chain = _chain(path, text)
     names = chain.joint_names
     if unknown := sorted(set(fixed) - set(names)):
@@ -289,14 +285,14 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
     }
     positions = sliding | {name: offset for name, (_, offset) in following.items()} | {**fixed}
     notes = [
-        f"{name} slides, and is fixed at {position:g} m in the cell's copy of the URDF; "
+        f"{name} is prismatic, and fixed at {position:g} m in the cell's copy of the URDF; "
         f"--fix {name}=… for another position"
         for name, position in sliding.items()
     ]
     notes += [
-        f"{name} follows {leader} (<mimic>), which no model here does: it is fixed at "
+        f"{name} follows {leader} (<mimic>), which the model does not support: it is fixed at "
         f"{positions[name]:g} rad in the cell's copy of the URDF, --fix {name}=… for another "
-        "position. If it is part of a linkage that carries the arm, this model is not of your arm"
+        "position. If it belongs to a linkage that supports the arm, the model is wrong"
         for name, (leader, _) in following.items()
     ]
     used = with_fixed(text, positions) if positions else text
@@ -304,8 +300,8 @@ def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
     shapes = _COLLISION.findall(text)
     if not shapes:
         notes.append(
-            "the URDF has no <collision> shapes: add some (boxes, cylinders and spheres will do) "
-            "before the arm is moved"
+            "the URDF has no <collision> shapes: add some (boxes, cylinders or spheres) before "
+            "the arm is moved"
         )
     name = re.search(r"<robot\b[^>]*\bname\s*=\s*[\"']([^\"']*)[\"']", used)
     return NewCell(
@@ -327,14 +323,14 @@ def _chain(path: Path, urdf: str) -> Chain:
 
 
 _TURNED: Final = 3
-"""Joints away from their home at most."""
+"""Largest number of joints turned away from the home posture."""
 
 
 def with_clear_home(text: str, new: NewCell, path: Path) -> str:
-    """The text of a cell file with a home that is clear of floor, walls and the arm itself.
+    """Return the text of a cell file with a home posture free of collision.
 
-    The first clear posture with none to three joints a right angle away from the home that is
-    there; that stays where none is clear, or the URDF has no shapes.
+    It is the first such posture with at most three joints turned by 90° from the present one; that
+    is used if there is none, or the URDF has no collision shapes.
     """
     urdf = new.urdf if new.urdf is not None else read_text(new.urdf_path)
     cell = Cell.from_texts(text, urdf, path)

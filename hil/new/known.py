@@ -1,4 +1,4 @@
-"""What is known of a cell before anybody has filled in anything, and who says so."""
+"""Known values of a new cell file, and their origin."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from hil.errors import ArchiveError, ControllerFault, OperatorStopError
 from hil.reading import parse_toml
 
 _DECIMALS: Final = 3
-"""Of degrees: rounding stays below what a cell may exceed its URDF's limits by."""
+"""Decimals of degrees; rounding is below the tolerance of URDF limits."""
 _CYCLES: Final = (1, 2)
 ASSUMED: Final = "assumed"
-"""Origin of figures that nobody said."""
+"""Origin of assumed values."""
 
 
 @dataclass(frozen=True)
 class Known:
-    """Figures of a cell file by dotted field, and the words that say where they come from.
+    """Values of a cell file by dotted field, and their origin.
 
     Attributes:
-        values: numbers, lists with an entry per joint (`"?"` where one is not known), words.
-        origin: of each of these fields, such as "from the URDF".
-        notes: what a person should know.
+        values: numbers, texts, lists with an entry per joint (`"?"` if unknown).
+        origin: origin of each field, such as "from the URDF".
+        notes: notes for the user.
     """
 
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class Known:
 
     @classmethod
     def said_by(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
-        """Figures that all have one origin; a field of which nothing is known is left out."""
+        """Create from values of one origin, without unknown fields."""
         nothing: list[Any] = [UNKNOWN]
         known = {
             name: value
@@ -61,12 +61,12 @@ class Known:
         return cls(known, dict.fromkeys(known, origin), tuple(notes))
 
     def without(self, table: str) -> Known:
-        """The same without the figures of one table."""
+        """Return the values without those of one table."""
         remaining = {k: v for k, v in self.values.items() if not k.startswith(f"{table}.")}
         return replace(self, values=remaining, origin={k: self.origin[k] for k in remaining})
 
     def __or__(self, other: Known) -> Known:
-        """Both; where they differ, `other` counts."""
+        """Merge; `other` has precedence."""
         return Known(
             {**self.values, **other.values},
             {**self.origin, **other.origin},
@@ -75,9 +75,9 @@ class Known:
 
 
 def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
-    """Limits that a URDF states, in degrees, in its own frame; `"?"` where it states none.
+    """Return the limits of a URDF in degrees in its own frame; `"?"` if not stated.
 
-    Torques are used only if every joint has one: a list of torque limits has no gaps.
+    Torque limits are used only if every joint has one.
     """
     limits = urdf_limits(urdf, joint_names)
     nowhere = limits.lower >= limits.upper
@@ -93,10 +93,11 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
 
 
 def assumed_for_design(known: Known, n_joints: int) -> Known:
-    """What a cell for designs alone needs, as far as it can be assumed.
+    """Return assumed values for a cell without controller.
 
-    Home is zero, or the middle of a range without it; endless joints have half a turn either way;
-    full speed takes 0.3 s, full acceleration 0.1 s; no friction; a floor at the base.
+    Home is zero, or the middle of a range without zero; continuous joints are limited to ±180°;
+    acceleration to full speed takes 0.3 s, to full acceleration 0.1 s; no friction; floor at the
+    base.
     """
     lower, upper, speed = (
         known.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
@@ -133,7 +134,7 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
 
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
-    """What an init packet says of the first `n_joints` axes of an arm (from 1)."""
+    """Return the values of an init packet for the first `n_joints` axes of an arm (from 1)."""
     row, n = arm - 1, n_joints
     wrist = dict(zip(("k54", "k64", "k65"), init.wrist_coupling(arm), strict=True))
     values: dict[str, Any] = {
@@ -148,20 +149,20 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
     if cycle in _CYCLES:
         values["controller.cycle_ms"] = cycle
     else:
-        notes.append(f"the controller's cycle is {cycle} ms; this software knows 1 and 2")
+        notes.append(f"the cycle of the controller is {cycle} ms; supported are 1 and 2")
     opened = {axis.axis for axis in init.open_axes() if axis.arm == arm}
     if missing := ", ".join(str(axis + 1) for axis in range(n) if axis not in opened):
         closed = f"axes {missing} of arm {arm} are not open in the controller"
-        notes.append(f"{closed}; a campaign needs all of the arm's")
+        notes.append(f"{closed}; a campaign needs all axes of the arm")
     version = ".".join(map(str, init.version))
     return Known.said_by(f"from the init packet (C4G {version})", values, notes)
 
 
 def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known:
-    """What an archive's own cell and init packet say.
+    """Return the values of the cell and the init packet in an archive.
 
     Raises:
-        ArchiveError: it cannot be read, is of another arm, or carries neither.
+        ArchiveError: it cannot be read, is of another arm, or contains neither.
     """
     archive = open_archive(path, fields=())
 
@@ -171,20 +172,20 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
 
     if archive.joint_names != tuple(joint_names):
         raise refusal(
-            f"is of an arm with the joints {', '.join(archive.joint_names)}",
-            remedy=f"those of the URDF are {', '.join(joint_names)}",
+            f"is of an arm with joints {', '.join(archive.joint_names)}",
+            remedy=f"the URDF has {', '.join(joint_names)}",
         )
     known = Known()
     if "cell.toml" in archive.attachments:
         try:
             tables = parse_toml(archive.text("cell.toml"))
         except ValueError as error:
-            raise refusal(f"is no TOML ({error})", "cell.toml") from error
+            raise refusal(f"is not TOML ({error})", "cell.toml") from error
         loose = [name for name, entries in tables.items() if not isinstance(entries, Mapping)]
         if loose:
-            raise refusal(f"is no cell file: {loose[0]!r} is no table", "cell.toml")
+            raise refusal(f"is not a cell file: {loose[0]!r} is not a table", "cell.toml")
         values = {f"{name}.{key}": value for name in tables for key, value in tables[name].items()}
-        for name in ("cell.urdf", "cell.mesh_folders"):  # of the computer it was recorded on
+        for name in ("cell.urdf", "cell.mesh_folders"):  # paths on the recording computer
             values.pop(name, None)
         known = Known.said_by(f"from {archive.path.name}", values)
     packet = archive.attachments.get("init_packet.bin")
@@ -194,9 +195,9 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         try:
             known |= from_init(InitPacket.decode(packet), len(joint_names), arm)
         except PacketError as error:
-            raise refusal(f"is no init packet ({error})", "init_packet.bin") from error
+            raise refusal(f"is not an init packet ({error})", "init_packet.bin") from error
     if not known.values:
-        raise refusal("carries neither a cell nor an init packet")
+        raise refusal("contains neither a cell nor an init packet")
     if archive.header.only_simulated:
         note = f"{archive.path.name} was recorded from a simulated controller"
         known |= Known(notes=(note,))
@@ -211,7 +212,7 @@ def _degrees(radians: ArrayLike) -> list[float | str]:
 
 
 def _wire(values: ArrayLike, *, zero: bool = True, positive: bool = False) -> list[float | str]:
-    """float32 figures as short as they can be written."""
+    """Return the shortest decimals of float32 values; `"?"` if invalid."""
     return [
         float(str(value))
         if math.isfinite(value) and (zero or value != 0.0) and not (positive and value <= 0.0)
@@ -227,21 +228,19 @@ _PLACEHOLDER_PERIOD = 0.002
 def read_init(
     spec: TransportSpec, n_joints: int, *, arm: int, wait: float, stop: Stop
 ) -> InitPacket:
-    """Wait for a controller to begin a session, take its init packet and leave.
+    """Wait `wait` s for a controller to start a session, and return its init packet.
 
-    The process that answers has no arm: a drive train of ones, which no controller announces,
-    so that its session is unusable for motion, and no archive, without which none is accepted.
-    After the init packet answers go on until the axes are closed. It is waited for `wait` seconds;
-    `arm` counts from 1.
+    Motion is impossible: the drive train of ones differs from any controller's, and there is no
+    archive. Replies continue until the axes are closed. `arm` counts from 1.
 
     Raises:
-        ControllerFault: the link cannot be opened, or no controller began a session in time.
-        OperatorStopError: stopped before it did.
+        ControllerFault: the link cannot be opened, or no session started in time.
+        OperatorStopError: stopped before.
     """
     try:
         exchange = ExchangeProcess.start(_nothing_moves(spec, n_joints, arm))
     except (DriverError, OSError) as error:
-        raise ControllerFault(f"the controller cannot be listened to: {error}") from error
+        raise ControllerFault(f"the link cannot be opened: {error}") from error
     try:
         return _waited_for(ExchangeView(exchange), wait, stop)
     finally:
@@ -258,15 +257,17 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
         if (failure := view.failure()) is not None:
             raise ControllerFault(failure)
         if stop.requested:
-            raise OperatorStopError("ended before the controller came; no file was written.")
+            raise OperatorStopError(
+                "stopped before a packet of the controller; no file was written."
+            )
         if time.monotonic() > deadline:
-            status, words = view.status, f"no init packet came within {wait:g} s"
+            status, text = view.status, f"no init packet within {wait:g} s"
             if status.answered or status.malformed or status.stale:
-                words += ", though packets did: a session was running already"
-            words += f"; {view.not_understood}" if view.not_understood else ""
-            words += "; start this command first, then the controller's Open program"
-            words += f" ({status.foreign} packets came from elsewhere)" if status.foreign else ""
-            raise ControllerFault(words)
+                text += ", but other packets: a session was already running"
+            text += f"; {view.not_understood}" if view.not_understood else ""
+            text += "; start this command first, then the controller's Open program"
+            text += f" ({status.foreign} packets from other addresses)" if status.foreign else ""
+            raise ControllerFault(text)
         time.sleep(_POLL)
     return view.connection.init
 

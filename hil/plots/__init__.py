@@ -1,4 +1,4 @@
-"""Pictures of motions, for people who compare them with what a teach pendant shows."""
+"""Pictures of motions, plans, designs and archives."""
 
 from __future__ import annotations
 

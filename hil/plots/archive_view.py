@@ -1,6 +1,6 @@
-"""An archive joint by joint as a page or a picture, thinned without losing a peak.
+"""Plots of an archive, joint by joint, as a page or a picture.
 
-A long archive is read window by window, so that memory does not grow with its length.
+Long archives are read in windows and reduced to minimum and maximum per interval.
 """
 
 from __future__ import annotations
@@ -33,11 +33,10 @@ from identification.model.kinematics import chain_from_urdf
 Array = NDArray[np.float64]
 
 _SAMPLES: Final = 30_000
-"""Of an archive that are in memory at a time: a minute of an arm with cycles of 2 ms."""
+"""Samples in memory at a time."""
 _BINS: Final = 4000
-"""Stretches of the time shown whose lowest and highest sample go into the page: every sample of
-16 s at 500 Hz."""
-_LEAP: Final = 10.0  # Samples left out, by which a line is broken
+"""Intervals of a page, each with its minimum and maximum: all samples of 16 s at 500 Hz."""
+_LEAP: Final = 10.0  # Missing samples that interrupt a line
 _TITLES: Final = {
     "position": "position [deg]",
     "velocity": "speed [deg/s]",
@@ -57,7 +56,7 @@ _COLOURS: Final = {
     "torque at the joint": (drawing.INK, "#5b3a8c"),
     "following error": (drawing.ROUTES[0], style.INK),
 }
-"""Of the lines on the page, and in the picture."""
+"""Line colours on the page and in the picture."""
 # px, of the page
 _WIDTH, _LEFT, _RIGHT, _TOP, _PLOT, _STEP, _BOTTOM = 440.0, 56.0, 10.0, 20.0, 66.0, 90.0, 22.0
 _MOST_GAPS: Final = 200
@@ -67,13 +66,13 @@ _MOST_GAPS: Final = 200
 class Trace:
     """One quantity of one joint."""
 
-    time: Array  #: (k,) s since the archive's first sample; NaN where the line is broken
-    value: Array  #: (k,) in the unit that is shown
-    limits: tuple[float, ...] = ()  #: lower and upper; empty where none are known
+    time: Array  #: (k,) s since the first sample of the archive; NaN interrupts the line
+    value: Array  #: (k,) in the displayed unit
+    limits: tuple[float, ...] = ()  #: lower and upper; empty if unknown
 
     @property
     def peak_share(self) -> float | None:
-        """Largest magnitude as a share of a limit that is the same both ways; None without one."""
+        """Largest magnitude over a symmetric limit; None without one."""
         if not self.limits or self.limits[0] != -self.limits[1] or not self.value.size:
             return None
         return float(np.nanmax(np.abs(self.value), initial=0.0) / self.limits[1])
@@ -81,7 +80,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """A quantity of every joint shown."""
+    """One quantity of all displayed joints."""
 
     title: str
     traces: tuple[Trace, ...]
@@ -89,29 +88,29 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class ArchiveView:
-    """What the page of an archive shows."""
+    """Content of the plot of an archive."""
 
-    facts: Overview  #: what `hil archive info` tells
-    joint_names: tuple[str, ...]  #: those shown
+    facts: Overview  #: content of `hil archive info`
+    joint_names: tuple[str, ...]  #: displayed joints
     start: float  #: s since the first sample
-    stop: float  #: s, likewise
-    quantities: tuple[Quantity, ...]  #: as far as the archive has them
-    #: (from [s], to [s], name) of the session; none in an imported recording
+    stop: float  #: s since the first sample
+    quantities: tuple[Quantity, ...]  #: those in the archive
+    #: (start [s], end [s], name) of session states; none in an imported recording
     states: tuple[tuple[float, float, str], ...] = ()
-    #: (s, name, text, whether it is a warning or worse) within the time shown
+    #: (time [s], name, text, whether a warning or worse)
     events: tuple[tuple[float, str, str, bool], ...] = ()
-    gaps: Array = field(default_factory=lambda: np.zeros(0))  #: s at which packets were missed
-    frame: str = ""  #: of positions, speeds and torques, in words
+    gaps: Array = field(default_factory=lambda: np.zeros(0))  #: times of missed packets [s]
+    frame: str = ""  #: description of the angle frame
 
     @property
     def missed(self) -> str:
-        """Packets that were missed, also where none was; "" where nobody counts them."""
+        """Text on missed packets; "" for imported recordings."""
         if not self.states:
             return ""
         return f"missed at {plural(len(self.gaps), 'place')}" if len(self.gaps) else "none missed"
 
     def marks(self, warning: str, other: str) -> list[tuple[float, str]]:
-        """Events and missed packets [s], each with one of two colours."""
+        """Return times of events and missed packets [s] with one of two colours."""
         events = [(at, warning if warns else other) for at, _, _, warns in self.events]
         return [*events, *((float(gap), other) for gap in self.gaps[:_MOST_GAPS])]
 
@@ -123,23 +122,23 @@ def view_of(
     stop: float | None = None,
     joints: Sequence[str] = (),
 ) -> ArchiveView:
-    """Read what is drawn of an archive.
+    """Read the content of a plot.
 
-    Times are s since its first sample; joints are names or numbers from 1, all if empty.
+    Times are s since the first sample; joints are names or numbers from 1, all if empty.
 
     Raises:
-        ArchiveError: it cannot be read, or holds no sample in that time.
+        ArchiveError: the archive cannot be read, or has no sample in that interval.
         InputError: there is no such joint.
     """
     head = open_archive(path, fields=())
     stamp = head.columns["stamp"]
     if not len(stamp):
-        raise ArchiveError(path, "holds no sample", remedy="name another archive")
+        raise ArchiveError(path, "contains no sample", remedy="name another archive")
     origin, last = float(stamp[0]) * 1e-9, float(stamp[-1] - stamp[0]) * 1e-9
     begin = 0.0 if start is None else max(start, 0.0)
     end = last if stop is None else min(stop, last)
     if not begin <= end:
-        problem = f"lasts {last:.6g} s; nothing lies in the time asked for"
+        problem = f"lasts {last:.6g} s, without a sample in this interval"
         raise ArchiveError(path, problem, remedy="correct --start and --stop")
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
@@ -171,7 +170,7 @@ def view_of(
 
 
 def _windows(path: Path, time: Array, begin: float, end: float) -> Iterator[Archive]:
-    """Pieces of a recording from `begin` to `end`, as many as its samples at `time` (m,) need."""
+    """Yield windows of a recording with samples at `time` (m,), from `begin` to `end`."""
     first, last = np.searchsorted(time, (begin, end))
     edges = [begin, *time[first + _SAMPLES : last : _SAMPLES], end + 1e-6]  # the last sample too
     for a, b in pairwise(edges):
@@ -184,7 +183,7 @@ def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
         if joint not in known:
             raise InputError(
                 None,
-                f"{joint!r} is no joint",
+                f"{joint!r} is not a joint",
                 field="--joint",
                 remedy=f"name one of {', '.join(names)}",
             )
@@ -193,7 +192,7 @@ def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
 
 @dataclass(frozen=True, eq=False)
 class _Scales:
-    """From SI to what is shown, and the limits (2, n), as far as the archive's cell tells them."""
+    """Conversion from SI to displayed units, and limits (2, n) of the cell in the archive."""
 
     frame: AngleFrame
     slides: NDArray[np.bool_]
@@ -215,7 +214,7 @@ class _Scales:
                 limits["torque"] = both * cell.torque_limit
         if cell is not None and cell.file.drive_train is not None:
             motors = cell.drive_train.motor_from_joint
-        # Limits that cannot be read are not drawn.
+        # Invalid limits are not drawn.
         with suppress(ArchiveError):
             table = archive.table("drive_train.json")
             for name, key in (("current", "current_limit"), ("following", "following_error")):
@@ -225,16 +224,16 @@ class _Scales:
 
     @property
     def words(self) -> str:
-        """The frame, for a person."""
+        """Description of the frame."""
         pendant = self.frame.name == "controller"
         whose = "as on the teach pendant" if pendant else "of the URDF"
         return f"angles, speeds and torques {whose}"
 
     def shown(self, columns: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Array]]:
-        """Quantities (m, n) of a window in the units that are shown: mm of a joint that slides.
+        """Yield quantities (m, n) of a window in displayed units.
 
-        Torques turn as their joint does, so that torque times speed stays the power. Following
-        errors are in motor revolutions where the drive train is known.
+        Torques have the sign of the displayed angle. Following errors are in motor revolutions if
+        the drive train is known.
         """
         position = columns.get("position")
         if position is not None:
@@ -252,7 +251,7 @@ class _Scales:
                 error = self._rate(error)
             else:
                 error = error @ self.motor_from_joint.T / (2.0 * np.pi)
-            # Before the drive is on the controller reports no target.
+            # The controller reports no target with the drive off.
             driven = columns["status"] == DRIVE_ON
             yield "following", np.where(driven[:, np.newaxis], error, np.nan)
 
@@ -261,7 +260,7 @@ class _Scales:
 
 
 def _limit_in(table: Any, key: str, n: int) -> Array | None:
-    """Limits (n,) of a table of an untrusted file; None where they are none."""
+    """Return limits (n,) of a table of an untrusted file; None if invalid."""
     try:
         limit = np.array(table[key], dtype=np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
@@ -270,7 +269,7 @@ def _limit_in(table: Any, key: str, n: int) -> Array | None:
 
 
 def _cell(archive: Archive) -> Cell | None:
-    """The cell that travels in an archive; None where there is none that can still be used."""
+    """Return the cell in an archive; None if it has none, or an invalid one."""
     try:
         cell = Cell.from_texts(archive.text("cell.toml"), archive.text("robot.urdf"), archive.path)
     except HilError:
@@ -295,11 +294,11 @@ def _collect(
     joints: Sequence[int],
     bins: int,
 ) -> None:
-    """Add a window of a recording, thinned, to the lines of each quantity and joint."""
+    """Add a window of a recording, reduced, to the lines of each quantity and joint."""
     leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
     gaps = np.flatnonzero(np.diff(time) > leap) + 1
     unbroken = np.insert(time, gaps, time[gaps])
-    # What is too large in degrees for any float is missing in the picture.
+    # Values that overflow in degrees are missing in the plot.
     with np.errstate(over="ignore", invalid="ignore"):
         for name, values in scales.shown(columns):
             for line, joint in zip(lines[name], joints, strict=True):
@@ -336,7 +335,7 @@ def _add_states(
 
 
 def _state_name(number: int) -> str:
-    """A state of the session; the number itself of one that an untrusted archive made up."""
+    """Return the name of a session state; an untrusted archive may contain unknown numbers."""
     known = number in State.__members__.values()
     return State(number).name.lower().replace("_", " ") if known else f"state {number}"
 
@@ -347,10 +346,9 @@ def _share(recorded: Trace) -> str:
 
 
 def even(recorded: Trace, grid: Array) -> Array:
-    """A line (k,) on an even grid of time (m,), m even; NaN where it is broken.
+    """Resample a line (k,) to an even grid of time (m,), m even; NaN interrupts it.
 
-    Of every two instants one has the lowest and one the highest sample between them, in the order
-    in which they came: no peak is lost, and none is moved by more than two steps.
+    Each pair of grid points has minimum and maximum of its samples, in their order.
     """
     found = np.full(grid.shape, np.nan)
     step = (grid[-1] - grid[0]) / (len(grid) - 1)
@@ -370,7 +368,7 @@ def even(recorded: Trace, grid: Array) -> Array:
 
 
 def _stretches(recorded: Trace) -> list[tuple[Array, Array]]:
-    """The unbroken parts of a line, those of no length left out."""
+    """Return the uninterrupted parts of a line."""
     broken = np.flatnonzero(np.isnan(recorded.time))
     parts = zip(np.split(recorded.time, broken), np.split(recorded.value, broken), strict=True)
     finite = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
@@ -399,7 +397,7 @@ def _panel(view: ArchiveView, j: int) -> drawing.Panel:
 
 
 def archive_page(view: ArchiveView) -> bytes:
-    """The page; the same archive gives the same bytes."""
+    """Return the page; the same archive gives the same bytes."""
     template = environment().get_template("archive.html.j2")
     joints = [_panel(view, j) for j in range(len(view.joint_names))]
     text = template.render(view=view, facts=view.facts, joints=joints)
@@ -407,7 +405,7 @@ def archive_page(view: ArchiveView) -> bytes:
 
 
 def draw_archive(view: ArchiveView) -> Figure:
-    """A picture with one row per joint and one column per quantity."""
+    """Draw a picture with one row per joint and one column per quantity."""
     rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
     width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
     marks = view.marks(style.LIMIT, style.MUTED)
@@ -427,7 +425,7 @@ def draw_archive(view: ArchiveView) -> Figure:
                 style.bare(axes)
                 axes.tick_params(labelbottom=j == rows - 1)
                 share = f"{share} % of limit" if (share := _share(trace)) else ""
-                # At a height of its own, or the power of ten of an axis moves it into the next one.
+                # A fixed height: an exponent of the axis would move it.
                 axes.set_title(share, loc="right", y=1.0, pad=2.0, fontsize=style.SMALL)
                 if j == 0:
                     axes.annotate(

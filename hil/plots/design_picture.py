@@ -1,4 +1,4 @@
-"""A designed motion on one page: joints against limits, correlations, the front, the postures."""
+"""Picture of a designed motion: joints and limits, correlations, front, postures."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ Measures = tuple[float, ...]  #: log10 det, I_c
 
 POSTURES: Final = 7
 _PERIOD: Final = 0.001
-"""s between samples of the correlations; the criteria are those of the same rate."""
+"""Sampling period of the correlations, s."""
 GREW: Final = "grew from"
-_LETTERS: Final = 180  # In a line of small print across the page
-_BARS: Final = "the arm (bars from joint to joint: its shapes are not known here)"
+_LETTERS: Final = 180  # Characters of a line of small text
+_BARS: Final = "the arm (bars from joint to joint, as its shapes are unknown)"
 _MARKERS: Final = "DsP^vX"
 _WHITE: Final[dict[str, Any]] = {"markerfacecolor": "white", "markeredgecolor": style.LIMIT}
 _CHOSEN: Final[dict[str, Any]] = {
@@ -65,17 +65,15 @@ _TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
 def draw_front(
     axes: Axes, front: Front | None, marks: Mapping[str, Measures], *, together: bool
 ) -> None:
-    """Draw the front and single motions, the first of them chosen; a legend above them.
+    """Draw the front and single motions, the first of them chosen, with a legend.
 
-    References (all but the chosen motion and that which it grew from) do not widen the axes: one
-    beyond them is in the legend alone. So is a motion that leaves a parameter unexcited.
-
-    `marks` are (log10 det, I_c) by name; `together`, earlier archives are part of all measures.
+    References outside the range of the front, and motions with infinite criteria, are only in the
+    legend. `marks` are (log10 det, I_c) by name; with `together` they include earlier archives.
     """
     if front is not None and len(front) > 1:
         points = np.column_stack([front.measure(name) for name in ("coupling_index", "log10_det")])
         line = points[np.argsort(points[:, 0], kind="stable")]
-        # What is had at most for a coupling index up to that.
+        # Best log det up to each coupling index.
         axes.plot(
             *line.T, drawstyle="steps-post", color=style.POSITION, linewidth=1.0, marker="o",
             markersize=3.4, label=f"front, {len(line)} motions",
@@ -92,10 +90,10 @@ def draw_front(
             axes.plot(index, size, linestyle="none", label=text, **look)
     for axis, steps in ((axes.xaxis, 7), (axes.yaxis, 6)):
         axis.set_major_locator(MaxNLocator(steps, steps=[1, 2, 5, 10], min_n_ticks=3))
-    across, up = "coupling index I_c (less is better)", "log₁₀(det ΦᵀΦ / Nᵖ) (more is better)"
+    across, up = "coupling index I_c (lower is better)", "log₁₀(det ΦᵀΦ / Nᵖ) (higher is better)"
     if together:
-        across += "\ntogether with earlier archives, weighted"
-        up = "log₁₀ det (more is better)\ntogether, weighted"
+        across += "\nincluding earlier archives, weighted"
+        up = "log₁₀ det (higher is better)\nincluding earlier archives"
     axes.set_xlabel(across)
     axes.set_ylabel(up)
     handles, _ = axes.get_legend_handles_labels()
@@ -111,10 +109,9 @@ _JOINT = re.compile(r"\d+")
 
 
 def draw_correlation(axes: Axes, matrix: Array, names: Sequence[str]) -> None:
-    """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)``, black for 1 and white for 0, in blocks of links.
+    """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)`` (b, b), black for 1 and white for 0, by joint.
 
-    The matrix (b, b) is of the parameters without friction; NaN where a motion leaves a parameter
-    without excitation.
+    Friction is excluded; entries are NaN if a parameter is not excited.
     """
     b = len(names)
     if np.all(np.isfinite(matrix)):
@@ -123,7 +120,9 @@ def draw_correlation(axes: Axes, matrix: Array, names: Sequence[str]) -> None:
         axes.set_xlim(-0.5, b - 0.5)
         axes.set_ylim(b - 0.5, -0.5)
         axes.set_aspect("equal")
-        text = "no correlations:\nthis motion leaves a parameter\n(or a sum of some) unexcited"
+        text = (
+            "no correlations:\nthis motion does not excite a parameter\n(or a combination of some)"
+        )
         axes.text(
             0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", color=style.LIMIT,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 5.0},
@@ -136,14 +135,14 @@ def draw_correlation(axes: Axes, matrix: Array, names: Sequence[str]) -> None:
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_ticks(middles, [joint for joint, _, _ in found], color=style.INK)
     axes.tick_params(length=0.0, pad=3.0)
-    axes.set_xlabel("parameters by joint, friction left out")
+    axes.set_xlabel("parameters by joint, without friction")
     for spine in axes.spines.values():
         spine.set_color(style.MUTED)
     shade_scale(axes.inset_axes((1.03, 0.5, 0.04, 0.5)), style.INK, style.MUTED)
 
 
 def blocks(names: Sequence[str]) -> list[tuple[str, int, int]]:
-    """Return (label, first, one after the last) of neighbours that belong to the same joint."""
+    """Return (label, start, stop) of adjacent parameters of the same joint."""
 
     def joint(k: int) -> str:
         match = _JOINT.search(names[k])
@@ -154,7 +153,7 @@ def blocks(names: Sequence[str]) -> list[tuple[str, int, int]]:
 
 
 def number(value: float, digits: int) -> str:
-    """Return a criterion as text; a motion that leaves a parameter unexcited has infinite ones."""
+    """Format a criterion, which is infinite if a parameter is not excited."""
     return f"{value:.{digits}f}" if np.isfinite(value) else ("∞" if value > 0.0 else "−∞")
 
 
@@ -168,24 +167,24 @@ def _heading(
     together: bool,
     shapes: bool,
 ) -> list[tuple[str, float, str]]:
-    """The lines above the page with size in points and colour: criteria, what was not looked at."""
+    """Return the heading lines with size in points and colour: criteria, what was not checked."""
     criteria = excitation.criteria
     determinant, index = number(criteria.log10_det, 2), f"I_c {number(criteria.coupling_index, 1)}"
     method, duration = f"method {excitation.method}", f"{excitation.trajectory.duration:.2f} s"
     parts = [f"log₁₀(det ΦᵀΦ / Nᵖ) {determinant}", index]
     note = ""
     if together:
-        parts = ["together with earlier archives, weighted"]
+        parts = ["including earlier archives, weighted"]
         note = (
-            f"log₁₀ det {determinant} and {index} of all of it together: "
-            "not comparable with those of a motion alone"
+            f"log₁₀ det {determinant} and {index} including earlier archives: "
+            "not comparable with those of a single motion"
         )
     legend = (
-        "red dashes: limits; grey lines: the postures numbered below; blue: all that "
-        f"{'the arm' if shapes else _BARS} sweeps; brown: the path of its end to the next one"
+        "red dashes: limits; grey lines: postures numbered below; blue: volume swept by "
+        f"{'the arm' if shapes else _BARS}; brown: path of the end effector to the next posture"
     )
     missing = f"NOT CHECKED: {', '.join(unchecked)}; not for a robot" if unchecked else ""
-    early = "" if complete else "search stopped early: it may have missed better motions"
+    early = "" if complete else "search interrupted: better motions may exist"
     small = style.SMALL + 0.5
     lines = [
         (" · ".join([label(title), method, duration, *parts]), style.TITLE, style.INK, _LETTERS),
@@ -216,20 +215,20 @@ def draw_design(
     margins: str = "",
     title: str = "",
 ) -> Figure:
-    """Draw a designed motion, so that a person sees what the robot is going to do.
+    """Draw a designed motion.
 
     Args:
-        excitation: the motion, and how good it is.
-        cell: where it is going to run.
-        front: what the search found beside it.
-        chosen: index of this motion on the front, None where it is not one of its points.
-        knee: (log10 det, I_c) of the point of the front that it grew from, if it did.
+        excitation: the motion with its criteria.
+        cell: the cell to run it on.
+        front: Pareto front of the search.
+        chosen: index of this motion on the front, None if it is not on it.
+        knee: (log10 det, I_c) of the point of the front that it was polished from.
         references: (log10 det, I_c) of other motions to compare with, by name.
-        unchecked: what the search did not look at ("floor", "the arm itself", ...).
-        complete: whether the search came to its end.
-        together: whether all measures, but those of the matrix, add earlier archives, weighted.
-        margins: how close the motion comes to its limits, in words.
-        title: stands above the page; the cell's name if empty.
+        unchecked: what the search did not check ("floor", "the arm itself", ...).
+        complete: whether the search was completed.
+        together: whether the criteria, except the matrix, include earlier archives.
+        margins: text on the distance to the limits.
+        title: title of the page. Default: name of the cell.
     """
     arm, model, trajectory = Arm.from_urdf(cell.urdf), cell.model, excitation.trajectory
     strip = Strip.of(arm, trajectory, cell.workspace, POSTURES)
@@ -279,7 +278,7 @@ def draw_design(
             figure.text(0.07, at, text, fontsize=size, color=colour, fontweight=weight)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
-        # The solver's last digits differ from one time to the next.
+        # The layout solver is not reproducible to the last digit.
         for part in (top, bottom, left, right):
             part.bbox_relative.set_points(np.round(part.bbox_relative.get_points(), 4))
         for axes in figure.axes:
@@ -289,7 +288,7 @@ def draw_design(
 
 def _correlations(axes: Axes, trajectory: Trajectory, model: RobotModel) -> None:
     motion = sampled(trajectory, _PERIOD)
-    unknown = np.zeros_like(motion.position)  # torque plays no part in the excitation
+    unknown = np.zeros_like(motion.position)  # the criteria do not depend on torque
     gram = information(Factor.from_samples(model, motion, unknown))
     b, p = len(model.base.names), model.n_parameters
     draw_correlation(axes, correlation(gram)[:b, :b], model.base.names)

@@ -1,4 +1,4 @@
-"""A motion or a plan on one page: every joint against its limits."""
+"""Picture of a motion or plan: each joint with its limits."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 FORMATS = (".png", ".svg", ".pdf")
 _SAMPLES = 4000
 _LINES = {"flown": "-", "reduced": "--", "stopped": ":"}
-_LETTERS = 12  # As many as a line along a row's height takes
+_LETTERS = 12  # Characters that fit the height of a row
 # inch
 _WIDTH, _ROW, _TOP, _BOTTOM = 11.0, 1.25, 0.95, 0.55
 _DOTS_PER_INCH = 110
@@ -41,10 +41,9 @@ def draw_motion(
     frame: AngleFrame,
     postures: Sequence[float] | Array = (),
 ) -> None:
-    """Draw one row per joint: position, velocity and, in a third column, acceleration.
+    """Draw one row per joint: position, velocity and, in a third column if any, acceleration.
 
-    Each row has two or three axes. Limits are URDF angles, shown in the angles of the frame; the
-    times of `postures` (k,) [s] are numbered.
+    Limits are URDF angles, displayed in the frame; the times of `postures` (k,) [s] are numbered.
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
@@ -77,10 +76,7 @@ def draw_motion(
 
 
 def broken(name: str) -> str:
-    """A joint's name in at most two lines, none longer than a row of the page is high.
-
-    What does not fit is left out of the middle: beginnings and ends tell joints apart.
-    """
+    """Break a joint's name into at most two lines; abbreviate in the middle."""
     name = "".join(c if c.isprintable() else " " for c in name).strip()
     ends = [match.end() for match in re.finditer(r"[_\W]+", name)]
     fitting = [end for end in ends if end <= _LETTERS and end < len(name)]
@@ -92,10 +88,7 @@ def broken(name: str) -> str:
 
 
 def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
-    """Show both limits and all values, with some room about them.
-
-    Zero, or the middle where it lies outside, has a tick too, if that lies apart from both limits.
-    """
+    """Draw limits, set the range of the axis, and ticks at limits and zero (or the middle)."""
     for bound in (low, high):
         axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
     least, most = min(low, float(values.min())), max(high, float(values.max()))
@@ -116,7 +109,7 @@ def _number(axes: Axes, number: int, at: float, **words: Any) -> None:
 
 
 def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
-    """From when to when each target but the last is rounded [s]; both alike for a stop."""
+    """Return start and end of the corner at each target but the last [s]; equal for a stop."""
     times = []
     end = 0.0
     entered = 0.0
@@ -131,12 +124,12 @@ def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
 def draw_plan(
     plan: MotionPlan, joint_names: Sequence[str], frame: AngleFrame, *, title: str = ""
 ) -> Figure:
-    """Draw a plan in angles of a frame: a row of three axes per joint, its targets and corners."""
+    """Draw a plan in angles of a frame, with targets and corners, one row per joint."""
     n = len(joint_names)
     height = _TOP + n * _ROW + _BOTTOM
     targets = np.array([frame.shown(move.target) for move in plan.moves])
     times = [target.time for target in plan.targets]
-    # No number lies upon another.
+    # Omit numbers that would overlap.
     apart = 0.03 * plan.trajectory.duration
     shown = [True, *(b - a >= apart for a, b in pairwise(times))]
     with style.page():
@@ -169,8 +162,8 @@ def draw_plan(
         passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
         headline = " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))
         legend = (
-            "red dashes: limits; shaded: corners; line at each numbered target: solid flown by as "
-            "asked, dashed less than asked, dotted stop; circles: targets"
+            "red dashes: limits; shaded: corners; line at each numbered target: solid fly-by as "
+            "requested, dashed reduced, dotted stop; circles: targets"
         )
         for text, at, size, colour in (
             (headline, 0.3, style.TITLE, style.INK),
@@ -180,20 +173,20 @@ def draw_plan(
     return figure
 
 
-def check_format(path: Path) -> None:
-    """Refuse a name that tells no format in which pictures are written.
+def check_format(path: Path, *others: str) -> None:
+    """Check that the suffix of a path is that of a picture, or one of `others`.
 
     Raises:
-        InputError: it does not.
+        InputError: it is not.
     """
-    if path.suffix.lower() not in FORMATS:
-        raise InputError(
-            path, f"{path.suffix!r} is no format for pictures", remedy=f"use {', '.join(FORMATS)}"
-        )
+    formats = (*FORMATS, *others)
+    if path.suffix.lower() not in formats:
+        problem = f"{path.suffix!r} is not a picture format"
+        raise InputError(path, problem, remedy=f"use {', '.join(formats)}")
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture in the format of its name, the whole of it or nothing.
+    """Write a picture atomically, in the format of its suffix.
 
     Raises:
         InputError: the format is unknown, or the file cannot be written.

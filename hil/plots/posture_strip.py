@@ -1,4 +1,4 @@
-"""What the robot is going to do: the room that it sweeps, and its postures one after the other."""
+"""Views of the swept volume and of postures of a motion."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class View(NamedTuple):
-    """An orthographic view: indices of the base axes to the right and upwards on the paper."""
+    """An orthographic view: indices of the horizontal and vertical base axes."""
 
     name: str
     across: int
@@ -32,7 +32,7 @@ class View(NamedTuple):
 
     @property
     def axes(self) -> tuple[int, int]:
-        """Both indices."""
+        """Indices of both axes."""
         return self.across, self.up
 
 
@@ -43,22 +43,21 @@ _BASE, _ARM, _ARM_EDGE = "#8a8a8a", "#4b5763", "#ffffff"
 _PATH = style.ACCELERATION
 _SOLID, _HATCH = "#ede7d9", "#a09270"
 _DIRECTIONS: Final = 48
-"""Corners of an outline; a circle's is seen too small by 0.2 % of its radius at most."""
+"""Corners of an outline; the error for a circle is at most 0.2 % of its radius."""
 _STEP, _LONGEST = 0.03, 1500
-"""s between two looks at the arm for what it sweeps, and how many at most."""
+"""Sampling period of the swept volume, s, and largest number of samples."""
 _ROOM: Final = 0.06
-_NEAR: Final = 0.2  # Obstacles that are nearer than this share of the swept room's size are shown
-_SHORT: Final = 0.08  # Paths shorter than this share of the view get no arrow head
-_GRID: Final = 500  # Points of the grid across a view, as many as a printer's dots
+_NEAR: Final = 0.2  # Obstacles within this fraction of the swept volume's size are drawn
+_SHORT: Final = 0.08  # Paths shorter than this fraction of the view have no arrow head
+_GRID: Final = 500  # Grid points across a view
 _HIGHEST, _FLATTEST = 1.3, 0.5
 _HEAD: Final = {"arrowstyle": "-|>,head_width=0.22,head_length=0.4", "color": _PATH}
 
 
 def outlines(points: Array) -> Array:
-    """The convex outline of each set of points (m, v, 2), anticlockwise: (m, k, 2).
+    """Return the convex outline of each set of points (m, v, 2), anticlockwise: (m, k, 2).
 
-    Corners are the points farthest in k directions; where one of them is farthest in several, it
-    is repeated.
+    Corners are the points farthest in k directions, with repetitions.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     farthest = np.argmax(points @ np.stack((np.cos(angle), np.sin(angle))), axis=1)
@@ -66,15 +65,15 @@ def outlines(points: Array) -> Array:
 
 
 def covered(bodies: Sequence[Array], window: Array, columns: int) -> Array:
-    """Points of a grid that bodies sweep from each sample to the next, as 1, others 0.
+    """Rasterise the area that bodies sweep between samples.
 
     Args:
         bodies: points of each at all samples (m, v, 2).
-        window: from where to where the grid reaches, across and up (2, 2).
-        columns: points of the grid across; those up are as far apart.
+        window: lower and upper end of the grid, horizontally and vertically (2, 2).
+        columns: horizontal grid points; the vertical spacing is the same.
 
     Returns:
-        (rows, columns), the lowest row first.
+        1 in the swept area, else 0, (rows, columns), lowest row first.
     """
     low, high = window.T
     pitch = (high[0] - low[0]) / (columns - 1)
@@ -90,21 +89,21 @@ def covered(bodies: Sequence[Array], window: Array, columns: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """Everything that the views of a strip share."""
+    """Data common to the views of a motion."""
 
     postures: Array  #: times of the postures (k,) [s]
     corners: Sequence[Array]  #: of each body at the times of the sweep, (m, v, 3) each [m]
     stand: Sequence[Array]  #: of each body at the postures, (k, v, 3) each [m]
     bones: Array  #: lines from joint to joint at the postures, (k, b, 2, 3) [m]
-    #: when (m,) [s] and where (m, 3) [m] the arm's end is
+    #: time (m,) [s] and position (m, 3) [m] of the end effector
     time: Array
     path: Array
     joints: Sequence[int]  #: the joint that moves each body, -1 for the base
-    workspace: Workspace  #: what stands around
+    workspace: Workspace  #: obstacles
 
     @classmethod
     def of(cls, arm: Arm, trajectory: Trajectory, workspace: Workspace, count: int) -> Strip:
-        """Look at a motion, and at `count` of its postures, equally far apart in time."""
+        """Sample a motion, and `count` of its postures at equal intervals."""
         postures = posture_times(trajectory, count)
         steps = int(np.clip(np.ceil(trajectory.duration / _STEP), 1, _LONGEST))
         time = np.linspace(0.0, trajectory.duration, steps + 1)
@@ -115,9 +114,9 @@ class Strip:
 
     @cached_property
     def extents(self) -> Array:
-        """From where to where each base axis is shown, floor and near obstacles included (3, 2).
+        """Displayed range of each base axis with floor and near obstacles (3, 2) [m].
 
-        [m] What is across is the same in both views; neither gets much higher or flatter than wide.
+        The aspect ratio of the views is bounded.
         """
         low, high = reach(self.corners)
         if self.workspace.floor is not None:
@@ -135,20 +134,20 @@ class Strip:
         return np.stack(((low + high - size) / 2.0, (low + high + size) / 2.0), axis=1)
 
     def shape(self, view: View) -> float:
-        """Height over width of a view."""
+        """Return height over width of a view."""
         size = np.ptp(self.extents, axis=1)
         return float(size[view.up] / size[view.across])
 
 
 def posture_times(trajectory: Trajectory, count: int) -> Array:
-    """`count` times [s] equally far apart, the end left out where it is the beginning."""
+    """Return `count` equidistant times [s], without the end of a closed motion."""
     ends, _, _ = trajectory.sample(np.array([0.0, trajectory.duration]))
     closed = bool(np.allclose(ends[0], ends[1], atol=1e-9))
     return np.linspace(0.0, trajectory.duration, count, endpoint=not closed)
 
 
 def draw_strip(rows: Sequence[Sequence[Axes]], strip: Strip) -> None:
-    """Draw one row of axes per view, one of its axes per posture."""
+    """Draw one row of axes per view, with one axes per posture."""
     for row, view in zip(rows, VIEWS, strict=True):
         window = strip.extents[list(view.axes)]
         sweep = covered([corners[..., view.axes] for corners in strip.corners], window, _GRID)
@@ -176,11 +175,11 @@ def draw_strip(rows: Sequence[Sequence[Axes]], strip: Strip) -> None:
 
 
 def _arm(axes: Axes, strip: Strip, k: int, view: View) -> None:
-    """One posture, the body nearest to the eye last, and where its end goes to the next one."""
-    # Between bodies there may be gaps.
+    """Draw one posture, nearest body last, and the end effector path to the next posture."""
+    # Bars close gaps between bodies.
     bones = list(strip.bones[k][..., view.axes])
     axes.add_collection(LineCollection(bones, colors=_ARM, linewidths=1.2, zorder=1.9))
-    # One looks from above, and from where y is smallest.
+    # Views are from above, and along positive y.
     depth, towards = (2, 1.0) if view is TOP else (1, -1.0)
     order = np.argsort([towards * body[k, :, depth].mean() for body in strip.stand], kind="stable")
     shapes = [outlines(strip.stand[b][k : k + 1, :, view.axes])[0] for b in order]
@@ -190,7 +189,7 @@ def _arm(axes: Axes, strip: Strip, k: int, view: View) -> None:
     end = strip.postures[k + 1] if k + 1 < len(strip.postures) else strip.time[-1]
     shown = (strip.time >= strip.postures[k]) & (strip.time <= end)
     way = strip.path[shown][:, view.axes]
-    if not len(way):  # a motion shorter than the steps between which it is looked at
+    if not len(way):  # a motion shorter than the sampling period
         return
     axes.plot(*way.T, color=_PATH, linewidth=1.3, zorder=3.0)
     axes.plot(*way[0], marker="o", markersize=3.2, color=_PATH, zorder=3.0)
@@ -199,7 +198,7 @@ def _arm(axes: Axes, strip: Strip, k: int, view: View) -> None:
 
 
 def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
-    """Obstacles below what the arm sweeps, and their outlines above it: both are seen."""
+    """Draw obstacles below the swept area, and their outlines above it."""
     boxes = [
         [[corner[k] for k in view.axes] for corner in (box.lower, box.upper)]
         for box in workspace.boxes
@@ -219,6 +218,6 @@ def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
     for wall in workspace.walls:
         normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
         across, up = normal[list(view.axes)]
-        if np.hypot(across, up) > 1.0 - 1e-9:  # others are not seen from their edge
+        if np.hypot(across, up) > 1.0 - 1e-9:  # planes parallel to the line of sight
             foot = (across * wall.offset, up * wall.offset)
             axes.axline(foot, (foot[0] - up, foot[1] + across), color=style.INK, zorder=1.6)

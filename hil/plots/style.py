@@ -1,4 +1,4 @@
-"""How pictures look: light paper, colours that differ in print and for the colour-blind."""
+"""Style of pictures; colours are distinguishable in print and for colour-blind readers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SMALL, TEXT, TITLE = 7.5, 9.0, 12.0
 
 @contextmanager
 def page() -> Iterator[None]:
-    """Draw inside this: one figure at a time, the same whatever the caller's settings are."""
+    """Draw with fixed settings, one thread at a time."""
     with drawing():
         mpl.rcParams.update(
             {
@@ -38,7 +38,7 @@ def page() -> Iterator[None]:
 
 
 def bare(axes: Axes) -> None:
-    """Leave away what does not carry information."""
+    """Remove the upper and right spine, and draw a light grid."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
     axes.grid(True, color=RULE, linewidth=0.5)

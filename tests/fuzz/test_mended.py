@@ -73,12 +73,12 @@ def test_a_position_too_large_for_degrees_is_missing_in_the_picture(tmp_path: Pa
 @pytest.mark.parametrize(
     ("name", "content", "problem"),
     [
-        ("cell_toml", b"[cell", "is no TOML"),
-        ("cell_toml", b"a = " + b"[" * 9999, "is no TOML"),
-        ("cell_toml", b"cell = 1", "'cell' is no table"),
+        ("cell_toml", b"[cell", "is not TOML"),
+        ("cell_toml", b"a = " + b"[" * 9999, "is not TOML"),
+        ("cell_toml", b"cell = 1", "'cell' is not a table"),
         ("cell_toml", b"\xff", "is no text"),
-        ("init_packet_bin", bytes(1200), "is no init packet"),
-        ("init_packet_bin", b"short", "is no init packet"),
+        ("init_packet_bin", bytes(1200), "is not an init packet"),
+        ("init_packet_bin", b"short", "is not an init packet"),
     ],
 )
 def test_a_cell_is_not_begun_from_what_an_archive_cannot_say(

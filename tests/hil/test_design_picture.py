@@ -230,7 +230,7 @@ class TestCorrelations:
         still = plan(np.array([ns16.home, ns16.home + 0.4 * np.eye(6)[0]]), ns16.joint_limits)
         figure = draw_design(excitation(ns16, still), ns16)
         said = " ".join(texts(figure))
-        assert "leaves a parameter" in said
+        assert "does not excite a parameter" in said
         assert "I_c ∞" in said
         assert "nan" not in said
 
@@ -292,10 +292,10 @@ class TestFront:
         front = front_of([100.0, 105.0], [70.0, 95.0])
         figure, axes = self.page(two_link, front, chosen=0, together=True)
         head = figure.texts[0].get_text()
-        assert "together with earlier archives, weighted" in head
+        assert "including earlier archives, weighted" in head
         assert "I_c" not in head
         assert "not comparable" in figure.texts[1].get_text()
-        assert "together with earlier archives, weighted" in axes.get_xlabel()
+        assert "including earlier archives, weighted" in axes.get_xlabel()
         assert "together" in axes.get_ylabel()
         assert "from this motion alone" in " ".join(texts(figure))
 
@@ -329,7 +329,7 @@ class TestPage:
         red = [text.get_text() for text in page.texts if text.get_color() == style.LIMIT]
         assert red == [
             "NOT CHECKED: floor, walls, the arm itself; not for a robot",
-            "search stopped early: it may have missed better motions",
+            "search interrupted: better motions may exist",
         ]
         margins = "current at most 71 % (motor of joint_2)"
         calm = draw_design(designed, two_link, margins=margins)

@@ -85,7 +85,7 @@ def test_a_file_may_leave_out_what_its_method_says_already():
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('metod = "b"', ["metod", "is not a field", "known are", "method"]),
+        ('metod = "b"', ["metod", "is not a field", "valid fields", "method"]),
         ('method = "c"', ["method = 'c'", "a, b, balanced, front"]),
         ("[search]\npopulation = 2", ["search.population = 2", "4 to 10000"]),
         ('[search]\npopulation = "24"', ["search.population = '24'", "4 to 10000"]),
@@ -94,7 +94,7 @@ def test_a_file_may_leave_out_what_its_method_says_already():
         ("[search]\nmutation = 1.5", ["search.mutation = 1.5", "0 to 1"]),
         ("[search]\nweights = [0.7, 0.7]", ["search", "1.4", "add up to 1"]),
         ("[search]\nweights = [1.0]", ["search.weights", "log det"]),
-        ("[via_points]\nn = 6", ["via_points.n", "known are", "n_via"]),
+        ("[via_points]\nn = 6", ["via_points.n", "valid fields", "n_via"]),
         ("[via_points]\nslowest = 0.0", ["via_points.slowest = 0.0", "above 0, at most 1"]),
         ("[via_points]\n[sines]", ["both", "[via_points]", "[sines]", "give one"]),
         ("[sines]\nramp = 0.04", ["sines", "a ramp of 0.04 s is a blow", "0.05 s or longer"]),

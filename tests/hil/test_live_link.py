@@ -31,7 +31,7 @@ from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.cell.cell import stays_here
+from hil.cell.cell import is_local
 from hil.cli.record import record
 from hil.demo_link import free_port, loopback_link
 from hil.errors import ArchiveWriteError, ControllerFault
@@ -344,7 +344,7 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
     ],
 )  # fmt: skip
 def test_a_link_is_judged_by_the_transport_that_is_opened(spec: TransportSpec, here: bool) -> None:
-    assert stays_here(spec) is here
+    assert is_local(spec) is here
 
 
 def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:

@@ -165,7 +165,7 @@ def test_a_real_controller_is_not_driven_unless_a_person_confirms(
 ) -> None:
     """Its link is told that the far end might be one; the far end is still simulated."""
     with UdpController.started(ns16, tmp_path) as controller:
-        monkeypatch.setattr("hil.campaign.live_link.stays_here", lambda _: False)
+        monkeypatch.setattr("hil.campaign.live_link.is_local", lambda _: False)
         arguments = ["move", str(controller.cell_path), "--to", "home", "-o", str(tmp_path / "m")]
         result = CliRunner().invoke(app, arguments)
         assert isinstance(result.exception, UnsafeError)

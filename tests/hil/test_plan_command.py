@@ -143,7 +143,7 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         ([], "--via or --random: one of them is needed"),
         (["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
         (["--via", "missing.csv"], "cannot be read"),
-        (["--via", "VIA", "--picture", "plan.bmp"], "no format"),
+        (["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
         (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
         (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
         (["--via", "VIA", "--output", "plan.yaml"], "not a plan file"),

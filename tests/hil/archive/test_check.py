@@ -204,7 +204,7 @@ class TestCheck:
     def test_an_archive_that_keeps_the_profile(self, written):
         done = run("check", written.path)
         assert done.exit_code == 0
-        assert "keeps profile 1, 43 samples" in done.stdout
+        assert "conforms to profile 1, 43 samples" in done.stdout
 
     def test_one_that_does_not_names_the_repair(self, torn, written, text_file):
         done = run("check", torn)
