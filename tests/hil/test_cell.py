@@ -152,9 +152,9 @@ FAULTS = [
     ("$", SPRING.replace("kind", "sort"), "robot.elements[0].kind: is missing", "torsion_spring"),
     ("$", SPRING.replace("joint_2", "joint_9"), "robot.elements[0].joint", "joint_6"),
     ("$", SPRING.replace("rest_deg = 5.0", ""), "robot.elements[0].rest_deg", "in degrees"),
-    ("$", SPRING + "free_length = 1.0", "robot.elements[0].free_length", "valid fields", "rest_deg"),
+    ("$", SPRING + "free_length = 1.0", "elements[0].free_length", "valid fields", "rest_deg"),
     ("$", SPRING.replace("true", "false"), "robot.elements[0]", "neither a stiffness nor"),
-    ("$", SPRING + SPRING, "robot.elements", "spring_2b", "same form", "give its figures"),
+    ("$", SPRING + SPRING, "robot.elements", "spring_2b", "distinguished", "state its values"),
     ("$", BALANCER.replace("volume = 1e-3", "volume = 1e-4"), "robot.elements[0]", "the gas has",
      "m³"),
 ]  # fmt: skip
