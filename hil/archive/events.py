@@ -1,7 +1,4 @@
-"""Events of an archive: what happened, when, in words and in data.
-
-Each is a message rcl_interfaces/Log; these differ in length and are encoded one by one.
-"""
+"""Events of an archive: messages rcl_interfaces/Log, encoded one by one."""
 
 from __future__ import annotations
 
@@ -34,14 +31,14 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class ArchivedEvent:
-    """Something that happened during the recorded interval.
+    """An event of the recorded interval.
 
     Attributes:
         time: seconds since the controller's initialisation.
         name: kind of event, such as ``MotionEnded``.
-        text: one line for a person.
+        text: one line.
         level: severity.
-        data: the same for a program: numbers, strings, lists and mappings.
+        data: machine-readable content: numbers, strings, lists and mappings.
     """
 
     time: float
@@ -52,14 +49,14 @@ class ArchivedEvent:
 
     @property
     def stamp(self) -> int:
-        """The time in nanoseconds, zero where it is none."""
+        """The time in ns, zero if it is not finite or negative."""
         return max(0, round(self.time * 1e9)) if math.isfinite(self.time) else 0
 
     def encode(self, stamp: int | None = None) -> bytes:
-        """The CDR bytes: the line of text and, if there are data, one of JSON.
+        """Return the CDR bytes: the line of text and, if there are data, one of JSON.
 
         Args:
-            stamp: another one than its own [ns].
+            stamp: replaces `self.stamp`, ns.
         """
         lines = [" ".join(self.text.split())]
         if self.data:
@@ -69,14 +66,14 @@ class ArchivedEvent:
         for text in (self.name, "\n".join(lines), "", ""):  # file and function stay empty
             encoded = text.encode() + b"\0"
             message += bytes(-len(message) % 4) + struct.pack("<I", len(encoded)) + encoded
-        return bytes(message + bytes(-len(message) % 4 + 4))  # and no line of a file
+        return bytes(message + bytes(-len(message) % 4 + 4))  # the line number stays 0
 
     @classmethod
     def decode(cls, message: bytes) -> Self:
-        """Read the CDR bytes; a second line that is no JSON object stays text.
+        """Decode CDR bytes; a second line that is not a JSON object is part of the text.
 
         Raises:
-            LayoutError: they are no log message.
+            LayoutError: they are not a log message.
         """
         if message[: len(ENCAPSULATION)] != ENCAPSULATION:
             raise LayoutError("the message is not little-endian CDR")
@@ -105,7 +102,7 @@ class ArchivedEvent:
 
 
 def _document(value: Any) -> Any:
-    """Reduce to what JSON knows. A number that is not finite becomes null."""
+    """Convert to JSON types; numbers that are not finite become null."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):

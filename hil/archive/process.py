@@ -1,11 +1,11 @@
-"""The archive process of a real link: drains the exchange's shared memory into files.
+"""The archive process of a real link: writes the exchange's shared memory to files.
 
 Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block,
 command socket and exchange process, the number of joints, and the descriptor of the raw packets
-where they are stored. It is in a process session of its own and ignores SIGINT and SIGHUP: what is
-being recorded is completed whatever happens to the terminal. If the supervisor dies, it goes on
-until the exchange has ended the motion or is dead, closes the archive with the true outcome, and
-ends. If it cannot write, it says so in the control block, and the exchange brings the arm to rest.
+if they are stored. It has its own process session and ignores SIGINT and SIGHUP, so that the end
+of a terminal does not end a recording. If the supervisor dies, it continues until the exchange has
+ended the motion or is dead, closes the archive with the true outcome, and ends. If it cannot write,
+it sets the archive's state in the control block to failed, and the exchange stops the arm.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from socket import SOCK_SEQPACKET, socket
 from types import FrameType
 from typing import Final
@@ -45,37 +45,37 @@ from hil.errors import ArchiveError, InputError
 
 Records = NDArray[np.void]
 
-RECENT: Final = 5000
-"""Cycles held back for what came before an event."""
-_PACKETS_PER_CYCLE = 2
+BUFFERED_CYCLES: Final = 5000
+"""Cycles buffered while no archive is open."""
+_PACKETS_PER_CYCLE: Final = 2
 
 
-@dataclass
-class Recent:
-    """The newest records, events and raw packets; the oldest go as others come."""
+class PreTriggerBuffer:
+    """The newest records, events and raw packets that came while no archive was open."""
 
-    _records: list[Records] = field(default_factory=list)
-    _packets: list[Records] = field(default_factory=list)
-    _events: list[ExchangeEvent] = field(default_factory=list)
+    def __init__(self) -> None:
+        self._records: list[Records] = []
+        self._packets: list[Records] = []
+        self._events: list[ExchangeEvent] = []
 
-    def keep(
+    def add(
         self, records: Records, events: Sequence[ExchangeEvent], packets: Records | None = None
     ) -> None:
-        """Take in what has come; `packets` None where they are not recorded."""
-        self._events = [*self._events, *events][-RECENT:]
+        """Append what has come; `packets` is None if they are not recorded."""
+        self._events = [*self._events, *events][-BUFFERED_CYCLES:]
         for parts, rows, count in (
-            (self._records, records, RECENT),
-            (self._packets, packets, _PACKETS_PER_CYCLE * RECENT),
+            (self._records, records, BUFFERED_CYCLES),
+            (self._packets, packets, _PACKETS_PER_CYCLE * BUFFERED_CYCLES),
         ):
             if rows is not None and len(rows):
                 parts.append(rows)
-            while sum(map(len, parts[1:])) >= count:  # a part goes that has none of the newest
+            while sum(map(len, parts[1:])) >= count:
                 parts.pop(0)
 
-    def take_session(self) -> tuple[Records, list[ExchangeEvent], Records]:
-        """Records, events and raw packets of the session that began last; they are removed here.
+    def pop_session(self) -> tuple[Records, list[ExchangeEvent], Records]:
+        """Remove and return records, events and raw packets of the latest session.
 
-        Its init packet is not among the events: it is not news any more.
+        Its init packet is not among the events.
         """
         events = self._events
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
@@ -90,49 +90,49 @@ class Recent:
 
 
 def _after_restart(parts: list[Records], dtype: np.dtype[np.void], *, least: int) -> Records:
-    """The rows since the cycles last began anew: since they grew by less than `least`."""
-    rows = np.concatenate(parts) if parts else np.zeros(0, dtype)
+    """Return the rows since the cycle number last increased by less than `least`."""
     if not parts:
-        return rows
+        return np.zeros(0, dtype)
+    rows = np.concatenate(parts)
     restarts = np.flatnonzero(np.diff(rows["cycle"]) < least)
     return rows[int(restarts[-1]) + 1 :] if restarts.size else rows
 
 
-DRAIN_PERIOD = 0.02
-"""s between two looks at the ring."""
-BEHIND, LONGEST_BEHIND = 0.005, 0.2
-"""s by which raw packets come later than the record made of them: as a rule, and at most."""
-PUNCTUAL = 0.0005
-"""s after the last cycle of a chunk is due, when it is looked for."""
-BEAT_PERIOD = 0.05
-"""s between two heartbeats."""
-STALL_LIMIT = 5.0
-"""s that a disk may keep us waiting before the heartbeat ends; the ring holds more."""
-SILENCE = 0.2
-"""s without a record after which an unfinished chunk is written out."""
-AFTERMATH_TIMEOUT = 2.0
-"""s after the end of a motion, by which its archive is completed on a link that is silent."""
-EXCHANGE_QUIET = 1.0
-"""s without a heartbeat of the exchange process after which the archive says so."""
-ORPHAN_QUIET = 60.0
-"""s after which one that lives, but gives no sign of it, is not waited for by us alone."""
+POLL_PERIOD: Final = 0.02
+"""Time between two readings of the ring, s."""
+PACKET_DELAY: Final = 0.005
+MAX_PACKET_DELAY: Final = 0.2
+"""Usual and longest delay of raw packets behind their record, s."""
+CHUNK_DELAY: Final = 0.0005
+"""Time after the last cycle of a chunk is due at which it is read, s."""
+HEARTBEAT_PERIOD: Final = 0.05
+"""s."""
+STALL_LIMIT: Final = 5.0
+"""Time for which a disk may block before the heartbeat stops, s; the ring stores more."""
+FLUSH_DELAY: Final = 0.2
+"""Time without a record after which an unfinished chunk is written, s."""
+AFTERMATH_TIMEOUT: Final = 2.0
+"""Time after the end of a motion until its archive is closed on a silent link, s."""
+EXCHANGE_SILENCE: Final = 1.0
+"""Time without a heartbeat of the exchange that is recorded in the archive, s."""
+DETACHED_SILENCE: Final = 60.0
+"""The same without a supervisor after which the archive is closed, s."""
 
 
 @dataclass
 class Job:
-    """The archive that is open.
+    """The open archive.
 
     Attributes:
-        number: by which the supervisor knows it.
+        number: identifies it to the supervisor.
         recorder: fills it.
-        until_ended: whether it is closed when the motion ends.
-        overflow: of the ring's reader when it began.
-        packets_overflow: likewise of the raw packets' reader.
-        accepted, ended_count: fields of the control block when it began.
-        heard: when the last record came, monotonic s.
-        flushed: whether everything taken so far was written out.
-        ended: when the motion's end was seen, monotonic s.
-        quiet: whether it was said that the exchange gives no sign of life.
+        until_ended: whether it is closed at the end of the motion.
+        overflow, packets_overflow: of the readers at its begin.
+        accepted, ended_count: fields of the control block at its begin.
+        last_record: time of the last record, monotonic s.
+        flushed: whether all records were written to the disk.
+        ended: time at which the end of the motion was read, monotonic s.
+        exchange_silent: whether silence of the exchange was recorded.
     """
 
     number: int
@@ -142,20 +142,20 @@ class Job:
     packets_overflow: int
     accepted: int
     ended_count: int
-    heard: float
+    last_record: float
     flushed: bool = True
     ended: float | None = None
-    quiet: bool = False
+    exchange_silent: bool = False
 
 
 class ArchiveProcess:
-    """Drains, writes, and answers the supervisor.
+    """Transfers records, events and packets to archives as commanded by the supervisor.
 
     Args:
-        ring, events, control: the exchange's memory.
-        commands: to the supervisor.
-        exchange: descriptor of the exchange process (a pidfd), which tells its death.
-        packets: the raw packets' memory, None where they are not recorded.
+        ring, events, control: memory of the exchange.
+        commands: channel to the supervisor.
+        exchange: descriptor of the exchange process (a pidfd), readable after its death.
+        packets: memory of the raw packets, None if they are not recorded.
     """
 
     def __init__(
@@ -176,36 +176,36 @@ class ArchiveProcess:
         self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
         self._packets = packets
         self._live: LivePublisher | None = None
-        self._recent = Recent()
+        self._buffer = PreTriggerBuffer()
 
     def run(self) -> None:
-        """Work until asked to end, or left alone with nothing to do."""
-        threading.Thread(target=self._beat, daemon=True).start()
+        """Work until the end is commanded, or supervisor and exchange have ended."""
+        threading.Thread(target=self._send_heartbeats, daemon=True).start()
         while not (self._leaving and self._job is None):
             self._progress = time.monotonic()
-            self._obey()
-            self._take()
-            if self._commands is None and self._job is None and self._exchange_gone():
+            self._run_command()
+            self._transfer()
+            if self._commands is None and self._job is None and self._exchange_ended():
                 return
-            self._look_after_exchange()
+            self._watch_exchange()
 
-    def end_view(self) -> None:
-        """Nobody can look any more."""
+    def close_view(self) -> None:
+        """End the live view."""
         if self._live is not None:
             self._live.close()
 
     def leave(self, _signum: int, _frame: FrameType | None) -> None:
-        """SIGTERM: complete the archive that is open, then end."""
+        """Handle SIGTERM: complete the open archive, then end."""
         self._leaving = True
 
-    def _beat(self) -> None:
+    def _send_heartbeats(self) -> None:
         while True:
             if time.monotonic() - self._progress < STALL_LIMIT:
                 self._control.archive_heartbeat = time.monotonic()
-            time.sleep(BEAT_PERIOD)
+            time.sleep(HEARTBEAT_PERIOD)
 
-    def _obey(self) -> None:
-        """Wait for a command until the ring is to be looked at again, and carry it out."""
+    def _run_command(self) -> None:
+        """Wait for a command until the ring is to be read again, and run it."""
         if self._commands is None:
             time.sleep(self._pause())
             return
@@ -221,7 +221,7 @@ class ArchiveProcess:
             self._open(command)
         elif isinstance(command, Close):
             if self._job is not None and self._job.number == command.job:
-                self._take()
+                self._transfer()
                 self._close(command.outcome, command.reason)
         elif isinstance(command, Serve):
             self._serve(command)
@@ -231,25 +231,25 @@ class ArchiveProcess:
                 self._close("stopped", "the recording was ended")
 
     def _pause(self) -> float:
-        """Until the next look at the ring [s]: a chunk is written out as soon as it is full."""
+        """Time until the ring is read again, s: a chunk is written as soon as it is full."""
         if self._job is None or self._job.flushed:
-            return DRAIN_PERIOD
-        return min(DRAIN_PERIOD, self._job.recorder.writer.chunk_ends_in + PUNCTUAL)
+            return POLL_PERIOD
+        return min(POLL_PERIOD, self._job.recorder.writer.chunk_ends_in + CHUNK_DELAY)
 
     def _serve(self, command: Serve) -> None:
         try:
             self._live = LivePublisher(command)
         except InputError as error:
-            self._answer(Failed(command.job, "", error.problem, error.remedy))
+            self._reply(Failed(command.job, "", error.problem, error.remedy))
         else:
-            self._answer(Serving(command.job, self._live.port))
+            self._reply(Serving(command.job, self._live.port))
 
     def _open(self, command: Open) -> None:
         if self._job is not None:
-            self._take()
-            self._close("interrupted", "another archive was begun")
-        self._idle()
-        records, events, packets = self._recent.take_session()
+            self._transfer()
+            self._close("interrupted", "another archive was opened")
+        self._fill_buffer()
+        records, events, packets = self._buffer.pop_session()
         overflow, control = self._ring.overflow, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
@@ -268,91 +268,95 @@ class ArchiveProcess:
             0 if self._packets is None else self._packets.overflow,
             accepted,
             ended_count,
-            heard=time.monotonic(),
+            last_record=time.monotonic(),
         )
         if self._live is not None:
             self._live.drive_train = command.drive_train
         control.archive_state = ArchiveState.READY
-        self._answer(Opened(command.job))
+        self._reply(Opened(command.job))
 
-    def _take(self) -> None:
-        """Move what has come into the archive, and close it if the interval is over."""
+    def _transfer(self) -> None:
+        """Write what has come to the archive, and close it at the end of the interval."""
         job = self._job
         if job is None:
-            self._idle()
+            self._fill_buffer()
             return
-        # Looked at first, so that what it left behind is taken.
-        gone, ended_count = self._exchange_gone(), self._control.ended_count
+        # Read before the ring, so that nothing the exchange wrote is missed.
+        exchange_ended, ended_count = self._exchange_ended(), self._control.ended_count
         events, records = self._events.drain(), self._ring.drain()
         lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
         if self._live is not None:
             self._live.publish(records, events)
         now = time.monotonic()
         try:
-            self._take_packets(job)
+            self._transfer_packets(job)
             job.recorder.record(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
-                # The motion has ended, and the event that says so was overwritten.
                 job.recorder.motion_ended(self._control.outcome, self._control.ended_interval)
             if len(records):
-                job.heard, job.flushed = now, False
-            elif not job.flushed and now - job.heard > SILENCE:
+                job.last_record, job.flushed = now, False
+            elif not job.flushed and now - job.last_record > FLUSH_DELAY:
                 job.recorder.writer.flush()
                 job.flushed = True
-        except Exception as error:  # whatever it is, the arm must not move unrecorded
+        except Exception as error:  # any of them: the arm must not move unrecorded
             self._fail(job.number, error)
             return
-        self._complete(job, now, gone=gone)
+        self._close_if_ended(job, now, exchange_ended=exchange_ended)
 
-    def _take_packets(self, job: Job) -> None:
-        """Move the raw packets that have come into the archive, and count those overwritten."""
+    def _transfer_packets(self, job: Job) -> None:
+        """Write the raw packets that have come, and count those overwritten."""
         if self._packets is None:
             return
         packets, before = self._packets.drain(), job.packets_overflow
         job.packets_overflow = self._packets.overflow
         job.recorder.record_packets(packets, job.packets_overflow - before)
 
-    def _complete(self, job: Job, now: float, *, gone: bool) -> None:
-        """Close the archive if the interval is over."""
+    def _close_if_ended(self, job: Job, now: float, *, exchange_ended: bool) -> None:
+        """Close the archive at the end of the interval."""
         ended = job.recorder.ended
         if ended is not None and job.ended is None:
             job.ended = now
-        waited = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
-        if job.until_ended and ended is not None and (job.recorder.complete or waited or gone):
+        expired = job.ended is not None and now - job.ended > AFTERMATH_TIMEOUT
+        if (
+            job.until_ended
+            and ended is not None
+            and (job.recorder.complete or expired or exchange_ended)
+        ):
             self._close(ended.outcome, ended.reason)
-        elif gone and job.until_ended:
-            who = "exchange process" if self._commands is not None else "supervising program"
+        elif exchange_ended and job.until_ended:
+            process = "exchange process" if self._commands is not None else "supervising program"
             if self._control.program_accepted == job.accepted:
-                self._close("void", f"nothing was sent: the {who} ended")
+                self._close("void", f"nothing was sent: the {process} ended")
             else:
                 self._close("lost", "the exchange process ended")
-        elif gone and self._commands is None:
+        elif exchange_ended and self._commands is None:
             self._close("stopped", "the supervising program ended")
 
-    def _look_after_exchange(self) -> None:
-        """Note in the archive that the exchange stands still, and that it goes on again."""
-        quiet, job = self._monitor.silence(), self._job
+    def _watch_exchange(self) -> None:
+        """Record in the archive that the exchange sends no heartbeats, or sends them again."""
+        silence, job = self._monitor.silence(), self._job
         if job is None:
             return
-        if (quiet > EXCHANGE_QUIET) is not job.quiet:
-            job.quiet = not job.quiet
-            name = "ExchangeSilent" if job.quiet else "ExchangeBack"
-            text = "no sign of life from the exchange process" if job.quiet else "it goes on again"
+        if (silence > EXCHANGE_SILENCE) is not job.exchange_silent:
+            job.exchange_silent = not job.exchange_silent
             try:
-                job.recorder.warn(name, text)
+                if job.exchange_silent:
+                    job.recorder.warn("ExchangeSilent", "no heartbeat from the exchange process")
+                else:
+                    job.recorder.warn("ExchangeBack", "heartbeats from the exchange process again")
             except Exception as error:
                 self._fail(job.number, error)
                 return
-        if quiet > ORPHAN_QUIET and self._commands is None:
-            self._close("lost", f"no sign of life from the exchange process for {quiet:.0f} s")
+        if silence > DETACHED_SILENCE and self._commands is None:
+            self._close("lost", f"no heartbeat from the exchange process for {silence:.0f} s")
 
-    def _idle(self) -> None:
-        """Keep the newest of what comes while no archive is open."""
+    def _fill_buffer(self) -> None:
+        """Buffer what has come while no archive is open."""
         records, events = self._ring.drain(), self._events.drain()
         if self._live is not None:
             self._live.publish(records, events)
         packets = None if self._packets is None else self._packets.drain()
-        self._recent.keep(records, events, packets)
+        self._buffer.add(records, events, packets)
 
     def _close(self, outcome: str, reason: str) -> None:
         job, self._job = self._job, None
@@ -361,16 +365,16 @@ class ArchiveProcess:
         self._control.archive_state = ArchiveState.NONE
         recorder = job.recorder
         try:
-            until = time.monotonic() + LONGEST_BEHIND
+            until = time.monotonic() + MAX_PACKET_DELAY
             while self._packets and recorder.lacks_packets and time.monotonic() < until:
-                time.sleep(BEHIND)
-                self._take_packets(job)
+                time.sleep(PACKET_DELAY)
+                self._transfer_packets(job)
             recorder.close(outcome, reason)
         except Exception as error:
             self._fail(job.number, error)
             return
         ended = recorder.ended
-        self._answer(
+        self._reply(
             Closed(
                 job.number,
                 outcome,
@@ -387,17 +391,17 @@ class ArchiveProcess:
         )
 
     def _fail(self, number: int, error: Exception) -> None:
-        """The arm comes to rest first: that needs nothing but this one field."""
+        """Report a failure; first by the field that makes the exchange stop the arm."""
         self._control.archive_state = ArchiveState.FAILED
         self._job = None
         path, problem, remedy = "", f"{type(error).__name__}: {error}", ""
         if isinstance(error, ArchiveError):
             path, problem, remedy = str(error.path), error.problem, error.remedy
         cause = error if isinstance(error, OSError) else error.__cause__
-        number_of_cause = cause.errno if isinstance(cause, OSError) else None
-        self._answer(Failed(number, path, problem, remedy, number_of_cause))
+        code = cause.errno if isinstance(cause, OSError) else None
+        self._reply(Failed(number, path, problem, remedy, code))
 
-    def _answer(self, answer: Answer) -> None:
+    def _reply(self, answer: Answer) -> None:
         if self._commands is None:
             return
         try:
@@ -405,13 +409,12 @@ class ArchiveProcess:
         except OSError:
             self._commands = None
 
-    def _exchange_gone(self) -> bool:
-        gone = self._control.finished or select.select([self._exchange], [], [], 0.0)[0]
-        return bool(gone)
+    def _exchange_ended(self) -> bool:
+        return bool(self._control.finished or select.select([self._exchange], [], [], 0.0)[0])
 
 
 def main() -> None:
-    """Attach what the command line names, and work."""
+    """Attach the descriptors of the command line, and run."""
     ring, events, control, commands, exchange, n_joints, *packets = map(int, sys.argv[1:])
     for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(signum, signal.SIG_IGN)
@@ -427,7 +430,7 @@ def main() -> None:
     try:
         process.run()
     finally:
-        process.end_view()
+        process.close_view()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,4 @@
-"""From the link's records and events to one archive.
-
-Shared by the two places that archive: the thread that runs a link in virtual time, and the archive
-process of a real one.
-"""
+"""Records and events of a link to one archive, in virtual and in real time."""
 
 from __future__ import annotations
 
@@ -49,36 +45,37 @@ _SENTENCES: Final[Mapping[type, str]] = {
     MotionStarted: "first set-point in cycle {0.cycle}",
     MotionEnded: "{0.outcome} in cycle {0.cycle}: {0.reason}",
     Refused: "{0.error}; {0.error.remedy}",
-    Leaving: "the exchange comes to its end: {0.reason}",
+    Leaving: "the exchange is ending: {0.reason}",
     ExchangeEnded: "the exchange ended: {0.reason}",
     OverrideRefused: "no override of {0.fraction:g}: {0.reason}",
-    HoldRefused: "nothing is held: {0.reason}",
+    HoldRefused: "no motion to hold: {0.reason}",
     ResumeRefused: "the motion cannot be resumed: {0.reason}",
     EventsLost: "{0.count} events were overwritten before they could be archived",
 }
 
 
 def describe(event: ExchangeEvent) -> str:
-    """One line for a person."""
+    """Return the event as one line of text."""
     match event:
         case GapSeen():
             return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
-            were = f"{plural(event.count, 'answer')} {'was' if event.count == 1 else 'were'}"
-            return f"{were} not accepted by the controller, until cycle {event.cycle}"
+            return (
+                f"{_replies(event.count)} not accepted by the controller, until cycle {event.cycle}"
+            )
         case OverrideChanged():
             return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
         case HoldChanged():
             return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
         case PacketRejected(kind="answered late"):
-            return f"{plural(event.count, 'answer')} left more than a cycle after their packet"
+            return f"{_replies(event.count)} sent more than a cycle late"
         case PacketRejected():
-            why = f" ({event.reason})" if event.reason else ""
-            return f"{plural(event.count, f'{event.kind} packet')} got no answer{why}"
+            reason = f" ({event.reason})" if event.reason else ""
+            return f"{plural(event.count, f'{event.kind} packet')} got no reply{reason}"
         case LinkLost(stale=stale):
-            packets = f"only {plural(stale, 'packet')} that cannot follow the last one"
-            what = packets if stale else "nothing heard"
-            return f"{what} for {event.silence:.3f} s in state {event.state.name}"
+            stale_only = f"only {plural(stale, 'packet')} older than the last one"
+            received = stale_only if stale else "no packet"
+            return f"{received} for {event.silence:.3f} s in state {event.state.name}"
         case InitReceived():
             started = ["the controller started a session", *event.differences]
             return event.unusable or "; ".join(started)
@@ -89,6 +86,10 @@ def describe(event: ExchangeEvent) -> str:
     return _SENTENCES[type(event)].format(event)
 
 
+def _replies(count: int) -> str:
+    return f"{count} {'reply' if count == 1 else 'replies'}"
+
+
 _ERRORS: Final = (Refused, LinkLost, ExchangeFailed, EventsLost)
 _WARNINGS: Final = (
     *(GapSeen, AnswersLost, PacketRejected),
@@ -97,7 +98,7 @@ _WARNINGS: Final = (
 
 
 def level_of(event: ExchangeEvent) -> Level:
-    """How serious an event is."""
+    """Return the severity of an event."""
     if isinstance(event, _ERRORS):
         return Level.ERROR
     return Level.WARN if isinstance(event, _WARNINGS) else Level.INFO
@@ -106,14 +107,14 @@ def level_of(event: ExchangeEvent) -> Level:
 Records = NDArray[np.void]
 
 LATE_KINDS = frozenset({"late", "answered late"})
-"""Of `PacketRejected`: the answer left out for a newer packet's, or sent after its cycle."""
+"""Kinds of `PacketRejected`: dropped for a newer packet, or answered after its cycle."""
 AFTERMATH = 0.5
-"""s of the controller's time that are recorded after a motion was refused or lost."""
+"""Time recorded after a motion was refused or lost, s."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArchiveSpec:
-    """An archive that is to be written; pickles.
+    """An archive to be written; pickles.
 
     Attributes:
         path: the file, which must not exist.
@@ -121,8 +122,8 @@ class ArchiveSpec:
         period: cycle of the controller [s].
         metadata: entries of the ``hil`` record.
         attachments: content by file name.
-        durable: wait at each flush until the disk has the data.
-        packets: whether the raw packets of the link are kept as well.
+        durable: wait at each flush until the data are on the disk.
+        packets: whether raw packets are stored as well.
     """
 
     path: Path
@@ -134,7 +135,7 @@ class ArchiveSpec:
     packets: bool = False
 
     def with_more(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> Self:
-        """The same archive with further metadata and attachments, which win over earlier ones."""
+        """Return a copy with further metadata and attachments, which replace earlier ones."""
         return replace(
             self,
             metadata={**self.metadata, **metadata},
@@ -145,7 +146,7 @@ class ArchiveSpec:
         """Create the file.
 
         Raises:
-            ArchiveWriteError: it exists, the disk refuses, or the metadata cannot stand.
+            ArchiveWriteError: it exists, cannot be written, or the metadata are invalid.
         """
         return ArchiveWriter(**{one.name: getattr(self, one.name) for one in fields(self)})
 
@@ -153,26 +154,24 @@ class ArchiveSpec:
 class Recorder:
     """Fills one archive from records and events, and closes it with the true outcome.
 
-    Only cycles of one session with the controller belong into a file: a controller that starts
-    anew counts from zero again, and what follows is left out.
+    A file contains cycles of one session with the controller; those of a later session are left
+    out.
 
     Args:
         writer: the archive.
-        drive_train: in force on the link; makes joint torques of target currents.
+        drive_train: of the link; converts target currents to joint torques.
 
     Attributes:
-        ended: how the motion ended, None as long as it goes on.
+        ended: end of the motion, None before.
         restarted: whether the controller began a new session meanwhile.
-        link_lost: whether the link fell silent meanwhile.
+        link_lost: whether the link was lost meanwhile.
         refused: the last refusal of the session meanwhile, None without one.
-        records: how many were archived.
-        records_lost: how many were overwritten before they could be archived.
-        events_lost: likewise of the events.
-        packets_lost: likewise of the raw packets, where they are stored.
+        records: number of archived records.
+        records_lost, events_lost, packets_lost: numbers overwritten before they were archived.
         missed: packets that never arrived.
-        late: packets whose answer was late or left out for a newer one.
-        not_accepted: answers that the controller did not take.
-        newest: cycle of the newest record archived, -1 before the first.
+        late: packets answered late, or dropped for a newer one.
+        not_accepted: replies not accepted by the controller.
+        newest: cycle of the newest archived record, -1 before the first.
     """
 
     def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
@@ -195,35 +194,34 @@ class Recorder:
         self._packets_cut = False
 
     def record_packets(self, packets: Records, lost: int = 0) -> None:
-        """Archive raw packets; `lost` of them before these were overwritten unread.
+        """Archive raw packets, `lost` of which were overwritten before.
 
-        To be called before `record` of what came with them. Where the archive is one without
-        packets, they are dropped.
+        To be called before `record` with their records. An archive without packets drops them.
         """
         if not self.writer.with_packets:
             return
         self.packets_lost += lost
         if self._packets_cut or not len(packets):
             return
-        packets, self._packets_cut = self._ours(packets, self._newest_packet, least=0)
+        packets, self._packets_cut = self._own_rows(packets, self._newest_packet, least=0)
         if len(packets):
             self.writer.add_packets(packets)
             self._newest_packet = int(packets["cycle"][-1])
 
     def record(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
-        """Archive what has come; `lost` records before these were overwritten unread.
+        """Archive records and events; `lost` records were overwritten before.
 
-        The records must be those up to the newest of the events, or more. Of events only those up
-        to the init packet that begins another session are archived, that one included.
+        The records must include those up to the newest event. Events are archived up to the init
+        packet that begins another session, that one included.
 
         Raises:
-            ArchiveWriteError: the disk refuses.
+            ArchiveWriteError: the file cannot be written.
         """
         restarts = [k for k, event in enumerate(events) if isinstance(event, InitReceived)]
-        ours = () if self.restarted else events[: restarts[0] + 1] if restarts else events
+        own = () if self.restarted else events[: restarts[0] + 1] if restarts else events
         self.update(events)
         self._write(records)
-        for event in ours:
+        for event in own:
             if isinstance(event, EventsLost):
                 self.events_lost += event.count
             elif isinstance(event, AnswersLost):
@@ -236,24 +234,24 @@ class Recorder:
             self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
 
     def motion_ended(self, outcome: Outcome, interval: int) -> None:
-        """Take it from elsewhere that the motion has ended: the event that says so was lost."""
-        ended = MotionEnded(outcome, "the event that said why was lost", interval, self.newest)
+        """Record that the motion ended when its event was lost."""
+        ended = MotionEnded(outcome, "the event with the reason was lost", interval, self.newest)
         self.update([ended])
         self._archive(ended)
 
     def warn(self, name: str, text: str) -> None:
-        """Archive a warning of our own."""
+        """Archive a warning."""
         self.writer.event(None, name, text, level=Level.WARN)
 
     @property
     def lacks_packets(self) -> bool:
-        """Whether raw packets of the newest record archived are still to come, if any are."""
-        packets_wanted = self.writer.with_packets and not self._packets_cut
-        return packets_wanted and self._newest_packet < self.newest
+        """Whether raw packets of the newest archived record are missing."""
+        expected = self.writer.with_packets and not self._packets_cut
+        return expected and self._newest_packet < self.newest
 
     @property
     def complete(self) -> bool:
-        """Whether the interval is over and all of it archived, aftermath included."""
+        """Whether the interval has ended and is archived, aftermath included."""
         if self.ended is None:
             return False
         if _at_rest(self.ended) or self._cut or self.restarted:
@@ -274,7 +272,7 @@ class Recorder:
         self.writer.close(outcome, reason=reason, details=details)
 
     def update(self, events: Sequence[ExchangeEvent]) -> None:
-        """Take in what events say of the interval, without archiving them."""
+        """Update the state of the interval by events, without archiving them."""
         for event in events:
             if isinstance(event, MotionEnded):
                 self.ended = event
@@ -290,18 +288,18 @@ class Recorder:
 
     @property
     def _last_cycle(self) -> int:
-        """The last cycle that may still belong to the archive, as far as is known."""
+        """The last cycle that belongs to the archive."""
         if self.ended is None or _at_rest(self.ended):
             return int(np.iinfo(np.int64).max)
         return self.ended.cycle + round(AFTERMATH / self.writer.period)
 
-    def _ours(self, rows: Records, newest: int, *, least: int) -> tuple[Records, bool]:
-        """Rows up to the end of the session and of the aftermath, and whether others follow.
+    def _own_rows(self, rows: Records, newest: int, *, least: int) -> tuple[Records, bool]:
+        """Return rows up to the end of session and aftermath, and whether others follow.
 
         Args:
-            rows: that came.
+            rows: new rows.
             newest: cycle of the row before them.
-            least: by which cycles grow from row to row.
+            least: smallest increment of the cycle from row to row.
         """
         cycles = rows["cycle"]
         beyond = (np.diff(cycles, prepend=newest) < least) | (cycles > self._last_cycle)
@@ -311,7 +309,7 @@ class Recorder:
         """Archive the records up to the end of the session and of the aftermath."""
         if self._cut or not len(records):
             return
-        records, self._cut = self._ours(records, self.newest, least=1)
+        records, self._cut = self._own_rows(records, self.newest, least=1)
         if not len(records):
             return
         self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
@@ -325,7 +323,7 @@ _DATA: Final[Mapping[type, Sequence[str]]] = {
     OverrideChanged: ("fraction",),
     HoldChanged: ("held",),
 }
-"""What a program may want to know of an event beside its cycle."""
+"""Data of an event beside its cycle."""
 
 
 def _at_rest(ended: MotionEnded) -> bool:

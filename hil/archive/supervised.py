@@ -24,14 +24,14 @@ from hil.archive.recorder import ArchiveSpec
 
 @dataclass(frozen=True, eq=False)
 class Open:
-    """Begin an archive; one that is still open is closed as interrupted.
+    """Open an archive; one that is open is closed as interrupted.
 
     Attributes:
         job: number of the archive.
-        spec: which.
-        drive_train: in force on the link.
-        from_now: leave out what came before; otherwise begin with the session's oldest record
-            that is still there.
+        spec: file and content.
+        drive_train: of the link.
+        from_now: leave out earlier records; otherwise begin with the oldest buffered record of
+            the session.
         until_ended: close it when the motion has ended; otherwise only on `Close`.
     """
 
@@ -53,7 +53,7 @@ class Close:
 
 @dataclass(frozen=True)
 class End:
-    """Close what is open and end the process."""
+    """Close the open archive and end the process."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Opened:
 
 @dataclass(frozen=True)
 class Serving:
-    """Viewers can look, at this TCP port."""
+    """The live view is served at this TCP port."""
 
     job: int
     port: int
@@ -77,14 +77,10 @@ class Closed:
 
     Attributes:
         job: its number.
-        outcome, reason: as in it.
+        outcome, reason: as in the file.
         interval: of the motion, -1 without one.
-        records, records_lost: how many it holds, and how many it should hold but does not.
-        events_lost: likewise of events.
-        missed: packets that never arrived.
-        late: answers that were late or left out.
-        not_accepted: answers that the controller did not take.
-        disk_waited: longest time that the disk took at once [s].
+        records, records_lost, events_lost, missed, late, not_accepted: as of `Recorder`.
+        disk_waited: longest write [s].
     """
 
     job: int
@@ -102,10 +98,10 @@ class Closed:
 
 @dataclass(frozen=True)
 class Failed:
-    """Archive `job` could not be opened or written further; what was flushed is whole.
+    """Archive `job` could not be opened or written; what was flushed is intact.
 
     Attributes:
-        errno: the operating system's number of the failure, None where it was none of its own.
+        errno: of the operating system, None for other failures.
     """
 
     job: int
@@ -120,10 +116,10 @@ Answer = Opened | Closed | Serving | Failed
 
 
 class Channel:
-    """One end of the socket, a `SOCK_SEQPACKET`.
+    """One end of the command socket, a `SOCK_SEQPACKET`.
 
-    A message may be larger than the socket takes at once: it is sent in parts, the number of
-    parts first. Neither end waits longer than `TIMEOUT` for the other.
+    A message is sent in parts, preceded by their number. Neither end waits longer than `TIMEOUT`
+    for the other.
     """
 
     PART = 64 << 10
@@ -134,15 +130,15 @@ class Channel:
         end.settimeout(timeout)
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the descriptor, for `select`."""
         return self._socket.fileno()
 
     def send(self, message: Any) -> None:
         """Send a message.
 
         Raises:
-            TimeoutError: the far end does not take it; the channel is of no use any more.
-            OSError: the far end is gone.
+            TimeoutError: the peer does not receive it; the channel cannot be used further.
+            OSError: the peer has closed its end.
         """
         data = pickle.dumps(message, protocol=5)
         parts = range(0, len(data), self.PART)
@@ -151,10 +147,10 @@ class Channel:
             self._socket.sendall(data[start : start + self.PART])
 
     def receive(self) -> Any:
-        """The next message; waits for it.
+        """Wait for the next message and return it.
 
         Raises:
-            EOFError: the far end is gone, or has stopped in the middle of a message.
+            EOFError: the peer has closed its end, or stopped within a message.
         """
         head = self._part()
         return pickle.loads(b"".join(self._part() for _ in range(int.from_bytes(head, "little"))))
@@ -163,30 +159,30 @@ class Channel:
         try:
             part = self._socket.recv(self.PART)
         except TimeoutError as error:
-            raise EOFError("the far end stopped in the middle of a message") from error
+            raise EOFError("the peer stopped within a message") from error
         except ConnectionError as error:
-            raise EOFError("the far end is gone") from error
+            raise EOFError("the peer has closed its end") from error
         if not part:
-            raise EOFError("the far end is gone")
+            raise EOFError("the peer has closed its end")
         return part
 
     def close(self) -> None:
-        """Give the socket up."""
+        """Close the socket."""
         self._socket.close()
 
 
 END_TIMEOUT = 30.0
-"""s for the last flush of a slow disk."""
+"""Time for the last flush of a slow disk, s."""
 HUNG = 5.0
-"""s without a sign of life after which it is ended; a slow disk alone does not silence it."""
-LAST_BREATH = 2.0
-"""s that a process whose socket is closed, or that was killed, may take to be gone."""
-LOOK = 0.05
-"""s between two looks while it is waited for."""
+"""Time without a heartbeat after which the process is killed, s; a slow disk does not stop it."""
+EXIT_TIMEOUT = 2.0
+"""Time to exit for a process that was killed or has closed its socket, s."""
+POLL = 0.05
+"""Time between two checks whether the process has ended, s."""
 
 
 class SharedMemory(Protocol):
-    """What the archive process attaches: the exchange process and its descriptors."""
+    """The exchange process and its descriptors."""
 
     pid: int
     ring_fd: int
@@ -203,15 +199,15 @@ class ArchiveProcessHandle:
     """Starts, commands and ends the archive process.
 
     Attributes:
-        process: the child, in a process session of its own.
-        channel: our end of the command socket.
-        pulse: of its heartbeat.
+        process: the child, in its own process session.
+        channel: to its command socket.
+        monitor: of its heartbeat.
     """
 
     process: subprocess.Popen[bytes]
     channel: Channel
     monitor: HeartbeatMonitor
-    _words: IO[bytes]
+    _stderr: IO[bytes]
     _gone: bool = False
     _ended_for: str = field(default="")
 
@@ -219,15 +215,15 @@ class ArchiveProcessHandle:
     def start(
         cls, memory: SharedMemory, n_joints: int, packets_fd: int = -1
     ) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory; `packets_fd` where packets are stored.
+        """Start the process on the exchange's shared memory; `packets_fd` if packets are stored.
 
         Raises:
-            OSError: the system refuses a process, a socket or memory.
+            OSError: the process, a socket or memory cannot be created.
         """
         control = ControlBlock(memory.control_fd)
-        pulse = HeartbeatMonitor(lambda: control.archive_heartbeat)
+        monitor = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
-            words: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())
+            stderr: IO[bytes] = undo.enter_context(tempfile.TemporaryFile())
             exchange = os.pidfd_open(memory.pid)
             undo.callback(os.close, exchange)
             ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
@@ -242,47 +238,46 @@ class ArchiveProcessHandle:
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=words,
-                # What this process can import, that one can.
+                stderr=stderr,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(_import_paths())},
             )
             undo.pop_all()
             os.close(exchange)
             theirs.close()
-        return cls(process, Channel(ours), pulse, words)
+        return cls(process, Channel(ours), monitor, stderr)
 
     @property
     def alive(self) -> bool:
-        """Whether the process runs and can be talked to."""
+        """Whether the process runs and its socket is open."""
         return not self._gone and self.process.poll() is None
 
     def failure(self) -> str | None:
-        """What is wrong with the process, in words; one that hangs is ended. None if it works."""
+        """Return the fault of the process, None if it works; one that hangs is killed."""
         if self.alive and self.monitor.silence() > HUNG:
             self.kill(f"sent no heartbeat for {HUNG:g} s and was ended")
         if self.alive:
             return None
-        return f"the archive process {self._ended_for or 'ended' + self.last_words()}"
+        return f"the archive process {self._ended_for or 'ended' + self._error_output()}"
 
-    def kill(self, why: str) -> None:
-        """End a process that hangs, for a reason that follows "the archive process"."""
-        self._ended_for, self._gone = why, True
+    def kill(self, reason: str) -> None:
+        """Kill the process; `reason` continues "the archive process" in messages."""
+        self._ended_for, self._gone = reason, True
         self.process.kill()
-        self._wait(LAST_BREATH)
+        self._wait(EXIT_TIMEOUT)
 
     def send(self, command: Command) -> None:
-        """Send a command; one that cannot be delivered shows in `failure`."""
+        """Send a command; `failure` reports one that could not be delivered."""
         try:
             self.channel.send(command)
         except TimeoutError:
-            self.kill(f"took no command for {Channel.TIMEOUT:g} s and was ended")
+            self.kill(f"accepted no command for {Channel.TIMEOUT:g} s and was ended")
         except OSError:
             self._lose()
 
     def answer(self, timeout: float, job: int) -> Answer | None:
-        """The next answer about archive `job`; those about earlier ones are dropped.
+        """Return the next answer about archive `job`; those about earlier ones are dropped.
 
-        None if none comes within `timeout` s, or none will ever.
+        None if none comes within `timeout` s, or the process has ended.
         """
         deadline = time.monotonic() + timeout
         while self.alive or not self._gone:
@@ -298,19 +293,20 @@ class ArchiveProcessHandle:
                 return answer
         return None
 
-    def last_words(self) -> str:
-        """What a process that died wrote last, as the rest of a sentence."""
-        if self._words.closed:
+    def _error_output(self) -> str:
+        """Return the last line on standard error, or the exit status, in parentheses."""
+        if self._stderr.closed:
             return ""
-        size = os.fstat(self._words.fileno()).st_size
-        text = os.pread(self._words.fileno(), 400, max(0, size - 400)).decode(errors="replace")
+        size = os.fstat(self._stderr.fileno()).st_size
+        text = os.pread(self._stderr.fileno(), 400, max(0, size - 400)).decode(errors="replace")
         lines = text.strip().splitlines()
         return f" ({lines[-1]})" if lines else f" (exit status {self.process.poll()})"
 
     def end(self) -> str | None:
-        """Let it complete what is open and end; what was wrong with it, None if nothing was.
+        """Close the open archive and end the process; one that hangs is killed.
 
-        It is waited for; one that hangs is killed.
+        Returns:
+            Its fault, None without one.
         """
         if self.alive:
             self.send(End())
@@ -321,17 +317,17 @@ class ArchiveProcessHandle:
             elif time.monotonic() > deadline:
                 self.kill(f"did not end within {END_TIMEOUT:g} s and was killed")
             else:
-                self._wait(LOOK)
+                self._wait(POLL)
         status = self.process.poll()
         if not self._ended_for and status not in (0, None):
-            self._ended_for = f"ended{self.last_words()}"
+            self._ended_for = f"ended{self._error_output()}"
         self.channel.close()
-        self._words.close()
+        self._stderr.close()
         return f"the archive process {self._ended_for}" if self._ended_for else None
 
     def _lose(self) -> None:
-        """Its socket is closed: it is dead or about to be."""
-        self._wait(LAST_BREATH)
+        """Wait for a process that has closed its socket."""
+        self._wait(EXIT_TIMEOUT)
         self._gone = True
 
     def _wait(self, timeout: float) -> None:

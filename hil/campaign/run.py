@@ -247,7 +247,7 @@ class Run:
                 for note in link.notes():
                     reporter.say(f"note: {note}")
                 if link.live is not None:
-                    reporter.say(link.live.invitation)
+                    reporter.say(link.live.notice)
             where = link.connect(self.stop)
             require_as_rehearsed(self, link.connection, dry_run.found())
             narrowed = active_checks(cell, link.connection, checks)

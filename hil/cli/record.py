@@ -77,7 +77,7 @@ def record(
         link.connection.report = view.warn
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
-            view.say(link.live.invitation)
+            view.say(link.live.notice)
         for note in link.notes():
             view.say(f"note: {note}")
         done = record_motion(

@@ -252,7 +252,7 @@ def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
     rig.process.send(Close(1, "x" * 4_000_000, ""))
     failure = rig.process.failure()
     assert failure is not None
-    assert "took no command" in failure
+    assert "accepted no command" in failure
     assert rig.process.process.poll() is not None
 
 
@@ -284,7 +284,7 @@ def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, Packet
 def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Path) -> None:
     with keeping_packets(tmp_path / NAME) as (process, memory, ring):
         memory.cycles(3)
-        process._take()
+        process._transfer()
         for cycle in range(30):  # after the last look, and before the archive is closed
             ring.put(cycle // 10, 0.0, False, b"packet")
         process._close("completed", "")
@@ -299,7 +299,7 @@ def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) 
         memory.cycles(3)
         for cycle in range(2):
             ring.put(cycle, 0.0, False, b"packet")
-        process._take()
+        process._transfer()
         late = threading.Timer(0.05, ring.put, (2, 0.0, False, b"packet"))
         late.start()
         process._close("completed", "")
@@ -311,7 +311,7 @@ def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) 
 def test_raw_packets_that_never_come_are_not_waited_for_long(tmp_path: Path) -> None:
     with keeping_packets(tmp_path / NAME) as (process, memory, _):
         memory.cycles(3)
-        process._take()
+        process._transfer()
         process._close("completed", "")
     assert whole(tmp_path / NAME).n_samples == 3
 

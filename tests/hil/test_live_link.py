@@ -362,6 +362,6 @@ def test_a_live_view_that_cannot_be_served_is_refused_before_anything_moves(cell
 
 
 def test_a_live_view_that_is_no_address_is_refused_by_the_command(tmp_path: Path) -> None:
-    with pytest.raises(LiveViewError, match=r"--live nonsense is no HOST:PORT"):
+    with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")
     assert not list(tmp_path.iterdir())

@@ -72,7 +72,7 @@ def test_a_viewer_is_told_the_channels_and_schemas_of_an_archive() -> None:
 
 
 def test_it_gets_what_was_measured_at_the_rate_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "ASTRAY", 3600.0)  # the cycles come slower here than they say
+    monkeypatch.setattr(live, "MAX_DRIFT", 3600.0)  # the cycles come slower here than they say
     with served(rate=100.0) as publisher, Viewer(publisher.port) as viewer:
         viewer.subscribe("/joint_states")
         seen: list[tuple[int, Any]] = []

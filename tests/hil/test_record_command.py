@@ -353,7 +353,7 @@ def test_a_hanging_archive_process_is_ended_and_answers_go_on(on_udp: tuple[Path
         os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
         assert recorder.stdout is not None
         told = next(line for line in recorder.stdout if "replying until" in line)
-        assert "gave no sign of life for 5 s and was ended" in told
+        assert "sent no heartbeat for 5 s and was ended" in told
         controller.send_signal(signal.SIGTERM)
         counts, _ = controller.communicate(timeout=60)
         _, errors = recorder.communicate(timeout=60)

@@ -23,7 +23,7 @@ from drivers.transports.faults import Lose
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.check import check_archive
-from hil.archive.process import RECENT, Recent
+from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
 from hil.archive.repair import repair
 from hil.archive.schema import CYCLE, PACKETS
 from hil.campaign import Link, Stop
@@ -136,7 +136,7 @@ def test_a_silent_link_and_lost_records_are_noticed(recorder: Recorder) -> None:
     archive = read(recorder)
     assert archive.outcome.entries["records_lost"] == "7"
     silent, lost = (event.text for event in archive.events)
-    assert "nothing heard for 1.200 s" in silent
+    assert "no packet for 1.200 s" in silent
     assert lost == "7 records overwritten"
     assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
 
@@ -155,27 +155,27 @@ def packets(*cycles: int) -> NDArray[np.void]:
     return rows
 
 
-@pytest.mark.parametrize("batch", [7, 20, 333, 2 * RECENT])
+@pytest.mark.parametrize("batch", [7, 20, 333, 2 * BUFFERED_CYCLES])
 def test_records_and_their_packets_go_together(batch: int) -> None:
-    recent, numbers = Recent(), range(3 * RECENT)
+    buffer, numbers = PreTriggerBuffer(), range(3 * BUFFERED_CYCLES)
     for begin in numbers[::batch]:
         part = numbers[begin : begin + batch]
-        recent.keep(at(*part), [], packets(*part))
-    kept, _, kept_packets = recent.take_session()
-    assert RECENT <= len(kept) < RECENT + batch
+        buffer.add(at(*part), [], packets(*part))
+    kept, _, kept_packets = buffer.pop_session()
+    assert BUFFERED_CYCLES <= len(kept) < BUFFERED_CYCLES + batch
     assert kept["cycle"].tolist() == list(numbers[-len(kept) :])
     assert kept_packets["cycle"].tolist() == np.repeat(kept["cycle"], 2).tolist()
 
 
 def test_only_the_session_that_began_last_counts_and_is_given_once() -> None:
-    recent = Recent()
-    recent.keep(at(7, 8, 0, 1), [], packets(7, 8, 0, 1))
-    recent.keep(at(2), [], packets(2))
-    kept, events, kept_packets = recent.take_session()
+    buffer = PreTriggerBuffer()
+    buffer.add(at(7, 8, 0, 1), [], packets(7, 8, 0, 1))
+    buffer.add(at(2), [], packets(2))
+    kept, events, kept_packets = buffer.pop_session()
     assert kept["cycle"].tolist() == [0, 1, 2]
     assert kept_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
     assert not events
-    assert not len(recent.take_session()[0])
+    assert not len(buffer.pop_session()[0])
 
 
 NAME = "excitation_000_a1.mcap"

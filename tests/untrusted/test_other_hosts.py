@@ -144,7 +144,7 @@ class Outcome:
         assert self.archive is not None
         found: Counter[str] = Counter()
         for event in self.archive.events:
-            if match := re.match(r"(\d+|a|one) (\w+) packets? got no answer", event.text):
+            if match := re.match(r"(\d+|a|one) (\w+) packets? got no reply", event.text):
                 count = int(match[1]) if match[1].isdigit() else 1
                 found[match[2]] += count
         return found
