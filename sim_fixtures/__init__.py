@@ -1,7 +1,7 @@
-"""The simulated cell: a robot with its controller, the other end of the link in tests.
+"""The simulated cell: a robot with its controller, the peer of the PC in tests.
 
-Nothing here shares conversion, friction or regressor code with what it tests; only the packet codec
-is common, because captures of foreign programs pin it.
+It shares no conversion, friction or regressor code with what it tests, only the packet codec, which
+is also tested against captures of foreign programs.
 """
 
 from __future__ import annotations

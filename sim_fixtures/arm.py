@@ -1,4 +1,4 @@
-"""Motors, gears and links of the simulated robot: target currents in, encoder positions out."""
+"""Simulated robot with motors and gears: target currents in, encoder positions out."""
 
 from __future__ import annotations
 
@@ -25,18 +25,16 @@ _ROWS: dict[DisturbanceKind, int] = {"jam": 0, "load": 1, "slip": 2}
 
 
 class Disturbances:
-    """Which axis is jammed, loaded or misread, and for how long.
+    """Jams, external loads and encoder errors of the axes, each for a number of cycles.
+
+    Args:
+        motor_torque: largest torque of each motor at its joint, (n,) [N m].
 
     Attributes:
         changed: whether jams have changed since the last cycle.
     """
 
     def __init__(self, motor_torque: Sequence[float]) -> None:
-        """Begin without any.
-
-        Args:
-            motor_torque: what each motor can muster on its joint, (n,) [N m].
-        """
         self._torque: Array = np.array(motor_torque, dtype=np.float64)
         self._size: Array = np.zeros((3, self._torque.size))
         self._left = np.zeros((3, self._torque.size), np.int64)
@@ -44,15 +42,14 @@ class Disturbances:
         self._any = False
 
     def begin(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Let one axis (0-based) disturb for some cycles.
+        """Disturb one axis for some cycles.
 
         Args:
-            kind: "jam": the axis is stuck; "load": a torque pushes on it; "slip": its encoder is
-                read wrongly.
+            kind: "jam": the axis is stuck; "load": an external torque; "slip": an encoder error.
             axis: 0-based.
-            size: load as a share of what the motor can muster; slip in motor revolutions; a jam
-                has none.
-            cycles: how long.
+            size: load as a share of the motor's largest torque; slip in motor revolutions; not used
+                for a jam.
+            cycles: duration.
         """
         row = _ROWS[kind]
         self._size[row, axis] = size
@@ -61,26 +58,26 @@ class Disturbances:
 
     @property
     def jam(self) -> Array | None:
-        """Friction of jammed joints, (n,) [N m]; None if none is."""
+        """Friction of jammed joints, (n,) [N m]; None without a jam."""
         stuck = self._left[0] > 0
         return np.where(stuck, _JAM_FACTOR * self._torque, 0.0) if stuck.any() else None
 
     @property
     def load(self) -> Array | None:
-        """Torques from outside, (n,) [N m]; None if there are none."""
+        """External torques, (n,) [N m], or None."""
         return self._of(1) * self._torque if self._any else None
 
     @property
     def slip(self) -> Array | None:
-        """What is added to the encoder positions that are reported, (n,) [motor rev], or None."""
+        """Error of the reported encoder positions, (n,) [motor rev], or None."""
         return self._of(2) if self._any else None
 
     def _of(self, row: int) -> Array:
         values: Array = np.where(self._left[row] > 0, self._size[row], 0.0)
         return values
 
-    def pass_cycle(self) -> None:
-        """Let one cycle pass."""
+    def advance(self) -> None:
+        """Advance by one cycle."""
         if self._any:
             before = self._left[0] > 0
             np.maximum(self._left - 1, 0, out=self._left)
@@ -89,34 +86,27 @@ class Disturbances:
 
 
 RIPPLES_PER_TURN = 2
-WARM_UP_TIME = 600.0
-"""Time constant of the friction drift [s]."""
-WARM_SPEED = 0.5
-"""Mean speed that warms a joint up half the way [rad/s]."""
+WARM_UP_TIME = 600.0  # time constant of the friction drift [s]
+WARM_SPEED = 0.5  # speed at which the final warmth of a joint is one half [rad/s]
 
 
 @dataclass(frozen=True)
 class UnmodelledEffects:
-    """What a real arm does and the estimator does not model; all zero is none.
+    """Effects that the estimator does not model; zero by default.
 
-    | effect | default size | what it is |
-    |---|---|---|
-    | torque ripple | 0.10 | a torque of this share of the Coulomb torque, twice per motor turn |
-    | friction drift | 0.08 | friction falls by this share from a cold joint to one that moves on |
-    | elasticity | 0.5e-6, 0.5e-6, 1.25e-6 rad/(N m), axes 1-3 | a spring between gear and link |
-    | delay | 0.5 ms | later effect of the target current, beyond the modelled lag |
-
-    On a fast motion of the NS 16 at these sizes, the torque of the true rigid model at the measured
-    positions misses the converted current (both low-passed at 30 Hz) by about: ripple 1-2 %, drift
-    1-4 % (a cold arm), elasticity 1.5 % on axis 1, delay under 0.3 %. The springs are at the stiff
-    end of what precision gears of this size have (580 and 230 N m per arc minute).
+    On a fast motion of the NS 16 at default sizes, the torque of the true rigid model differs from
+    the converted current (both low-passed at 30 Hz) by about: ripple 1-2 %, drift 1-4 % (cold arm),
+    elasticity 1.5 % on axis 1, delay below 0.3 %. The springs are at the stiff end of those of
+    precision gears of this size (580 and 230 N m per arc minute).
 
     Attributes:
-        torque_ripple: amplitude at the joint, as a share of the joint's Coulomb torque.
-        friction_drift: relative fall of all friction between cold and hot. The planted friction
-            is that of a joint that is half warm; a run starts cold.
-        elasticity: compliance of each gear [rad/(N m)], (n,) or empty; 0 is rigid.
-        delay: s, rounded to the plant's sub-steps.
+        torque_ripple: amplitude of a torque with two periods per motor turn, as a share of the
+            Coulomb torque of the joint.
+        friction_drift: relative decrease of all friction between cold and hot. The truth is the
+            friction of a half-warm joint; a run starts cold.
+        elasticity: compliance of the spring between gear and link [rad/(N m)], (n,) or empty; 0 is
+            rigid.
+        delay: additional delay of the target current [s], rounded to sub-steps of the plant.
     """
 
     torque_ripple: float = 0.0
@@ -134,7 +124,7 @@ class UnmodelledEffects:
 
     @classmethod
     def default_sizes(cls, n_joints: int) -> UnmodelledEffects:
-        """Return all effects at their documented default sizes."""
+        """Return all effects at their default sizes."""
         elasticity = (0.5e-6, 0.5e-6, 1.25e-6)[:n_joints]
         return cls(
             torque_ripple=0.10,
@@ -145,15 +135,14 @@ class UnmodelledEffects:
 
     @property
     def is_elastic(self) -> bool:
-        """Whether any gear gives."""
+        """Whether any gear is elastic."""
         return any(self.elasticity)
 
 
 class TorqueRipple:
-    """A torque that comes and goes with the turning of each motor."""
+    """Torque ripple of amplitudes (n,) [N m] on the joint side, with random phases."""
 
     def __init__(self, amplitude: Array, rng: np.random.Generator) -> None:
-        """Draw the phases; `amplitude` (n,) [N m] on the joint side."""
         self._amplitude = amplitude
         self._phase = rng.uniform(0.0, 2.0 * pi, size=amplitude.size)
 
@@ -165,18 +154,17 @@ class TorqueRipple:
 
 
 class FrictionDrift:
-    """Friction of joints that warm up by moving and cool down at rest."""
+    """Friction of joints that warm up by moving, from cold; `drift` as `friction_drift`."""
 
     def __init__(self, drift: float, n_joints: int) -> None:
-        """Start cold; `drift` is the relative fall from cold to hot."""
         self._drift = drift
         self._warmth = np.zeros(n_joints)
 
     def scale(self, velocity: Array, duration: float) -> Array:
         """Return the factor on the friction (n,) after `duration` [s] at a velocity."""
         speed = np.abs(velocity)
-        aim = speed / (speed + WARM_SPEED)
-        self._warmth += (duration / WARM_UP_TIME) * (aim - self._warmth)
+        final = speed / (speed + WARM_SPEED)
+        self._warmth += (duration / WARM_UP_TIME) * (final - self._warmth)
         factor: Array = 1.0 + self._drift * (0.5 - self._warmth)
         return factor
 
@@ -185,20 +173,19 @@ _BLOCK = 1024
 
 
 class NoiseSource:
-    """White Gaussian noise, one value per axis and call."""
+    """White Gaussian noise of a standard deviation, one value per axis and call."""
 
     def __init__(self, deviation: float, n_axes: int, rng: np.random.Generator) -> None:
-        """Start a source of its own; `deviation` is the standard deviation."""
         self._deviation = deviation
         self._rng = rng
         self._n_axes = n_axes
         self._block: list[list[float]] = []
-        self._silence = [0.0] * n_axes
+        self._zeros = [0.0] * n_axes
 
     def draw(self) -> list[float]:
         """Return the next values, (n,)."""
         if self._deviation == 0.0:
-            return self._silence
+            return self._zeros
         if not self._block:
             shape = (_BLOCK, self._n_axes)
             self._block = (self._rng.standard_normal(shape) * self._deviation).tolist()
@@ -206,12 +193,14 @@ class NoiseSource:
 
 
 class SimulatedArm:
-    """What the controller's cables lead to.
+    """Plant, drives and encoders of the arm, at rest with closed brakes.
+
+    The arguments are those of `SimulatedController`.
 
     Attributes:
         plant: the mechanics.
-        currents: currents that flowed in the last sub-step, (n,) [A].
-        disturbances: what happens to the mechanics from outside.
+        currents: currents in the last sub-step, (n,) [A].
+        disturbances: external disturbances.
     """
 
     def __init__(
@@ -226,12 +215,11 @@ class SimulatedArm:
         position: ArrayLike | None,
         rng: np.random.Generator,
     ) -> None:
-        """Put the arm at rest with closed brakes; arguments as for `SimulatedController`."""
         self._drive = drive
         self._period = settings.period
         self._substeps = settings.substeps
         self._substep = settings.period / settings.substeps
-        # closed brakes hold as much as the motors could lift
+        # closed brakes hold the largest torques of the motors
         holding = [abs(t) for t in drive.joint_torques(drive.current_limit)]
         if effects.is_elastic:
             self.plant: Plant = ElasticPlant(
@@ -266,7 +254,7 @@ class SimulatedArm:
         return self._drive.encoder(self._motors(), self._encoder_noise.draw())
 
     def run_cycle(self, target_currents: Sequence[float] | None, *, braked: bool) -> None:
-        """Let one period pass under target currents (n,) [A]; None for a drive that is off."""
+        """Simulate one period under target currents (n,) [A]; None for a drive that is off."""
         plant = self.plant
         plant.close_brakes(braked)
         disturbances = self.disturbances
@@ -288,7 +276,7 @@ class SimulatedArm:
             if load is not None:
                 torque += load
             plant.step(torque, self._substep)
-        disturbances.pass_cycle()
+        disturbances.advance()
 
     def _motors(self) -> list[float]:
         position: list[float] = self.plant.motor_position.tolist()

@@ -1,7 +1,7 @@
-"""The controller's end of the CAN profile: what a gateway in the cabinet would do.
+"""The controller's end of the CAN profile, as a gateway at the controller.
 
-Start packets travel as many frames and take longer than a cycle on a real bus, so a gateway waits
-for their answers; cyclic packets it leaves to the controller's clock.
+Start packets consist of many frames and take longer than a cycle on a real bus, so answers to them
+are waited for; cyclic packets are timed by the controller.
 """
 
 from __future__ import annotations
@@ -20,20 +20,17 @@ from drivers.transports.can.transport import CanSpec, Port, open_bus
 from sim_fixtures.serve import ControllerLinkError
 
 START_PATIENCE: Final = 0.25
-"""s that the answer to a packet sent as segments is waited for."""
+"""Least timeout for the answer to a packet sent as segments [s]."""
 
 
 class CanControllerLink:
-    """Carries the controller's packets over a bus; fulfils `sim_fixtures.serve.ControllerLink`.
+    """`sim_fixtures.serve.ControllerLink` on a CAN bus.
 
     Args:
-        bus: python-can's; closed with this.
+        bus: python-can bus; closed by `close`.
         rates: profile and bit rates.
-        start_patience: least time in s that `receive` waits after a packet sent as segments.
-        clock: s, the arrival of frames that the bus does not stamp.
-
-    Attributes:
-        foreign: frames that are not of the profile, or of no use.
+        start_patience: least timeout of `receive` after a packet sent as segments [s].
+        clock: time of arrival of frames without time stamp [s].
     """
 
     def __init__(
@@ -52,7 +49,7 @@ class CanControllerLink:
     def send(self, packet: bytes) -> None:
         """Send one packet of the controller.
 
-        What the bus does not take is lost; an empty packet cannot be sent.
+        What the bus refuses is lost; an empty packet is not sent.
 
         Raises:
             CanError: an init packet of a session that the profile or the bus cannot carry.
@@ -64,28 +61,27 @@ class CanControllerLink:
         self._awaited = self._end.segmented
 
     def receive(self, timeout: float) -> bytes | None:
-        """The PC's next packet, or None after `timeout` s without one.
+        """Return the next packet of the PC, or None after `timeout` s.
 
         Raises:
             TransportClosed: closed, or the bus failed.
         """
         patience = max(timeout, self._start_patience) if self._awaited else timeout
-        # Asked again after that, a lost answer is not waited for a second time.
-        self._awaited = False
+        self._awaited = False  # a lost answer is waited for once
         return self._port.receive(patience)
 
     @property
     def discarded(self) -> Counter[str]:
-        """Frames, sets and packets thrown away so far, by kind."""
+        """Number of discarded frames, sets and packets by kind."""
         return self._port.discarded
 
     @property
     def foreign(self) -> int:
-        """Frames that are none of the PC's."""
+        """Number of frames that are not the PC's."""
         return self._port.discarded["foreign"]
 
     def close(self) -> None:
-        """Give the bus up. Closing twice changes nothing."""
+        """Close the bus; closing twice has no effect."""
         self._port.close()
 
 

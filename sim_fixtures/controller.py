@@ -1,19 +1,18 @@
-"""The controller's end of the link, with its servo and the arm behind it, in virtual time.
+"""Simulated controller with servo loops and arm, in virtual time.
 
-`SimulatedController` is what a transport in virtual time talks to: `next_packet()` gives the packet
-of a cycle, `accept(reply)` takes the PC's answer and lets one period pass. It has no clock, thread
-or file; one seed gives one run, bit for bit.
+`next_packet()` returns the packet of a cycle, `accept(reply)` processes the reply of the PC and
+simulates one period. There is no clock, thread or file; one seed gives bit-identical runs.
 
-Time line of cycle k, which begins at t_k with T the period:
+Cycle k begins at t_k, with period T:
 
-    t_k             encoders are read; packet k carries them as D3, and as D5 the target current
-                    that the servo computed at t_(k-1) from the positions of packet k-1
-    right after     the reply brings the target for t_(k+1); the servo computes its current
-    t_k .. t_(k+1)  the plant moves under that current, which flows with a lag of tau
+    t_k             encoders are read; packet k has them as D3, and as D5 the target current that
+                    the servo computed at t_(k-1) from the positions of packet k-1
+    after t_k       the reply has the target for t_(k+1); the servo computes its current
+    t_k .. t_(k+1)  the plant moves under that current, which follows with a lag of tau
 
-The current in packet k acted from t_(k-1) to t_k, in the mean at t_k - T/2 + tau. So position and
-current of one packet are `current_delay_cycles` = 1/2 - tau/T cycles apart: the current that
-belongs to the position of packet k stands that many cycles *later* in the recording.
+The current in packet k acted from t_(k-1) to t_k, on average at t_k - T/2 + tau. So the current
+that belongs to the position of packet k is recorded `current_delay_cycles` = 1/2 - tau/T cycles
+later.
 """
 
 from __future__ import annotations
@@ -47,45 +46,43 @@ from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.errors import SettingError
 from sim_fixtures.faults import ControllerFault
-from sim_fixtures.plant import Plant, PlantTruth, standard_parameters
+from sim_fixtures.plant import PlantTruth, standard_parameters
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import NominalModel, Servo
 from sim_fixtures.settings import AXES_PER_ARM, MAX_SLOTS, ControllerSettings
 
-_LED_BY_THE_PC = (1, 4, 5)
+_PC_TARGETS = (1, 4, 5)
 _FOREIGN = {
     "calibration": 0.5,
     "current_limit": 10.0,
     "gear_ratio": 100.0,
     "following_error": 2.0,
 }
-"""What the init packet says of every axis of another arm."""
+"""Init packet entries of each axis of other arms."""
 
 
 class Layout:
-    """Axis blocks of this arm and of the others, and the packets they make.
+    """Axis blocks of this arm and of others, and the packets with them.
+
+    Args:
+        n_axes: axes of this arm.
+        settings: arm, slots, foreign axes, long packets.
+        tail: random bytes that fill long packets.
 
     Attributes:
         axes: (n_slots,) the axis blocks of the next packet.
-        own: slot of each axis of this arm.
-        slots: the same as numbers.
+        own: slot of each axis of this arm, as an array.
+        slots: the same as a tuple.
         n_slots: axis blocks in a packet.
+
+    Raises:
+        SettingError: more axes than slots in a packet, or slots that are not distinct or out of
+            range.
     """
 
     def __init__(
         self, n_axes: int, settings: ControllerSettings, tail: np.random.Generator
     ) -> None:
-        """Distribute the slots.
-
-        Args:
-            n_axes: of this arm.
-            settings: arm, slots, foreign axes, long packets.
-            tail: where the garbage of long packets comes from.
-
-        Raises:
-            SettingError: more axes than a packet has slots or the other arms have axes, or slots
-                that are not distinct numbers below their count.
-        """
         self.n_slots = n = n_axes + settings.foreign_axes
         if n > MAX_SLOTS:
             raise SettingError("foreign_axes", settings.foreign_axes, f"{MAX_SLOTS} axes in all")
@@ -103,7 +100,7 @@ class Layout:
         # D1..D5, extra1..3 of all slots, (8, n_slots)
         self._values = self.axes.view(np.float32).reshape(n, -1)[:, 1:].T
         self._modes: tuple[int | bool | None, ...] = ()
-        # the axes of other arms stand somewhere, each in another place
+        # different positions of the axes of other arms
         places = np.arange(1.0, 1.0 + settings.foreign_axes) / 4.0
         self.axes["d"][self._foreign, 0] = self.axes["d"][self._foreign, 2] = places
         arms = {settings.arm - 1, *self._foreign_arm}
@@ -116,12 +113,12 @@ class Layout:
         return targets
 
     def fill(self, values: NDArray[np.float64]) -> None:
-        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite where float32 ends."""
+        """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite beyond float32."""
         with np.errstate(over="ignore"):
             self._values[:, self.own] = values
 
     def set_modes(self, common: int | None, open_axes: Sequence[bool]) -> None:
-        """Set all modes to `common`, or each axis to the open mode or to closed."""
+        """Set all modes to `common`, or if None each axis to the open mode or to closed."""
         wanted = (common, *open_axes)
         if wanted == self._modes:
             return
@@ -142,10 +139,10 @@ class Layout:
             packet += self._tail.bytes(MAX_CYCLIC_LENGTH - len(packet))
         return packet
 
-    def obey(self, answer: CyclicPacket) -> None:
-        """Let open axes of other arms go where the PC sends them."""
+    def move_foreign(self, answer: CyclicPacket) -> None:
+        """Move open axes of other arms to the targets of the PC."""
         mode = self._settings.open_mode
-        if mode not in _LED_BY_THE_PC:
+        if mode not in _PC_TARGETS:
             return
         for slot in self._foreign.tolist():
             if self.axes["mode"][slot] == mode == answer.axes["mode"][slot]:
@@ -153,7 +150,7 @@ class Layout:
                 self.axes["d"][slot, :4] = (target, delta, target, delta)
 
     def init(self, drive: SimulatedDrive, period: float) -> bytes:
-        """Return the 1200 bytes with what the controller announces about its axes."""
+        """Return the init packet (1200 bytes)."""
         settings = self._settings
         row = settings.arm - 1
         own = (row, slice(drive.n_axes))
@@ -180,23 +177,19 @@ class Layout:
 
 Array = NDArray[np.float64]
 
-RUN_UP = 0.4
-"""Time [s] to full speed at the acceleration that these moves keep; a guess."""
+RUN_UP = 0.4  # time to full speed at the largest acceleration of own moves [s]; assumed
 _PEAK_SPEED = 15.0 / 8.0
 _PEAK_ACCELERATION = 10.0 / sqrt(3.0)
 
 
 def quintic(s: float) -> tuple[float, float]:
-    """Return the share of the way at time share s in [0, 1] and its derivative.
-
-    10 s^3 - 15 s^4 + 6 s^5: speed and acceleration are zero at both ends, the jerk is finite.
-    """
+    """Return 10 s^3 - 15 s^4 + 6 s^5, at rest at both ends of [0, 1], and its derivative."""
     left = 1.0 - s
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * left * left
 
 
 def duration(distance: Array, speed: Array) -> float:
-    """Return how long [s] a quintic over `distance` [rad] at most at `speed` [rad/s] takes."""
+    """Return the duration [s] of a quintic over `distance` [rad] at up to `speed` [rad/s]."""
     reach = np.abs(distance)
     by_speed = float((_PEAK_SPEED * reach / speed).max())
     by_acceleration = sqrt(float((_PEAK_ACCELERATION * reach * RUN_UP / speed).max()))
@@ -204,12 +197,20 @@ def duration(distance: Array, speed: Array) -> float:
 
 
 class OwnMotion:
-    """Visits postures one after the other; all joints of a move start and stop together.
+    """Moves of the controller's own program through postures, synchronised in all joints.
+
+    Args:
+        postures: joint angles (n,) [rad] each.
+        speed: largest speed of each joint, (n,) [rad/s].
+        period: cycle [s].
+        dwell: rest in each posture [s].
+        repeats: move back through the list and forth again until `end`.
 
     Attributes:
-        position, velocity: set-point of the present tick, (n,) [rad], [rad/s].
-        finished: the last posture is reached, or the motion was asked to end.
-        at_rest: no move is under way.
+        position, velocity: set-point of the present cycle, (n,) [rad], [rad/s].
+
+    Raises:
+        SettingError: a posture of another size, or a speed that is not finite and positive.
     """
 
     def __init__(
@@ -221,18 +222,6 @@ class OwnMotion:
         dwell: float = 0.2,
         repeats: bool = False,
     ) -> None:
-        """Take the list; `begin` says from where.
-
-        Args:
-            postures: joint angles (n,) [rad] each.
-            speed: greatest speed of each joint, (n,) [rad/s].
-            period: cycle [s].
-            dwell: rest in each posture [s].
-            repeats: go back through the list at its end, and forth again, until asked to end.
-
-        Raises:
-            SettingError: a posture of another size, or a speed that is not a finite number above 0.
-        """
         self._speed: Array = np.array(speed, dtype=np.float64)
         if not (np.isfinite(self._speed).all() and (self._speed > 0.0).all()):
             raise SettingError("own_motion", self._speed.tolist(), "velocity limits in the URDF")
@@ -248,7 +237,7 @@ class OwnMotion:
         self.begin(np.zeros(n))
 
     def begin(self, position: ArrayLike) -> None:
-        """Start the list from where the arm stands, (n,) [rad]."""
+        """Start from a position, (n,) [rad]."""
         self.position: Array = np.array(position, dtype=np.float64)
         self.velocity: Array = np.zeros_like(self.position)
         self._next = 0
@@ -260,21 +249,21 @@ class OwnMotion:
 
     @property
     def at_rest(self) -> bool:
-        """Whether no move is under way."""
+        """Whether no move is in progress."""
         return self._cycle >= self._cycles
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the last posture was reached, or the last move after `end`."""
         done = self._ending or not 0 <= self._next < len(self._postures)
         return done and self.at_rest
 
     def end(self) -> None:
-        """Finish the move that is under way and begin no other."""
+        """Finish the present move and start no other."""
         self._ending = True
 
     def advance(self) -> tuple[Array, Array]:
-        """Return the set-point of the next tick: position [rad] and velocity [rad/s], (n,)."""
+        """Return the set-point of the next cycle: position [rad] and velocity [rad/s], (n,)."""
         if self.at_rest and not self.finished:
             self._rested += 1
             if self._rested > self._dwell_cycles:
@@ -283,7 +272,7 @@ class OwnMotion:
             self._cycle += 1
             share, rate = quintic(self._cycle / self._cycles)
             way = self._to - self._from
-            # at the end exactly where it was to go, not a rounding beside it
+            # exactly the target at the end
             at_end = self._cycle == self._cycles
             self.position = self._to if at_end else self._from + share * way
             self.velocity = rate / (self._cycles * self._period) * way
@@ -302,19 +291,19 @@ class OwnMotion:
 
 Numbers = Sequence[float]
 Wanted = Sequence[Sequence[float] | None]
-"""D1..D5 that the PC answered for each axis; None for an axis without an answer to be accepted."""
+"""D1..D5 of the reply for each axis; None for an axis without a valid one."""
 
 _ADDS_SPEED = (2, 8)
 _ADDS_CURRENT = (1, 2, 9)
 
 
 class Demand(NamedTuple):
-    """What the servo is to do until the next tick; motor side, (n,) each.
+    """Input of the servo for one cycle; motor side, (n,) each.
 
     Attributes:
         target: rev.
         delta: rev per cycle.
-        speed: added to the speed demanded, rev per cycle.
+        speed: added to the demanded speed, rev per cycle.
         current: added to the target current, A.
     """
 
@@ -325,10 +314,10 @@ class Demand(NamedTuple):
 
 
 class Targets:
-    """Makes the demands, cycle by cycle.
+    """Computes the demand of each cycle from the own program and the replies.
 
     Attributes:
-        own: the targets that the controller reports, (n,) [motor rev].
+        own: targets that the controller reports, (n,) [motor rev].
         own_delta: their speed, (n,) [motor rev per cycle].
     """
 
@@ -348,34 +337,28 @@ class Targets:
 
     @property
     def own_motion_done(self) -> bool:
-        """Whether the controller's own program has nothing left to do."""
+        """Whether the own motion is finished, or there is none."""
         return self._motion is None or self._motion.finished
 
     def release(self, servo: Servo) -> None:
-        """The drive is off: targets are where the motors stand, an own motion is over for good."""
+        """With the drive off, set targets to the motor positions and abort the own motion."""
         self.own, self.own_delta = list(servo.target), list(servo.delta)
         self._offset = [0.0] * len(self.own)
         self._break_off()
 
     def _break_off(self) -> None:
-        """The drive was lost: an own motion under way is not resumed."""
+        """Abort an own motion in progress."""
         self._broken_off = self._broken_off or self._moving
         self._moving = False
 
     def end_own_motion(self) -> None:
-        """Finish the move under way, if there is one, and begin no other."""
+        """Finish the present own move and start no other."""
         if self._motion is not None:
             self._motion.end()
 
     def advance(self, servo: Servo, program: LoopProgram, wanted: Wanted) -> Demand:
-        """Return the demand of the cycle that begins.
-
-        Args:
-            servo: at the present tick.
-            program: says which axes are open and whether the PC is listened to.
-            wanted: what the PC answered, (n,).
-        """
-        demand = self._lead(servo, program)
+        """Return the demand of the cycle that begins, with the PC's reply `wanted` (n,)."""
+        demand = self._own_demand(servo, program)
         if self._settings.corrected and program.listening:
             self.own, self.own_delta = list(demand.target), list(demand.delta)
             self._correct(demand, wanted)
@@ -386,22 +369,22 @@ class Targets:
             self._offset = [0.0] * len(self.own)
         return demand
 
-    def _lead(self, servo: Servo, program: LoopProgram) -> Demand:
-        """Return what the controller does by itself."""
+    def _own_demand(self, servo: Servo, program: LoopProgram) -> Demand:
+        """Return the demand without a reply."""
         n = self._drive.n_axes
         zero = [0.0] * n
         corrected = self._settings.corrected and program.listening
-        if self._plays(program):
-            return Demand(*self._play(), zero, list(zero))
+        if self._moves_itself(program):
+            return Demand(*self._own_move(), zero, list(zero))
         if not program.powered:
             self._break_off()
         self._moving = False
         if corrected:
             return Demand(list(self.own), list(zero), zero, list(zero))
-        goes_on = self._settings.while_silent == "continue"
+        continues = self._settings.while_silent == "continue"
         target, delta = list(servo.target), [0.0] * n
         for i, before in enumerate(servo.delta):
-            if before == 0.0 or not goes_on:
+            if before == 0.0 or not continues:
                 self._ramp[i] = 0.0
                 continue
             delta[i] = self._slow_down(i, before, program)
@@ -409,7 +392,7 @@ class Targets:
         return Demand(target, delta, zero, list(zero))
 
     def _slow_down(self, axis: int, before: float, program: LoopProgram) -> float:
-        """Return the speed after `before` of an axis that nobody leads in this cycle."""
+        """Return the speed after `before` of an axis without a target in this cycle."""
         if program.listening and program.open_axes[axis]:
             self._ramp[axis] = 0.0
             return before
@@ -417,14 +400,13 @@ class Targets:
             self._ramp[axis] = abs(before) * self._settings.period / self._settings.ramp_time
         return copysign(max(0.0, abs(before) - self._ramp[axis]), before)
 
-    def _plays(self, program: LoopProgram) -> bool:
-        """Whether the controller's own motion goes on in this cycle."""
+    def _moves_itself(self, program: LoopProgram) -> bool:
+        """Whether the own motion advances in this cycle."""
         phase = Phase.OPEN if self._settings.corrected else Phase.MOVING
-        there_is_one = self._motion is not None and not self._broken_off
-        return there_is_one and program.phase is phase
+        return self._motion is not None and not self._broken_off and program.phase is phase
 
-    def _play(self) -> tuple[list[float], list[float]]:
-        """Return the own motion's next target and its speed."""
+    def _own_move(self) -> tuple[list[float], list[float]]:
+        """Return the next target of the own motion and its speed."""
         assert self._motion is not None
         if not self._moving:
             self._moving = True
@@ -435,7 +417,7 @@ class Targets:
         return target, [period * v for v in self._drive.motor_speeds(velocity.tolist())]
 
     def _follow(self, demand: Demand, wanted: Wanted) -> None:
-        """Let the PC's targets take the place of the controller's."""
+        """Replace the controller's targets by those of the PC."""
         feeds = self._settings.open_mode == 1
         for i, fields in enumerate(wanted):
             if fields is None:
@@ -447,7 +429,7 @@ class Targets:
                 demand.current[i] = fields[4]
 
     def _correct(self, demand: Demand, wanted: Wanted) -> None:
-        """Let the PC's corrections act on the controller's own targets."""
+        """Apply the PC's corrections to the controller's targets."""
         mode = self._settings.open_mode
         for i, fields in enumerate(wanted):
             before = self._offset[i]
@@ -469,13 +451,30 @@ _COMMON_MODE = {Phase.DRIVING_ON: Mode.DRIVING_ON, Phase.ENDING: Mode.END_OF_SES
 
 
 class SimulatedController:
-    """A C4G with its robot; the peer of a transport in virtual time.
+    """A simulated C4G with its robot, just powered up, at rest with closed brakes.
+
+    Args:
+        urdf: URDF text; the true inertias are these times `truth.inertia_scale`.
+        drive: true drive train, used by servo and plant.
+        truth: rotor inertias, friction and link inertias of the plant.
+        settings: cycle, noise, gains, timing.
+        seed: of the model errors, the noise and the phases of the ripple.
+        session: number of earlier power-ups of the same controller; each has other noise.
+        effects: unmodelled effects, none by default.
+        initial_position: joint angles [rad]; zero by default.
+        gravity: m/s2 in the base frame.
+        stated: drive train in the init packet, in place of `drive`.
+        faults: faults of controller and robot, by packet number.
 
     Attributes:
-        truth: planted rotor inertias, friction and inertias of links.
-        settings: as given.
+        truth, settings: as given.
         period: cycle [s].
-        rejected_replies: replies that were not accepted: wrong number, length or content.
+        rejected_replies: number of replies with a wrong number, length or content.
+        plant: the mechanics with the true position, velocity, acceleration, friction.
+        servo: the servo loops.
+
+    Raises:
+        SettingError: sizes that do not match, or a fault of an axis that the arm does not have.
     """
 
     def __init__(
@@ -493,24 +492,6 @@ class SimulatedController:
         stated: SimulatedDrive | None = None,
         faults: Sequence[ControllerFault] = (),
     ) -> None:
-        """Power the cabinet up; the arm rests with closed brakes.
-
-        Args:
-            urdf: URDF text; its inertias are true but for `truth.inertia_scale`.
-            drive: what the robot really has; servo and plant work with it.
-            truth: rotor inertias, friction and inertias of links of the plant.
-            settings: cycle, noise, gains, time table.
-            seed: of the model's errors, the noise and the phases of the ripple.
-            session: how often the same cabinet was powered up before: each has its own noise.
-            effects: unmodelled effects, none by default.
-            initial_position: joint angles [rad]; the URDF's zero if not given.
-            gravity: m/s2 in the base frame.
-            stated: what the init packet tells the PC instead of `drive`.
-            faults: what goes wrong with controller and robot, by the number of the packet.
-
-        Raises:
-            SettingError: sizes that do not match.
-        """
         n = drive.n_axes
         if truth.n_joints != n or n > AXES_PER_ARM:
             raise SettingError("drive", f"{n} axes", f"{truth.n_joints}, at most {AXES_PER_ARM}")
@@ -527,19 +508,20 @@ class SimulatedController:
             urdf, drive, truth, settings,
             effects=effects, gravity=gravity, position=initial_position, rng=noise_rng,
         )  # fmt: skip
+        self.plant = self._arm.plant
         gains, resolution = settings.servo, settings.current_resolution
         model = NominalModel(urdf, truth, gravity=gravity, error=gains.model_error, rng=model_rng)
-        self._servo = Servo(
+        self.servo = Servo(
             drive, model, gains, period=settings.period, current_resolution=resolution
         )
-        self._servo.start_at(self._arm.encoders())
+        self.servo.start_at(self._arm.encoders())
         self._layout = Layout(n, settings, tail_rng)
         self._targets = Targets(drive, settings, self._own_motion())
-        self._targets.release(self._servo)
+        self._targets.release(self.servo)
         self._faults = self._schedule(faults)
         self._cycle = 0
         self._silent = 0
-        self._program = LoopProgram(n, settings)
+        self.program = LoopProgram(n, settings)
         self._number = 1 if settings.cold_start else 10
         self._nothing: Wanted = (None,) * n
         self._awaiting = False
@@ -557,11 +539,6 @@ class SimulatedController:
         )
 
     def _schedule(self, faults: Sequence[ControllerFault]) -> dict[int, list[ControllerFault]]:
-        """Sort faults by cycle.
-
-        Raises:
-            SettingError: an axis that this arm does not have.
-        """
         schedule: dict[int, list[ControllerFault]] = {}
         for fault in faults:
             if not 1 <= getattr(fault, "axis", 1) <= self._drive.n_axes:
@@ -570,80 +547,57 @@ class SimulatedController:
         return schedule
 
     @property
-    def plant(self) -> Plant:
-        """The true mechanics: position, velocity, acceleration, friction."""
-        return self._arm.plant
-
-    @property
-    def servo(self) -> Servo:
-        """The servo loops."""
-        return self._servo
-
-    @property
     def phase(self) -> Phase:
-        """What the controller is doing."""
-        return self._program.phase
+        """Phase of the loop program."""
+        return self.program.phase
 
     @property
     def reason(self) -> str:
-        """Why the drive was last lost or the session ended; "" if neither."""
-        return self._program.reason
-
-    @property
-    def openings_lost(self) -> int:
-        """Openings in a row that were lost to missing replies."""
-        return self._program.openings_lost
-
-    @property
-    def gave_up(self) -> bool:
-        """Whether the session ends, or has ended, because too many openings were lost."""
-        return self._program.gave_up
+        """Reason of the last loss of the drive or of the end of the session; "" if neither."""
+        return self.program.reason
 
     @property
     def current_delay_cycles(self) -> float:
-        """How many cycles after a position its current stands in the recording; see above.
-
-        A deliberate extra delay among the unmodelled effects is not included.
-        """
+        """Cycles by which the current lags its position in the recording, without `effects`."""
         return 0.5 - self.settings.servo.current_lag / self.period
 
     def standard_parameters(self) -> dict[str, float]:
-        """Return the planted standard parameters by name (m1, mc1x, ..., I6zz, I1m, ...)."""
+        """Return the true standard parameters by name (m1, mc1x, ..., I6zz, I1m, ...)."""
         return standard_parameters(self.plant.model, self.truth.rotor_inertia)
 
     def finish(self) -> None:
-        """Let the program end: drive off, 504, no more packets. Waits for the arm to stand."""
-        self._program.finish()
+        """End the session when the arm is at rest: drive off, 504, no more packets."""
+        self.program.finish()
         self._targets.end_own_motion()
 
     def drive_on(self) -> None:
-        """Press the operator's button after the drive was lost."""
-        self._program.drive_on()
+        """Press the drive-on button after the drive was lost."""
+        self.program.drive_on()
 
     def emergency_stop(self) -> None:
-        """Press the other button: the drive goes off, the brakes close."""
-        self._program.trip("emergency stop")
+        """Press the emergency stop: the drive is switched off, the brakes close."""
+        self.program.trip("emergency stop")
 
     def lose_drive(self, reason: str) -> None:
-        """The drive goes off, for this reason; the brakes close."""
-        self._program.trip(reason)
+        """Switch the drive off for a reason and close the brakes."""
+        self.program.trip(reason)
 
     def restart(self, *, warm: bool) -> None:
-        """Begin anew: cold after `boot_time` of silence, warm with the init packet at once."""
-        self._program = self._program.restarted(replace(self.settings, cold_start=not warm))
+        """Restart: cold after `boot_time` of silence, warm with the init packet at once."""
+        self.program = self.program.restarted(replace(self.settings, cold_start=not warm))
         self._number = 10 if warm else 1
         self._silent = 0 if warm else round(self.settings.boot_time / self.period)
 
     def axis_leaves(self, axis: int) -> None:
-        """One axis (from 1) leaves open mode by itself."""
-        self._program.axis_leaves(axis - 1)
+        """Close one axis (from 1) while the others stay open."""
+        self.program.axis_leaves(axis - 1)
 
     def pause(self, mode: int, cycles: int) -> None:
         """Report mode 500 or 502 for some cycles, then closed axes."""
-        self._program.pause(mode, cycles)
+        self.program.pause(mode, cycles)
 
     def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Something befalls the mechanics of one axis (from 1); see `Disturbances.begin`."""
+        """Disturb one axis (from 1), slip relative to its threshold; see `Disturbances.begin`."""
         if kind == "slip":
             size *= self._drive.following_error[axis - 1]
         self._arm.disturbances.begin(kind, axis - 1, size, cycles)
@@ -654,17 +608,16 @@ class SimulatedController:
         return self._layout.foreign_targets
 
     def next_packet(self) -> bytes | None:
-        """Return the packet of the cycle that begins; None once the session has ended.
+        """Return the packet of the cycle that begins; None after the end of the session.
 
-        It is empty while a controller that was restarted cold is silent. A packet that was never
-        followed by `accept` counts as not answered.
+        It is empty while the controller boots. A packet without `accept` counts as not answered.
         """
         if self._awaiting:
             self.accept(None)
         for fault in self._faults.get(self._cycle, ()):
             fault.apply_to(self)
         self._cycle += 1
-        phase = self._program.phase
+        phase = self.program.phase
         if phase is Phase.ENDED:
             return None
         self._awaiting = True
@@ -672,12 +625,12 @@ class SimulatedController:
             return b""
         if phase is not Phase.START:
             return self._cyclic_packet(phase)
-        if self._program.start_step is StartStep.INIT:
+        if self.program.start_step is StartStep.INIT:
             return self._layout.init(self._stated, self.period)
         return CyclicPacket.zeros(self._number, MAX_AXES).encode()
 
     def accept(self, reply: bytes | None) -> None:
-        """Take the PC's answer to the last packet (None: none came) and let one period pass."""
+        """Process the reply to the last packet (None if none came) and simulate one period."""
         if not self._awaiting:
             return
         self._awaiting = False
@@ -686,45 +639,45 @@ class SimulatedController:
             self._run(Demand([], [], [], []))
             return
         answer, wanted = self._read(reply) if reply is not None else (MISSING, self._nothing)
-        demand = self._targets.advance(self._servo, self._program, wanted)
+        demand = self._targets.advance(self.servo, self.program, wanted)
         if not all(map(isfinite, chain(*demand))):
-            self._program.trip("the PC sent a number that is none")
+            self.program.trip("the PC sent a number that is not finite")
         done = self._targets.own_motion_done
-        self._program.advance(answer, not any(demand.delta), done)
+        self.program.advance(answer, not any(demand.delta), done)
         self._run(demand)
         self._number = next_number(self._number)
 
     def _run(self, demand: Demand) -> None:
-        """Move the arm for one period and read its encoders."""
-        servo, program = self._servo, self._program
+        """Simulate the arm for one period and read its encoders."""
+        servo, program = self.servo, self.program
         if program.powered:
             servo.feed(demand.speed, demand.current)
             currents = servo.advance(demand.target, demand.delta)
             self._arm.run_cycle(currents, braked=program.braked)
             servo.measure(self._arm.encoders())
-            self._watch_following_error()
+            self._check_following_error()
         else:
             self._arm.run_cycle(None, braked=True)
             servo.measure(self._arm.encoders())
             servo.release()
             self._targets.release(servo)
 
-    def _watch_following_error(self) -> None:
-        """Switch the drive off where an axis does not follow."""
+    def _check_following_error(self) -> None:
+        """Switch the drive off if an axis exceeds its threshold."""
         thresholds = self._drive.following_error
-        errors = self._servo.following_error()
+        errors = self.servo.following_error()
         if not any(map(gt, map(abs, errors), thresholds)):
             return
         for axis, (error, threshold) in enumerate(zip(errors, thresholds, strict=True), start=1):
             if abs(error) > threshold:
-                self._program.trip(
+                self.program.trip(
                     f"following error of axis {axis}: {error:.3f} motor revolutions, "
                     f"threshold {threshold:g}"
                 )
 
     def _read(self, reply: bytes) -> tuple[Answer, Wanted]:
-        """Return what a reply asks for, and what it says of each axis where that counts."""
-        program, layout = self._program, self._layout
+        """Decode a reply: its requests, and the fields of each open axis."""
+        program, layout = self.program, self._layout
         try:
             if packet_number(reply) != next_number(self._number):
                 raise PacketError("number", packet_number(reply), "that of this cycle")
@@ -743,7 +696,7 @@ class SimulatedController:
         )
         if answer.drive_off or answer.following_error or not program.listening:
             return answer, self._nothing
-        layout.obey(packet)
+        layout.move_foreign(packet)
         answered = packet.axes["d"][layout.own].tolist()
         open_mode = self.settings.open_mode
         return answer, [
@@ -752,8 +705,8 @@ class SimulatedController:
         ]
 
     def _cyclic_packet(self, phase: Phase) -> bytes:
-        """Return the packet of a running exchange."""
-        servo, program, layout = self._servo, self._program, self._layout
+        """Return the cyclic packet of the present cycle."""
+        servo, program, layout = self.servo, self.program, self._layout
         common = program.pause_mode if phase is Phase.PAUSED else _COMMON_MODE.get(phase)
         layout.set_modes(common, program.open_axes)
         zero = [0.0] * self._drive.n_axes

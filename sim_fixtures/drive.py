@@ -1,16 +1,16 @@
-"""How the simulated robot's motors are geared to its joints.
+"""Drive train of the simulated robot: motors, gears, wrist coupling.
 
-Written per axis from the controller's own formulas: axes 1 to 4 stand alone, 4 turns 5 and 6 along,
-5 turns 6 along. It shares no code with the drive train that the PC uses, so that a wrong sign on
-one side cannot cancel on the other.
+Implemented per axis from the formulas of the controller, without code of the drive train of the PC,
+so that a sign error on one side cannot cancel on the other. Motor 4 also turns axes 5 and 6, motor
+5 also axis 6.
 
-With a the angles the teach pendant shows (a = sign * q + offset, q the joint angles of the URDF):
+With the controller angles a = sign * q + offset, q the joint angles of the URDF:
 
     p_i = kr_i a_i / 2 pi + cal_i                                   all axes but 5 and 6
     p_5 = kr_5 (a_5 - k54 a_4) / 2 pi + cal_5
     p_6 = kr_6 (a_6 - k65 a_5 + (k65 k54 - k64) a_4) / 2 pi + cal_6
 
-Joint torques follow from motor torques by virtual work, so the coupling acts on them transposed.
+Joint torques follow from motor torques by the transposed coupling.
 """
 
 from __future__ import annotations
@@ -116,10 +116,10 @@ class SimulatedDrive:
         return [p + zero for p, zero in zip(self.motor_speeds(q), self._motor_at_zero, strict=True)]
 
     def motor_speeds(self, qd: Sequence[float]) -> list[float]:
-        """Return motor speeds [rev/s] of joint speeds [rad/s]; calibration and offset drop out."""
+        """Return motor speeds [rev/s] of joint speeds [rad/s]."""
         speeds = [ratio * v for ratio, v in zip(self._signed_ratio, qd, strict=True)]
         if self._coupled:
-            # the coupling is between controller angles, hence the signs
+            # the coupling is defined for controller angles
             kr, sign = self.gear_ratio, self.joint_sign
             a4, a5 = sign[3] * qd[3], sign[4] * qd[4]
             speeds[4] -= kr[4] * self.k54 * a4 / (2.0 * pi)
@@ -134,7 +134,7 @@ class SimulatedDrive:
         ]
 
     def joint_speeds(self, revolutions_per_second: Sequence[float]) -> list[float]:
-        """Return joint speeds [rad/s] of motor speeds [rev/s]; accelerations map alike."""
+        """Return joint speeds [rad/s] of motor speeds [rev/s]; also for accelerations."""
         speeds = [
             v / ratio for v, ratio in zip(revolutions_per_second, self._signed_ratio, strict=True)
         ]
@@ -150,14 +150,14 @@ class SimulatedDrive:
         motor = [kt * i for kt, i in zip(self.torque_constant, currents, strict=True)]
         torque = [2.0 * pi * ratio * m for ratio, m in zip(self._signed_ratio, motor, strict=True)]
         if self._coupled:
-            # motors 5 and 6 also push on joint 4, motor 6 on joint 5
+            # motors 5 and 6 also act on joint 4, motor 6 on joint 5
             kr, sign = self.gear_ratio, self.joint_sign
             torque[3] += sign[3] * (kr[5] * self._k46 * motor[5] - kr[4] * self.k54 * motor[4])
             torque[4] -= sign[4] * kr[5] * self.k65 * motor[5]
         return torque
 
     def currents(self, torques: Sequence[float]) -> list[float]:
-        """Return the motor currents [A] that give joint torques [N m]."""
+        """Return the motor currents [A] of joint torques [N m]."""
         motor = [
             t / (2.0 * pi * ratio) for t, ratio in zip(torques, self._signed_ratio, strict=True)
         ]
@@ -168,6 +168,6 @@ class SimulatedDrive:
         return [m / kt for m, kt in zip(motor, self.torque_constant, strict=True)]
 
     def encoder(self, revolutions: Sequence[float], noise: Sequence[float]) -> list[float]:
-        """Return motor positions as encoders read them: whole counts, `noise` in counts."""
+        """Return the encoder readings of motor positions [rev], with `noise` in counts."""
         counts = self.encoder_counts
         return [round(p * counts + e) / counts for p, e in zip(revolutions, noise, strict=True)]

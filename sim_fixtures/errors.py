@@ -1,30 +1,18 @@
-"""What can go wrong in the simulated cell.
-
-SimulationError
-├── FixtureError        a figure of a fixture is impossible
-├── SettingError        a setting that the simulation cannot run with: name, value, what is valid
-└── PlantDiverged       the integration left the finite numbers: joint, time
-"""
+"""Errors of the simulated cell; all derive from `SimulationError`."""
 
 from __future__ import annotations
 
 
 class SimulationError(Exception):
-    """Base of every error raised by the simulated cell."""
+    """Base of every error of the simulated cell."""
 
 
 class FixtureError(SimulationError):
-    """A fixture's figures contradict each other."""
+    """Parameters of a fixture are impossible."""
 
 
 class SettingError(SimulationError, ValueError):
-    """A setting is out of range or of the wrong size.
-
-    Attributes:
-        name: the setting.
-        value: what was given.
-        valid: what would have been valid, in words.
-    """
+    """A setting is out of range or of the wrong size; `valid` states what is valid."""
 
     def __init__(self, name: str, value: object, valid: str) -> None:
         self.name = name
@@ -34,12 +22,7 @@ class SettingError(SimulationError, ValueError):
 
 
 class PlantDiverged(SimulationError):  # noqa: N818 - the field says "diverged", not "error"
-    """The simulated arm left the finite numbers.
-
-    Attributes:
-        joint: 0-based index of the first joint concerned.
-        time: simulated time [s].
-    """
+    """The state of the simulated arm is not finite; `joint` counts from 0, `time` in s."""
 
     def __init__(self, joint: int, time: float) -> None:
         self.joint = joint

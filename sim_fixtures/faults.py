@@ -1,7 +1,6 @@
-"""Faults of the simulated controller and its robot, and one line of text for any fault.
+"""Faults of the simulated controller and its robot, and the text format of all faults.
 
-Cycles count the controller's packets from 0, as those of `drivers.transports.faults` do. Axes count
-from 1, as they are printed.
+Cycles are packets of the controller from 0, as in `drivers.transports.faults`; axes count from 1.
 """
 
 from __future__ import annotations
@@ -20,33 +19,30 @@ if TYPE_CHECKING:
 GRAMMAR: Final = """\
 KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
 
-lose@1200x3                      packets to the PC never arrive; :to_controller the PC's answers
+lose@1200x3                      packets to the PC are lost; :to_controller the PC's answers
 delay@1200:5ms                   they arrive later, by ms, us, s or cycles (:1.5cycles)
 duplicate@1200                   they arrive twice
 reorder@1200                     the packet is overtaken by the next one
 corrupt@1200:offset=8            the byte at that offset is changed; :mask=0x80 says which bits
     all five: to_pc (the default) or to_controller
-restart@5000:cold                the controller starts anew; :warm with the init packet at once
-drive-drop@2000                  the drive goes off by itself
+restart@5000:cold                the controller restarts; :warm with the init packet at once
+drive-drop@2000                  the drive is switched off
 e-stop@2000                      the emergency stop is pressed
 axis-leaves@2000:axis=3          one axis leaves open mode
-following-error@2000x500:axis=2  the axis is stuck; :slip its encoder is read wrongly
+following-error@2000x500:axis=2  the axis is stuck; :slip its encoder reads a wrong position
 saturate@2000x500:axis=1         a load drives the current near its limit
-push@2000x50:axis=1              somebody leans against the axis; nothing trips
+push@2000x50:axis=1              a push on the axis that does not trip the drive
 pause@2000x50:502                the controller pauses; :500 for the other kind"""
 
 
-SLIP = 1.5
-"""Size of an encoder's slip, as a multiple of the axis's following-error threshold."""
-LOAD = 0.9
-"""Size of a load, as a share of what the axis's motor can muster."""
-PUSH = 0.15
-"""Size of a push, likewise: nothing trips, and the repetition is another one than its fellows."""
+SLIP = 1.5  # encoder error as a multiple of the following-error threshold
+LOAD = 0.9  # load as a share of the largest motor torque
+PUSH = 0.15  # push as a share of the largest motor torque; it does not trip the drive
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """What a kind of fault takes: an axis, a count (0: none), words (the default first)."""
+    """Options of a kind of fault: an axis, a default count (0: none), words (default first)."""
 
     axis: bool = False
     count: int = 0
@@ -68,14 +64,14 @@ _OF_LINK: Final = ("lose", "delay", "duplicate", "reorder", "corrupt")
 
 @dataclass(frozen=True)
 class ControllerFault:
-    """One fault of the controller or its robot; see `GRAMMAR` for what each kind is.
+    """One fault of the controller or its robot; see `GRAMMAR` for the kinds.
 
     Attributes:
-        kind: as in a line of text.
-        cycle: in which it happens.
-        axis: from 1; 1 for kinds that have none.
-        count: cycles that it lasts; 1 for kinds that have none.
-        word: option of its kind, "" for kinds that have none.
+        kind: as in the text.
+        cycle: cycle of its beginning.
+        axis: from 1; 1 for kinds without axis.
+        count: duration in cycles; 1 for kinds without count.
+        word: option of the kind; "" without one.
     """
 
     kind: str
@@ -85,7 +81,7 @@ class ControllerFault:
     word: str = ""
 
     def apply_to(self, controller: SimulatedController) -> None:
-        """Make it happen."""
+        """Apply the fault."""
         match self.kind:
             case "restart":
                 controller.restart(warm=self.word == "warm")
@@ -114,12 +110,7 @@ _SECONDS: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 
 class FaultScriptError(SimulationError, ValueError):
-    """A line that describes no fault.
-
-    Attributes:
-        text: the line.
-        reason: what is wrong with it.
-    """
+    """A text that is not a fault, with the reason."""
 
     def __init__(self, text: str, reason: str) -> None:
         self.text = text
@@ -128,7 +119,7 @@ class FaultScriptError(SimulationError, ValueError):
 
 
 class _Line:
-    """The parts of a line; every option has to be asked for."""
+    """The parts of a text; each option is removed when it is read."""
 
     def __init__(self, text: str) -> None:
         head, *self.options = text.strip().split(":")
@@ -141,13 +132,13 @@ class _Line:
 
     @staticmethod
     def _cycles(what: str, digits: str) -> int:
-        # Compared by length first: Python refuses to read thousands of digits.
+        # By length first: int() rejects thousands of digits.
         if len(digits.lstrip("0")) > len(str(link.MOST_CYCLES)) or int(digits) > link.MOST_CYCLES:
             raise ValueError(f"the {what} is more than {link.MOST_CYCLES}")
         return int(digits)
 
     def word(self, *words: str) -> str:
-        """The one of `words` that is an option; the first if none is."""
+        """Return the one of `words` that is an option; the first if none is."""
         found = next((option for option in self.options if option in words), None)
         if found is None:
             return words[0]
@@ -155,7 +146,7 @@ class _Line:
         return found
 
     def number(self, name: str, default: int | None = None) -> int:
-        """The value of option NAME=..., decimal or with 0x."""
+        """Return the value of option NAME=..., decimal or hexadecimal with 0x."""
         found = next((option for option in self.options if option.startswith(f"{name}=")), None)
         if found is None:
             if default is None:
@@ -168,7 +159,7 @@ class _Line:
             raise ValueError(f"{found!r} is not {name}=NUMBER") from None
 
     def time(self) -> dict[str, float]:
-        """The duration as keyword arguments of `Delay`."""
+        """Return the duration as keyword arguments of `Delay`."""
         for option in self.options:
             match = _TIME.fullmatch(option)
             if match is not None:
@@ -181,10 +172,10 @@ class _Line:
 
 
 def parse_fault(text: str) -> Fault:
-    """Return the fault that a line describes; see `GRAMMAR`.
+    """Return the fault of a text; see `GRAMMAR`.
 
     Raises:
-        FaultScriptError: it describes none.
+        FaultScriptError: the text is not a fault.
     """
     try:
         line = _Line(text)
@@ -236,5 +227,5 @@ def split_faults(
 ) -> tuple[tuple[link.Fault, ...], tuple[ControllerFault, ...]]:
     """Return the faults of the link and those of the controller."""
     every = tuple(faults)
-    of_controller = tuple(fault for fault in every if isinstance(fault, ControllerFault))
-    return tuple(fault for fault in every if not isinstance(fault, ControllerFault)), of_controller
+    of_link = tuple(fault for fault in every if not isinstance(fault, ControllerFault))
+    return of_link, tuple(fault for fault in every if isinstance(fault, ControllerFault))

@@ -1,12 +1,12 @@
-"""The simulated arm: rigid bodies of a URDF, rotor inertias, friction with a real standstill.
+"""Simulated arm: rigid bodies of a URDF, rotor inertias, friction with stiction.
 
 Forward dynamics are pinocchio's articulated-body algorithm with the rotor inertias as armature
-(link side, diagonal). One step drifts half, kicks, drifts half:
+(link side, diagonal). One step is
 
     q_mid = q + h/2 v;   v' = v + h a(q_mid, v + h/2 a_before, torque);   q' = q_mid + h/2 v'
 
-It is exact for constant acceleration, symplectic for a system with constant inertia, and of second
-order otherwise, at the price of one evaluation.
+It is exact for constant acceleration, symplectic for constant inertia, and of second order
+otherwise, with one evaluation of the dynamics.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _TENSOR_KEYS = ("xx", "xy", "yy", "xz", "yz", "zz")
 
 @dataclass(frozen=True, eq=False)
 class PlantTruth:
-    """Rotor inertias, friction and inertias of links; every array (n,), on the joint side.
+    """True rotor inertias, friction and link inertias; arrays (n,), on the joint side.
 
     Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3).
 
@@ -38,13 +38,13 @@ class PlantTruth:
         coulomb: N m.
         viscous: N m s/rad.
         third: N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic").
-        third_law: which of the two.
-        inertia_scale: mass, first moment and tensor of what each joint moves, over those of the
-            URDF; (1,) for the same of all joints. Scaled alike, a possible body stays one.
+        third_law: law of the third term.
+        inertia_scale: factor on mass, first moment and tensor of each link of the URDF; (1,) for
+            one factor of all.
 
     Raises:
-        SettingError: arrays of different sizes, non-finite or (all but `third`) negative values,
-            a scale that is not positive.
+        SettingError: arrays of different sizes, non-finite or (except `third`) negative values, a
+            scale that is not positive.
     """
 
     rotor_inertia: Array
@@ -89,7 +89,7 @@ class PlantTruth:
         return self.coulomb * np.sign(v) + self.smooth_friction(v)
 
     def smooth_friction(self, velocity: Array) -> Array:
-        """Return the part of the friction torque that vanishes with the velocity."""
+        """Return the friction torque without its Coulomb part."""
         factor = self.viscous
         if self._has_third:
             shape = np.abs(velocity) if self.third_law == "quadratic" else velocity * velocity
@@ -114,8 +114,7 @@ def standard_parameters(model: pin.Model, rotor_inertia: ArrayLike) -> dict[str,
 
 
 MAX_SWEEPS = 200
-TOLERANCE = 1e-6
-"""Change of a torque that is no longer made, relative to the Coulomb torque."""
+TOLERANCE = 1e-6  # of friction torques, relative to the Coulomb torque
 
 
 class DryFriction(NamedTuple):
@@ -139,25 +138,25 @@ def resolve_dry_friction(
         inverse_inertia: A, (n, n), symmetric, positive definite.
         coulomb: Coulomb torques f0, (n,) [N m].
         step: h [s].
-        guess: torques to start from, (n,) [N m]; those of the step before.
+        guess: initial torques of the iteration, (n,) [N m].
     """
     coupling = inverse_inertia * step
     rows: list[list[float]] = coupling.tolist()
     torque = [max(-c, min(c, f)) for f, c in zip(guess, coulomb, strict=True)]
     velocity: list[float] = (np.array(free_velocity) - coupling @ torque).tolist()
     for _ in range(MAX_SWEEPS):
-        settled = True
+        converged = True
         for i, limit in enumerate(coulomb):
-            held = torque[i]
-            wanted = max(-limit, min(limit, held + velocity[i] / rows[i][i]))
-            change = wanted - held
+            before = torque[i]
+            wanted = max(-limit, min(limit, before + velocity[i] / rows[i][i]))
+            change = wanted - before
             if abs(change) > TOLERANCE * limit:
                 torque[i] = wanted
                 velocity = [v - a * change for v, a in zip(velocity, rows[i], strict=True)]
-                settled = False
-        if settled:
+                converged = False
+        if converged:
             break
-    # a joint stands if friction had enough in hand to take away what is left of its velocity
+    # a joint sticks if its Coulomb torque suffices to remove the rest of its velocity
     for i, limit in enumerate(coulomb):
         if abs(torque[i] + velocity[i] / rows[i][i]) < limit:
             velocity[i] = 0.0
@@ -167,14 +166,12 @@ def resolve_dry_friction(
 def build_model(
     urdf: str, gravity: ArrayLike, armature: ArrayLike, inertia_scale: ArrayLike = 1.0
 ) -> pin.Model:
-    """Return pinocchio's model of a URDF text with gravity [m/s2] and armature [kg m2] set.
-
-    What each joint moves has `inertia_scale` (n,) times the inertia of the URDF.
+    """Return pinocchio's model of a URDF text with gravity [m/s2], armature [kg m2], scaled links.
 
     Raises:
-        SettingError: the joints are not as many as the armatures, or not simple revolute ones.
+        SettingError: the number of armatures is not that of the joints, or a joint is not revolute.
     """
-    model = pin.buildModelFromXML(_with_one_angle_each(urdf))
+    model = pin.buildModelFromXML(_as_revolute(urdf))
     inertias = np.asarray(armature, dtype=np.float64)
     if not model.nq == model.nv == inertias.size:
         raise SettingError(
@@ -187,16 +184,16 @@ def build_model(
 
 
 def scale_bodies(model: pin.Model, factor: ArrayLike) -> None:
-    """Scale mass, first moment and tensor of what each joint moves, in place; `factor` (n,)."""
+    """Scale mass, first moment and tensor of each link in place; `factor` (n,)."""
     for i, scale in enumerate(np.broadcast_to(factor, model.nv).tolist(), start=1):
         body = model.inertias[i]
         model.inertias[i] = pin.Inertia(scale * body.mass, body.lever, scale * body.inertia)
 
 
-def _with_one_angle_each(urdf: str) -> str:
-    """Continuous joints as revolute ones: pinocchio describes the former by sine and cosine."""
+def _as_revolute(urdf: str) -> str:
+    """Return the URDF with continuous joints as revolute: pinocchio gives those one angle."""
     root = ET.fromstring(urdf)
-    # To pinocchio a namespace is nothing; ET would write it back before every name.
+    # pinocchio ignores a namespace; ET would write it before every name.
     namespace = root.tag[: root.tag.rfind("}") + 1]
     for element in root.iter():
         element.tag = element.tag.removeprefix(namespace)
@@ -220,11 +217,18 @@ def joint_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
 
 
 class Plant:
-    """A rigid arm under joint torques.
+    """A rigid arm under joint torques, initially at rest.
+
+    Args:
+        urdf: URDF text.
+        truth: rotor inertias, friction and link inertias.
+        gravity: m/s2 in the base frame.
+        position: joint angles [rad]; zero by default.
+        brake_torque: dry friction of the closed brake of each joint [N m].
 
     Attributes:
-        truth: the planted rotor inertias, friction and inertias of links.
-        model: pinocchio's model; its armature holds the rotor inertias.
+        truth: as given.
+        model: pinocchio's model, with the rotor inertias as armature.
         position, velocity, acceleration: state (n,), rad, rad/s, rad/s2. The acceleration is the
             mean over the last step.
         time: simulated time [s].
@@ -239,15 +243,6 @@ class Plant:
         position: ArrayLike | None = None,
         brake_torque: ArrayLike = 0.0,
     ) -> None:
-        """Put the arm at rest.
-
-        Args:
-            urdf: URDF text.
-            truth: rotor inertias, friction, and how far the links are those of the URDF.
-            gravity: m/s2 in the base frame.
-            position: joint angles [rad]; the URDF's zero if not given.
-            brake_torque: dry friction of each joint's brake when it is closed [N m].
-        """
         n = truth.n_joints
         self.truth = truth
         self.model = build_model(urdf, gravity, truth.rotor_inertia, truth.inertia_scale)
@@ -277,16 +272,16 @@ class Plant:
 
     @property
     def friction_torque(self) -> Array:
-        """Friction during the last step, (n,) [N m], positive against positive speed."""
+        """Friction during the last step, (n,) [N m], positive at positive speed."""
         return self._dry + self._smooth
 
     @property
     def motor_position(self) -> Array:
-        """Where the motors stand, as joint angles (n,) [rad]; the joints', for gears are rigid."""
+        """Motor positions as joint angles (n,) [rad]; those of the joints with rigid gears."""
         return self.position
 
     def set_state(self, position: ArrayLike, velocity: ArrayLike) -> None:
-        """Put the arm somewhere, moving: (n,) [rad] and (n,) [rad/s]."""
+        """Set position (n,) [rad] and velocity (n,) [rad/s]."""
         self.position = np.array(position, dtype=np.float64)
         self.velocity = np.array(velocity, dtype=np.float64)
         self.acceleration = self._trend = np.zeros(self.n_joints)
@@ -299,17 +294,17 @@ class Plant:
             self._set_coulomb()
 
     def scale_friction(self, factor: Array) -> None:
-        """Set the factor on all friction but the brakes', (n,)."""
+        """Set the factor on all friction except that of brakes, (n,)."""
         self._scale = factor
         self._set_coulomb()
 
     def jam(self, torque: Array | None) -> None:
-        """Set dry friction that comes on top of everything, (n,) [N m]; None for none."""
+        """Set additional dry friction, (n,) [N m]; None for none."""
         self._jam = torque
         self._set_coulomb()
 
     def _set_coulomb(self) -> None:
-        """Set the dry friction that each joint can muster [N m]."""
+        """Update the Coulomb torque of each joint [N m]."""
         coulomb = self.truth.coulomb
         if self._scale is not None:
             coulomb = coulomb * self._scale
@@ -319,17 +314,16 @@ class Plant:
 
     def energy(self) -> float:
         """Return kinetic (rotors included) plus potential energy [J]."""
-        # From the inertia matrix: pinocchio's own kinetic energy (4.1) leaves the armature of
-        # joints out whose axis is not +x, +y or +z.
+        # The kinetic energy of pinocchio 4.1 omits armatures of joints about axes not +x, +y or +z.
         momentum = joint_inertia(self.model, self.data, self.position) @ self.velocity
         potential = pin.computePotentialEnergy(self.model, self.data, self.position)
         return float(0.5 * self.velocity @ momentum + potential)
 
     def step(self, torque: Array, step: float) -> None:
-        """Advance by `step` [s] under joint torques (n,) [N m] that are constant over it.
+        """Advance by `step` [s] under constant joint torques (n,) [N m].
 
         Raises:
-            PlantDiverged: the state left the finite numbers.
+            PlantDiverged: the state is not finite.
         """
         self.time += step
         if self._rests_on(torque):
@@ -343,12 +337,12 @@ class Plant:
         self.position = middle + half * self.velocity
 
     def _smooth_friction(self, velocity: Array) -> Array:
-        """Return the friction that vanishes with the velocity, warm or cold as it is [N m]."""
+        """Return the scaled friction without its Coulomb part [N m]."""
         smooth = self.truth.smooth_friction(velocity)
         return smooth if self._scale is None else smooth * self._scale
 
     def _rests_on(self, torque: Array) -> bool:
-        """Return whether an arm resting under gravity torque `_holding` stays so."""
+        """Whether an arm at rest under gravity torque `_holding` stays at rest."""
         if self._holding is None:
             return False
         friction = torque - self._holding
@@ -361,7 +355,7 @@ class Plant:
     def _advance(
         self, torque: Array, coulomb: Array, middle: Array, predicted: Array, step: float
     ) -> None:
-        """Set velocity, acceleration and dry friction from torques without dry friction."""
+        """Update velocity, acceleration and dry friction from torques without dry friction."""
         before = self.velocity.tolist()
         if 0.0 not in before:
             sliding = np.copysign(coulomb, self.velocity)
@@ -377,7 +371,7 @@ class Plant:
     def _stop_or_turn(
         self, torque: Array, coulomb: Array, middle: Array, predicted: Array, step: float
     ) -> None:
-        """Do the same where a joint stands, starts, stops or turns within the step."""
+        """Do so if a joint rests, starts, stops or reverses within the step."""
         free = pin.aba(self.model, self.data, middle, predicted, torque)
         inverse = pin.computeMinverse(self.model, self.data, middle)
         result = resolve_dry_friction(
@@ -395,19 +389,27 @@ class Plant:
             gravity = pin.computeGeneralizedGravity(self.model, self.data, self.position)
             self._holding = np.array(gravity)
         self.acceleration = (after - self.velocity) / step
-        # a joint that has just been stopped does not go on decelerating
+        # a joint that has just stopped does not decelerate further
         self._trend = np.where(after == 0.0, 0.0, self.acceleration)
         self.velocity = after
         self._dry = np.array(result.torque)
 
 
 DAMPING_RATIO = 0.05
-MAX_STEP_ANGLE = 1.0
-"""Largest natural frequency times step [rad] that the integration is trusted with."""
+MAX_STEP_ANGLE = 1.0  # largest natural frequency times step [rad] of a stable integration
 
 
 class ElasticPlant(Plant):
-    """A plant whose links hang on springs behind the gears of some axes."""
+    """A plant with springs behind the gears of some axes, initially loaded by gravity.
+
+    Args:
+        urdf, truth, gravity, position, brake_torque: as of `Plant`.
+        elasticity: compliance of each gear (n,) [rad/(N m)]; 0 is rigid.
+        step: step of the simulation [s].
+
+    Raises:
+        SettingError: no elastic axis, one without a rotor, or a resonance too fast for `step`.
+    """
 
     def __init__(
         self,
@@ -420,20 +422,6 @@ class ElasticPlant(Plant):
         position: ArrayLike | None = None,
         brake_torque: ArrayLike = 0.0,
     ) -> None:
-        """Put the arm at rest, the springs loaded by gravity.
-
-        Args:
-            urdf: URDF text.
-            truth: rotor inertias, friction, and how far the links are those of the URDF.
-            gravity: m/s2 in the base frame.
-            position: joint angles [rad]; the URDF's zero if not given.
-            brake_torque: dry friction of each joint's closed brake [N m].
-            elasticity: compliance of each gear (n,) [rad/(N m)]; 0 is rigid.
-            step: the step that will be used [s].
-
-        Raises:
-            SettingError: no elastic axis, one without a rotor, or a resonance too fast for `step`.
-        """
         super().__init__(urdf, truth, gravity=gravity, position=position, brake_torque=brake_torque)
         compliance = np.asarray(elasticity, dtype=np.float64)
         if compliance.shape != (self.n_joints,) or not (compliance > 0.0).any():
@@ -445,7 +433,7 @@ class ElasticPlant(Plant):
         self._rigid = ~soft
         self._stiffness: Array = np.where(soft, 1.0 / np.where(soft, compliance, 1.0), 0.0)
         self._rotor: Array = np.where(soft, truth.rotor_inertia, 1.0)
-        # the rotors of elastic axes are bodies of their own
+        # rotors of elastic axes are separate bodies
         self.model.armature = np.where(soft, 0.0, truth.rotor_inertia)
         self._damping: Array = self._damping_within(step)
         gravity_torque = pin.computeGeneralizedGravity(self.model, self.data, self.position)
@@ -454,7 +442,7 @@ class ElasticPlant(Plant):
         self._motor_trend: Array = np.zeros(self.n_joints)
 
     def _damping_within(self, step: float) -> Array:
-        """Return each spring's damper [N m s/rad]; SettingError if `step` is too long for one."""
+        """Return the damping of each spring [N m s/rad]; SettingError if `step` is too long."""
         inertia = joint_inertia(self.model, self.data, self.position).diagonal()
         reduced = 1.0 / (1.0 / self._rotor + 1.0 / inertia)
         fastest = float(np.sqrt(self._stiffness / reduced).max())
@@ -466,7 +454,7 @@ class ElasticPlant(Plant):
 
     @property
     def motor_position(self) -> Array:
-        """Where the motors stand, as joint angles (n,) [rad]."""
+        """Motor positions as joint angles (n,) [rad]."""
         return np.where(self._soft, self._motor, self.position)
 
     def energy(self) -> float:
@@ -500,11 +488,11 @@ class ElasticPlant(Plant):
         """Accelerate the rotors of the elastic axes and return their friction (n,) [N m]."""
         smooth = self._smooth_friction(predicted)
         free = self._motor_velocity + step * (torque - smooth) / self._rotor
-        # alone on its axis, a rotor is stopped by the friction that takes its free speed away
+        # a rotor is coupled to no other, so the friction that stops it is explicit
         momentum = self._rotor / step
         dry = np.minimum(np.maximum(free * momentum, -coulomb), coulomb)
         after = np.where(np.abs(dry) < coulomb, 0.0, free - dry / momentum) * self._soft
-        # a rotor that has just been stopped does not go on decelerating
+        # a rotor that has just stopped does not decelerate further
         self._motor_trend = np.where(after == 0.0, 0.0, (after - self._motor_velocity) / step)
         self._motor_velocity = after
         friction: Array = (smooth + dry) * self._soft

@@ -1,8 +1,8 @@
-"""The program that runs on the simulated controller: which phase it is in and when it moves on.
+"""State machine of the program on the simulated controller.
 
-It plays the usual loop program: start the link, switch the drive on, open all axes (one after the
-other), wait until the PC wants out, close, pause, open again. It knows nothing of packets, motors
-or robots; once a cycle it receives what the PC's answer asked for.
+The program starts the link, switches the drive on, opens the axes one after the other, waits for
+the end of open mode, closes the axes and opens them again. Its input is the content of one reply
+per cycle.
 
     START -> DRIVE_OFF -> DRIVING_ON -> CLOSED -> OPENING -> OPEN -> CLOSING -+
                   ^           ^           ^                                   |
@@ -24,7 +24,7 @@ from sim_fixtures.settings import ControllerSettings
 
 
 class Phase(IntEnum):
-    """What the controller is doing."""
+    """State of the program."""
 
     START = auto()
     DRIVE_OFF = auto()
@@ -54,13 +54,13 @@ POWERED = frozenset(
 )
 UNBRAKED = POWERED - {Phase.DRIVING_ON}
 STILL_OPEN = frozenset({Phase.CLOSING, Phase.TRIPPED})
-"""Phases in which an axis keeps for some cycles the mode it had."""
+"""Phases whose first cycles report the previous modes."""
 HAS_OPEN_AXES = frozenset({Phase.OPENING, Phase.OPEN, Phase.CLOSING})
 LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
 
 
 class StartStep(IntEnum):
-    """What the packets of the start are."""
+    """Kind of a packet of the start."""
 
     SYNC = auto()
     INIT = auto()
@@ -75,11 +75,11 @@ def _cycles(count: int) -> str:
 
 
 class Answer(NamedTuple):
-    """What one reply of the PC asked for.
+    """Requests in one reply of the PC.
 
     Attributes:
         valid: a reply came, with the right number and length.
-        exit: end of open mode asked for (status byte 1).
+        exit: end of open mode requested (status byte 1).
         drive_off: mode 505 on some axis.
         following_error: mode 508 on some axis.
     """
@@ -100,14 +100,14 @@ class LoopProgram:
         phase: the present one.
         powered: whether the drive is on (status DRIVE_ON).
         braked: whether the brakes are closed.
-        wanted_axes: which axes the program opens, (n,).
+        wanted_axes: axes that the program opens, (n,).
         listening: whether targets of open axes are read from the PC.
-        open_axes: which axes stand in open mode in the packet of this cycle, (n,).
-        reason: why the drive was last lost or the session ended, in words; "" if neither.
-        intervals: how often all of these have been open.
-        openings_lost: openings in a row that ended because replies were missing, or by 508.
-        gave_up: the session ends because there were too many of these.
-        pause_mode: mode of every axis in phase PAUSED.
+        open_axes: axes in open mode in the packet of this cycle, (n,).
+        reason: reason of the last loss of the drive or of the end of the session; "" if neither.
+        intervals: number of times that all wanted axes were open.
+        openings_lost: consecutive openings that ended by missing replies or 508.
+        gave_up: whether the session ends because of too many of these.
+        pause_mode: mode of each axis in phase PAUSED.
     """
 
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
@@ -137,15 +137,15 @@ class LoopProgram:
 
     @property
     def start_step(self) -> StartStep:
-        """What the present packet of the start is; only in phase START."""
+        """Kind of the present packet in phase START."""
         return self._start[self._age]
 
     def finish(self) -> None:
-        """End the session: at once where no axis is open, else when the arm stands."""
+        """End the session, at once or when open axes are at rest."""
         self._finishing = True
 
     def drive_on(self) -> None:
-        """Press the button that brings the drive back after it was lost."""
+        """Press the drive-on button after the drive was lost."""
         self._stays_off = False
 
     def trip(self, reason: str) -> None:
@@ -165,13 +165,13 @@ class LoopProgram:
             self.open_axes[axis] = False
 
     def pause(self, mode: int, cycles: int) -> None:
-        """Report a pause, mode 500 or 502, for some cycles; nothing where the drive is off."""
+        """Report a pause, mode 500 or 502, for some cycles if the drive is on."""
         if self.powered and self.phase is not Phase.DRIVING_ON:
             self.pause_mode, self._pause_cycles = mode, cycles
             self._enter(Phase.PAUSED)
 
     def restarted(self, settings: ControllerSettings) -> LoopProgram:
-        """Return the program after a restart; somebody has to switch the drive on then."""
+        """Return the program after a restart, with the drive off."""
         program = LoopProgram(self._n_axes, settings)
         program._stays_off = True
         program.reason = "the controller was restarted"
@@ -181,9 +181,9 @@ class LoopProgram:
         """End the cycle.
 
         Args:
-            answer: what the PC replied to this cycle's packet.
-            at_rest: the target of every axis stands still.
-            own_motion_done: the controller's own motion has come to its end.
+            answer: content of the reply.
+            at_rest: whether the targets of all axes are at rest.
+            own_motion_done: whether the own motion has ended.
         """
         self._age += 1
         self._missed = 0 if answer.valid else self._missed + 1
@@ -223,7 +223,7 @@ class LoopProgram:
         ]
 
     def _close_due_axes(self) -> None:
-        """Close one axis after the other, those of an interrupted opening at once."""
+        """Close one axis after the other."""
         settings, age = self._settings, self._age
         self.open_axes = [
             is_open and age < settings.closing_cycles + i * settings.closing_stagger
@@ -231,7 +231,7 @@ class LoopProgram:
         ]
 
     def _advance_start(self, answer: Answer) -> None:
-        """Go through the packets of the start; an init packet that nobody answers ends it."""
+        """Advance through the packets of the start; an init packet without answer ends it."""
         if self._start[self._age - 1] is StartStep.INIT and not answer.valid:
             self.reason = "the init packet was not answered"
             self._enter(Phase.ENDED)
@@ -239,7 +239,7 @@ class LoopProgram:
             self._enter(Phase.DRIVE_OFF)
 
     def _advance_open(self, answer: Answer, at_rest: bool) -> None:
-        """React to the PC while axes are open or opening."""
+        """Process a reply while axes are open or opening."""
         settings = self._settings
         self._missed_open = 0 if answer.valid else self._missed_open + 1
         if answer.drive_off:
@@ -275,7 +275,7 @@ class LoopProgram:
             self._lose_opening(reason)
 
     def _lose_opening(self, reason: str) -> None:
-        """End open mode, and open again after a while; not where that happened too often."""
+        """End open mode; open again later, unless that happened too often."""
         settings = self._settings
         self.openings_lost += 1
         if settings.lost_openings is not None and self.openings_lost >= settings.lost_openings:
@@ -286,7 +286,7 @@ class LoopProgram:
         self._reopens_at = ceil(settings.reopening_time / settings.period)
 
     def _advance_closed(self) -> None:
-        """Leave closed axes for what is on next."""
+        """Leave phase CLOSED."""
         settings = self._settings
         limit = settings.open_intervals
         done = limit is not None and self.intervals >= limit

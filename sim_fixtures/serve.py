@@ -1,14 +1,13 @@
-"""A simulated controller in real time: it paces a link as the cabinet would.
+"""Server of a simulated controller on a real link, in real time.
 
-Each cycle begins at its own moment, one period after the one before, however long the work took.
-The controller's packet goes out; the first answer with the right number within a period is the
-reply, whatever else arrives is counted and dropped; then controller and arm compute their cycle.
+Cycles begin one period after another. The packet is sent; the first answer with the right number
+within a period is the reply; other packets are counted and dropped; then controller and arm are
+simulated for a cycle.
 
-The server may itself run late. That is never laid at the PC's door: an answer has a whole period
-from the moment the packet really left, and before an answer is called missing the server looks
-into the link once more, for it may have slept while the answer lay there. A server that is late by
-a period or more goes on from where it is; it does not send the packets it owes in a burst. What
-happened is a `ServeCounts`: counts and times, in memory that does not grow.
+Delays of the server are not counted as the PC's: the period for an answer begins when the packet
+was sent, and the link is polled once more before an answer counts as missing. If the server is late
+by a period or more, later cycles are shifted; packets are not sent in a burst. `ServeCounts` has
+counts and times, in memory of fixed size.
 """
 
 from __future__ import annotations
@@ -46,24 +45,24 @@ _CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 class ControllerLink(Protocol):
-    """The controller's end of a real link: moves whole packets; knows no cycle, state or mode."""
+    """The controller's end of a real link, for complete packets."""
 
     def send(self, packet: bytes) -> None:
-        """Send towards the PC. What the network refuses to carry is lost, not an error."""
+        """Send to the PC; what the network refuses is lost without an error."""
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet of the PC; None if none came within `timeout` seconds (0: look)."""
+        """Return the next packet of the PC, or None after `timeout` seconds (0: poll)."""
 
     def close(self) -> None:
-        """Give the link up."""
+        """Close the link."""
 
 
 class ControllerLinkError(SimulationError):
     """The controller's end of a link cannot be opened.
 
     Attributes:
-        place: what was to be opened.
-        problem: why it cannot be.
+        place: address or device.
+        problem: reason.
     """
 
     def __init__(self, place: str, problem: str) -> None:
@@ -76,17 +75,17 @@ class ControllerLinkError(SimulationError):
 
 
 class UdpControllerLink:
-    """One datagram, one packet, to a PC program that listens at `host`:`port` (IPv4).
+    """Link to a PC program that listens at `host`:`port` (IPv4), one datagram per packet.
 
-    The socket is not connected: a PC that does not listen yet is a PC that does not answer, not a
-    broken connection. Datagrams of any other address or port are dropped.
+    The socket is not connected, so that a PC that does not listen yet is not an error. Datagrams
+    from any other address or port are dropped.
 
     Attributes:
-        foreign: datagrams that came from elsewhere.
-        last_foreign: where the last of them came from, "host:port"; "" if there was none.
-        waited: s that the packet received last lay in the kernel's queue; 0 where that is unknown.
-        unsent: packets that the network refused to carry.
-        trouble: why it refused the last one, in words; "" if it never did.
+        foreign: number of datagrams from other addresses.
+        last_foreign: "host:port" of the last of them; "" if there was none.
+        waited: time of the last packet in the kernel's queue [s]; 0 if unknown.
+        unsent: number of packets that the network refused.
+        problem: reason of the last refusal; "" if there was none.
 
     Raises:
         ControllerLinkError: no such host, or the local port is in use.
@@ -97,13 +96,13 @@ class UdpControllerLink:
         self.last_foreign = ""
         self.waited = 0.0
         self.unsent = 0
-        self.trouble = ""
+        self.problem = ""
         try:
             self._pc = (socket.gethostbyname(host), port)
         except (OSError, UnicodeError) as error:
             raise ControllerLinkError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        with suppress(OSError):  # not every system has it; nothing needs it
+        with suppress(OSError):  # not available on every system
             self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             self._socket.setblocking(False)
@@ -116,28 +115,28 @@ class UdpControllerLink:
 
     @property
     def source_port(self) -> int:
-        """The local port that packets leave from."""
+        """Local port of sent packets."""
         port: int = self._socket.getsockname()[1]
         return port
 
     def send(self, packet: bytes) -> None:
-        """Send one datagram; a network that is down or full loses it."""
+        """Send one datagram; it is lost if the network is down or full."""
         try:
             self._socket.sendto(packet, self._pc)
         except OSError as error:
             self.unsent += 1
-            self.trouble = error.strerror or str(error)
+            self.problem = error.strerror or str(error)
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next datagram of the PC, or None."""
+        """Return the next datagram of the PC, or None."""
         until = time.monotonic() + timeout
         while True:
-            # select() waits to the microsecond; the time-out of a socket rounds up to the next ms.
+            # select() waits to the microsecond; the timeout of a socket is rounded up to ms.
             if not select([self._socket], [], [], max(0.0, until - time.monotonic()))[0]:
                 return None
             try:
                 packet, control, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM, _CONTROL_SPACE)
-            except OSError:  # reported ready, then dropped for a bad checksum; or an ICMP notice
+            except OSError:  # dropped for a bad checksum, or an ICMP error
                 continue
             if sender == self._pc:
                 self.waited = _waited(control)
@@ -153,7 +152,7 @@ class UdpControllerLink:
 
 
 def _waited(control: list[tuple[int, int, bytes]]) -> float:
-    """How long ago the kernel had a datagram [s], by its time stamp."""
+    """Return the age of a datagram by the kernel's time stamp [s]."""
     for _, kind, data in control:
         if kind == _SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
             seconds, nanoseconds = _TIMESPEC.unpack(data)
@@ -165,7 +164,7 @@ REMEMBERED: Final = 1000
 
 
 class Histogram:
-    """Durations in bins of 5 µs up to 50 ms; the largest is left as it is."""
+    """Durations in bins of 5 µs up to 50 ms, and the largest one."""
 
     BIN: Final = 5e-6
     BINS: Final = 10_000
@@ -182,7 +181,7 @@ class Histogram:
         self._bins[min(self.BINS, int(max(0.0, seconds) / self.BIN))] += 1
 
     def quantile(self, fraction: float) -> float:
-        """Upper edge (s) of the bin that this fraction of all durations ends in; 0 for none."""
+        """Return the upper edge of the bin of a quantile [s]; 0 without durations."""
         wanted, seen = fraction * self.count, 0
         for index, entries in enumerate(self._bins):
             seen += entries
@@ -193,24 +192,24 @@ class Histogram:
 
 @dataclass(eq=False)
 class ServeCounts:
-    """What a served session came to so far.
+    """Counts and times of a served session.
 
     Attributes:
-        cycles: packets the controller sent, the repeated first one counted once.
-        knocks: how often the first packet was sent until somebody answered.
-        replies: answers the controller took, at most one a cycle.
-        missed: cycles that no valid answer came in.
-        late: answers that came after their cycle; not accepted.
-        surplus: further answers to a cycle that had been answered.
+        cycles: packets of the controller, the repeated first one counted once.
+        knocks: transmissions of the first packet.
+        replies: accepted answers, at most one per cycle.
+        missed: cycles without a valid answer.
+        late: answers after their cycle, not accepted.
+        surplus: further answers in an answered cycle.
         rejected: answers of wrong length, number or content.
-        stretched: cycles made longer than a period to wait for their answer.
-        own_late: cycles that began late by a tenth of the period or more though the answer before
-            had come in time: the server's fault, not the PC's.
-        slips: how many of these were late by a whole period or more; the cycle goes on from there.
-        ended: whether the controller has ended its session (504); otherwise it was given up.
-        stretch_max: by how much the longest stretched cycle was longer, s.
-        answer: times from the packet to its answer, as seen here.
-        cost: times of computing a cycle of controller and arm.
+        stretched: cycles extended to wait for their answer.
+        own_late: cycles that began late by a tenth of the period or more although the answer before
+            was in time.
+        slips: those of them that were late by a period or more.
+        ended: whether the controller has ended its session (504).
+        stretch_max: longest extension of a cycle, s.
+        answer: times from the packet to its answer.
+        cost: computing times of a cycle of controller and arm.
     """
 
     cycles: int = 0
@@ -230,8 +229,8 @@ class ServeCounts:
     _unanswered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _answered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
-    def take(self, number: int, *, valid: bool) -> None:
-        """A reply with the right number was handed over; the controller found it valid or not."""
+    def count_reply(self, number: int, *, valid: bool) -> None:
+        """Count a reply with the right number, valid for the controller or not."""
         if valid:
             self.replies += 1
         else:
@@ -239,18 +238,18 @@ class ServeCounts:
             self.missed += 1
         self._answered.append(number)
 
-    def miss(self, number: int) -> None:
-        """The cycle whose answer should have carried `number` had none."""
+    def count_missing(self, number: int) -> None:
+        """Count a cycle without the answer `number`."""
         self.missed += 1
         self._unanswered.append(number)
 
-    def stretch(self, seconds: float) -> None:
-        """A cycle was made longer by that much."""
+    def count_stretched(self, seconds: float) -> None:
+        """Count an extended cycle."""
         self.stretched += 1
         self.stretch_max = max(self.stretch_max, seconds)
 
-    def discard(self, number: int | None) -> None:
-        """An answer that is not that of the running cycle; `number` is None if it has none."""
+    def count_discarded(self, number: int | None) -> None:
+        """Count an answer that is not that of the present cycle; None if it has no number."""
         if number is not None and number in self._unanswered:
             self.late += 1
             self._unanswered.remove(number)
@@ -265,24 +264,20 @@ Delayed = tuple[float, int, bytes]
 
 
 class Clock(Protocol):
-    """What time it is, and waiting; the module `time` is one."""
+    """Clock and sleep functions, as of the module `time`."""
 
     def monotonic(self) -> float:
-        """Seconds since whenever, never falling."""
+        """Return a monotonic time [s]."""
 
     def sleep(self, seconds: float, /) -> None:
-        """Let that much time pass."""
+        """Wait."""
 
 
 class Wire:
-    """A far end whose packets go through `faults`.
+    """A link with simulated faults; delayed packets are sent in `receive` and `sleep_until`."""
 
-    What is held back leaves or arrives when its time has come, as long as somebody waits here
-    (`receive` or `sleep_until`), which the server of a controller always does.
-    """
-
-    def __init__(self, far_end: ControllerLink, faults: FaultyLink | None, clock: Clock) -> None:
-        self._far_end = far_end
+    def __init__(self, link: ControllerLink, faults: FaultyLink | None, clock: Clock) -> None:
+        self._link = link
         self._faults: Final = faults
         self._clock = clock
         self._leaving: list[Delayed] = []
@@ -292,25 +287,21 @@ class Wire:
     def send(self, cycle: int, packet: bytes) -> None:
         """Send the packet of a cycle."""
         if self._faults is None:
-            self._far_end.send(packet)
+            self._link.send(packet)
             return
         self._hold(self._leaving, self._faults.carry(cycle, "to_pc", packet))
         self._release()
 
     def receive(self, cycle: int, until: float) -> bytes | None:
-        """What arrives by the time `until`, None if nothing does.
-
-        Looks into the link at least once, even if `until` has passed: what lies there already
-        arrived while this program was not running.
-        """
+        """Return the next packet by the time `until`, or None; poll at least once."""
         if self._faults is None:
-            return self._far_end.receive(max(0.0, until - self._clock.monotonic()))
+            return self._link.receive(max(0.0, until - self._clock.monotonic()))
         while True:
             now = self._release()
             if self._arriving and self._arriving[0][0] <= now:
                 return heappop(self._arriving)[2]
             next_event = min(until, _due(self._leaving), _due(self._arriving))
-            packet = self._far_end.receive(max(0.0, next_event - now))
+            packet = self._link.receive(max(0.0, next_event - now))
             if packet is not None:
                 self._hold(self._arriving, self._faults.carry(cycle, "to_controller", packet))
             elif now >= until:
@@ -318,12 +309,11 @@ class Wire:
 
     @property
     def waited(self) -> float:
-        """S that the packet received last lay in the kernel's queue, as far as is known."""
-        # What is held back by a fault arrives when its time has come.
-        return 0.0 if self._faults is not None else float(getattr(self._far_end, "waited", 0.0))
+        """Time of the last packet in the kernel's queue [s]; 0 if unknown."""
+        return 0.0 if self._faults is not None else float(getattr(self._link, "waited", 0.0))
 
     def sleep_until(self, moment: float) -> None:
-        """Wait; what is due meanwhile leaves."""
+        """Wait, and send delayed packets meanwhile."""
         while True:
             now = self._release()
             if now >= moment:
@@ -337,10 +327,10 @@ class Wire:
             self._order += 1
 
     def _release(self) -> float:
-        """Send what is due; the time."""
+        """Send the packets that are due; return the time."""
         now = self._clock.monotonic()
         while self._leaving and self._leaving[0][0] <= now:
-            self._far_end.send(heappop(self._leaving)[2])
+            self._link.send(heappop(self._leaving)[2])
         return now
 
 
@@ -351,15 +341,15 @@ def _due(queue: list[Delayed]) -> float:
 KNOCK_INTERVAL: Final = 1.0
 """Seconds between two first packets while nobody answers."""
 PATIENCE: Final = 3.0
-"""Seconds that the arm may take to come to rest once the session is to end."""
+"""Time for the arm to stop when the session is to end [s]."""
 _NO_CYCLE: Final = -1
-"""Of the repeated first packet: a fault scripted for cycle 0 strikes once."""
-_LOOKS: Final = 100
-"""Stray packets looked at after a cycle is over, so that a flood cannot hold the cycle up."""
+"""Cycle of repetitions of the first packet: a fault of cycle 0 occurs once."""
+_MOST_STRAY: Final = 100
+"""Stray packets read after the end of a cycle, so that a flood cannot delay the next one."""
 
 
 class Request(IntEnum):
-    """What the person in front of the cabinet wants."""
+    """Request of the operator at the controller."""
 
     CONTINUE = auto()
     END = auto()
@@ -367,20 +357,20 @@ class Request(IntEnum):
 
 
 class ServedPeer(Peer, Protocol):
-    """A controller that can be served: `SimulatedController` is one."""
+    """A controller that can be served, such as `SimulatedController`."""
 
     rejected_replies: int
 
     def finish(self) -> None:
-        """End the session when the arm stands."""
+        """End the session when the arm is at rest."""
 
     def lose_drive(self, reason: str) -> None:
-        """Switch the drive off, for this reason."""
+        """Switch the drive off for a reason."""
 
 
 def serve(
     peer: ServedPeer,
-    far_end: ControllerLink,
+    link: ControllerLink,
     *,
     faults: FaultyLink | None = None,
     request: Callable[[], Request] = lambda: Request.CONTINUE,
@@ -391,27 +381,26 @@ def serve(
 ) -> ServeCounts:
     """Run a controller on a real link until its session has ended.
 
-    The first packet is repeated once a second until a PC answers it, so that the order of starting
-    does not matter and the PC still sees each packet of the start once.
+    The first packet is repeated once a second until a PC answers, so that either program may be
+    started first.
 
     Args:
         peer: the controller.
-        far_end: its link, left open.
-        faults: what the link does to packets; cycle 0 is that of the first one.
-        request: asked every cycle. At `END` the controller ends its session, with the drive
-            switched off under a moving arm if it does not stand within `patience` s; at `ABORT`
-            it falls silent at once.
-        watch: called once a cycle, in the time that is left over, with the counts so far.
-        clock: of the machine, if left out.
+        link: its link, left open.
+        faults: faults of the link; cycle 0 is that of the first packet.
+        request: called every cycle. At `END` the controller ends its session; if the arm does not
+            stop within `patience` s, its drive is switched off. At `ABORT` it stops at once.
+        watch: called once per cycle with the counts so far.
+        clock: clock of the machine by default.
         patience: see `request`, s.
-        stretch: a cycle without an answer is made longer by up to so many s until one comes. No
-            real controller does that; it is for PCs that are held up now and then. Once the end is
-            requested, a PC that let such a wait pass counts as gone until it answers again.
+        stretch: largest extension of a cycle without an answer, s. Real controllers do not extend
+            cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer
+            within an extension is not waited for until it answers again.
     """
-    server = _Server(peer, Wire(far_end, faults, clock), clock, watch, stretch)
-    if server.knock(request):
+    server = _Server(peer, Wire(link, faults, clock), clock, watch, stretch)
+    if server.await_pc(request):
         server.run(request, patience)
-    return server.tally
+    return server.counts
 
 
 class _Server:
@@ -425,7 +414,7 @@ class _Server:
         watch: Callable[[ServeCounts], None],
         stretch: float,
     ) -> None:
-        self.tally = ServeCounts()
+        self.counts = ServeCounts()
         self._peer = peer
         self._wire = wire
         self._clock = clock
@@ -435,80 +424,81 @@ class _Server:
         self._due = 0.0
         self._finish_by: float | None = None
         self._patience = 0.0
-        self._deserted = False
+        self._unanswered = False
 
-    def knock(self, request: Callable[[], Request]) -> bool:
-        """Repeat the first packet until it is answered; False if asked to end before."""
+    def await_pc(self, request: Callable[[], Request]) -> bool:
+        """Repeat the first packet until it is answered; False if the end is requested before."""
         packet = self._peer.next_packet()
         if packet is None:
-            self.tally.ended = True
+            self.counts.ended = True
             return False
         while request() is Request.CONTINUE:
             sent = self._clock.monotonic()
-            self._wire.send(0 if self.tally.knocks == 0 else _NO_CYCLE, packet)
-            self.tally.knocks += 1
-            reply = self._patient_reply(packet, sent + KNOCK_INTERVAL, request)
+            self._wire.send(0 if self.counts.knocks == 0 else _NO_CYCLE, packet)
+            self.counts.knocks += 1
+            reply = self._first_reply(packet, sent + KNOCK_INTERVAL, request)
             if reply is not None:
-                self.tally.cycles += 1
+                self.counts.cycles += 1
                 self._due = max(sent + self._period, self._clock.monotonic())
                 self._hand_over(packet, reply)
                 return True
         return False
 
-    def _patient_reply(
+    def _first_reply(
         self, packet: bytes, until: float, request: Callable[[], Request]
     ) -> bytes | None:
-        """An answer to the first packet, in steps short enough to notice a request to end."""
+        """Return the answer to the first packet, checking for requests every 0.1 s."""
         while request() is Request.CONTINUE and (now := self._clock.monotonic()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
-            self._watch(self.tally)
+            self._watch(self.counts)
             if reply is not None:
                 return reply
         return None
 
     def run(self, request: Callable[[], Request], patience: float) -> None:
-        """Cycle by cycle to the end."""
+        """Run cycle by cycle to the end."""
         late_by_missing = False
         while True:
-            if not self._heed(request(), patience):
+            if not self._apply(request(), patience):
                 return
             self._wire.sleep_until(self._due)
-            self._note_lateness(excused=late_by_missing)
+            self._count_lateness(excused=late_by_missing)
             packet = self._peer.next_packet()
             if packet is None:
-                self.tally.ended = True
+                self.counts.ended = True
                 return
-            stretched = self.tally.stretched
+            stretched = self.counts.stretched
             answered = self._exchange(packet) if packet else self._stay_silent()
-            late_by_missing = not answered or self.tally.stretched > stretched
+            late_by_missing = not answered or self.counts.stretched > stretched
             self._due += self._period
-            self._watch(self.tally)
+            self._watch(self.counts)
 
     def _exchange(self, packet: bytes) -> bool:
-        """One cycle: packet, reply, computation. Whether it was answered."""
+        """Run one cycle with a packet; return whether it was answered."""
         sent = self._clock.monotonic()
-        self.tally.cycles += 1
-        self._wire.send(self.tally.cycles - 1, packet)
+        self.counts.cycles += 1
+        self._wire.send(self.counts.cycles - 1, packet)
         reply = self._reply(packet, sent + self._period)
-        if reply is None and self._stretch and not (self._deserted and self._finish_by is not None):
+        ending = self._finish_by is not None
+        if reply is None and self._stretch and not (self._unanswered and ending):
             until = sent + self._period
             reply = self._reply(packet, until + self._stretch)
-            self.tally.stretch(self._clock.monotonic() - until)
-        self._deserted = reply is None
+            self.counts.count_stretched(self._clock.monotonic() - until)
+        self._unanswered = reply is None
         if reply is not None:
-            # By the kernel's time: that this program looked late is not the PC's doing.
-            self.tally.answer.add(max(0.0, self._clock.monotonic() - sent - self._wire.waited))
+            # By the kernel's time stamp: the time in the queue is not the PC's.
+            self.counts.answer.add(max(0.0, self._clock.monotonic() - sent - self._wire.waited))
         self._hand_over(packet, reply)
         return reply is not None
 
     def _stay_silent(self) -> bool:
-        """A cycle in which the controller sends nothing, for it is booting."""
-        self.tally.cycles += 1
+        """Run one cycle of a booting controller, without a packet."""
+        self.counts.cycles += 1
         self._peer.accept(None)
         return True
 
-    def _heed(self, request: Request, patience: float) -> bool:
-        """Ask the controller to end; take its drive away if the arm does not come to rest."""
+    def _apply(self, request: Request, patience: float) -> bool:
+        """Apply a request of the operator; return False to stop at once."""
         if request is Request.END:
             now = self._clock.monotonic()
             if self._finish_by is None:
@@ -522,47 +512,47 @@ class _Server:
                 )
         return request is not Request.ABORT
 
-    def _note_lateness(self, *, excused: bool) -> None:
-        """Count a cycle that begins late; go on from here if a whole period is gone."""
+    def _count_lateness(self, *, excused: bool) -> None:
+        """Count a cycle that begins late; shift later ones after a delay of a period or more."""
         late = self._clock.monotonic() - self._due
         if late >= 0.1 * self._period and not excused:
-            self.tally.own_late += 1
+            self.counts.own_late += 1
         if late >= self._period:
-            self.tally.slips += not excused
+            self.counts.slips += not excused
             self._due += late
 
     def _reply(self, packet: bytes, until: float) -> bytes | None:
-        """The first answer that carries the number after that of `packet`; the rest is counted."""
+        """Return the first answer with the next number; count others."""
         wanted = next_number(packet_number(packet))
-        looks = _LOOKS
-        while looks:
-            answer = self._wire.receive(self.tally.cycles - 1, until)
+        stray = 0
+        while stray < _MOST_STRAY:
+            answer = self._wire.receive(self.counts.cycles - 1, until)
             if answer is None:
                 return None
             number = _number(answer)
             if number == wanted:
                 return answer
-            self.tally.discard(number)
+            self.counts.count_discarded(number)
             if self._clock.monotonic() > until:
-                looks -= 1
+                stray += 1
         return None
 
     def _hand_over(self, packet: bytes, reply: bytes | None) -> None:
-        """Let controller and arm compute their cycle."""
+        """Simulate a cycle of controller and arm."""
         begun = self._clock.monotonic()
         rejected = self._peer.rejected_replies
         self._peer.accept(reply)
-        self.tally.cost.add(self._clock.monotonic() - begun)
+        self.counts.cost.add(self._clock.monotonic() - begun)
         number = next_number(packet_number(packet))
         if reply is None:
             if not _ends_the_session(packet):
-                self.tally.miss(number)
+                self.counts.count_missing(number)
         else:
-            self.tally.take(number, valid=self._peer.rejected_replies == rejected)
+            self.counts.count_reply(number, valid=self._peer.rejected_replies == rejected)
 
 
 def _ends_the_session(packet: bytes) -> bool:
-    """Whether a packet says 504, which needs no answer."""
+    """Whether a packet has mode 504, which needs no answer."""
     if len(packet) < HEADER_LENGTH + AXIS_LENGTH or is_init(packet):
         return False
     mode = packet[HEADER_LENGTH : HEADER_LENGTH + 4]

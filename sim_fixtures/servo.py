@@ -1,13 +1,13 @@
-"""The servo of the simulated controller: position, velocity and current loops of every axis.
+"""Servo of the simulated controller: position, velocity and current loops of each axis.
 
-All loops run on the motor side, once per cycle, on positions as the encoders give them:
+All loops are on the motor side, once per cycle, with encoder positions:
 
-    speed demanded  = speed of the target + position gain * (target - measured)
-    target current  = model current + velocity gain * (error of the speed + its integral)
+    demanded speed  = target speed + position gain * (target - measured)
+    target current  = model current + velocity gain * (speed error + its integral)
 
-The PC may add to the speed demanded and to the target current in the modes that provide for it.
-The model current is the dynamic model's for the target motion of the cycle that begins. What leaves
-here is the *target* current; the current that flows follows with a lag and noise (`CurrentLoop`).
+In some modes the PC adds to the demanded speed and the target current. The model current is that of
+the dynamic model for the target motion of the cycle. The actual current follows the target current
+with a lag and noise (`CurrentLoop`).
 """
 
 from __future__ import annotations
@@ -25,14 +25,20 @@ from sim_fixtures.settings import ServoSettings
 
 Array = NDArray[np.float64]
 
-COULOMB_SPEED = 0.02
-"""Speed over which the model's Coulomb torque turns its sign [rad/s]."""
+COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [rad/s]
 
 
 class NominalModel:
-    """Inverse dynamics with link inertias, rotors and friction off by a few per cent.
+    """Inverse dynamics with random relative errors of links, rotors and friction.
 
-    A link's mass, first moment and tensor are scaled together, so that it stays a possible body.
+    Mass, first moment and tensor of a link have the same error.
+
+    Args:
+        urdf: URDF text of the arm.
+        truth: true rotor inertias, friction and link inertias.
+        gravity: m/s2 in the base frame.
+        error: smallest and largest relative error; signs are random.
+        rng: source of the errors.
     """
 
     def __init__(
@@ -44,15 +50,6 @@ class NominalModel:
         error: tuple[float, float],
         rng: np.random.Generator,
     ) -> None:
-        """Draw the errors.
-
-        Args:
-            urdf: URDF text of the arm.
-            truth: its rotor inertias and friction, and how far its links are those of the URDF.
-            gravity: m/s2 in the base frame.
-            error: smallest and largest relative error of each figure.
-            rng: where magnitudes and signs of the errors come from.
-        """
         n = truth.n_joints
 
         def factors() -> Array:
@@ -67,7 +64,7 @@ class NominalModel:
         self._viscous = truth.viscous * factors()
 
     def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Return the joint torques (n,) [N m] that a motion should take."""
+        """Return the joint torques (n,) [N m] of a motion."""
         torque: Array = pin.rnea(self._model, self._data, q, qd, qdd) + self._viscous * qd
         torque += self._coulomb * np.tanh(qd * (1.0 / COULOMB_SPEED))
         return torque
@@ -79,18 +76,17 @@ class NominalModel:
 
 
 _TURN = 2.0 * pi
-INERTIA_CYCLES = 8
-"""The inertia of the posture, which changes slowly, is computed anew every so many cycles."""
+INERTIA_CYCLES = 8  # cycles between two evaluations of the inertia, which changes slowly
 
 
 class Servo:
     """Position and velocity loops; per-axis values are lists (n,), motor side.
 
     Attributes:
-        target: position demanded at the present tick [motor rev].
+        target: demanded position of the present cycle [motor rev].
         delta: its speed [motor rev per cycle].
-        measured: encoder position at the present tick [motor rev].
-        measured_delta: difference to the tick before [motor rev per cycle].
+        measured: encoder position of the present cycle [motor rev].
+        measured_delta: difference to the previous cycle [motor rev per cycle].
         current: target current computed in the last cycle [A].
         model_current: the dynamic model's share of it [A].
         inertia: diagonal of the model's inertia matrix on the *joint* side [kg m2].
@@ -122,7 +118,7 @@ class Servo:
         self.release()
 
     def release(self) -> None:
-        """Forget everything: no current, integrals empty, target where the motors stand."""
+        """Reset: no current, zero integrals, targets at the measured positions."""
         n = self._drive.n_axes
         self.target = list(self.measured)
         self.delta = [0.0] * n
@@ -137,12 +133,12 @@ class Servo:
         self.feed()
 
     def measure(self, revolutions: Sequence[float]) -> None:
-        """Take the encoders' positions of a new tick."""
+        """Set the encoder positions of a new cycle."""
         self.measured_delta = [p - q for p, q in zip(revolutions, self.measured, strict=True)]
         self.measured = list(revolutions)
 
     def start_at(self, revolutions: Sequence[float]) -> None:
-        """Take the encoders' positions of the very first tick, where there is no tick before."""
+        """Set the encoder positions of the first cycle."""
         self.measured = list(revolutions)
         self.release()
 
@@ -153,25 +149,17 @@ class Servo:
     def feed(
         self, speed: Sequence[float] | None = None, current: Sequence[float] | None = None
     ) -> None:
-        """Set what is added from now on to the speed demanded and to the target current.
-
-        Args:
-            speed: (n,) [motor rev per cycle]; None for nothing.
-            current: (n,) [A]; None for nothing.
-        """
-        nothing = (0.0,) * self._drive.n_axes
-        self._fed_speed = nothing if speed is None else tuple(speed)
-        self._fed_current = nothing if current is None else tuple(current)
+        """Set the feed-forward of speed (n,) [motor rev per cycle] and current (n,) [A]."""
+        zero = (0.0,) * self._drive.n_axes
+        self._fed_speed = zero if speed is None else tuple(speed)
+        self._fed_current = zero if current is None else tuple(current)
 
     def advance(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
-        """Close the loops for the cycle that begins and move on to its target.
+        """Return the target currents of the cycle, (n,) [A].
 
         Args:
-            target: position at the next tick, (n,) [motor rev].
-            delta: speed there, (n,) [motor rev per cycle].
-
-        Returns:
-            Target currents of the cycle, (n,) [A].
+            target: position of the next cycle, (n,) [motor rev].
+            delta: its speed, (n,) [motor rev per cycle].
         """
         self.model_current = self._feed_forward(target, delta)
         self.current = self._close_loops(self._gains)
@@ -180,7 +168,7 @@ class Servo:
         return self.current
 
     def _feed_forward(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
-        """Return the model's currents for the motion in the middle of the cycle."""
+        """Return the model currents for the motion in the middle of the cycle."""
         rate = 1.0 / self._period
         drive = self._drive
         middle = [0.5 * (a + b) for a, b in zip(self.target, target, strict=True)]
@@ -196,7 +184,7 @@ class Servo:
         return drive.currents(self._model.torque(q, qd, qdd).tolist())
 
     def _velocity_gains(self) -> list[float]:
-        """Return A per motor rev/s of each velocity loop."""
+        """Return the gain of each velocity loop [A s/motor rev]."""
         bandwidth = self._settings.velocity_bandwidth
         return [
             _TURN * min(bandwidth * inertia, rotor) / (squared * kt)
@@ -231,14 +219,14 @@ class Servo:
         for i, row in enumerate(rows):
             target, delta, before, fed, extra, measured, moved, gain, model, limit = row
             error = target - measured
-            # the encoder's difference is the speed half a cycle ago, as the mean of the targets'
+            # the encoder difference is the speed half a cycle ago, like the mean of the targets
             lag = rate * (0.5 * (delta + before) + fed - moved) + position_gain * error
             total = integral[i]
             if delta != 0.0 or fed != 0.0 or abs(error) > deadband:
                 total += growth * lag
             wanted = model + extra + gain * (lag + total)
             current = _within(limit, wanted)
-            if current == wanted or lag * wanted < 0.0:  # no winding up against the limit
+            if current == wanted or lag * wanted < 0.0:  # anti-windup
                 integral[i] = total
             if resolution > 0.0:
                 current = _within(limit, round(current / resolution) * resolution)
@@ -247,27 +235,25 @@ class Servo:
 
 
 def _within(limit: float, value: float) -> float:
-    """Return `value` cut to +-`limit`; comparisons cost half of what `min` and `max` do."""
+    """Return `value` clipped to +-`limit`; faster than `min` and `max`."""
     if value < limit:
         return value if value > -limit else -limit
     return limit
 
 
 class CurrentLoop:
-    """The current that flows: the target through a delay and a first-order lag, plus noise.
+    """Actual current: the target through a delay and a first-order lag, plus noise.
 
-    Currents are means over a sub-step, so that the lag is the stated one whatever the sub-steps.
+    Currents are means over a sub-step, so that the lag does not depend on its length.
+
+    Args:
+        n_axes: number of axes.
+        lag: time constant [s].
+        substep: duration of a sub-step [s].
+        delay_substeps: sub-steps before a target takes effect.
     """
 
     def __init__(self, n_axes: int, *, lag: float, substep: float, delay_substeps: int) -> None:
-        """Start without current.
-
-        Args:
-            n_axes: number of axes.
-            lag: time constant [s].
-            substep: duration of a sub-step [s].
-            delay_substeps: sub-steps before a target takes effect.
-        """
         self._decay = exp(-substep / lag) if lag > 0.0 else 0.0
         # mean of exp(-t / lag) over the sub-step
         self._mean = lag / substep * (1.0 - self._decay)
@@ -275,7 +261,7 @@ class CurrentLoop:
         self._queue: list[Sequence[float]] = [[0.0] * n_axes for _ in range(delay_substeps)]
 
     def substep(self, target: Sequence[float], noise: Sequence[float]) -> list[float]:
-        """Return the mean current (n,) [A] of the next sub-step under a target current."""
+        """Return the mean current (n,) [A] of the next sub-step."""
         if self._queue:
             self._queue.append(target)
             target = self._queue.pop(0)
@@ -285,6 +271,6 @@ class CurrentLoop:
         return [t + mean * x + e for t, x, e in zip(target, lag, noise, strict=True)]
 
     def cut(self) -> None:
-        """Interrupt the current at once, as a drive does that is switched off."""
+        """Set the current to zero, as a drive does that is switched off."""
         self._state = [0.0] * len(self._state)
         self._queue = [list(self._state) for _ in self._queue]

@@ -1,4 +1,4 @@
-"""Settings of the simulated controller; every default is a guess at an industrial controller."""
+"""Settings of the simulated controller; defaults are assumed for an industrial controller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WhileSilent = Literal["hold", "continue", "drive_off"]
 WHILE_SILENT: Final[tuple[WhileSilent, ...]] = ("hold", "continue", "drive_off")
 OPEN_MODES: Final = (1, 2, 4, 5, 7, 8, 9)
 CORRECTED_MODES: Final = (2, 7, 8, 9)
-"""Open modes in which the controller goes on making its own targets, and the PC corrects."""
+"""Open modes in which the controller generates the targets and the PC corrects them."""
 AXES_PER_ARM: Final = 10
 ARMS: Final = 4
 MAX_SLOTS: Final = 20
@@ -22,7 +22,7 @@ MAX_SLOTS: Final = 20
 def _require(
     owner: object, name: str, lower: float, upper: float = inf, *, exclusive: bool = False
 ) -> None:
-    """Raise SettingError unless the named number is finite and within its bounds."""
+    """Check that a number is finite and within bounds; SettingError if not."""
     value = getattr(owner, name)
     above = value > lower if exclusive else value >= lower
     if not (isfinite(value) and above and value <= upper):
@@ -35,16 +35,16 @@ class ServoSettings:
     """Gains of the position-velocity-current cascade.
 
     Attributes:
-        position_gain: speed demanded per position error, 1/s.
-        velocity_bandwidth: of the velocity loop on the inertia the joint shows, rad/s.
-        rotor_bandwidth: bound on the same gain over the rotor's own inertia, rad/s. Above the
-            resonance of its gear a motor feels little more than its rotor; a loop tuned for the
-            whole arm would be unstable on a real gear.
-        integral_rate: of the velocity loop's integral part, 1/s.
+        position_gain: demanded speed per position error, 1/s.
+        velocity_bandwidth: of the velocity loop with the inertia of the joint, rad/s.
+        rotor_bandwidth: upper bound of the bandwidth with the inertia of the rotor alone, rad/s, as
+            above the resonance of the gear.
+        integral_rate: of the integral part of the velocity loop, 1/s.
         current_lag: time constant of the current loop, s.
-        model_error: range of the relative errors of the built-in dynamic model; each link's
-            inertia, each rotor and each friction figure is off by one of them, either way.
-        deadband_counts: encoder counts within which a resting axis stops integrating.
+        model_error: smallest and largest relative error of each inertia and friction parameter of
+            the built-in dynamic model, of random sign.
+        deadband_counts: position error in encoder counts below which a resting axis does not
+            integrate.
     """
 
     position_gain: float = 20.0
@@ -67,47 +67,44 @@ class ServoSettings:
 
 @dataclass(frozen=True)
 class ControllerSettings:
-    """The controller's cycle, noise and time table. Numbers of cycles unless a unit is given.
+    """Cycle, noise and timing of the controller, in cycles unless a unit is given.
 
     Attributes:
-        period: cycle, s; a whole number of ms, for so it stands in the init packet.
-        open_mode: mode that the controller's program opens the axes in: 1, 2, 4, 5, 7, 8 or 9.
+        period: cycle, s; an integer number of ms.
+        open_mode: open mode of the program: 1, 2, 4, 5, 7, 8 or 9.
         substeps: integration steps of the plant per cycle.
-        current_noise: standard deviation of the current that flows about the target, A; white
-            from cycle to cycle, on each axis.
+        current_noise: standard deviation of the actual current about its target, A; white from
+            cycle to cycle.
         current_resolution: step of the target current, A; 0 for none.
-        encoder_noise: standard deviation of a reading before it is rounded, encoder counts. Also
-            what makes the servo's current tremble at standstill.
+        encoder_noise: standard deviation of a reading before rounding, encoder counts.
         servo: gains.
-        cold_start: begin with nine sync packets, init, two more; otherwise init comes first.
-        boot_time: s of silence before a controller that was restarted cold speaks again.
-        drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase.
-            `closed_cycles` passes before every opening.
+        cold_start: start with nine sync packets, init, two more sync packets; else with init.
+        boot_time: silence of a controller that was restarted cold, s.
+        drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase;
+            `closed_cycles` before every opening.
         opening_stagger: cycles between one axis entering open mode and the next.
-        only_axis: number, from 1, of the only axis that the program opens; None for all.
+        only_axis: the only axis (from 1) that the program opens; None for all.
         closing_stagger: cycles between one axis leaving open mode and the next.
-        missed_replies: replies missing in a row that end open mode.
-        lost_openings: openings in a row that were lost to missing replies and end the session;
-            None for never. One that the PC ended, or that led to a lost drive, begins anew.
-        reopening_time: s that pass at least before the axes open again after such a loss.
-        while_silent: what the arm does in open mode without a target it can use. "hold": the last
-            target is held, during and after; at speed that stop is so hard that the drive trips.
-            "continue": it goes on at the velocity of the last target, and once open mode has ended
-            comes to rest within `ramp_time`. "drive_off": the last target is held, and where
-            replies missing end open mode, the drive goes off with it.
-        ramp_time: s in which a moving axis that nobody leads any more is brought to rest.
-        silence_limit: replies missing in a row, in any state, that end the session.
-        open_intervals: how often the program opens before it ends by itself; None for endlessly.
+        missed_replies: consecutive missing replies that end open mode.
+        lost_openings: consecutive openings ended by missing replies that end the session; None for
+            no limit. An opening that ends otherwise resets the count.
+        reopening_time: least time before the axes open again after such an opening, s.
+        while_silent: motion in open mode without a valid target. "hold": the last target is held;
+            at speed this can trip the drive. "continue": the last velocity continues, and after
+            the end of open mode decreases to zero within `ramp_time`. "drive_off": the last target
+            is held, and the drive is switched off when missing replies end open mode.
+        ramp_time: time in which a moving axis without a target stops, s.
+        silence_limit: consecutive missing replies, in any state, that end the session.
+        open_intervals: number of openings before the program ends; None for no limit.
         arm: number of this arm, 1..4.
         slots: slot of each axis in the packets; None for 0, 1, 2, ...
-        foreign_axes: axes of other arms in the packets, in the slots that are left; at rest.
-        foreign_open: whether those open together with this arm; they obey what they are sent.
-        long_packets: send 732 bytes whatever the number of axes; what follows the axes is garbage.
-        own_motion: joint angles [rad] of postures that the controller's own program moves to, one
-            after the other, with closed axes; then it ends the session. In a mode in which the
-            PC only corrects, it moves while the axes are open.
-        own_motion_repeats: go to and fro through these postures until asked to finish.
-        own_speed: of those moves, as a fraction of the URDF's velocity limits.
+        foreign_axes: axes of other arms in the packets, in the other slots; at rest.
+        foreign_open: whether those open with this arm; they move to the targets sent.
+        long_packets: send 732 bytes for any number of axes; random bytes follow the axes.
+        own_motion: postures [rad] to which the controller's program moves with closed axes, one
+            after the other, before it ends the session; in corrected modes, with open axes.
+        own_motion_repeats: move back and forth through these postures until `finish`.
+        own_speed: speed of those moves, as a fraction of the URDF's velocity limits.
         version: major, minor, build in the init packet.
     """
 
@@ -187,5 +184,5 @@ class ControllerSettings:
 
     @property
     def corrected(self) -> bool:
-        """Whether the controller makes the targets of open axes, and the PC corrects them."""
+        """Whether the PC corrects targets of the controller in open mode."""
         return self.open_mode in CORRECTED_MODES

@@ -104,8 +104,8 @@ class Status:
             self._write("\r\x1b[K")
 
     def _say_change(self, controller: SimulatedController) -> None:
-        lost, phase, reason = controller.openings_lost, controller.phase, controller.reason
-        if lost <= 1 or controller.gave_up or phase not in _REPEATED:
+        lost, phase, reason = controller.program.openings_lost, controller.phase, controller.reason
+        if lost <= 1 or controller.program.gave_up or phase not in _REPEATED:
             text = WORDS[phase]
             text += f" in mode {self._settings.open_mode}" if phase is Phase.OPENING else ""
             text += f": {reason}" if reason and reason != self._reason else ""
@@ -258,7 +258,7 @@ def simulate(
         typer.echo(printable("\n".join(_sentences(served))))
     if not served.summary.ended and pressed.interrupted:
         raise typer.Exit(130)
-    if served.controller.gave_up or not served.summary.ended:
+    if served.controller.program.gave_up or not served.summary.ended:
         raise typer.Exit(4)
 
 

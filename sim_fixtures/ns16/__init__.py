@@ -1,4 +1,4 @@
-"""The COMAU SMART NS 16-1.65: geometry, planted truth, the paper's Table 2, URDF and cell file."""
+"""The COMAU SMART NS 16-1.65: geometry, true parameters, Table 2 of the paper, URDF, cell file."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class LinkInertia:
 
 @dataclass(frozen=True)
 class Ns16Truth:
-    """What is planted in the simulated NS 16.
+    """True parameters of the simulated NS 16.
 
     Attributes:
         links: inertial parameters of links 1 ... 6.
         rotor_inertia: on the link side, kg m2.
         coulomb: N m.
-        viscous: N m s/rad; the printed figures read as N m s/deg, which is an assumption.
+        viscous: N m s/rad; the unit of the printed values is assumed to be N m s/deg.
         third: factor of sgn(qd) qd^2, N m s2/rad2.
     """
 
@@ -126,13 +126,13 @@ class Table2Row:
 
     Attributes:
         id: 1 ... 58 as printed.
-        printed_symbol: the symbol in the print.
-        parameter: how it is read; rows 41 ... 52 are interleaved in print.
-        pivot: standard parameter whose regressor column is this row's column ("" for friction).
+        printed_symbol: the symbol as printed.
+        parameter: its interpretation; rows 41 ... 52 are interleaved in print.
+        pivot: standard parameter whose regressor column is that of this row ("" for friction).
         sign: +1 or -1, the factor of that column.
         terms: standard parameters grouped in this row with their factors, pivot included.
-        pi_a, pi_b, pi_c: estimates of methods A and B, and the manufacturer's value (None where
-            the table has none). Rows f1 are printed in an unstated unit.
+        pi_a, pi_b, pi_c: estimates of methods A and B, and the manufacturer's value or None. The
+            unit of rows f1 is not stated in print.
     """
 
     id: int
@@ -221,15 +221,15 @@ TABLE2 = table2()
 
 
 def _numbers(values: Sequence[float]) -> str:
-    """Write numbers with as many digits (up to 17) as carry a double without loss."""
+    """Return numbers with as many digits (up to 17) as restore the same doubles."""
     return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 
 
 def inertial(link: LinkInertia, name: str, scale: float = 1.0) -> str:
-    """Line of a URDF with the inertia of a link over `scale`.
+    """Return the line of a URDF with the inertia of a link divided by `scale`.
 
     Raises:
-        FixtureError: no rigid body could have it.
+        FixtureError: no rigid body has this inertia.
     """
     xx, xy, xz, yy, yz, zz = tensor = link.tensor_at_centre
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -244,12 +244,12 @@ def inertial(link: LinkInertia, name: str, scale: float = 1.0) -> str:
 
 
 def urdf_text(inertia_scale: Sequence[float] = (1.0,) * 6) -> str:
-    """Return the URDF with the planted inertias over `inertia_scale`; ns16.urdf has nominal ones.
+    """Return the URDF with the true inertias divided by `inertia_scale`; ns16.urdf is nominal.
 
-    Link frame i stands at O_{i-1} with the axes of DH frame i, so that the standard parameters that
-    a rigid-body library reads from joint frame i *are* those of the paper: mass, first moment, and
-    the tensor about the frame's origin. Joint i stands at p_{i-1} of link i-1, turned by
-    Rx(alpha_i); its axis is Rx(-alpha_i) z, because DH turns about z before it twists.
+    Link frame i is at O_{i-1} with the axes of DH frame i, so that the standard parameters of joint
+    frame i in a rigid-body library are those of the paper: mass, first moment, and the tensor about
+    the origin of the frame. Joint i is at p_{i-1} of link i-1, rotated by Rx(alpha_i); its axis is
+    Rx(-alpha_i) z, because DH rotates about z before the twist.
     """
     links = enumerate(zip(load_truth().links, inertia_scale, strict=True), start=1)
     lines = URDF_PATH.read_text(encoding="utf-8").splitlines(keepends=True)

@@ -1,18 +1,15 @@
-"""Where the links of the NS 16 are: the Denavit-Hartenberg table, and how the teach pendant counts.
+"""Geometry of the NS 16: Denavit-Hartenberg table and controller angles.
 
-Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Link frame i has the axes of DH frame i but
-stands at O_{i-1}, a point of the link's own joint axis, because the parameters of the paper's
-Table 2 are about that point.
+Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Link frame i has the axes of DH frame i and
+its origin at O_{i-1}, a point of the joint axis, to which the parameters of Table 2 refer.
 
-Table 2 fixes a_1, a_2, a_3, d_4 and the twists alpha_2 ... alpha_5. It leaves open the sign of
-alpha_1 (a mirror image of the arm has the same table), d_1, d_6, every zero position and every
-direction of rotation. Chosen here: alpha_1 = -90 deg with z0 up, d_1 and d_6 of the data sheet,
-and the published directions of rotation. One consequence can be seen: with the forearm level, the
-elbow offset a_3 puts the forearm *below* the elbow axis and home turns the flange up, the mirror
-image of the real arm. Dynamics and identification are the same in both.
+Table 2 determines a_1, a_2, a_3, d_4 and the twists alpha_2 ... alpha_5, not the sign of alpha_1
+(a mirror image has the same table), d_1, d_6, the zero positions and the directions of rotation.
+Chosen are alpha_1 = -90 deg with z0 up, d_1 and d_6 of the data sheet, and published directions.
+With the forearm level, the elbow offset a_3 then puts the forearm *below* the elbow axis and home
+turns the flange up, the mirror image of the real arm; dynamics and identification are the same.
 
-The zero of the teach pendant: link 2 stands upright at 0; the forearm continues it straight up at
-0 and points level forward at -90 deg while link 2 is upright.
+At controller angles of zero, links 2 and 3 are upright; at -90 deg of axis 3 the forearm is level.
 """
 
 from __future__ import annotations
@@ -34,12 +31,12 @@ JOINT_SIGN: Final = (-1, 1, -1, -1, 1, -1)
 JOINT_OFFSET_DEG: Final = (0.0, 90.0, 90.0, 0.0, 0.0, 0.0)
 
 LOWER_DEG: Final = (-180.0, -50.0, -170.0, -360.0, -120.0, -360.0)
-"""Controller angles: what both the catalogue and the published URDF allow."""
+"""Controller angles allowed by both the catalogue and the published URDF."""
 
 UPPER_DEG: Final = (180.0, 95.0, 110.0, 360.0, 120.0, 360.0)
 
 VELOCITY_DEG: Final = (155.0, 155.0, 170.0, 360.0, 350.0, 550.0)
-"""Maximum speeds [deg/s]; assumed, the data sheet was not at hand."""
+"""Maximum speeds [deg/s]; assumed."""
 
 HOME_DEG: Final = (0.0, 0.0, -90.0, 0.0, 90.0, 0.0)
-"""The maker's home posture, controller angles."""
+"""Home posture of the manufacturer, controller angles."""

@@ -452,5 +452,5 @@ def test_datagrams_from_elsewhere_or_to_nobody_are_borne():
     far_end.close()
     far_end = far_end_at("255.255.255.255:9")  # broadcast is not permitted
     far_end.send(b"x")
-    assert (far_end.unsent, far_end.trouble) == (1, "Permission denied")
+    assert (far_end.unsent, far_end.problem) == (1, "Permission denied")
     far_end.close()

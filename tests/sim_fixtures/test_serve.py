@@ -431,8 +431,8 @@ def test_a_quantile_is_the_duration_to_the_width_of_a_bin(durations: list[float]
 def test_the_memory_of_a_tally_does_not_grow():
     tally = ServeCounts()
     for number in range(5000):
-        tally.take(number, valid=True)
-        tally.miss(number)
-    tally.discard(4999)
-    tally.discard(3)
+        tally.count_reply(number, valid=True)
+        tally.count_missing(number)
+    tally.count_discarded(4999)
+    tally.count_discarded(3)
     assert (tally.late, tally.rejected) == (1, 1)

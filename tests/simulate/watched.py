@@ -61,7 +61,7 @@ class WatchedController:
         self._position.append(plant.position.copy())
         self._velocity.append(plant.velocity.copy())
         self._phase.append(self.controller.phase.name)
-        self._open.append(any(self.controller._program.open_axes))
+        self._open.append(any(self.controller.program.open_axes))
         return packet
 
     def accept(self, reply: bytes | None) -> None:
