@@ -952,7 +952,7 @@ class TestDhRefusals:
             (["--dh", "dh.csv"], "--convention: is not given; --dh needs standard"),
             (["--dh", "dh.csv", "--convention", "craig"], "'craig' is unknown"),
             (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: exclude each other"),
-            ([], "--urdf or --dh: one of them is needed"),
+            ([], "--urdf or --dh: one of them is required"),
         ],
     )
     def test_options_that_do_not_fit(self, options: list[str], sentence: str) -> None:
@@ -1181,7 +1181,7 @@ NONSENSE = {
     "gains a.mcap --loaded a.mcap --mass 4": "listed twice",
     f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
     f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
-    "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "is no term of",
+    "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "is not a friction term",
     "import log a.csv -o a.mcap --map m.toml --urdf r.urdf --cell c.toml": (
         "--urdf and --cell: exclude each other"
     ),
@@ -1250,7 +1250,7 @@ class TestRobotOfAnImport:
         (place / "map.toml").write_text(text.replace('joints = ["elbow"]\n', ""))
         refused = self.run(place, "log", "--urdf", str(TWO_JOINT_URDF), "--lock-others")
         assert isinstance(refused.exception, InputError)
-        assert "map.toml: joints: does not say which joints were recorded" in str(refused.exception)
+        assert "map.toml: joints: does not name the recorded joints" in str(refused.exception)
 
     @pytest.mark.parametrize("kind", ["log", "rosbag2"])
     def test_gravity_has_any_finite_direction_and_size(self, place: Path, kind: str) -> None:
