@@ -443,8 +443,7 @@ def _corrections(facts: Facts, _: Sequence[str]) -> Iterator[Finding]:
 _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], ...]] = (
     _Row("tested", {"wrong": "everything"},
          "no motion was held out: all errors are in-sample",
-         "predict a recording that is not fitted (`hil identify --predict ARCHIVE` without"
-         " `--in-sample`)"),
+         "predict a recording that is not fitted (`hil identify --predict ARCHIVE`)"),
     _Row("tested", {"wrong": "still"},
          "{joints} moved in fewer than {limit.rows} samples of {on}",
          "record a validation motion that moves {joints}; a joint that must not move is locked"

@@ -1181,7 +1181,7 @@ NONSENSE = {
     "gains a.mcap --loaded a.mcap --mass 4": "listed twice",
     f"{LOADED} --inertia=-1,0,0,-1,0,-1": "no body",
     f"{LOADED} --inertia=1,0,0,1,0,3": "no body",
-    "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "is not a friction term",
+    "import log a.csv -o a.mcap --map m.toml --cell c.toml --friction none": "not a friction term",
     "import log a.csv -o a.mcap --map m.toml --urdf r.urdf --cell c.toml": (
         "--urdf and --cell: exclude each other"
     ),
