@@ -23,7 +23,7 @@ from identification.factor.factor import (
     Factor,
     joint_weights,
     mark_undetermined,
-    nothing_usable,
+    no_rows_message,
     solve,
 )
 from identification.factor.phases import PhaseFactor
@@ -95,7 +95,7 @@ class Estimator:
         """
         total = phase.total
         if not total.samples.any():
-            raise IdentificationError(nothing_usable(self.model))
+            raise IdentificationError(no_rows_message(self.model))
         if self._shrinkage.strength == 0.0:
             return None
         return centre_of(self.model, total, self._shrinkage)[0]

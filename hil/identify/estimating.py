@@ -42,7 +42,7 @@ from identification.estimators.prior import (
     nominal_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.factor.factor import QR_CONDITION, Estimate, Factor, nothing_usable
+from identification.factor.factor import QR_CONDITION, Estimate, Factor, no_rows_message
 from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
@@ -100,7 +100,7 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         if not samples.usable.any():  # for example a truncated recording
             lasts = f"it lasts {np.ptp(samples.motion.time):.3g} s"
             raise ArchiveError(
-                Path(source.name), f"{nothing_usable(model)} ({lasts})", remedy="leave it out"
+                Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
             )
     with reporter.task("estimating", 4) as task:
         # The endogeneity test needs the samples of least squares, unless "iv" is the estimator.

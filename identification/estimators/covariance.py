@@ -35,7 +35,7 @@ from identification.factor.factor import (
     mark_undetermined,
     solve,
 )
-from identification.factor.phases import FINE_BLOCK, PhaseFactor, block_runs, fine_blocks, merged
+from identification.factor.phases import FINE_BLOCK, PhaseFactor, block_slices, fine_blocks, merged
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -322,7 +322,7 @@ def clustered_covariance(
                 score = weights[joint] * loss.weight(scaled) * error
                 unit = columns.T @ solution.root[used]
                 curved = unit * (weights[joint] * loss.slope(scaled))[:, None]
-                for block, at in block_runs(index[part]):
+                for block, at in block_slices(index[part]):
                     scores[block, used] += columns[:, at] @ score[at]
                     information[block] += curved[at].T @ unit[at]
     length = block_length(scores[rows > 0])

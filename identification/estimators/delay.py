@@ -35,7 +35,7 @@ from identification.factor.factor import (
     Solution,
     estimate,
     inverse_variance,
-    nothing_usable,
+    no_rows_message,
     residual_variance,
     solve,
 )
@@ -463,7 +463,7 @@ class _Reader:
             usable=every(samples.usable),
             segments=tuple(b for _, b in parts),
             mask=None,
-            whole=None,
+            parent=None,
         )
         return cls(model, samples, binned, tuple(parts), every(clear), cycle)
 
@@ -498,7 +498,7 @@ class _Reader:
                 heights[k] = np.average(height, weights=factor.samples[moving])
                 best = found.values if heights[k] <= heights.min() else best
         if not np.isfinite(heights).any():
-            raise IdentificationError(nothing_usable(self.model))
+            raise IdentificationError(no_rows_message(self.model))
         return heights, best
 
     def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:

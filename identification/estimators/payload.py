@@ -29,7 +29,7 @@ from identification.estimators.covariance import Clustered, cluster_covariance
 from identification.factor.factor import (
     NormalEquations,
     mark_undetermined,
-    nothing_usable,
+    no_rows_message,
     solve,
 )
 from identification.factor.phases import (
@@ -299,7 +299,7 @@ def _fit(
         raise PayloadError("recordings without and with the payload are required")
     rows = np.sum([run.phase.samples.sum(axis=0) for run in runs], axis=0)
     if not rows.any():
-        raise IdentificationError(nothing_usable(model))
+        raise IdentificationError(no_rows_message(model))
     p, n = model.n_parameters, model.n_joints
     edges = p + np.cumsum([0, *(shape.shape[1] for shape in shapes)])
     bodies = [np.arange(a, b) for a, b in pairwise(edges.tolist())]

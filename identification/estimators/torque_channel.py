@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
-from identification.signals.masks import LONGEST_END, torn_rows
+from identification.signals.masks import LONGEST_END, edge_rows
 from identification.signals.noise import noiseless_above
 from identification.signals.recording import Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
@@ -105,7 +105,7 @@ class _Channel:
     ) -> _Channel:
         samples = prepare(recording, model, noise_variance=noise_variance, options=options)
         # Without the ends, which filters distort.
-        usable = samples.usable & ~torn_rows(recording, LONGEST_END)[:, None]
+        usable = samples.usable & ~edge_rows(recording, LONGEST_END)[:, None]
         load = samples.known_torque(model)
         every = max(1, round(1.0 / (_RATE * float(np.median(np.diff(recording.time))))))
         counts = [(one.stop - one.start) // every for one in samples.segments]

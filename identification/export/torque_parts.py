@@ -68,9 +68,9 @@ class TorqueParts(NamedTuple):
 
 def torque_parts(model: RobotModel, values: Array, samples: Samples) -> TorqueParts:
     """Return the parts of the predicted torque of parameters (p,), as the channel records it."""
-    if samples.whole is not None:
-        whole, part = samples.whole
-        return TorqueParts(*(one[part] for one in torque_parts(model, values, whole)))
+    if samples.parent is not None:
+        parent, part = samples.parent
+        return TorqueParts(*(one[part] for one in torque_parts(model, values, parent)))
     inertial = np.where(np.arange(model.n_parameters) < model.base.rank, values, 0.0)
     motion = samples.motion
     rest = np.zeros_like(motion.velocity)

@@ -1,8 +1,8 @@
-r"""What a fit needs of the samples, and least squares on it (the paper's eq. 4).
+"""Reduced samples, and weighted least squares on them (eq. 4 of the paper).
 
 Per joint j a :class:`Factor` holds the Gram matrix of the rows [W | y], a :class:`QRFactor` their
-triangular factor. Both add, over chunks, repetitions, archives and machines; joint weights are
-applied afterwards. Gram matrices square the condition: from 1e5 on triangles are used instead.
+triangular factor. Both add over chunks, repetitions, archives and processes; joint weights are
+applied afterwards. Gram matrices square the condition: from 1e5 on triangles are used.
 """
 
 from __future__ import annotations
@@ -22,11 +22,10 @@ from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
 
-# Scaled regressors of condition 1e6 leave four of the sixteen digits of a Gram matrix, less than
-# any torque measurement has; a real rank deficiency shows as 1e8 and more.
+# Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
+# shows as 1e8 and more.
 WORST_CONDITION: Final = 1e6
-# Rows of condition 1e10 leave six of sixteen digits. What is dependent by construction shows as
-# 1e14 and more.
+# Condition 1e10 leaves six digits of rows; structural dependence shows as 1e14 and more.
 WORST_ROW_CONDITION: Final = 1e10
 QR_CONDITION: Final = 1e5
 _PARTICIPATION: Final = 1e-3
@@ -38,19 +37,19 @@ class NormalEquations(NamedTuple):
     A: Array  #: sum of the weighted ``W^T W``, shape (p, p)
     b: Array  #: sum of the weighted ``W^T y``, shape (p,)
     yy: float = 0.0  #: sum of the weighted ``y^T y``
-    n: int = 0  #: number of rows (one joint at one instant) in the sums
+    n: int = 0  #: rows (one joint at one time)
 
     def part(self, chosen: NDArray[np.intp]) -> NormalEquations:
-        """Those of some parameters (k,), the others zero."""
+        """Return the equations of some parameters (k,), the others zero."""
         return self._replace(A=self.A[np.ix_(chosen, chosen)], b=self.b[chosen])
 
 
 class Solution(NamedTuple):
     """Solution of a least-squares problem, of normal equations ``A x = b`` or of rows."""
 
-    values: Array  # (p,), of least (scaled) norm where the data leave a choice
-    root: Array  # S (p, k) with S S' the inverse of A on the k directions the data determine
-    condition: float  # of the regressor with columns of unit length, infinite without some column
+    values: Array  # (p,), of least (scaled) norm where undetermined
+    root: Array  # S (p, k) with S S' the inverse of A on the k determined directions
+    condition: float  # of the regressor with unit columns, infinite without some column
     determined: NDArray[np.bool_]  # (p,)
 
     @property
@@ -61,21 +60,20 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Rows of [W | y], reduced joint by joint to their Gram matrices."""
+    """Gram matrices of the rows of [W | y], joint by joint."""
 
     matrices: Array  #: (n, p + 1, p + 1)
     samples: NDArray[np.intp]  #: rows per joint (n,)
     parameter_names: tuple[str, ...]  #: the p columns of W
 
     words: ClassVar[str] = ""
-    """Behind the name of an estimator."""
+    """Suffix of estimator names."""
     smallest_noise: ClassVar[float] = 1e-6
-    """Share of the torque's own RMS below which a residual is rounding, not noise: it would make a
-    joint that happens to fit exactly the only one that counts."""
+    """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
 
     @classmethod
     def zero(cls, model: RobotModel) -> Self:
-        """Return the factor of no samples: what a sum starts from."""
+        """Return the factor of no samples."""
         n, p = model.n_joints, model.n_parameters
         return cls(np.zeros((n, p + 1, p + 1)), np.zeros(n, dtype=np.intp), model.parameter_names)
 
@@ -84,7 +82,7 @@ class Factor:
         """Reduce the usable rows of a recording.
 
         Raises:
-            ShapeError: an array does not have the shape it should have.
+            ShapeError: wrong shape of an array.
         """
         blocks = (rows.blocks for rows in augmented_rows(model, samples))
         return cls.from_blocks(model, blocks, np.count_nonzero(samples.usable, axis=0))
@@ -97,12 +95,12 @@ class Factor:
         torque: Array,
         mask: NDArray[np.bool_] | None = None,
     ) -> Self:
-        """Reduce m samples of a motion and the torque that W pi should equal [N·m, N] (m, n).
+        """Reduce m samples of a motion and the torque of W pi [N·m, N] (m, n).
 
-        A mask (m, n) says which rows count: all without it. See :meth:`RobotModel.moving`.
+        `mask` (m, n): usable rows, by default all; see :meth:`RobotModel.moving`.
 
         Raises:
-            ShapeError: an array does not have the shape it should have.
+            ShapeError: wrong shape of an array.
         """
         usable = np.ones(np.shape(torque), dtype=np.bool_) if mask is None else mask
         nothing = np.full(model.n_joints, np.inf)
@@ -112,15 +110,15 @@ class Factor:
     def from_blocks(
         cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
     ) -> Self:
-        """Reduce chunks of :func:`augmented_rows`, with `samples` rows that count (n,)."""
+        """Reduce chunks of :func:`augmented_rows`, with numbers of usable rows (n,)."""
         columns = model.plan.columns
         sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
         for blocks in chunks:
             for joint, block in enumerate(blocks):
-                sums[joint] = cls._more(sums[joint], block)
+                sums[joint] = cls._accumulate(sums[joint], block)
         factor = cls.zero(model)
         for small, used, target in zip(sums, columns, factor.matrices, strict=True):
-            target[:] = cls._wide(small, np.append(used, model.n_parameters), target)
+            target[:] = cls._expanded(small, np.append(used, model.n_parameters), target)
         factor.samples[:] = samples
         return factor
 
@@ -152,36 +150,36 @@ class Factor:
                 f"{self.n_joints} joints and {self.n_parameters} parameters, "
                 f"{other.n_joints} joints and {other.n_parameters} parameters"
             )
-        both = self._both(other)
+        both = self._added(other)
         return type(self)(both, self.samples + other.samples, self.parameter_names)
 
     def weighted(self, weights: Array) -> NormalEquations:
-        """Return the normal equations with one weight per joint, shape (n,): 1/variance."""
+        """Return the normal equations with one weight per joint (n,): 1/variance."""
         total = np.tensordot(self._checked(weights), self.gram, axes=1)
         return NormalEquations(
             A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
         )
 
     def squared_errors(self, values: Array) -> Array:
-        """Sum of the squared torque errors of parameters (p,) on each joint (n,)."""
+        """Return the sum of squared torque errors of parameters (p,) per joint (n,)."""
         augmented = np.append(-values, 1.0)
         squares = np.einsum("i,jik,k->j", augmented, self.gram, augmented)
         return np.asarray(np.maximum(squares, 0.0))
 
     def relative_errors(self, values: Array) -> Array:
-        """||e|| / ||tau|| of parameters (p,) on each joint (n,), NaN without torque."""
+        """Return ||e|| / ||tau|| of parameters (p,) per joint (n,), NaN without torque."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.sqrt(self.squared_errors(values) / self.gram[:, -1, -1])
 
     def relative_error(self, values: Array) -> float:
-        """||e|| / ||tau|| of parameters (p,) over all joints, NaN without torque."""
+        """Return ||e|| / ||tau|| of parameters (p,) over all joints, NaN without torque."""
         power = float(self.gram[:, -1, -1].sum())
         return float(np.sqrt(self.squared_errors(values).sum() / power)) if power > 0.0 else np.nan
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
-        """Rows (k, p) and target (k,) that stand for all samples, joints weighted (n,).
+        """Return equivalent rows (k, p) and target (k,) with joint weights (n,).
 
-        Directions that hold nothing but the rounding of the Gram matrix are left out.
+        Directions below the rounding of the Gram matrix are left out.
         """
         return rows_of(self.weighted(weights))
 
@@ -194,21 +192,21 @@ class Factor:
         size = len(directions)
         return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
 
-    def _both(self, other: Self) -> Array:
+    def _added(self, other: Self) -> Array:
         return self.matrices + other.matrices
 
     @staticmethod
-    def _more(matrix: Array, block: Array) -> Array:
+    def _accumulate(matrix: Array, block: Array) -> Array:
         matrix += block @ block.T
         return matrix
 
     @staticmethod
-    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
+    def _expanded(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
         target[np.ix_(place, place)] = matrix
         return target
 
     def _checked(self, weights: Array) -> Array:
-        """Raises ShapeError where there is not one weight per joint."""
+        """Raise ShapeError unless there is one weight per joint."""
         weights = np.asarray(weights, dtype=np.float64)
         if weights.shape != (self.n_joints,):
             raise ShapeError("weights", weights.shape, f"({self.n_joints},)")
@@ -216,19 +214,19 @@ class Factor:
 
 
 class QRFactor(Factor):
-    """Upper triangular factors of [W | y], one per joint, in place of Gram matrices."""
+    """Upper triangular factors of [W | y], one per joint, instead of Gram matrices."""
 
     words = " by QR"
-    # A triangular factor gives the residual to about 1e-13 of the torque.
+    # Rounding of the residual by triangular factors.
     smallest_noise = 1e-12
 
     @property
     def gram(self) -> Array:
-        """The Gram matrices, for what works on those; loses digits."""
+        """Gram matrices, with loss of digits."""
         return np.asarray(self.matrices.transpose(0, 2, 1) @ self.matrices)
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
-        """The triangle of all joints together."""
+        """Return the triangle of all joints."""
         rows = np.sqrt(self._checked(weights))[:, None, None] * self.matrices
         triangle = _triangle(rows.reshape(-1, rows.shape[2]))
         return triangle[:-1, :-1], triangle[:-1, -1]
@@ -238,28 +236,28 @@ class QRFactor(Factor):
         return solve_rows(*self.rows(weights))
 
     def products(self, directions: Array) -> Array:
-        """Squares of the triangles times the directions."""
+        """Return squares of the triangles times the directions."""
         through = self.matrices[:, :, : len(directions)] @ directions
         return np.asarray(through.transpose(0, 2, 1) @ through)
 
-    def _both(self, other: Self) -> Array:
+    def _added(self, other: Self) -> Array:
         stacked = np.concatenate([self.matrices, other.matrices], axis=1)
         return np.array([_triangle(joint) for joint in stacked])
 
     @staticmethod
-    def _more(matrix: Array, block: Array) -> Array:
+    def _accumulate(matrix: Array, block: Array) -> Array:
         return _triangle(np.concatenate([matrix, block.T]))
 
     @staticmethod
-    def _wide(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
+    def _expanded(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
         wide = np.zeros((len(matrix), len(target)))
         wide[:, place] = matrix
-        # Columns of a joint need not rise, and then the wide rows are not triangular.
+        # Columns are not sorted, so the expanded rows are not triangular.
         return _triangle(wide)
 
 
 def _triangle(rows: Array) -> Array:
-    """Upper triangular R with R'R = rows'rows and as many rows as columns, missing ones zero."""
+    """Return upper triangular R with R'R = rows'rows, square, missing rows zero."""
     triangle = np.linalg.qr(rows, mode="r")
     square = np.zeros((rows.shape[1], rows.shape[1]))
     square[: len(triangle)] = triangle
@@ -267,12 +265,12 @@ def _triangle(rows: Array) -> Array:
 
 
 def _unit_columns(length: Array) -> Array:
-    """What columns of a length (p,) are divided by: one where there is nothing."""
+    """Return divisors for columns of a length (p,), one for zero."""
     return np.where(length > 0.0, length, 1.0)
 
 
-def _by_size(length: Array, size: Array, vectors: Array, worst: float) -> Solution:
-    """Solution without values, from singular values (p,) and vectors of columns of unit length."""
+def _determined_part(length: Array, size: Array, vectors: Array, worst: float) -> Solution:
+    """Return a solution without values, from singular values (p,) and vectors of unit columns."""
     significant = (size > size.max(initial=0.0) / worst) & (size > 0.0)
     lost = np.abs(vectors[:, ~significant]).max(axis=1, initial=0.0)
     smallest = size.min(initial=np.inf) if np.all(length > 0.0) else 0.0
@@ -285,39 +283,36 @@ def _by_size(length: Array, size: Array, vectors: Array, worst: float) -> Soluti
 
 
 def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
-    """Solve ``A x = b`` with columns scaled to unit length, naming what A does not determine.
+    """Solve ``A x = b`` with columns scaled to unit length.
 
-    Directions of the scaled parameter space in which the condition exceeds `worst` are left out;
-    the parameters that take part in one of them are undetermined.
+    Directions of scaled condition above `worst` are left out; their parameters are undetermined.
     """
     length = np.sqrt(np.diag(equations.A))
     scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
-    found = _by_size(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
+    found = _determined_part(length, np.sqrt(np.maximum(eigenvalues, 0.0)), vectors, worst)
     return found._replace(values=found.root @ (found.root.T @ equations.b))
 
 
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
-    """Solve ``rows @ x = target`` (k, p), (k,) by least squares, naming what they do not determine.
+    """Solve ``rows @ x = target`` (k, p), (k,) by least squares.
 
-    By a singular value decomposition of the rows with columns scaled to unit length: forming
-    ``rows'rows`` would square the condition (Golub and Van Loan 2013, section 5.3); `worst` as for
-    :func:`solve`.
+    By a singular value decomposition of rows with unit columns, without squaring the condition
+    (Golub and Van Loan 2013, section 5.3); `worst` as for :func:`solve`.
     """
     length = np.linalg.norm(rows, axis=0)
     left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
     size = np.zeros(rows.shape[1])
     size[: len(singular)] = singular
-    found = _by_size(length, size, right.T, worst)
-    # The significant ones are the first.
+    found = _determined_part(length, size, right.T, worst)
+    # Significant values come first.
     return found._replace(values=found.root @ (left[:, : found.root.shape[1]].T @ target))
 
 
 def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``.
 
-    Directions in which A holds nothing but its own rounding (condition above `WORST_CONDITION`)
-    are left out: they carry no information.
+    Directions below rounding (condition above `WORST_CONDITION`) are left out.
     """
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
     scale = _unit_columns(length)
@@ -325,15 +320,15 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
     significant = eigenvalues > max(eigenvalues[-1], 0.0) / WORST_CONDITION**2
     singular = np.sqrt(eigenvalues[significant])
     basis = vectors[:, significant].T
-    # Times the length itself: a column without data stays exactly zero, without rounding.
+    # Exactly zero for columns without data.
     return singular[:, None] * basis * length, (basis @ (equations.b / scale)) / singular
 
 
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
-    """Variance of the torque residual per joint (n,), NaN for a joint without rows.
+    """Return the variance of the torque residual per joint (n,), NaN without rows.
 
-    The parameters cost degrees of freedom, shared among the joints by how much each contributes
-    to the information: trace(w_j S' G_j S), with the root S (p, k) of a :class:`Solution`.
+    Degrees of freedom are shared among joints by their information trace(w_j S' G_j S), with the
+    root S (p, k) of a :class:`Solution`.
     """
     squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
     spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
@@ -345,21 +340,21 @@ def residual_variance(factor: Factor, values: Array, root: Array, weights: Array
 
 
 def joint_weights(factor: Factor) -> Array:
-    """Inverse variance of each joint's residual in an ordinary fit (n,), zero without rows."""
+    """Return the inverse residual variance per joint in an ordinary fit (n,), zero without rows."""
     ordinary = np.ones(factor.n_joints)
     first = factor.solve(ordinary)
     return inverse_variance(residual_variance(factor, first.values, first.root, ordinary))
 
 
 def inverse_variance(variance: Array) -> Array:
-    """Weights (n,) of joints, zero where the variance is NaN or infinite."""
+    """Return weights (n,) of joints, zero for variances of NaN or infinity."""
     known = np.isfinite(variance)
     return np.where(known, 1.0 / np.where(known, variance, 1.0), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Parameters and how well they are known."""
+    """Parameters with their covariance."""
 
     names: tuple[str, ...]  #: (p,)
     units: tuple[str, ...]  #: (p,)
@@ -367,12 +362,11 @@ class Estimate:
     covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
     noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
     samples: NDArray[np.intp]  #: rows per joint (n,)
-    method: str  #: how it was made, in words, and what the covariance assumes
-    condition: float  #: condition number of the weighted regressor with columns of unit length
-    #: parameters the data say nothing about, alone or as part of a combination
+    method: str  #: description of estimator and covariance
+    condition: float  #: condition number of the weighted regressor with unit columns
+    #: undetermined parameters, alone or in a combination
     undetermined: tuple[str, ...] = ()
-    #: standard deviations in half a 95 % interval: 1.96, more where the covariance itself comes
-    #: from few data
+    #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
     interval_factor: float = 1.96
 
     @property
@@ -381,18 +375,18 @@ class Estimate:
         return np.sqrt(np.diag(self.covariance))
 
     def value(self, name: str) -> float:
-        """Value of one parameter by name."""
+        """Return one parameter by name."""
         return float(self.values[self.names.index(name)])
 
 
 def estimate(model: RobotModel, factor: Factor, weights: Array | None = None) -> Estimate:
-    """Weighted least squares (eq. 4); weights (n,) by default from residuals of an ordinary fit.
+    """Estimate by weighted least squares (eq. 4); weights (n,) by default from an ordinary fit.
 
-    The covariance is the classical one, A^-1: honest only if the residuals are white. See
-    :mod:`identification.estimators.covariance` for the one that does not need that.
+    The covariance is the classical one, A^-1, valid for white residuals; see
+    :mod:`identification.estimators.covariance` for others.
 
     Raises:
-        IdentificationError: the factor holds no rows.
+        IdentificationError: the factor has no rows.
     """
     require_rows(model, factor)
     if weights is None:
@@ -410,9 +404,9 @@ def estimate_of(
     covariance: Array | None = None,
     interval_factor: float = 1.96,
 ) -> Estimate:
-    """Estimate from a solution with weights (n,) per joint.
+    """Return the estimate of a solution with weights (n,) per joint.
 
-    The `covariance` (p, p) is that on what is determined, by default the inverse of A.
+    `covariance` (p, p) of the determined part is by default the inverse of A.
     """
     covariance = solution.inverse if covariance is None else covariance.copy()
     mark_undetermined(covariance, solution.determined)
@@ -432,40 +426,39 @@ def estimate_of(
 
 
 def require_rows(model: RobotModel, factor: Factor) -> None:
-    """Raise IdentificationError where no row can be fitted."""
+    """Raise IdentificationError without usable rows."""
     if not factor.samples.any():
-        raise IdentificationError(nothing_usable(model))
+        raise IdentificationError(no_rows_message(model))
 
 
-def nothing_usable(model: RobotModel) -> str:
-    """What to say where no row can be fitted."""
+def no_rows_message(model: RobotModel) -> str:
+    """Return the error message for no usable rows."""
     slowest = float(np.min(model.friction.standstill))
     return (
         "there is not one usable sample: no joint moves faster than the standstill speed of"
-        f" {slowest:g} away from the ends and gaps of the recording"
+        f" {slowest:g} rad/s or m/s away from ends and gaps of the recording"
     )
 
 
 def mark_undetermined(covariance: Array, determined: NDArray[np.bool_]) -> None:
-    """Give undetermined parameters an infinite variance and no covariance, in place."""
+    """Set infinite variance and zero covariance of undetermined parameters, in place."""
     covariance[~determined, :] = 0.0
     covariance[:, ~determined] = 0.0
     covariance[~determined, ~determined] = np.inf
 
 
 def undetermined_names(names: Sequence[str], determined: NDArray[np.bool_]) -> tuple[str, ...]:
-    """Names (p,) of what is not determined (p,)."""
+    """Return the names (p,) of undetermined parameters (p,)."""
     return tuple(name for name, known in zip(names, determined, strict=True) if not known)
 
 
 def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> Factor:
-    """Return the Gram matrices of recordings, or triangles where the condition demands it.
+    """Return Gram matrices of recordings, or triangles if the condition exceeds `QR_CONDITION`.
 
-    The samples are read once more only if the scaled condition of the ordinary problem exceeds
-    `QR_CONDITION`; there are none where the factor is all there is.
+    Triangles read the samples once more; without recordings the Gram matrices are returned.
 
     Raises:
-        IdentificationError: not one usable row.
+        IdentificationError: no usable row.
     """
     require_rows(model, gram)
     if not recordings or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
@@ -476,21 +469,20 @@ def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> F
 class Rows(NamedTuple):
     """Rows of k consecutive samples, joint by joint."""
 
-    part: slice  # which samples of the recording these are
-    # per joint j the columns of its row and, last, its torque (c_j + 1, k). Columns of samples
-    # that do not count are zero. Valid until the next chunk is asked for
+    part: slice  # of the recording
+    # per joint j its columns and, last, its torque (c_j + 1, k), zero for unusable rows; valid
+    # until the next chunk
     blocks: list[Array]
 
 
 def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
-    """Yield [W | y] of a recording in chunks, with zeros for what is not usable.
+    """Yield [W | y] of a recording in chunks, zero for unusable rows.
 
-    ``model.plan.columns[j]`` says which parameters the columns of joint j belong to. Where the
-    torque has come through a low-pass the columns have too, and then the regressor of the whole
-    recording is made at once: a filter without phase needs what comes later.
+    ``model.plan.columns[j]`` are the parameters of the columns of joint j. With a torque low-pass
+    the regressor of the whole recording is computed at once and filtered as well.
 
     Raises:
-        ShapeError: an array does not have the shape the model asks for.
+        ShapeError: wrong shape of an array.
     """
     q, qd, qdd, torque = joint_arrays(
         model.n_joints,
@@ -509,7 +501,7 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     for part, blocks in chunks:
         for block, lost in zip(blocks, ~samples.usable[part].T, strict=True):
             if lost.any():
-                # Assigned, not multiplied: a row left out may hold NaN.
+                # Unusable rows may be NaN.
                 block[:, np.flatnonzero(lost)] = 0.0
         yield Rows(part, blocks)
 

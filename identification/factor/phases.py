@@ -1,8 +1,8 @@
-r"""Gram matrices of [W | y] by short blocks of time: factor and covariance in one pass.
+"""Gram matrices of [W | y] by short blocks of time: factor and covariance in one pass.
 
-Summed over blocks they are the :class:`identification.factor.factor.Factor`; block by block they
-give the scores of a cluster-robust covariance for any weights and parameters. Instrumental
-variables need the same of [Z | W | y], gains of [W | t | i].
+Their sum over blocks is the :class:`identification.factor.factor.Factor`; blocks give the scores of
+a cluster-robust covariance for any weights and parameters. Instrumental variables use [Z | W | y],
+gains [W | t | i].
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ _MOST_BLOCKS: Final = 400  # of one recording, for gains
 class PhaseFactor:
     """Factors of B short blocks of time since the motion's origin.
 
-    They add at equal times since the origin: repetitions of a motion block by block.
+    Repetitions of a motion add block by block.
     """
 
-    #: per joint j over its columns, and last the torque, (B, c_j + 1, c_j + 1)
+    #: per joint j over its columns and the torque, (B, c_j + 1, c_j + 1)
     gram: tuple[Array, ...]
-    #: per joint the parameter index of each of its columns (c_j,)
+    #: per joint the parameter indices of its columns (c_j,)
     columns: tuple[NDArray[np.intp], ...]
-    samples: NDArray[np.intp]  #: rows that count (B, n)
+    samples: NDArray[np.intp]  #: usable rows (B, n)
     parameter_names: tuple[str, ...]  #: (p,)
 
     @classmethod
     def zero(cls, model: RobotModel) -> PhaseFactor:
-        """Return the factor of no samples: what a sum starts from."""
+        """Return the factor of no samples."""
         nothing = np.zeros(0, dtype=np.int64), np.zeros((0, model.n_joints), dtype=np.bool_)
         return cls.of_rows(*nothing, model.plan.columns, model.parameter_names, ())
 
     @classmethod
     def from_samples(cls, model: RobotModel, samples: Samples) -> PhaseFactor:
-        """Reduce a recording, block by block. Rows before the origin belong to the first."""
+        """Reduce a recording by blocks; rows before the origin belong to the first."""
         index, rows = fine_blocks(samples), augmented_rows(model, samples)
         columns = model.plan.columns
         return cls.of_rows(index, samples.usable, columns, model.parameter_names, rows)
@@ -68,7 +68,7 @@ class PhaseFactor:
     ) -> PhaseFactor:
         """Reduce chunks: per joint columns and torque (c_j + 1, k), zero if not usable (m, n).
 
-        `index` is the block of each row (m,), rising; `columns` are per joint the parameters of its
+        `index` is the block of each row (m,), rising; `columns` are the parameters of each joint's
         columns (c_j,), `names` those of all (p,).
         """
         count = int(index[-1]) + 1 if len(index) else 0
@@ -94,22 +94,22 @@ class PhaseFactor:
         return len(self.samples)
 
     def __add__(self, other: PhaseFactor) -> PhaseFactor:
-        """Blocks of both at equal times since the origin.
+        """Add blocks at equal times since the origin.
 
         Raises:
             IdentificationError: the two belong to different models.
         """
         if self.parameter_names != other.parameter_names or self.n_joints != other.n_joints:
             raise IdentificationError("factors with different joints or parameters cannot be added")
-        gram = tuple(_sum(a, b) for a, b in zip(self.gram, other.gram, strict=True))
-        return replace(self, gram=gram, samples=_sum(self.samples, other.samples))
+        gram = tuple(_added(a, b) for a, b in zip(self.gram, other.gram, strict=True))
+        return replace(self, gram=gram, samples=_added(self.samples, other.samples))
 
     def places(self, joint: int) -> NDArray[np.intp]:
-        """Where the columns of a joint's Gram stand among all p + 1, the torque being last."""
+        """Return the indices of a joint's columns among all p + 1, torque last."""
         return np.append(self.columns[joint], self.n_parameters)
 
     def weighted(self, weights: Array) -> Array:
-        """Gram matrices of the blocks (B, p + 1, p + 1) with one weight per joint (n,)."""
+        """Return the Gram matrices of the blocks (B, p + 1, p + 1) with joint weights (n,)."""
         width = self.n_parameters + 1
         whole = np.zeros((len(self.samples), width * width))
         for joint, (weight, gram) in enumerate(zip(weights, self.gram, strict=True)):
@@ -119,24 +119,24 @@ class PhaseFactor:
         return whole.reshape(-1, width, width)
 
     def scores(self, weights: Array, values: Array) -> Array:
-        """Pull of each block's residuals on the parameters, ``W' w (y - W values)`` (B, p)."""
+        """Return the scores ``W' w (y - W values)`` of each block (B, p)."""
         pull = np.zeros((len(self.samples), self.n_parameters))
         for weight, gram, used in zip(weights, self.gram, self.columns, strict=True):
             pull[:, used] += weight * (gram[:, :-1] @ np.append(-values[used], 1.0))
         return pull
 
     def blocks(self, which: slice | NDArray[np.bool_]) -> PhaseFactor:
-        """Some of the blocks, by place or by a mask (B,)."""
+        """Return some blocks, by slice or mask (B,)."""
         gram = tuple(own[which] for own in self.gram)
         return replace(self, gram=gram, samples=self.samples[which])
 
     def occupied(self) -> PhaseFactor:
-        """Without the blocks that hold no row."""
+        """Return the blocks with rows."""
         rows = np.asarray(self.samples.any(axis=1))
         return self if rows.all() else self.blocks(rows)
 
     def merged(self, length: int) -> PhaseFactor:
-        """Runs of `length` blocks as one; the last one may be shorter."""
+        """Merge runs of `length` blocks; the last one may be shorter."""
         gram = tuple(merged(own, length) for own in self.gram)
         return replace(self, gram=gram, samples=merged(self.samples, length))
 
@@ -151,7 +151,7 @@ class PhaseFactor:
         return Factor(whole, self.samples.sum(axis=0), self.parameter_names)
 
     def restricted(self, chosen: NDArray[np.intp]) -> PhaseFactor:
-        """The same samples for a model of the parameters `chosen` (k,) alone, in that order."""
+        """Return the factor of the parameters `chosen` (k,), in that order."""
         place = np.full(self.n_parameters, -1, dtype=np.intp)
         place[chosen] = np.arange(len(chosen))
         gram, columns = [], []
@@ -170,18 +170,17 @@ def instrument_factor(
     instrument: Motion,
     usable: NDArray[np.bool_] | None = None,
 ) -> PhaseFactor:
-    """Reduce a recording to blocks of [Z | W | y]: columns of Z by name, then the same of W.
+    """Reduce a recording to blocks of [Z | W | y].
 
-    The instrument is a motion without measurement noise in the rows of the samples, known where
-    `usable` (m, n) says. Rows count in which it moves as well: which count must not depend on
-    noise.
+    The instrument is a noise-free motion in the rows of the samples, known where `usable` (m, n).
+    Rows count if it moves as well, independently of noise.
     """
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
         rows &= usable
     columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
     measured = augmented_rows(model, replace(samples, usable=rows))
-    # Of the same rows, and through the same torque channel.
+    # The same rows, with the same torque low-pass.
     planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
     both = (
         (part, [np.concatenate([z[:-1], w]) for z, w in zip(quiet, noisy, strict=True)])
@@ -192,7 +191,7 @@ def instrument_factor(
 
 
 def measured_part(factor: PhaseFactor) -> PhaseFactor:
-    """Of :func:`instrument_factor` the part [W | y]: what least squares on the same rows sees."""
+    """Return the part [W | y] of :func:`instrument_factor`, for least squares on equal rows."""
     p = factor.n_parameters // 2
     return factor.restricted(np.arange(p, 2 * p))
 
@@ -207,9 +206,8 @@ def gain_factor(
 ) -> PhaseFactor:
     """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
 
-    A motor's current (m, n) [A] counts where the rows of all joints that it acts on do; t is the
-    torque of what the robot carried. `transmission`: motors' angles per joint angle (n, n),
-    identity: motors are joints, and gains include the gear ratio.
+    A motor's current (m, n) [A] counts if the rows of all its joints do; t is the payload torque.
+    `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios.
     """
     n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
     turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
@@ -234,14 +232,14 @@ def gain_factor(
 
 
 def joined(parts: Sequence[PhaseFactor]) -> PhaseFactor:
-    """Blocks of several recordings one after the other."""
+    """Concatenate the blocks of several recordings."""
     gram = tuple(np.concatenate(own) for own in zip(*(part.gram for part in parts), strict=True))
     samples = np.concatenate([part.samples for part in parts])
     return replace(parts[0], gram=gram, samples=samples)
 
 
 def total_phase(model: RobotModel, recordings: Iterable[Samples]) -> PhaseFactor:
-    """Sum of the factors of recordings, each read once."""
+    """Return the sum of the factors of recordings, each read once."""
     return sum(
         (PhaseFactor.from_samples(model, samples) for samples in recordings),
         PhaseFactor.zero(model),
@@ -249,13 +247,13 @@ def total_phase(model: RobotModel, recordings: Iterable[Samples]) -> PhaseFactor
 
 
 def fine_blocks(samples: Samples) -> NDArray[np.int64]:
-    """Block of each sample (m,), rising; rows before the origin belong to the first."""
+    """Return the block of each sample (m,), rising; rows before the origin belong to the first."""
     since = samples.motion.time - samples.origin
     return np.maximum(np.floor(since / FINE_BLOCK + 1e-9).astype(np.int64), 0)
 
 
-def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
-    """Yield each value of a rising index with where it stands."""
+def block_slices(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
+    """Yield each value of a rising index with its slice."""
     edges = np.flatnonzero(np.diff(index)) + 1
     for start, stop in pairwise([0, *edges.tolist(), len(index)]):
         if stop > start:
@@ -263,18 +261,18 @@ def block_runs(index: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
 
 
 class EqualRuns(NamedTuple):
-    """Blocks in a row of as many rows each."""
+    """Consecutive blocks of equally many rows."""
 
     first: int  # block
     blocks: int
-    start: int  # first row of the first block
-    length: int  # rows of each
+    start: int  # first row
+    length: int  # rows per block
 
 
 def equal_runs(index: NDArray[np.int64]) -> list[EqualRuns]:
-    """Group :func:`block_runs` of a rising index, for as few and large operations as can be."""
+    """Group :func:`block_slices` of a rising index, for few large operations."""
     groups: list[EqualRuns] = []
-    for block, at in block_runs(index):
+    for block, at in block_slices(index):
         length = at.stop - at.start
         last = groups[-1] if groups else None
         if last is not None and last.length == length and last.first + last.blocks == block:
@@ -288,13 +286,13 @@ def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
     """Add ``rows rows'`` of each block to the total (B, c, c), in place; rows is (c, k)."""
     for first, count, start, length in runs:
         own = rows[:, start : start + count * length].reshape(len(rows), count, length)
-        # The product of an array with itself transposed takes half the work.
+        # A product with the own transpose takes half the work.
         own = own.transpose(1, 0, 2)
         total[first : first + count] += own @ own.transpose(0, 2, 1)
 
 
 def samples_by_cell(index: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Rows that count (B, n) of a mask (m, n), by a rising index of blocks (m,)."""
+    """Return usable rows per block (B, n) of a mask (m, n), by a rising index (m,)."""
     if not len(index):
         return np.zeros((0, usable.shape[1]), dtype=np.intp)
     ends = np.searchsorted(index, np.arange(int(index[-1]) + 1), side="right")
@@ -304,23 +302,23 @@ def samples_by_cell(index: NDArray[np.int64], usable: NDArray[np.bool_]) -> NDAr
 
 
 def merged(blocks: Blocks, length: int) -> Blocks:
-    """Sum runs of `length` blocks along the first axis (B, ...); the last one may be shorter."""
+    """Sum runs of `length` blocks along the first axis (B, ...); the last may be shorter."""
     total = blocks[::length].copy()
-    for later in range(1, length):  # several times as fast as np.add.reduceat
+    for later in range(1, length):  # faster than np.add.reduceat
         own = blocks[later::length]
         total[: len(own)] += own
     return total
 
 
-def _sum(first: Blocks, second: Blocks) -> Blocks:
-    """Sum of blocks (B, ...) of possibly different number."""
+def _added(first: Blocks, second: Blocks) -> Blocks:
+    """Add blocks (B, ...) of possibly different number."""
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
     total = longer.copy()
     total[: len(shorter)] += shorter
     return total
 
 
-# Rows of one recording: what is asked of any gravity is coarse, and neighbours say the same.
+# of one recording
 _MOST_ROWS: Final = 1000
 
 
@@ -328,18 +326,16 @@ _MOST_ROWS: Final = 1000
 class StandardGram:
     """Sums over samples of products of [W0 | Wx | Wy | Wz | y] in standard parameters, by joint.
 
-    The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz. One pass over the
-    samples therefore says what any other gravity would have made of them. Standard parameters are
-    used, since which combinations of them are base parameters depends on gravity.
+    The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any
+    gravity. Base parameters would depend on it.
     """
 
-    # (n, 4 s + 1, 4 s + 1) for s columns: standard parameters, friction, then springs and
-    # balancers
+    # (n, 4 s + 1, 4 s + 1) for s standard parameters, friction, springs and balancers
     gram: Array
-    rows: NDArray[np.intp]  # that were summed (n,)
+    rows: NDArray[np.intp]  # summed rows (n,)
 
     def under(self, gravity: Array) -> Factor:
-        """Factor of the s columns under a gravity (3,) [m/s²]."""
+        """Return the factor of the s columns under a gravity (3,) [m/s²]."""
         share, n, s = np.append(1.0, gravity), len(self.gram), len(self.gram[0]) // 4
         parts = self.gram[:, :-1, :-1].reshape(n, 4, s, 4, s)
         found = np.empty((n, s + 1, s + 1))
@@ -370,7 +366,7 @@ class StandardGram:
         for samples in recordings:
             every = max(1, len(samples.torque) // _MOST_ROWS)
             filtered = samples.torque_bandwidth is not None
-            part = slice(None, None, 1 if filtered else every)  # a filter reads all rows
+            part = slice(None, None, 1 if filtered else every)  # filters need all rows
             found = [plan.evaluate(*(one[part] for one in samples.motion[1:4])) for plan in plans]
             for joint in range(n):
                 usable = samples.usable[::every, joint]
@@ -390,10 +386,10 @@ class StandardGram:
 
 
 def gravity_loads(model: RobotModel, position: Array) -> NDArray[np.bool_]:
-    """Whether gravity can load each joint (n,) in some of the positions (m, n)."""
+    """Return whether gravity can load each joint (n,) in some of the positions (m, n)."""
     still = np.zeros_like(position)
     plan = RegressorPlan.of_bodies(model.chain, model.gravity)
     blocks = plan.evaluate(position, still, still).blocks
-    # Of a unit first moment the torque is g; rounding in the URDF's angles leaves far less.
+    # A unit first moment makes a torque of g; rounding of URDF angles far less.
     floor = 1e-3 * float(np.linalg.norm(model.gravity))
     return np.array([bool(np.abs(block).max(initial=0.0) > floor) for block in blocks])

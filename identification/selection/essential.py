@@ -1,9 +1,9 @@
-"""Essential parameters: those that a motion needs, chosen by backward elimination.
+"""Essential parameters, chosen by backward elimination.
 
 The parameter of the largest relative standard deviation is removed (Pham and Gautier 1991) unless
-motion that was held out is predicted worse without it, by more than :class:`CutRule` gives away;
-what was refused is tried once more when nothing else can go. What the choice is worth on motion
-that had no say is found beside it (:class:`BlindChoice`). All of it works on factors.
+that raises the error on held-out motion by more than :class:`CutRule` allows; refused removals are
+tried once more at the end. :class:`BlindChoice` evaluates the choice on motion that was not used
+for it.
 """
 
 from __future__ import annotations
@@ -35,59 +35,55 @@ Indices = NDArray[np.intp]
 
 _CHANCE: Final = 0.05
 _TINY: Final = 1e-300
-# Of the fitted motion, the share that parameters are fitted to when the rest chooses them.
+# Share of the fitted motion used for the fit of a blind choice.
 _FITTED_SHARE: Final = 0.7
-# Blocks below which an error is no evidence on anything.
+# Minimum blocks for an error.
 _FEWEST_BLOCKS: Final = 10
 _MOST_BLOCKS: Final = 150
 
 
 @dataclass(frozen=True)
 class CutRule:
-    """When to stop taking parameters out."""
+    """Termination of the elimination."""
 
-    # largest over smallest relative standard deviation of those left; below it the data know all
-    # of them comparably well (Pham and Gautier 1991: 10 to 30)
+    # largest over smallest relative standard deviation at which to stop (Pham and Gautier 1991: 10
+    # to 30)
     spread: float = 30.0
-    # rise of the relative torque error on held-out motion, over all joints, that is given away for
-    # a smaller model: 0.001 is 0.1 points of per cent
+    # allowed rise of the relative held-out torque error over all joints (0.001 is 0.1 %)
     overall: float = 0.001
-    axis: float = 0.005  # the same for one joint, as a share of that joint's torque
-    noticeable: float = 0.1  # share of both that a rise beyond chance must reach to count
+    axis: float = 0.005  # the same for one joint
+    noticeable: float = 0.1  # share of both allowed for a significant rise
 
 
-# A rule that no held-out error can stop: the cut is that of Pham and Gautier alone.
+# Elimination by Pham and Gautier, without held-out error.
 _BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
 
 
 class EliminationStep(NamedTuple):
-    """The model after one more parameter was removed."""
+    """Model after the removal of one more parameter."""
 
-    removed: str | None  # the parameter, None for the model it all begins with
-    left: int  # number of parameters left
+    removed: str | None  # None for the full model
+    left: int  # parameters left
     spread: float  # largest over smallest relative standard deviation of those left
-    # of those left, classical; infinite with one that is not determined
+    # classical; infinite if undetermined
     largest_relative_std: float
-    in_sample: float  # relative torque error ||e|| / ||tau|| over all joints on the fitted motion
-    held_out: float  # the same on the motion that was held out
+    in_sample: float  # relative torque error ||e|| / ||tau|| on the fitted motion
+    held_out: float  # on the held-out motion
 
 
 @dataclass(frozen=True, eq=False)
 class Elimination:
-    """All steps down to one parameter, and where to stop."""
+    """All steps down to one parameter, and the cut."""
 
-    #: the path: step k has k removals. Behind the cut parameters go on being removed by relative
-    #: standard deviation alone, to show what that costs
+    #: step k has k removals; after the cut by relative standard deviation alone
     steps: tuple[EliminationStep, ...]
-    cut: int  #: the step chosen
-    #: parameters that the held-out motion did not let go before the cut, in order
+    cut: int  #: index of the chosen step
+    #: parameters whose removal was refused, in order
     refused: tuple[str, ...]
-    reason: str  #: why the cut is there, in words
-    #: of the parameters left at the cut, with their names and the cluster-robust covariance,
-    #: which is that of a model with exactly these parameters: it takes no account of their having
-    #: been chosen
+    reason: str  #: explanation of the cut
+    #: of the remaining parameters, with cluster-robust covariance that ignores their selection
     estimate: Estimate
-    values: Array  #: the same for the full model (p,), zero for what was removed
+    values: Array  #: for the full model (p,), zero if removed
 
     @property
     def removed(self) -> tuple[str, ...]:
@@ -96,51 +92,50 @@ class Elimination:
 
     @property
     def chosen(self) -> EliminationStep:
-        """The step at the cut."""
+        """Step at the cut."""
         return self.steps[self.cut]
 
 
 class BlindChoice(NamedTuple):
-    """Parameters that were chosen inside the fitted motion, tried on the held-out motion."""
+    """Parameters chosen within the fitted motion, evaluated on the held-out motion."""
 
-    left: int  # how many were chosen
-    essential: float  # relative torque error of these on the held-out motion
-    full: float  # that of all parameters
+    left: int  # parameters
+    essential: float  # relative torque error on the held-out motion
+    full: float  # the same of all parameters
 
 
 class EssentialChoice(NamedTuple):
-    """Which parameters a robot needs, and how far that can be relied on."""
+    """Essential parameters of a robot, with their evaluation."""
 
-    elimination: Elimination  # all steps and the cut, chosen on all held-out motion
-    # last step by relative standard deviations alone (Pham and Gautier 1991), for comparison
+    elimination: Elimination  # chosen on the held-out motion
+    # last step by standard deviations alone, for comparison
     by_spread: EliminationStep
-    # a choice without a look at the held-out motion; None where the fitted motion is too short
+    # None if the fitted motion is too short
     blind: BlindChoice | None
 
 
 def choose_essential(
     model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
 ) -> EssentialChoice:
-    """Choose the essential parameters of fitted samples, and say what the choice is worth.
+    """Choose the essential parameters of fitted samples, and evaluate the choice.
 
     Raises:
         IdentificationError: nothing was fitted or held out.
     """
     if not held_out:
-        raise IdentificationError("there is no held-out motion to choose parameters on")
+        raise IdentificationError("no held-out motion to choose parameters on")
     weights = joint_weights(training.total)
-    # Of many recordings neighbouring blocks are added up: what they are for, telling chance from a
-    # rise of the error, needs some hundred of them and costs time with each.
+    # Blocks are merged to some hundred, enough for significance.
     longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)
     unseen = joined([factor.merged(longer) for factor in held_out]).occupied()
     return EssentialChoice(
         elimination=eliminate(model, training, unseen, weights=weights),
         by_spread=eliminate(model, training, unseen, weights=weights, rule=_BY_SPREAD).chosen,
-        blind=_blind(model, training, unseen.total, weights),
+        blind=_choose_blind(model, training, unseen.total, weights),
     )
 
 
-def _blind(
+def _choose_blind(
     model: RobotModel, training: PhaseFactor, unseen: Factor, weights: Array
 ) -> BlindChoice | None:
     used = training.occupied()
@@ -163,24 +158,24 @@ def eliminate(
     weights: Array | None = None,
     rule: CutRule = CutRule(),
 ) -> Elimination:
-    """Take parameters out one by one and choose how many can go.
+    """Remove parameters one by one and choose the cut.
 
-    The held-out samples, better of another motion, choose the cut, so their error there is a little
-    flattered. Weights (n,) are by default the inverse residual variances of an ordinary fit.
+    The held-out samples, preferably of another motion, choose the cut, so their error is slightly
+    optimistic. Weights (n,) are by default the inverse residual variances of an ordinary fit.
 
     Raises:
         IdentificationError: one of the factors has no rows.
     """
     for factor, what in ((training, "fitted"), (held_out, "held-out")):
         if not factor.samples.any():
-            raise IdentificationError(f"there is not one usable {what} sample")
+            raise IdentificationError(f"no usable {what} sample")
     total, names = training.total, training.parameter_names
     if weights is None:
         weights = joint_weights(total)
     path = _Path(total, held_out, weights, rule)
-    path.guarded()
+    path.remove_guarded()
     cut, refused, chosen = len(path.steps) - 1, tuple(names[k] for k in path.refused), path.current
-    path.to_the_end()
+    path.remove_all()
     part, units = training.restricted(chosen.left), [model.units[k] for k in chosen.left]
     classical = estimate_of(units, part.total, chosen.solution, weights, "")
     name = "essential parameters by weighted least squares"
@@ -195,7 +190,7 @@ def eliminate(
 
 
 class _Subset(NamedTuple):
-    """The fit with some of the parameters, and its errors."""
+    """Fit of some parameters, and its errors."""
 
     left: Indices  # (k,)
     solution: Solution  # of the normal equations in these
@@ -206,7 +201,7 @@ class _Subset(NamedTuple):
     held_out_joint: Array  # (n,), zero for one without rows
 
     def spread(self, free: NDArray[np.bool_] | bool = True) -> float:
-        """Largest relative standard deviation of those that are free over the smallest of all."""
+        """Return the largest relative deviation of `free` parameters over the smallest."""
         largest = np.where(free, self.relative, 0.0).max()
         return float(largest / max(self.relative.min(), _TINY))
 
@@ -221,12 +216,12 @@ class _Path:
         self.refused: list[int] = []
         self.steps: list[EliminationStep] = []
         self.best = self.current = self._subset(np.arange(total.n_parameters))
-        self._go_on(self.current, None)
+        self._append_step(self.current, None)
 
-    def guarded(self) -> None:
-        """Remove until those that may go are known comparably well, or nothing may go."""
+    def remove_guarded(self) -> None:
+        """Remove until the spread is below the rule, or no removal is allowed."""
         before: list[int] | None = None
-        # What another parameter stood in for may have become superfluous without it.
+        # Refused removals may be possible after others.
         while before != self.refused:
             before, self.refused = self.refused, []
             while self.current.spread(self._free) >= self._rule.spread:
@@ -237,22 +232,22 @@ class _Path:
                 if np.isfinite(relative_std) and self._is_worse(smaller):
                     self.refused.append(index)
                 else:
-                    self._go_on(smaller, index)
+                    self._append_step(smaller, index)
 
-    def to_the_end(self) -> None:
-        """Remove by relative standard deviation alone until one parameter is left."""
+    def remove_all(self) -> None:
+        """Remove by relative standard deviation until one parameter is left."""
         self.refused = []
         while len(self.current.left) > 1:
             index, _ = self._worst()
-            self._go_on(self._without(index), index)
+            self._append_step(self._without(index), index)
 
     @property
     def _free(self) -> NDArray[np.bool_]:
-        """Which of those left may go."""
+        """Mask of the remaining parameters whose removal was not refused."""
         return ~np.isin(self.current.left, self.refused)
 
     def _worst(self) -> tuple[int, float]:
-        """Index and relative standard deviation of what to take out next."""
+        """Return index and relative standard deviation of the next parameter to remove."""
         solution, left = self.current.solution, self.current.left
         if not solution.determined.all():
             own = self._equations.part(left).A
@@ -282,15 +277,15 @@ class _Path:
         )
 
     def _is_worse(self, smaller: _Subset) -> bool:
-        """Whether a removal raises the held-out error, by more than the rule gives away."""
+        """Return whether a removal raises the held-out error by more than the rule allows."""
         if smaller.blocks.sum() <= self.current.blocks.sum():
             return False
         overall = (smaller.held_out - self.best.held_out) / self._rule.overall
         axis = (smaller.held_out_joint - self.best.held_out_joint) / self._rule.axis
-        certain = _is_certain(smaller.blocks - self.best.blocks)
-        return max(overall, float(axis.max())) > (self._rule.noticeable if certain else 1.0)
+        significant = _is_significant(smaller.blocks - self.best.blocks)
+        return max(overall, float(axis.max())) > (self._rule.noticeable if significant else 1.0)
 
-    def _go_on(self, subset: _Subset, index: int | None) -> None:
+    def _append_step(self, subset: _Subset, index: int | None) -> None:
         self.steps.append(
             EliminationStep(
                 removed=None if index is None else self._total.parameter_names[index],
@@ -306,11 +301,10 @@ class _Path:
             self.best = subset
 
 
-def _is_certain(difference: Array) -> bool:
-    """Whether a sum of differences of squared errors, by blocks (B,), is above zero beyond chance.
+def _is_significant(difference: Array) -> bool:
+    """Return whether a sum of differences by blocks (B,) is significantly above zero.
 
-    Student's t with as many blocks as are left when they are merged until neighbours hardly
-    correlate.
+    Student's t over blocks merged until neighbours are nearly uncorrelated.
     """
     if not difference.any():
         return False
@@ -328,20 +322,17 @@ def _limit(freedom: int) -> float:
 
 
 def _reason(steps: list[EliminationStep], cut: int, refused: tuple[str, ...], rule: CutRule) -> str:
-    """Say why the cut is where it is."""
+    """Describe why the cut is at this step."""
     full, chosen = steps[0], steps[cut]
     text = (
         f"{chosen.left} of {full.left} parameters are essential: their relative standard deviations"
         f" differ by a factor of {chosen.spread:.3g}"
     )
     if refused:
-        text += (
-            f"; those of more than {rule.spread:g} times the smallest stay because the error on"
-            f" held-out motion rises without them: {', '.join(refused)}"
-        )
+        text += f"; removing these raises the error on held-out motion: {', '.join(refused)}"
     elif chosen.spread < rule.spread:
         text += f", less than {rule.spread:g}"
     return (
-        f"{text}. Error on the motion they were chosen on: {full.held_out:.2%} with all"
+        f"{text}. Error on the motion used for the choice: {full.held_out:.2%} with all"
         f" parameters, {chosen.held_out:.2%} with these"
     )

@@ -1,14 +1,12 @@
-"""Settings of an identification, chosen by predicting parts of what is fitted from the rest.
+"""Settings of an identification, chosen by predicting parts of the fitted data from the rest.
 
-Each recording is cut into `FOLDS` stretches of time. Parameters are estimated from all stretches
-but one and predict the torque of that one: every row of it, at rest too. The score of a candidate
-is ``||e|| / ||tau||`` over all joints, its mean over the stretches: squared and summed, one stretch
-whose motion the others do not determine would decide alone. What is held out of the fit is never
-read.
+Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
+predict all rows of that one, including rest. The score of a candidate is ``||e|| / ||tau||`` over
+all joints, averaged over the segments, so that a single poorly determined segment does not
+dominate. Held-out data are not read.
 
-Only the factors of the stretches are needed (:mod:`identification.factor.phases`), so the samples
-are read once for each candidate way of preparing them, and any number of estimators are compared
-on the same factors.
+Factors of the segments (:mod:`identification.factor.phases`) are computed once per preparation and
+shared by all estimators.
 """
 
 from __future__ import annotations
@@ -51,70 +49,61 @@ Question = Literal[
 FOLDS: Final = 5
 LOW_PASS: Final = "low-pass of the torque"
 DELAY: Final = "delay of the torque"
-"""Names of those choices."""
-# What a rigid model leaves out (elasticity of gears, the clock of a logger, the servo) begins at
-# some 10 Hz on most arms: the first candidate, which others have to beat.
+"""Names of decisions."""
+# Unmodelled dynamics start at about 10 Hz on most arms: the default.
 BANDWIDTHS: Final = (10.0, 5.0, 7.0, 14.0, 20.0, 40.0)  # Hz
-# In the middle of what gears do first. A jump (zero) is no candidate: at rest its sign is that of
-# the noise.
+# A typical value of gears first. Zero is no candidate: its sign at rest is noise.
 PRESLIDING: Final = (1e-4, 1e-6, 1e-5, 3e-5, 3e-4, 1e-3)  # rad or m
-# Rows near a reversal say how dry friction turns round, but not so well as sliding ones what it is:
-# where they do not help, intervals are honest only without them.
+# Rows near a reversal show presliding, but bias intervals of sliding friction.
 LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
-NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # of a low-pass that was found
+NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
 STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
 PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
-# Beyond Coulomb and viscous friction; one of them alone, for they look alike.
+# Terms beside Coulomb and viscous friction; they correlate, so one at most.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": None, "stribeck": None},
     {"third": "quadratic", "stribeck": None},
     {"third": "cubic", "stribeck": None},
     {"third": None, "stribeck": 0.1},
 )
-# A candidate replaces the simpler one before it only if it predicts better by this share; a
-# low-pass of the torque, which can stand in for much else, by more. Of estimators and rows none is
-# simpler, and the best is chosen; what differs by less than a tie is rounding.
+# Improvement required to replace the first, simpler candidate; more for a low-pass, which
+# correlates with other settings. Estimators and rows have no order of simplicity: the best is used.
+# Less than a tie is rounding.
 TIE: Final = 1e-4
 WORTHWHILE: Final = 0.01
 LOW_PASS_WORTHWHILE: Final = 0.05
 TERM_WORTHWHILE: Final = 0.02
-# Rows beyond this rate add nothing to a comparison of bandwidths of 40 Hz and less.
+# Sufficient to compare bandwidths up to 40 Hz.
 _RATE: Final = 250.0  # Hz
 _MOST_SWEEPS: Final = 4
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is chosen.
+    """Chosen settings."""
 
-    Attributes:
-        model: the robot, with its friction.
-        preprocessing: of recordings into samples.
-        shrinkage: of the estimate.
-    """
-
-    model: RobotModel
-    preprocessing: Preprocessing
-    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+    model: RobotModel  # with its friction
+    preprocessing: Preprocessing  # of recordings into samples
+    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen  # of the estimate
 
     @property
     def key(self) -> tuple[Columns, Preprocessing, Shrinkage]:
-        """What differs between settings of one robot."""
+        """Key of the settings of one robot."""
         return *self.factor_key, self.shrinkage
 
     @property
     def factor_key(self) -> tuple[Columns, Preprocessing]:
-        """What of it factors depend on."""
+        """Key of the settings that change factors."""
         return (self.model.friction.laws, self.model.elements.elements), self.preprocessing
 
     @property
     def ripple(self) -> tuple[int, ...]:
-        """Orders of the torque ripple that is estimated, periods per motor turn."""
+        """Orders of the estimated torque ripple, periods per motor turn."""
         elements = self.model.elements.elements
         return next((one.orders for one in elements if isinstance(one, TorqueRipple)), ())
 
     def describe(self) -> tuple[str, ...]:
-        """The settings in words, part by part."""
+        """Return descriptions of the settings, one by one."""
         how, width = self.preprocessing, self.preprocessing.torque_bandwidth
         return (
             f"{how.rigid_bandwidth:g} Hz",
@@ -134,49 +123,33 @@ class Settings:
 
 @dataclass(frozen=True)
 class Choice:
-    """One question that was decided by inner prediction.
+    """Decision by inner prediction."""
 
-    Attributes:
-        name: what was chosen.
-        candidates: in words.
-        errors: ``||e|| / ||tau||`` of each candidate over all joints, mean over the stretches; of a
-            low-pass the geometric mean of those of each joint.
-        chosen: index of the one that is used.
-    """
-
-    name: str
-    candidates: tuple[str, ...]
+    name: str  # of the setting
+    candidates: tuple[str, ...]  # descriptions
+    # ``||e|| / ||tau||`` over all joints, mean over the segments; of a low-pass by joint (geometric
+    # mean)
     errors: tuple[float, ...]
-    chosen: int
+    chosen: int  # index of the candidate
 
 
 class Errors(NamedTuple):
-    """Errors of predictions, infinite where some stretch cannot be predicted.
+    """Prediction errors, infinite if some segment cannot be predicted."""
 
-    Attributes:
-        overall: ``||e|| / ||tau||`` over all joints, mean over the stretches.
-        by_joint: geometric mean of those of each joint over all stretches.
-    """
-
-    overall: float = math.inf
-    by_joint: float = math.inf
+    overall: float = math.inf  # ``||e|| / ||tau||`` over all joints, mean over the segments
+    by_joint: float = math.inf  # geometric mean of the relative errors of the joints
 
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Factors of each stretch: of the rows that count in a fit, and of all rows.
+    """Factors of each segment."""
 
-    Attributes:
-        fitted: FOLDS factors.
-        predicted: FOLDS factors.
-    """
-
-    fitted: tuple[Factor, ...]
-    predicted: tuple[Factor, ...]
+    fitted: tuple[Factor, ...]  # of usable rows
+    predicted: tuple[Factor, ...]  # of all rows
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> Folds:
-        """Reduce recordings, each cut into `FOLDS` stretches of equal length."""
+        """Reduce recordings, each cut into `FOLDS` segments of equal length."""
         fitted = [Factor.zero(model) for _ in range(FOLDS)]
         predicted = [Factor.zero(model) for _ in range(FOLDS)]
         places = [np.append(columns, model.n_parameters) for columns in model.plan.columns]
@@ -200,14 +173,14 @@ class Folds:
         return cls(tuple(fitted), tuple(predicted))
 
     def without(self, k: int) -> Factor:
-        """What is fitted to predict stretch k."""
+        """Return the factor of all segments but k."""
         others = [factor for index, factor in enumerate(self.fitted) if index != k]
         return sum(others[1:], others[0])
 
     def errors(
         self, estimate: Callable[[int, Factor], Array], rows: Literal["all", "fitted"] = "all"
     ) -> Errors:
-        """Errors of predictions by ``estimate(k, factor without stretch k)`` on these rows."""
+        """Return prediction errors of ``estimate(k, factor without segment k)`` on these rows."""
         targets = self.predicted if rows == "all" else self.fitted
         squares = np.zeros((FOLDS, targets[0].n_joints))
         for k, target in enumerate(targets):
@@ -222,20 +195,20 @@ class Folds:
 
 
 def _relative(squares: Array, torque: Array) -> Array:
-    """Relative errors of those sums of squares that have any torque, above zero."""
+    """Return relative errors of sums of squares with torque, above zero."""
     loaded = torque > 0.0
     shares = squares[loaded] / torque[loaded]
     return np.sqrt(np.maximum(shares, np.finfo(np.float64).tiny))
 
 
 Ready = Callable[[RobotModel, Preprocessing], Sequence[Samples]]
-"""What is fitted, prepared for a model, and nothing else."""
+"""Prepares the fitted data for a model."""
 
 Columns = tuple[tuple[FrictionLaw, ...], tuple[Element, ...]]
-"""What columns a model of one robot has beside the rigid body's."""
+"""Friction and elements of a model."""
 
 LowPasses = Callable[[RobotModel, Preprocessing], Sequence[Preprocessing]]
-"""Settings with low-passes that the torque may have come through."""
+"""Returns settings with candidate low-passes of the torque."""
 
 
 def choose_settings(
@@ -246,20 +219,19 @@ def choose_settings(
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
-    """Choose settings one question after the other, each with what was chosen before it.
+    """Choose settings one after the other.
 
     Args:
-        ready: prepares what is fitted.
-        start: what is not asked for stays as it is here.
-        questions: what is chosen.
-        low_passes: looked for where "low-pass" is among them.
-        delays: of the torque that were found to be significant [s], of which one is used where
-            "delay" is among them and it predicts no worse than that of `start`.
-        ripples: of which one is added to the model where "ripple" is among them and it helps.
+        ready: prepares the fitted data.
+        start: initial settings.
+        questions: settings to choose.
+        low_passes: candidates for "low-pass".
+        delays: significant delays of the torque [s], of which one is used for "delay" if it
+            predicts no worse than that of `start`.
+        ripples: candidates for "ripple".
 
     Returns:
-        The settings, and how they were chosen; those of `start` where what is fitted is too short
-        to predict a part of it from the rest.
+        Settings and decisions; `start` without decisions if the data are too short.
     """
     trial = _Trial(ready)
     now = start
@@ -270,17 +242,17 @@ def choose_settings(
     if "presliding" in questions:
         now = _friction(now, presliding=PRESLIDING[0])
     if "estimator" in questions:
-        # The consistent solution is found once: what is compared on the way has to follow the data.
+        # During the sweep estimators without consistent solution are used.
         quick = [Shrinkage(strength) for strength in STRENGTHS if math.isfinite(strength)]
         now = trial.decide("", [replace(now, shrinkage=one) for one in quick]).settings
     first = now
     now, choices = _sweep(trial, first, questions)
     if "delay" in questions:
-        first, now, choices = _with_delay(trial, first, now, choices, questions, delays)
+        first, now, choices = _compare_delays(trial, first, now, choices, questions, delays)
     if "low-pass" in questions:
-        now, choices = _with_low_pass(trial, first, now, choices, questions, low_passes)
-    # Models with other columns are compared, each with a centre of its own: now it needs one, too.
-    trial.renew_centres()
+        now, choices = _compare_low_passes(trial, first, now, choices, questions, low_passes)
+    # The following models have other columns and need their own centres.
+    trial.clear_centres()
     if "friction" in questions:
         found = trial.decide(
             "friction at speed", [_friction(now, **one) for one in FRICTION_TERMS], TERM_WORTHWHILE
@@ -301,7 +273,7 @@ def choose_settings(
     return now, tuple(choice for choice in choices if len(choice.candidates) > 1)
 
 
-def _with_delay(
+def _compare_delays(
     trial: _Trial,
     first: Settings,
     now: Settings,
@@ -309,13 +281,13 @@ def _with_delay(
     questions: Collection[Question],
     delays: Sequence[float],
 ) -> tuple[Settings, Settings, list[Choice]]:
-    """Compensate a delay that was found to be significant, unless that predicts worse.
+    """Compensate a significant delay unless it predicts worse.
 
-    Compared are sliding rows: at reversals a presliding displacement stands in for a delay. All
-    else is chosen anew beside it.
+    Compared on sliding rows, as presliding is similar to a delay. The other settings are chosen
+    again.
 
     Returns:
-        The settings before and after the sweep, and its choices.
+        The settings before and after the sweep, and its decisions.
     """
     compared: list[Choice] = []
     for delay in delays:
@@ -329,7 +301,7 @@ def _with_delay(
     return first, now, [*compared, *choices]
 
 
-def _with_low_pass(
+def _compare_low_passes(
     trial: _Trial,
     first: Settings,
     now: Settings,
@@ -337,23 +309,23 @@ def _with_low_pass(
     questions: Collection[Question],
     low_passes: LowPasses,
 ) -> tuple[Settings, list[Choice]]:
-    """Add a low-pass of the torque, or a delay in its place, where that predicts better.
+    """Add a low-pass of the torque, or its delay alone, if that predicts better.
 
-    Looked for from the `first` settings: a narrow bandwidth of the motion or a long presliding
-    displacement, chosen `now`, would stand in for a part of it.
+    Starts from the `first` settings, as a narrow bandwidth or a long presliding displacement,
+    chosen `now`, would replace a part of it.
     """
     possible = low_passes(first.model, first.preprocessing)
     if not possible:
         return now, choices
     some = [replace(first, preprocessing=one) for one in possible]
     filtered, behind = _sweep(trial, trial.best(some), questions)
-    # The residual's least is flat; prediction with what was chosen beside it is sharper.
-    filtered = trial.decide("", _widths(filtered), share=0.0).settings
-    # All joints come through the same channel: the largest errors are not to decide alone.
+    # Refined by prediction, as the residual's minimum is flat.
+    filtered = trial.decide("", _nearby_bandwidths(filtered), share=0.0).settings
+    # Compared by joint, as the channel is common to all.
     found = trial.decide(LOW_PASS, [now, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
     if found.choice.chosen and filtered.preprocessing.torque_shape.causal:
-        # What its lag alone predicts as well is a delay.
-        late = trial.decide("", _lags(now, filtered), share=0.0).settings
+        # A lag that predicts as well is called a delay.
+        late = trial.decide("", _nearby_lags(now, filtered), share=0.0).settings
         delay = trial.decide(DELAY, [now, late], LOW_PASS_WORTHWHILE, by_joint=True)
         both = trial.decide(LOW_PASS, [late, filtered], LOW_PASS_WORTHWHILE, by_joint=True)
         if delay.choice.chosen and not both.choice.chosen:
@@ -369,7 +341,7 @@ class _Decision(NamedTuple):
 
 
 class _Trial:
-    """Scores of settings, on factors that are made once."""
+    """Scores of settings, with cached factors."""
 
     def __init__(self, ready: Ready) -> None:
         self._ready = ready
@@ -377,8 +349,8 @@ class _Trial:
         self._folds: dict[tuple[Columns, Preprocessing], Folds] = {}
         self._errors: dict[tuple[Columns, Preprocessing, Shrinkage, str], Errors] = {}
         self._centres: dict[tuple[tuple[str, ...], float, int], Array] = {}
-        self._near: dict[tuple[str, ...], Array] = {}  # a solution, from which others are found
-        self._without_centre: set[tuple[tuple[str, ...], float]] = set()
+        self._near: dict[tuple[str, ...], Array] = {}  # solutions to start from
+        self._unsolved: set[tuple[tuple[str, ...], float]] = set()
 
     def decide(
         self,
@@ -389,9 +361,9 @@ class _Trial:
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
     ) -> _Decision:
-        """Take the first candidate, or the best one if it predicts better by that share.
+        """Return the first candidate, or the best one if it predicts better by a share.
 
-        By `WORTHWHILE` without one.
+        The default share is `WORTHWHILE`.
         """
         share = WORTHWHILE if share is None else share
         each = [self.errors(one, rows) for one in candidates]
@@ -402,11 +374,11 @@ class _Trial:
         return _Decision(candidates[chosen], Choice(name, words, tuple(errors), chosen))
 
     def best(self, candidates: Sequence[Settings]) -> Settings:
-        """The one that predicts best on average over the joints."""
+        """Return the candidate with the least error by joint."""
         return min(candidates, key=lambda one: self.errors(one).by_joint)
 
     def errors(self, settings: Settings, rows: Literal["all", "fitted"] = "all") -> Errors:
-        """Errors of predicting these rows of each stretch from the others."""
+        """Return the errors of predicting these rows of each segment from the others."""
         key = *settings.key, rows
         if key not in self._errors:
             self._errors[key] = self._predicted(settings, rows)
@@ -414,8 +386,8 @@ class _Trial:
 
     def _predicted(self, settings: Settings, rows: Literal["all", "fitted"]) -> Errors:
         shrinkage, folds = settings.shrinkage, self._reduced(settings)
-        machine = settings.model.parameter_names, shrinkage.prior_weight
-        if shrinkage.strength > 0.0 and machine in self._without_centre:
+        centre_key = settings.model.parameter_names, shrinkage.prior_weight
+        if shrinkage.strength > 0.0 and centre_key in self._unsolved:
             return Errors()
         if not all(folds.without(k).samples.any() for k in range(FOLDS)):
             return Errors()
@@ -424,7 +396,7 @@ class _Trial:
             weights = joint_weights(factor)
             if shrinkage.strength == 0.0:
                 return solve(factor.weighted(weights)).values
-            key = *machine, k
+            key = *centre_key, k
             if key not in self._centres:
                 near = self._near.get(settings.model.parameter_names)
                 found = consistent_estimate(
@@ -440,16 +412,16 @@ class _Trial:
 
         try:
             return folds.errors(estimate, rows)
-        except SolverError:  # after a long search, which is not repeated
-            self._without_centre.add(machine)
+        except SolverError:  # slow, not repeated
+            self._unsolved.add(centre_key)
         except IdentificationError:
             pass
         return Errors()
 
-    def renew_centres(self) -> None:
-        """Find consistent solutions anew, with the settings that are asked for next."""
+    def clear_centres(self) -> None:
+        """Discard consistent solutions, to solve again with the next settings."""
         self._centres.clear()
-        self._without_centre.clear()
+        self._unsolved.clear()
         self._errors.clear()
 
     def _reduced(self, settings: Settings) -> Folds:
@@ -459,14 +431,14 @@ class _Trial:
                 samples = self._ready(settings.model, settings.preprocessing)
                 self._samples[settings.preprocessing] = [*samples]
             samples = self._samples[settings.preprocessing]
-            self._folds[key] = Folds.of(
-                settings.model, (_thinned(one.directed(settings.model)) for one in samples)
-            )
+            model = settings.model
+            ready = (_thinned(one.with_friction_direction(model)) for one in samples)
+            self._folds[key] = Folds.of(model, ready)
         return self._folds[key]
 
 
 def _thinned(samples: Samples) -> Samples:
-    """One row in so many, as far as what is compared has no more to say."""
+    """Reduce the rate of samples to what comparisons need."""
     usual = float(np.median(np.diff(samples.motion.time)))
     every = max(1, round(1.0 / (_RATE * usual)))
     if every == 1 or samples.torque_bandwidth is not None:
@@ -485,7 +457,7 @@ def _thinned(samples: Samples) -> Samples:
 def _sweep(
     trial: _Trial, now: Settings, questions: Collection[Question]
 ) -> tuple[Settings, list[Choice]]:
-    """Decide what depends on one another in turn, until nothing changes."""
+    """Decide interdependent settings in turn until nothing changes."""
     asked = [one for one in _SWEPT if one.question in questions]
     choices: list[Choice] = []
     for _ in range(_MOST_SWEEPS):
@@ -500,19 +472,12 @@ def _sweep(
 
 
 class _Swept(NamedTuple):
-    """A question that is decided again and again.
-
-    Attributes:
-        question: which.
-        name: of the choice.
-        vary: settings with each candidate.
-        share: by which one has to predict better than the first, see `_Trial.decide`.
-    """
+    """Setting that is decided repeatedly."""
 
     question: Question
     name: str
-    vary: Callable[[Settings], list[Settings]]
-    share: float = WORTHWHILE
+    vary: Callable[[Settings], list[Settings]]  # settings with each candidate
+    share: float = WORTHWHILE  # required improvement, see `_Trial.decide`
 
 
 _SWEPT: Final = (
@@ -540,13 +505,13 @@ _SWEPT: Final = (
 )
 
 
-def _widths(now: Settings) -> list[Settings]:
+def _nearby_bandwidths(now: Settings) -> list[Settings]:
     width = now.preprocessing.torque_bandwidth or math.nan
     return [_with(now, torque_bandwidth=share * width) for share in NEARBY]
 
 
-def _lags(now: Settings, filtered: Settings) -> list[Settings]:
-    """Delays in place of a causal low-pass, about its lag."""
+def _nearby_lags(now: Settings, filtered: Settings) -> list[Settings]:
+    """Return delays near the lag of a causal low-pass, in its place."""
     how, width = filtered.preprocessing, filtered.preprocessing.torque_bandwidth or math.inf
     lag = how.torque_shape.lag(width)
     return [_with(now, torque_delay=how.torque_delay + share * lag) for share in NEARBY]
@@ -561,7 +526,7 @@ def _with(settings: Settings, **changes: Any) -> Settings:
 
 
 def _differences(candidates: Sequence[Settings]) -> tuple[str, ...]:
-    """Each candidate in words, by what differs between them."""
+    """Describe candidates by their differences."""
     parts = [one.describe() for one in candidates]
     differ = [len(set(column)) > 1 for column in zip(*parts, strict=True)]
     return tuple(

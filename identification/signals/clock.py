@@ -1,7 +1,7 @@
-"""The clock of a recording: what its time stamps are, and when the samples were measured.
+"""Time stamps of a recording, and the times at which its samples were measured.
 
-Uneven stamps are either right or the logger's lateness. The positions decide: at a speed of v, a
-stamp wrong by e moves its sample off the smooth motion of every joint by v e at once.
+Uneven stamps are either correct or delayed by the logger. The positions decide: at a speed of v, a
+stamp error e moves the sample of every joint off its smooth motion by v e.
 """
 
 from __future__ import annotations
@@ -19,44 +19,44 @@ from identification.signals.recording import GAP_STEPS, Recording, RecordingErro
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
-# A filter that takes samples for uniform misplaces them by their jitter. One percent of a step
-# moves a sine of a tenth of the sampling rate by less than one percent of its amplitude.
+# Largest deviation from a uniform step: 1 % displaces a sine of a tenth of the sampling rate by
+# less than 1 % of its amplitude.
 UNIFORM: Final = 0.01
-_LAG: Final = 7  # steps that the usual step is measured over
-# The phase of even samples in their stamps is the mean of so many; what is slower is drift.
+_LAG: Final = 7  # steps for measuring the usual step
+# Samples averaged for the phase; slower changes are drift.
 _PHASE: Final = 51
-_REFINEMENTS: Final = 3  # of the step, by the count of steps that it leads to
+_REFINEMENTS: Final = 3  # iterations of step and count of steps
 _DRIFT: Final = 101
-# Standard deviations by which one reading of the stamps has to be nearer than the other.
+# Required significance of the decision, standard deviations.
 _MARGIN: Final = 3.0
-# A row's share of the evidence is limited: what is off by more under both readings is an outlier.
+# Limit of the influence of a row, standard deviations.
 _OUTLIER: Final = 6.0
-_SHORTEST: Final = 32  # samples of a stretch; below it the stamps stand
-_BESIDE: Final = 4  # steps to either side that give the speed at one
-_SPEED_TIME: Final = 0.025  # s to either side that give the speed beside a residual
-# A step is counted from the positions where these know it to an eighth of a step of the clock.
+_SHORTEST: Final = 32  # samples; shorter segments keep their stamps
+_BESIDE: Final = 4  # steps to either side for the speed at one
+_SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
+# Steps are counted by positions that resolve an eighth of a clock step.
 _CLEAR: Final = 8.0
-# Multiples of noise and resolution that a step must have to be no standstill.
+# Multiples of noise and resolution of a moving joint.
 _MOVES: Final = 3.0
-# Noise of the distance from the cubic where the samples are rounded: sqrt((1 + 17 / 18) / 12).
+# Rounding noise of the distance from the cubic: sqrt((1 + 17 / 18) / 12).
 _ROUNDING: Final = 0.4  # steps of the encoder
 _CUBIC: Final = np.array([-2, -1, 1, 2])  # samples beside
 
 
 @dataclass(frozen=True)
 class TimeBase:
-    """What the clock of a recording did."""
+    """Statistics of the time stamps of a recording."""
 
-    samples: int  #: number of them
+    samples: int
     duration: float  #: from the first to the last [s]
-    step: float  #: mean step of the clock; repeats, drops and gaps aside [s]
-    jitter: float  #: standard deviation of the steps that are no drop and no gap, in such steps
-    largest_deviation: float  #: of one of them, in such steps
+    step: float  #: mean step without repeats, drops and gaps [s]
+    jitter: float  #: standard deviation of the other steps, in steps
+    largest_deviation: float  #: of such a step, in steps
     repeated: int  #: samples with the time stamp of the one before
     backward: int  #: samples with an earlier time stamp than the one before
-    #: samples that are missing where the clock steps by at most `GAP_STEPS` usual steps
+    #: missing samples in steps of up to `GAP_STEPS`
     dropped: int
-    gaps: int  #: longer steps, and gaps that were reported
+    gaps: int  #: longer steps and reported gaps
 
     @property
     def rate(self) -> float:
@@ -65,12 +65,12 @@ class TimeBase:
 
     @property
     def uniform(self) -> bool:
-        """Whether a filter may take each stretch between gaps for uniform as it is."""
+        """Whether segments between gaps are uniformly sampled."""
         even = self.largest_deviation <= UNIFORM
         return even and self.repeated == self.backward == self.dropped == 0
 
     def describe(self) -> list[str]:
-        """What there is to say about it, in words; the first line always."""
+        """Return lines on the time stamps, at least one."""
         lines = [f"{self.samples} samples in {self.duration:.6g} s, {self.rate:.6g} Hz"]
         if self.largest_deviation > UNIFORM:
             lines.append(
@@ -86,12 +86,12 @@ class TimeBase:
         if self.gaps:
             lines.append(f"{self.gaps} gaps")
         if not self.uniform:
-            lines.append("a filter that counts samples needs it resampled; the spline does not")
+            lines.append("digital filters require resampling; the spline does not")
         return lines
 
 
 def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeBase:
-    """Examine finite time stamps (m,) [s], legal or not, and where samples are missing before.
+    """Analyse finite time stamps (m,) [s], and where samples are missing before.
 
     Raises:
         RecordingError: fewer than two different times.
@@ -99,7 +99,7 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
     steps = np.diff(time)
     forward = steps[steps > 0.0]
     if forward.size == 0:
-        raise RecordingError(f"the clock of all {len(time)} samples stands still")
+        raise RecordingError(f"all {len(time)} samples have the same time stamp")
     reported = np.zeros(len(steps), dtype=np.bool_) if gap_before is None else gap_before[1:]
     median = float(np.median(forward))
     gap = reported | (steps > GAP_STEPS * median)
@@ -111,7 +111,7 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
         for start, stop in pairwise([0, *(np.flatnonzero(gap) + 1).tolist(), len(time)]):
             new = start + np.flatnonzero(np.diff(time[start:stop], prepend=np.nan) != 0.0)
             counts = _steps_by_phase(time[new], step)
-            # After a stamp that was given twice a double step leaves nothing out.
+            # After a repeated stamp a double step is no gap.
             missing[new[1:] - 1] = np.maximum(counts - np.diff(new), 0.0)
             passed += float(counts.sum())
         step = float(steps[~gap].sum()) / passed if passed else step
@@ -130,7 +130,7 @@ def time_base(time: Array, gap_before: NDArray[np.bool_] | None = None) -> TimeB
 
 
 def _usual_step(time: Array, steps: Array, median: float) -> float:
-    """Step of the clock [s], to more digits than stamps that were rounded to a few."""
+    """Return the step of the clock [s], with more digits than rounded stamps."""
     lag = min(_LAG, len(time) - 1)
     usual = float(np.median(time[lag:] - time[:-lag])) / lag
     if not 0.5 * median < usual < 2.0 * median:
@@ -140,34 +140,33 @@ def _usual_step(time: Array, steps: Array, median: float) -> float:
 
 
 def _steps_by_phase(time: Array, step: float) -> Array:
-    """Steps of an even clock between stamps (m,) [s] that are off by less than half a step."""
+    """Return steps of an even clock between stamps (m,) [s] with errors below half a step."""
     turns = (time - time[0]) / step
     phasor = scipy.ndimage.uniform_filter1d(
         np.exp(2j * np.pi * turns).view(np.float64).reshape(-1, 2), _PHASE, axis=0, mode="nearest"
     )
     phase = np.unwrap(np.arctan2(phasor[:, 1], phasor[:, 0])) / (2.0 * np.pi)
     ahead = np.rint(turns - phase) - np.arange(len(time))
-    # A stamp that is off by more than half a step is one alone; what is missing stays missing.
+    # Single stamps may deviate more; a missing sample shifts all later ones.
     ahead = np.maximum.accumulate(scipy.ndimage.median_filter(ahead, 5, mode="nearest"))
     return np.asarray(np.diff(ahead) + 1.0)
 
 
 def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
-    """The recording at the times its samples were measured, and what was decided in sentences.
+    """Return the recording at the times of its samples, and sentences on the decision.
 
-    Decided from the positions, and velocities where given. Two readings are compared where they
-    differ: the stamps, and even times that follow the stamps' slow drift, with missing samples
-    counted. Of an even reading, the distance of each sample from the cubic through
-    its neighbours is noise; if the stamps are right it holds the speed times their distance from
-    even times, too. The share of that product in it, over all joints, is near one or near zero;
-    where it is neither the stamps are right. Rows that repeat the sample before them although the
-    arm moves are left out: the logger had no new one, and they say nothing of their time.
+    Two hypotheses are compared by positions, and velocities if given: the stamps, and even times
+    that follow the slow drift of the stamps, with missing samples counted. With even times, the
+    distance of each sample from the cubic through its neighbours is noise; if the stamps are
+    correct it also contains speed times stamp deviation. Its share of that product, over all
+    joints, is near one or near zero; otherwise the stamps are used. Rows that repeat the sample
+    before them although the arm moves are removed.
 
     Args:
-        recording: its samples in order; stamps that repeat or fall back are legal.
+        recording: samples in order; stamps may repeat or fall back.
 
     Raises:
-        RecordingError: NaN or infinity, or the clock stands still.
+        RecordingError: NaN or infinity, or constant time stamps.
     """
     recording.check_finite()
     time, signals = recording.time, recording.position
@@ -189,7 +188,7 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
         if len(rows) < _SHORTEST:
             continue
         lost = int(number[-1]) + 1 - len(rows)
-        if base.uniform:  # a count of rows and no clock: with what is missing they took longer
+        if base.uniform:  # row counter: missing samples extend the time
             times = time[rows[0]] + base.step * number
             even[rows] = times + longer
             longer += base.step * lost
@@ -202,8 +201,10 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     scattered = np.concatenate([np.zeros(1), *scatter])
     share, deviation, residuals = np.nan, np.nan, (1.0, 1.0)
     if np.abs(scattered).max() > UNIFORM:
-        share, deviation, residuals = _share(*map(np.concatenate, zip(*evidence, strict=True)))
-    # Nearer to one reading than to the other, and not half way between them.
+        share, deviation, residuals = _stamp_share(
+            *map(np.concatenate, zip(*evidence, strict=True))
+        )
+    # Not between the hypotheses.
     certain = bool(abs(share - 0.5) > max(_MARGIN * deviation, 0.25))
     is_even = certain and share < 0.5 and bool(np.all(np.diff(even[~(repeated | idle)]) > 0.0))
     out = repeated | idle if is_even else repeated
@@ -211,16 +212,16 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     if out.any():
         words.append(
             f"{np.count_nonzero(out)} rows repeat the sample before them while the arm moves and"
-            " were left out"
+            " were removed"
         )
     if is_even or (base.largest_deviation > UNIFORM and not np.isnan(share)):
         used = f"even times, {missing} missing samples counted" if is_even else "the stamps"
         if not certain or (share < 0.5 and not is_even):
-            used += ", for the positions do not decide"
+            used += " (positions are inconclusive)"
         words.append(
             f"the time stamps scatter by {0.0 if base.uniform else scattered.std():.1%} of a step;"
-            f" share of it that the positions follow: {share:.2f} ± {deviation:.1g}; their"
-            f" high-frequency residual, in multiples of noise: {residuals[0]:.3g} with the stamps,"
+            f" share confirmed by the positions: {share:.2f} ± {deviation:.1g}; high-frequency"
+            f" residual in multiples of noise: {residuals[0]:.3g} with the stamps,"
             f" {residuals[1]:.3g} with even times; used: {used}"
         )
     if not out.any() and not is_even:
@@ -229,17 +230,17 @@ def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
 
 
 def _numbers(time: Array, signals: Array, step: float) -> Array:
-    """Number of each sample (m,) in an even clock, the first zero."""
+    """Return the number of each sample (m,) in an even clock, the first zero."""
     phased = _steps_by_phase(time, step)
     moved, resolution = np.diff(signals, axis=0), _resolution(signals)[1:]
     before, after = (_run(signals, side) for side in (-1, 1))
     pace = np.add(*(np.abs(_run(signals, side)) for side in (-1, 1))) / (2 * _BESIDE)
     steps = phased
-    for _ in range(2):  # speeds first by the stamps' count, then by the better one
+    for _ in range(2):  # speeds by stamps, then by the improved count
         number = np.concatenate([[0.0], np.cumsum(steps)])[:, None]
         passed = [np.maximum(_run(number, side), 0.5) for side in (-1, 1)]
         each = (before + after) / (passed[0] + passed[1])
-        noise = np.maximum(_level(moved - each * steps[:, None]), resolution)
+        noise = np.maximum(_robust_rms(moved - each * steps[:, None]), resolution)
         unit, way = each / noise, moved / noise
         clarity = (unit**2).sum(axis=1)
         whole_steps = np.rint((unit * way).sum(axis=1) / np.maximum(clarity, 1.0))
@@ -254,17 +255,17 @@ def _numbers(time: Array, signals: Array, step: float) -> Array:
 
 
 def _run(values: Array, side: int) -> Array:
-    """Change of values (m, k) over the `_BESIDE` steps before (-1) or after (1) each (m - 1, k)."""
+    """Return the change of values (m, k) in steps before (-1) or after (1) each (m - 1, k)."""
     at = np.arange(len(values) - 1) + (side > 0)
     there = np.clip(at + side * _BESIDE, 0, len(values) - 1)
     return np.asarray(side * (values[there] - values[at]))
 
 
 def _even_times(stamps: Array, number: Array) -> Array:
-    """Even times (m,) [s] that follow the slow drift of the stamps (m,) [s]."""
+    """Return even times (m,) [s] that follow the slow drift of the stamps (m,) [s]."""
     line = np.polynomial.Polynomial.fit(number, stamps - stamps[0], 1)
     off = stamps - stamps[0] - line(number)
-    # The median first: single stamps may be late by many steps.
+    # Median first: single stamps may be late by many steps.
     drift = scipy.signal.savgol_filter(
         scipy.ndimage.median_filter(off, _odd(_DRIFT / 3, len(off)), mode="nearest"),
         _odd(_DRIFT, len(off)),
@@ -274,17 +275,17 @@ def _even_times(stamps: Array, number: Array) -> Array:
 
 
 def _odd(wanted: float, samples: int) -> int:
-    """The odd number of samples at or below both."""
+    """Return the largest odd number of samples at or below both."""
     return (int(min(wanted, samples)) - 1) // 2 * 2 + 1
 
 
 def _repeated(time: Array, signals: Array) -> Rows:
-    """Rows (m,) that repeat the one before them, with its stamp or while the arm moves steadily."""
+    """Return rows (m,) that repeat the one before with its stamp or during steady motion."""
     equal = np.concatenate([[False], (np.diff(signals, axis=0) == 0.0).all(axis=1)])
     again = np.diff(time) == 0.0
     samples = signals[~equal]
     if equal.any() and len(samples) >= _SHORTEST:
-        noise = _level(_off_cubic(np.arange(len(samples), dtype=np.float64), samples))
+        noise = _robust_rms(_off_cubic(np.arange(len(samples), dtype=np.float64), samples))
         noise = np.maximum(noise, _resolution(signals)[1:])
         before, after = (_run(signals, side) / (_BESIDE * noise) for side in (-1, 1))
         moving = (np.abs(before + after) > 2.0 * _MOVES).any(axis=1)
@@ -293,22 +294,22 @@ def _repeated(time: Array, signals: Array) -> Rows:
 
 
 def _steady(before: Array, after: Array, most: float) -> Rows:
-    """Where the square of speeds (m, k) changes by this share at most: no stop, no jump beside."""
+    """Return where the square of speeds (m, k) changes by at most this share."""
     change, mean = (after - before) ** 2, (after + before) ** 2 / 4.0
     return np.asarray(change.sum(axis=1) < most * mean.sum(axis=1))
 
 
 def _resolution(signals: Array) -> Array:
-    """Least change of speed nearby (m, k) that is not zero: an encoder's step, or less."""
+    """Return the least non-zero change of speed nearby (m, k), such as an encoder step."""
     change = np.abs(np.diff(signals, n=2, axis=0))
-    # A difference of decimal numbers is zero to some digits only.
+    # Differences of decimal numbers are rounded.
     change[change <= 1e-10 * np.abs(signals).max()] = np.inf
     change = np.vstack([change[:1], change, change[-1:]])
     return np.asarray(scipy.ndimage.minimum_filter1d(change, _DRIFT, axis=0))
 
 
 def _off_cubic(number: Array, values: Array) -> Array:
-    """Distance of samples (m, k) from the cubic through two to either side (m - 4, k)."""
+    """Return the distance of samples (m, k) from the cubic through two each side (m - 4, k)."""
     at = np.arange(2, len(number) - 2)
     beside = number[at[:, None] + _CUBIC] - number[at][:, None]
     self = np.eye(len(_CUBIC), dtype=np.bool_)
@@ -321,10 +322,10 @@ def _off_cubic(number: Array, values: Array) -> Array:
 def _residuals(
     number: Array, times: Array, signals: Array, late: Array, step: float
 ) -> tuple[Array, Array, Array]:
-    """High-frequency residual of even signals, what right stamps make it, and its resolution."""
+    """Return the residual of even signals, that of correct stamps, and the resolution."""
     half = round(float(np.clip(_SPEED_TIME / step, _DRIFT // 10, _DRIFT // 2)))
     at = np.arange(len(number))
-    # From samples that the residual has no part in: their noise must not meet its own.
+    # From other samples than the residual, for independent noise.
     ahead = half // 2 + len(_CUBIC)
     there, behind = np.minimum(at + ahead, at[-1]), np.maximum(at - ahead, 0)
 
@@ -337,11 +338,11 @@ def _residuals(
     return _off_cubic(number, signals), speed[2:-2] * late, _resolution(signals)[2:-2]
 
 
-def _share(
+def _stamp_share(
     measured: Array, late: Array, resolution: Array
 ) -> tuple[float, float, tuple[float, float]]:
-    """Share of `late` (m, k) in `measured`, its deviation, and the residual without and with it."""
-    level = np.minimum(_level(measured), _level(measured - late))
+    """Return the share of `late` (m, k) in `measured`, its deviation, and both residuals."""
+    level = np.minimum(_robust_rms(measured), _robust_rms(measured - late))
     level = np.maximum(level, _ROUNDING * resolution)
     measured, late = measured / level, late / level
     inlier = np.minimum(np.abs(measured), np.abs(measured - late)) < _OUTLIER
@@ -350,7 +351,7 @@ def _share(
     if weight == 0.0:
         return 0.5, np.inf, (1.0, 1.0)
     share = float((measured * late).sum()) / weight
-    # Neighbours share samples, joints share the stamp: what is independent are stretches of rows.
+    # Rows are correlated with neighbours, joints by the stamp: blocks of rows are independent.
     score = ((measured - share * late) * late).sum(axis=1)
     score = np.add.reduceat(score, np.arange(0, len(score), 2 * len(_CUBIC)))
     deviation = float(np.sqrt(max(weight, (score**2).sum()))) / weight
@@ -359,8 +360,8 @@ def _share(
     return share, deviation, (float(with_stamps), float(evenly))
 
 
-def _level(values: Array) -> Array:
-    """Root mean square (k,) of what is not zero in each column, outliers limited."""
+def _robust_rms(values: Array) -> Array:
+    """Return the root mean square (k,) of non-zero values per column, outliers limited."""
     levels = []
     for column in np.abs(values).T:
         some = column[column > 0.0]

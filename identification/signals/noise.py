@@ -1,4 +1,4 @@
-"""Noise variances of measured channels: from a standstill, or from the channels themselves."""
+"""Noise variances of measured channels, and spectra."""
 
 from __future__ import annotations
 
@@ -22,20 +22,17 @@ _HIGHEST_DIFFERENCE: Final = 8
 
 
 def standstill_variance(time: Array, values: Array) -> Array:
-    """Noise variance per channel (c,) of a recording at standstill (m, c).
+    """Return the noise variance per channel (c,) of a recording at standstill (m, c).
 
-    The variance about a straight line in windows of a tenth of a second, and of these the
-    median: an arm at rest creeps, and now and then dry friction lets go of an axis whose servo
-    has been winding up, which is motion and no noise. A reading that hardly ever changes gives
-    zero; its resolution is then what is known about it.
+    Median over windows of 0.1 s of the variance about a straight line, so that creep and single
+    stick-slip moves do not count. Zero for a constant reading.
 
     Raises:
-        RecordingError: fewer samples than one window needs.
+        RecordingError: fewer samples than one window.
     """
     if len(time) < _SHORTEST_WINDOW:
         raise RecordingError(
-            f"a variance at standstill needs {_SHORTEST_WINDOW} samples, the recording has"
-            f" {len(time)}"
+            f"a variance at standstill requires {_SHORTEST_WINDOW} samples, got {len(time)}"
         )
     width = max(_SHORTEST_WINDOW, round(STANDSTILL_WINDOW / float(np.median(np.diff(time)))))
     width = min(width, len(time))
@@ -48,31 +45,30 @@ def standstill_variance(time: Array, values: Array) -> Array:
     residual = windows - np.einsum("wk,vk,nvc->nwc", basis, basis, windows)
     freedom = width - 2
     variance = (residual**2).sum(axis=1) / freedom
-    # The median of a chi-squared variable lies a little below its mean (Wilson and Hilferty).
+    # Median over mean of a chi-squared variable (Wilson and Hilferty).
     return np.asarray(np.median(variance, axis=0) / (1.0 - 2.0 / (9.0 * freedom)) ** 3)
 
 
 def difference_variance(time: Array, values: Array) -> Array:
-    """Variance of the white noise on smooth channels (m, c), from the channels themselves.
+    """Return the white noise variance (c,) of smooth channels (m, c).
 
-    Divided differences of rising order, scaled to unit noise gain, remove ever more of the
-    smooth part and keep the noise (Gasser, Sroka and Jennen-Steinmetz 1986). Used is the first
-    order at which the next one changes the estimate by less than 5 %; a channel without white
-    noise (filtered before it was logged) gives the highest order's, next to nothing.
+    By divided differences of rising order, scaled to unit noise gain (Gasser, Sroka and
+    Jennen-Steinmetz 1986), up to the order at which the next changes the estimate by less than 5 %.
+    A filtered channel without white noise gives almost zero.
 
     Raises:
         RecordingError: fewer samples than the highest order needs.
     """
     if len(time) < 2 * _HIGHEST_DIFFERENCE:
         raise RecordingError(
-            f"a noise variance needs {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
+            f"a noise variance requires {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
         )
     found = [_difference_variance(time, values, 1)]
     settled = np.zeros((0, values.shape[1]), dtype=np.bool_)
     for order in range(2, _HIGHEST_DIFFERENCE + 1):
         found.append(_difference_variance(time, values, order))
         settled = np.array(found[1:]) > 0.95 * np.array(found[:-1])
-        if settled.any(axis=0).all():  # higher orders would not be asked
+        if settled.any(axis=0).all():  # higher orders are not needed
             break
     estimates = np.array(found)
     first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
@@ -90,18 +86,17 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
     return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
 
 
-# A standstill shows the noise of a sensor at rest: no quantisation steps, no ripple, no current
-# under load. The difference between repetitions of one motion shows all of that, and the motion
-# itself, whatever it is, drops out of it.
+# Standstill noise lacks quantisation steps, ripple and current noise under load, which the
+# differences between repetitions contain.
 
 _SHORTEST_RUN: Final = 64  # samples
 
 
 class RepetitionNoise(NamedTuple):
-    """Variances of what differs from sample to sample between repetitions of one motion.
+    """Variances of the differences between repetitions of one motion.
 
-    Measurement noise, the tolerance of a smoothing spline; not friction that drifts, nor motion
-    that a servo makes from noise.
+    White measurement noise, the tolerance of a smoothing spline, without friction drift and servo
+    motion.
     """
 
     position: Array  # (n,) [rad² or m²]
@@ -109,31 +104,30 @@ class RepetitionNoise(NamedTuple):
 
 
 def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
-    """Variances from two or more repetitions, aligned at the start of their commanded motion.
+    """Return variances from two or more repetitions, aligned at the commanded start.
 
-    Times are compared to the nearest sampling interval. What a shift of less than one leaves of the
-    motion is smooth, and no white noise.
+    Times are rounded to the sampling interval; the remaining shift is smooth and does not count.
 
     Raises:
-        IdentificationError: fewer than two, other joints or rates, or no stretch in common.
+        IdentificationError: fewer than two, other joints or rates, or no common segment.
     """
     if len(recordings) < 2:
-        raise IdentificationError(f"noise from repetitions takes two, got {len(recordings)}")
+        raise IdentificationError(f"noise from repetitions requires two, got {len(recordings)}")
     first = recordings[0]
     step = float(np.median(np.diff(first.time)))
     for one in recordings[1:]:
         own = float(np.median(np.diff(one.time)))
         if one.joint_names != first.joint_names or abs(own - step) > 0.01 * step:
-            raise IdentificationError("these are no repetitions: joints or sampling rates differ")
+            raise IdentificationError("not repetitions: joints or sampling rates differ")
     indices = [np.rint((one.time - one.motion_start) / step).astype(np.int64) for one in recordings]
     common, runs = _common_runs(recordings, indices)
-    # First of the samples that round to the same instant, if clocks jitter.
+    # First of the samples with the same index.
     rows = [np.searchsorted(index, common) for index in indices]
     time: Array = common.astype(np.float64) * step
 
     def white(channels: Sequence[Array]) -> Array:
         stacked = np.stack([channel[row] for channel, row in zip(channels, rows, strict=True)])
-        # About the mean of R repetitions a share of 1/R of the variance is lost.
+        # The mean of R repetitions removes a share of 1/R of the variance.
         lost = np.sqrt(len(channels) / (len(channels) - 1.0))
         apart = (stacked - stacked.mean(axis=0)) * lost
         parts = [(a, b, one[a:b]) for a, b in runs for one in apart]
@@ -150,18 +144,18 @@ def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
 def _common_runs(
     recordings: Sequence[Recording], indices: Sequence[NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
-    """Instants in all repetitions, and which stretches of them no gap of any interrupts."""
+    """Return indices common to all repetitions, and runs of them without gap."""
     common = indices[0]
     for index in indices[1:]:
         common = np.intersect1d(common, index)
     common = np.unique(common)
-    torn = np.diff(common) > 1
+    gap = np.diff(common) > 1
     for one, index in zip(recordings, indices, strict=True):
         for segment in one.segments()[1:]:
-            torn[: len(torn)] |= (common[:-1] < index[segment.start]) & (
+            gap[: len(gap)] |= (common[:-1] < index[segment.start]) & (
                 common[1:] >= index[segment.start]
             )
-    edges = [0, *(np.flatnonzero(torn) + 1).tolist(), len(common)]
+    edges = [0, *(np.flatnonzero(gap) + 1).tolist(), len(common)]
     runs = [(a, b) for a, b in pairwise(edges) if b - a >= _SHORTEST_RUN]
     if not runs:
         raise IdentificationError(
@@ -170,12 +164,12 @@ def _common_runs(
     return common, runs
 
 
-_STRETCH: Final = 4.0  # s; lines a quarter of a hertz apart
+_STRETCH: Final = 4.0  # s; resolution 0.25 Hz
 _FEWEST: Final = 32  # samples
 _BINS: Final = 120
-# Share of a signal's power: that of noise of a thousandth of its amplitude.
+# Share of a signal's power; noise of 0.1 % of the amplitude.
 _NO_POWER: Final = 1e-6
-# Share of half the sampling rate: filters against aliases usually cut at 0.8 of it.
+# Share of half the sampling rate; anti-alias filters cut at about 0.8.
 _LOW_PASSED: Final = 0.75
 
 
@@ -189,8 +183,8 @@ class Spectrum(NamedTuple):
 def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:
     """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s].
 
-    As few points as a logarithmic figure shows. Uneven samples are interpolated at their median
-    interval; f is 0 where there are too few.
+    Reduced to the points of a logarithmic figure. Uneven samples are interpolated at the median
+    interval; f is 0 with too few.
     """
     frequency, power = _power(time, signals, segments, "hann")
     if not frequency.size:
@@ -204,10 +198,9 @@ def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum
 
 
 def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
-    """Return the frequency [Hz] above which signals (m, c) have no power, not even that of noise.
+    """Return the frequency [Hz] above which signals (m, c) have no power, such as after a low-pass.
 
-    A measured signal has noise up to half its sampling rate, unless it came through a low-pass.
-    None where any of the signals has some, or where there are too few samples.
+    None if any signal has noise up to half the sampling rate, or with too few samples.
     """
     frequency, power = _power(time, signals, segments, "blackmanharris")
     power = power[:, power.sum(axis=0) > 0.0]
@@ -222,7 +215,7 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
 def _power(
     time: Array, signals: Array, segments: Sequence[slice], window: str
 ) -> tuple[Array, Array]:
-    """Frequencies (f,) above zero, and the power spectral density at each (f, c)."""
+    """Return frequencies (f,) above zero and power spectral densities (f, c)."""
     longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
     time, signals = time[longest], signals[longest]
     if time.size < _FEWEST:
@@ -234,5 +227,5 @@ def _power(
     frequency, power = scipy.signal.welch(
         resampled, fs=1.0 / interval, window=window, nperseg=length, axis=0
     )
-    # The mean is no part of it, and its line has what detrending left.
+    # Without the mean, and the line changed by detrending.
     return frequency[1:], power[1:]

@@ -1,4 +1,4 @@
-"""What identification reads: one stretch of motion as it was measured, and what was commanded."""
+"""Recording of one motion: measured and commanded signals, with checks."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from identification.errors import IdentificationError, ShapeError
 Array = NDArray[np.float64]
 
 
-# A joint is not held still to the last bit of its encoder while it is commanded to move this far.
+# Command range beyond which a constant position is an error.
 STUCK_MOVEMENT: Final = 0.02  # rad or m
 LONGEST_PAUSE: Final = 600.0
-"""s without a sample. What is reckoned in stretches of time takes memory for empty ones, too."""
-# A step of the clock this many times the usual one is a gap, whether it was reported or not.
+"""Longest time without sample, s; empty blocks of time take memory."""
+# Clock steps of a gap, in usual steps.
 GAP_STEPS: Final = 5.0
 
 
 class RecordingError(IdentificationError, ValueError):
-    """A recording that must not be identified from."""
+    """Recording that cannot be identified from."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,15 +38,14 @@ class Recording:
     #: joint torque or force (m, n) [N·m or N], None where only currents are known
     torque: Array | None = None
     velocity: Array | None = None  #: measured (m, n) [rad/s or m/s], None where it was not
-    #: (m, n) [A]; no use is made of it here but to carry it along
+    #: (m, n) [A]
     motor_current: Array | None = None
     commanded_position: Array | None = None  #: (m, n) [rad or m], NaN where nothing was commanded
-    #: (m,) True at a sample before which samples are known to be missing
+    #: (m,) whether samples are missing before
     gap_before: NDArray[np.bool_] | None = None
-    #: joints that are known to be clamped or switched off, so that a constant position is no
-    #: fault
+    #: joints that are clamped or switched off
     held_joints: tuple[str, ...] = ()
-    #: where the recording comes from, in words
+    #: origin of the recording
     provenance: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -70,14 +69,14 @@ class Recording:
         return len(self.joint_names)
 
     def checked(self, joint_names: Sequence[str] | None = None) -> Recording:
-        """Return the recording itself if it can be identified from.
+        """Return the recording if it can be identified from.
 
         Args:
-            joint_names: the model's joints; names and order have to be the recording's.
+            joint_names: of the model; names and order must be those of the recording.
 
         Raises:
-            RecordingError: too short, NaN or infinity, a repeated, falling or leaping clock,
-                joints that are not the model's, or a stuck joint.
+            RecordingError: too short, NaN or infinity, invalid time stamps, other joints than the
+                model, or a stuck joint.
         """
         if self.n_samples < 2:
             raise RecordingError(f"the recording has {self.n_samples} samples")
@@ -92,7 +91,7 @@ class Recording:
         return self
 
     def between(self, start: int, stop: int) -> Recording:
-        """Return samples start to stop (exclusive) as a recording of its own."""
+        """Return samples start to stop (exclusive)."""
         return self.rows(slice(start, stop))
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Recording:
@@ -106,10 +105,9 @@ class Recording:
 
     @property
     def motion_start(self) -> float:
-        """Time at which the commanded position begins to move [s]; the first sample's without.
+        """Time of the first commanded motion [s], of the first sample without command.
 
-        The first sample commanded otherwise than the first command: the same instant of a plan
-        in every repetition of it.
+        The same instant of the plan in every repetition.
         """
         if self.commanded_position is None:
             return float(self.time[0])
@@ -121,10 +119,9 @@ class Recording:
         return float(self.time[int(np.argmax(moved))])
 
     def segments(self) -> list[slice]:
-        """Stretches without a gap, in order.
+        """Return the segments without gap, in order.
 
-        A gap is where one was reported, and where the clock steps by more than `GAP_STEPS` of
-        its usual (median) step. Derivatives across one are wrong.
+        Gaps are reported, or steps of more than `GAP_STEPS` times the median step.
         """
         steps = np.diff(self.time)
         breaks = steps > GAP_STEPS * np.median(steps)
@@ -134,7 +131,7 @@ class Recording:
         return [slice(a, b) for a, b in pairwise(edges)]
 
     def _channels(self) -> list[tuple[str, Array]]:
-        """Channels present, each (m, n), by attribute name."""
+        """Return the channels present, each (m, n), by attribute name."""
         channels = {
             "position": self.position,
             "velocity": self.velocity,
@@ -145,16 +142,16 @@ class Recording:
         return [(name, array) for name, array in channels.items() if array is not None]
 
     def each_channel(self, select: Callable[[Array], Array]) -> dict[str, Any]:
-        """Return every channel present, changed alike, by attribute name."""
+        """Apply a function to every channel present."""
         return {name: select(array) for name, array in self._channels()}
 
     def check_finite(self) -> None:
-        """Raise RecordingError where a number is NaN or infinite; commands may be NaN."""
+        """Raise RecordingError for NaN or infinity; commands may be NaN."""
         bad = np.flatnonzero(~np.isfinite(self.time))
         if bad.size:
             raise RecordingError(f"time is {self.time[bad[0]]} at sample {bad[0]}")
         for name, array in self._channels():
-            # A packet without a set-point has no commanded position; that is legal.
+            # NaN: packet without set-point.
             wrong = np.isinf(array) if name == "commanded_position" else ~np.isfinite(array)
             for sample, joint in np.argwhere(wrong)[:1].tolist():
                 raise RecordingError(
@@ -175,12 +172,12 @@ class Recording:
         sample = int(np.argmax(steps)) + 1
         if steps[sample - 1] > LONGEST_PAUSE:
             raise RecordingError(
-                f"the clock leaps by {steps[sample - 1]:.6g} s at sample {sample}; pauses of "
-                f"{LONGEST_PAUSE:g} s are borne: cut the recording there"
+                f"the time step is {steps[sample - 1]:.6g} s at sample {sample}, limit "
+                f"{LONGEST_PAUSE:g} s: cut the recording there"
             )
 
     def _check_stuck(self) -> None:
-        """Refuse a position reading that stays the same to the last bit when it should not."""
+        """Raise RecordingError for a constant position of a commanded joint."""
         ranges = np.ptp(self.position, axis=0)
         for j, name in enumerate(self.joint_names):
             if name in self.held_joints:
@@ -202,10 +199,10 @@ class Recording:
 
 
 def without_repeats(recording: Recording) -> Recording:
-    """Return the recording with one sample per time stamp: the mean of those that share it.
+    """Return the recording with one sample per time stamp, the mean of repeated ones.
 
     Raises:
-        RecordingError: the clock falls back; which sample is right cannot be determined.
+        RecordingError: a time stamp is earlier than the one before.
     """
     steps = np.diff(recording.time)
     if np.any(steps < 0.0):
@@ -217,7 +214,7 @@ def without_repeats(recording: Recording) -> Recording:
     count = np.diff(np.append(starts, recording.n_samples))[:, None]
 
     def mean(values: Array) -> Array:
-        # One sample stays what it is to the last bit.
+        # Bit-identical for single samples.
         total = np.add.reduceat(values, starts, axis=0)
         return np.asarray(np.where(count == 1, values[starts], total / count))
 
@@ -231,10 +228,9 @@ def without_repeats(recording: Recording) -> Recording:
 
 
 def stuck(position: Array, command: Array) -> tuple[int, float] | None:
-    """Where positions (m,) stay the same to the last bit while commands (m,) move [rad or m].
+    """Return where positions (m,) are constant while commands (m,) move most [rad or m].
 
-    First sample of the stretch during which the command travels farthest, and how far; None where
-    that is nowhere more than `STUCK_MOVEMENT`. Commands are NaN where there are none.
+    First sample and command range; None if no range exceeds `STUCK_MOVEMENT`. NaN without command.
     """
     edges = np.flatnonzero(np.diff(position, prepend=np.nan, append=np.nan) != 0.0)
     starts = edges[:-1]
@@ -248,18 +244,17 @@ def stuck(position: Array, command: Array) -> tuple[int, float] | None:
 
 
 _STEP: Final = 0.01  # s
-# A repetition follows the first within this share of each joint's own scatter, ...
-_ALIKE: Final = 0.02
-# ... over this share of the longer one.
+# Largest difference of repetitions as a share of each joint's scatter.
+_MAX_DIFFERENCE: Final = 0.02
+# Required overlap as a share of the longer recording.
 _OVERLAP: Final = 0.8
-_REFINED: Final = 21  # offsets that are tried within a step
+_REFINED: Final = 21  # offsets tried within a step
 
 
 def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
-    """Offset of each clock against the first one's (R,) [s] where all show one motion.
+    """Return the offset of each clock from the first one's (R,) [s] for one common motion.
 
-    Returns:
-        None where some recording shows another motion, or where there is only one.
+    None if motions differ, or for a single recording.
     """
     offsets = [0.0]
     for one in recordings[1:]:
@@ -271,9 +266,9 @@ def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
 
 
 def _offset(first: Recording, other: Recording) -> float | None:
-    """Time of the other recording less that of the first at equal postures [s]."""
-    time, position = _even(first)
-    other_time, other_position = _even(other)
+    """Return the time of the other recording minus the first at equal positions [s]."""
+    time, position = _resampled(first)
+    other_time, other_position = _resampled(other)
     scatter = position.std(axis=0)
     if position.shape[1] != other_position.shape[1] or not scatter.any():
         return None
@@ -288,11 +283,11 @@ def _offset(first: Recording, other: Recording) -> float | None:
     fine = coarse + _STEP * np.linspace(-1.0, 1.0, _REFINED)
     differences = [_difference(time, a, other_time - offset, b) for offset in fine]
     best = int(np.argmin(differences))
-    return float(fine[best]) if differences[best] < _ALIKE else None
+    return float(fine[best]) if differences[best] < _MAX_DIFFERENCE else None
 
 
 def _lag(a: Array, b: Array) -> int | None:
-    """Rows by which b (k, n) lags a (l, n) where their mean square difference is least."""
+    """Return the rows by which b (k, n) lags a (l, n) at the least mean square difference."""
     lags = np.arange(1 - len(a), len(b))
     first, last = np.maximum(0, -lags), np.minimum(len(a), len(b) - lags)
     rows = last - first
@@ -309,7 +304,7 @@ def _lag(a: Array, b: Array) -> int | None:
 
 
 def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:
-    """Largest RMS difference of a joint where both run; infinite where that is too short."""
+    """Return the largest RMS difference of a joint; infinite if the overlap is short."""
     inside = (time >= other_time[0]) & (time <= other_time[-1])
     if np.count_nonzero(inside) < _OVERLAP * max(len(a), len(b)):
         return np.inf
@@ -317,8 +312,8 @@ def _difference(time: Array, a: Array, other_time: Array, b: Array) -> float:
     return float(np.sqrt(np.mean((a[inside] - at) ** 2, axis=0)).max())
 
 
-def _even(recording: Recording) -> tuple[Array, Array]:
-    """Times and positions (k, n) at even steps."""
+def _resampled(recording: Recording) -> tuple[Array, Array]:
+    """Return times and positions (k, n) at even steps."""
     time = np.arange(recording.time[0], recording.time[-1], _STEP)
     columns = [np.interp(time, recording.time, column) for column in recording.position.T]
     return time, np.column_stack(columns)

@@ -1,4 +1,4 @@
-"""From a recording to what a fit reads: smoothed motion, torque, and which rows count."""
+"""Preparation of a recording for a fit: smoothed motion, torque, and usable rows."""
 
 from __future__ import annotations
 
@@ -29,44 +29,37 @@ from identification.signals.smoothing import (
 
 Array = NDArray[np.float64]
 
-# Widest where nobody chose (see :mod:`identification.selection.inner_prediction`): planned motion
-# has next to nothing above 10 Hz, and the first resonance of a large arm lies at 10 to 30 Hz. On
-# the simulated NS 16 everything from 20 to 60 Hz is as good as noise allows.
+# Default (see :mod:`identification.selection.inner_prediction`). Planned motion is below 10 Hz, the
+# first resonance of large arms at 10 to 30 Hz; on the simulated NS 16 20 to 60 Hz are equal.
 RIGID_BANDWIDTH: Final = 40.0  # Hz
-_SHORTEST_SEGMENT: Final = 12  # samples: twice what a quintic spline needs
+_SHORTEST_SEGMENT: Final = 12  # samples, twice the minimum of a quintic spline
 
 VelocitySource = Literal["position", "measured"]
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How a recording is turned into samples."""
+    """Settings of the preparation."""
 
-    #: widest bandwidth of the smoothed positions [Hz], however little noise they have. A rigid
-    #: model has nothing to say above the first resonance of the arm, where motors accelerate
-    #: without their links; and a wide one lets ripple that has found a resonance pass for inertia
+    #: largest bandwidth of the smoothed positions [Hz]; a rigid model is wrong above the first
+    #: resonance
     rigid_bandwidth: float = RIGID_BANDWIDTH
-    #: where the velocity comes from: the slope of the smoothed position, or the measured
-    #: velocity, smoothed alike, whose slope is then the acceleration. Recordings without a
-    #: measured velocity take the position's
+    #: velocity and acceleration from the smoothed position, or from the smoothed measured velocity
+    #: if recorded
     velocity: VelocitySource = "position"
-    #: which rows do not count for being slow, see :func:`identification.signals.masks.mask_rows`.
-    #: By default "rests" where dry friction has a presliding state in every joint, "slow" where
-    #: it jumps: no sgn(v) is right there
+    #: excluded slow rows, see :func:`identification.signals.masks.mask_rows`; by default "rests" if
+    #: all joints have presliding friction, else "slow"
     left_out: LeftOut | None = None
-    #: the paper's way. The torque is smoothed, and the regressor goes through the same linear
-    #: smoother. By default the torque is left as measured: least squares averages it better
+    #: as in the paper: torque and regressor are smoothed alike. Without it least squares averages
+    #: noise better
     smooth_torque: bool = False
-    #: with `smooth_torque` the bandwidth of that smoother [Hz]; None smooths until the mean
-    #: squared residual is the torque's noise variance. Without, the bandwidth of a low-pass that
-    #: the torque has come through before it was logged, as many controllers do it: the regressor
-    #: then goes through the same low-pass and the torque is left alone. None: it has come through
-    #: none
+    #: bandwidth [Hz] of the torque smoother with `smooth_torque` (None: by noise variance),
+    #: otherwise of a low-pass in the recorded torque, also applied to the regressor (None: no
+    #: low-pass)
     torque_bandwidth: float | None = None
-    #: how that low-pass falls off; `smooth_torque` is always by the spline's
+    #: of that low-pass; ignored with `smooth_torque`
     torque_shape: LowPassShape = SMOOTHER
-    #: time by which the recorded torque lags the recorded position [s], beside the lag of a
-    #: causal low-pass
+    #: lag of the recorded torque behind the position [s], without that of a causal low-pass
     torque_delay: float = 0.0
 
     def __post_init__(self) -> None:
@@ -78,29 +71,26 @@ class Preprocessing:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """m samples of n joints, ready for a fit, in the rows of the recording they come from."""
+    """m samples of n joints, prepared for a fit, in the rows of their recording."""
 
-    #: smoothed positions and their derivatives, at the instants the torque belongs to
+    #: smoothed positions and derivatives, at the times of the torque
     motion: Motion
     torque: Array  #: (m, n) [N·m or N]
-    #: (m, n) rows that count: moving, and away from gaps, ends and reversals
+    #: (m, n) moving, and away from gaps, ends and reversals
     usable: NDArray[np.bool_]
     segments: tuple[slice, ...]  #: stretches without a gap
-    #: time at which the planned motion begins [s]; repetitions are compared at equal times since
-    #: then
+    #: start time of the planned motion [s], common to repetitions
     origin: float
-    position_bandwidth: Array  #: of the smoothing, per joint (n,) [Hz]
-    #: of the low-pass the torque has come through, per joint (n,) [Hz]; the regressor has to go
-    #: through it as well. None: it has come through none
+    position_bandwidth: Array  #: of the smoothing (n,) [Hz]
+    #: of the low-pass of torque and regressor (n,) [Hz]; None: no low-pass
     torque_bandwidth: Array | None = None
     torque_shape: LowPassShape = SMOOTHER  #: of that low-pass
-    mask: RowMask | None = None  #: why rows do not count; None where nobody asked
-    #: the samples that these are part of, and which part: a low-pass reads what comes before and
-    #: after. None where they are all there is
-    whole: tuple[Samples, slice] | None = None
+    mask: RowMask | None = None  #: reasons against rows; None if unknown
+    #: samples that these are part of, and which part, for a low-pass
+    parent: tuple[Samples, slice] | None = None
 
     def between(self, start: int, stop: int) -> Samples:
-        """Return samples start to stop (exclusive), still filtered as part of these."""
+        """Return samples start to stop (exclusive), filtered as part of these."""
         part = slice(start, stop)
         segments = [
             slice(max(one.start, start) - start, min(one.stop, stop) - start)
@@ -114,35 +104,35 @@ class Samples:
             usable=self.usable[part],
             segments=tuple(segments),
             mask=None if self.mask is None else self.mask.rows(part),
-            whole=None if self.torque_bandwidth is None else (self, part),
+            parent=None if self.torque_bandwidth is None else (self, part),
         )
 
     def moving(self) -> Samples:
-        """Return samples of which only rows count in which the joint moves."""
+        """Return samples with the rows in sliding motion only."""
         return self if self.mask is None else replace(self, usable=self.mask.moving)
 
-    def directed(self, model: RobotModel) -> Samples:
-        """Return samples whose dry friction has the direction that a model's law gives it."""
-        if self.whole is not None:
-            whole, part = self.whole
-            whole = whole.directed(model)
-            return replace(self, motion=whole.motion.rows(part), whole=(whole, part))
+    def with_friction_direction(self, model: RobotModel) -> Samples:
+        """Return samples with the direction of dry friction by a model's law."""
+        if self.parent is not None:
+            parent, part = self.parent
+            parent = parent.with_friction_direction(model)
+            return replace(self, motion=parent.motion.rows(part), parent=(parent, part))
         direction = None
         if any(law.presliding > 0.0 for law in model.friction.laws):
             direction = model.friction.direction(*self.motion[:3])
         return replace(self, motion=self.motion._replace(direction=direction))
 
     def as_measured(self, joint: int, columns: Array) -> Array:
-        """Columns (m, c) of a joint's row as the torque channel would have recorded them."""
+        """Filter columns (m, c) of a joint's row by the torque's low-pass."""
         if self.torque_bandwidth is None:
             return columns
         bandwidth = np.full(columns.shape[1], self.torque_bandwidth[joint])
         return _low_passed(self.motion.time, columns, bandwidth, self.segments, self.torque_shape)
 
     def regressor(self, model: RobotModel) -> Regressor:
-        """Regressor of every row, usable or not, as the torque channel would record it."""
-        if self.whole is not None:
-            samples, part = self.whole
+        """Return the regressor of every row, filtered by the torque's low-pass."""
+        if self.parent is not None:
+            samples, part = self.parent
             blocks, columns = samples.regressor(model)
             return Regressor(tuple(block[part] for block in blocks), columns)
         blocks, columns = model.regressor(*self.motion[1:])
@@ -151,18 +141,18 @@ class Samples:
         )
 
     def predicted_torque(self, model: RobotModel, values: Array) -> Array:
-        """Torque (m, n) that parameters (p,) predict, as the torque channel would record it."""
-        if self.whole is not None:
-            samples, part = self.whole
+        """Return the torque (m, n) of parameters (p,), filtered by the torque's low-pass."""
+        if self.parent is not None:
+            samples, part = self.parent
             return samples.predicted_torque(model, values)[part]
-        return self._through_channel(model.torque(values, *self.motion[1:]))
+        return self._filtered(model.torque(values, *self.motion[1:]))
 
     def known_torque(self, model: RobotModel) -> Array:
-        """Torque (m, n) of payload and elements that is known, as it would be recorded."""
+        """Return the torque (m, n) of known payload and elements, filtered likewise."""
         torque = model.load_torque(*self.motion[1:4])
-        return self._through_channel(torque) if model.has_load else torque
+        return self._filtered(torque) if model.has_load else torque
 
-    def _through_channel(self, torque: Array) -> Array:
+    def _filtered(self, torque: Array) -> Array:
         if self.torque_bandwidth is None:
             return torque
         return _low_passed(
@@ -175,19 +165,19 @@ def smooth(
     noise_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),
 ) -> tuple[Motion, Array]:
-    """Smoothed motion at each instant less the delay, and the bandwidth of the longest stretch.
+    """Return the smoothed motion at each time minus the delay, and the bandwidth.
 
-    Rows of a stretch too short to smooth keep their position, at rest; see :func:`prepare` for
-    which rows count.
+    Rows of segments too short to smooth keep their position, at rest.
 
     Args:
         recording: checked.
         noise_variance: of the measured positions (n,) [rad² or m²], from standstill and at least
-            resolution²/12. None: estimated from the differences of the positions.
-        options: its bandwidth, velocity and delay.
+            resolution²/12. None: estimated from differences of positions.
+        options: bandwidth, velocity and delay.
 
     Returns:
-        Motion in the rows of the recording, and the bandwidth per joint (n,) [Hz].
+        Motion in the rows of the recording, and the bandwidth per joint (n,) [Hz] of the longest
+            segment.
     """
     position = recording.position.copy()
     velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
@@ -224,21 +214,19 @@ def prepare(
     origin: float | None = None,
     current_limit: Array | None = None,
 ) -> Samples:
-    """Samples of a recording for a model; of its torque, that of a known payload is subtracted.
+    """Prepare a recording for a model; the torque of a known payload is subtracted.
 
     Args:
         recording: with torque; joints in the model's order.
-        model: says below which speed a joint stands, and what the arm carried.
+        model: with standstill speeds and payload.
         noise_variance: of the positions (n,), see :func:`smooth`.
         torque_variance: of the torques (n,), for `options.smooth_torque` only; None: estimated.
-        options: what to do with the torque.
-        origin: time at which the planned motion begins [s]; by default where the command begins
-            to move.
-        current_limit: largest current a motor is given (n,) [A]; rows at it do not
-            count.
+        options: settings.
+        origin: start time of the planned motion [s]; by default of the command.
+        current_limit: of the motors (n,) [A]; rows at it are excluded.
 
     Raises:
-        RecordingError: the recording does not pass its checks, or has no torque.
+        RecordingError: the recording is invalid or has no torque.
     """
     recording.checked(model.joint_names)
     if recording.torque is None:
@@ -273,7 +261,7 @@ def prepare(
         torque_bandwidth=torque_bandwidth,
         torque_shape=SMOOTHER if options.smooth_torque else options.torque_shape,
         mask=mask,
-    ).directed(model)
+    ).with_friction_direction(model)
     if not model.has_load:
         return samples
     return replace(samples, torque=samples.torque - samples.known_torque(model))
@@ -282,7 +270,7 @@ def prepare(
 def _noise_bandwidth(
     recording: Recording, variance: Array | None, segments: tuple[slice, ...]
 ) -> Array:
-    """Bandwidth per joint (n,) [Hz] that takes the noise variance (n,) out of the torque."""
+    """Return the bandwidth per joint (n,) [Hz] that removes the torque noise variance (n,)."""
     assert recording.torque is not None
     longest = max(segments, key=lambda segment: int(segment.stop - segment.start))
     time, measured = recording.time[longest], recording.torque[longest]
@@ -290,7 +278,7 @@ def _noise_bandwidth(
 
 
 def _attainable(time: Array, measured: Array, variance: Array | None) -> Array:
-    """Noise variance (c,), by default from differences; at least that of rounding."""
+    """Return the noise variance (c,), by default from differences, at least that of rounding."""
     if variance is None:
         variance = difference_variance(time, measured)
     rounding = (np.finfo(np.float64).eps * np.abs(measured).max(axis=0)) ** 2
@@ -304,7 +292,7 @@ def _low_passed(
     segments: tuple[slice, ...],
     shape: LowPassShape = SMOOTHER,
 ) -> Array:
-    """Columns (m, c), each through a low-pass of its own (c,), segment by segment."""
+    """Filter columns (m, c) by own low-passes (c,), segment by segment."""
     filtered = np.zeros_like(columns)
     for segment in segments:
         if segment.stop - segment.start < _SHORTEST_SEGMENT:

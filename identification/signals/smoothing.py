@@ -1,12 +1,12 @@
-"""Smoothing spline whose mean squared residual equals a given tolerance (the paper's SPAPS).
+"""Smoothing splines with a given mean squared residual (SPAPS of the paper), and low-passes.
 
-Quintic splines f on uniform knots that minimise, per channel and on any increasing time base,
+Quintic splines f on uniform knots minimise, per channel on any increasing times,
 
     sum_i (y_i - f(t_i))^2 + penalty * integral f'''(t)^2 dt
 
-with mean (y_i - f(t_i))^2 = tolerance (de Boor; Villagrossi et al. 2014, section 4.1): away from
+with mean (y_i - f(t_i))^2 = tolerance (de Boor; Villagrossi et al. 2014, section 4.1), away from
 the ends a zero-phase low-pass of gain 1 / (1 + (w / w_c)^6). The normal equations have five
-off-diagonals; knots are refined where the tolerance asks for more detail.
+off-diagonals; knots are refined to the tolerance.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ Array = NDArray[np.float64]
 
 
 DEGREE: Final = 5
-ORDER: Final = DEGREE + 1  # basis functions that are non-zero on each knot interval
-# The penalty is limited, in knot units and per sample, to where it still smooths something the
-# knots can show (lower end) and where the normal equations still have digits left (upper end).
+ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
+# Limits of the penalty in knot units per sample: resolution of the knots, and rounding of the
+# normal equations.
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
-# Radians of a cutoff frequency per knot: the knots then follow far more than the smoother passes.
+# Radians of the cutoff frequency per knot.
 _KNOT_OF_CUTOFF: Final = 0.5
 
 
@@ -41,12 +41,12 @@ class SmoothingSpline:
     start: float  # time of the first knot [s]
     spacing: float  # knot spacing [s]
     coefficients: Array  # B-spline coefficients (intervals + 5, c)
-    bandwidth: Array  # frequency at which the smoothing halves a sine, per channel (c,) [Hz]
+    bandwidth: Array  # half-amplitude frequency per channel (c,) [Hz]
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
-        """Value or derivative at ``time`` (m,): (m, c), per second to the power ``derivative``.
+        """Return value or derivative at times (m,): (m, c), per second to the power ``derivative``.
 
-        Times outside the knots extrapolate the first or last piece.
+        Extrapolates beyond the knots.
         """
         rows = _rows(self.start, self.spacing, len(self.coefficients) - DEGREE, time, derivative)
         return np.asarray(rows @ self.coefficients)
@@ -55,17 +55,15 @@ class SmoothingSpline:
 def fit_smoothing_spline(
     time: Array, values: Array, tolerance: Array, *, widest: float = np.inf
 ) -> SmoothingSpline:
-    """Smooth each channel until its mean squared residual equals its tolerance.
+    """Smooth each channel to a mean squared residual equal to its tolerance.
 
-    A tolerance below what one knot per sample can follow gives the closest such spline, one
-    above the residual of the smoothest representable spline gives that spline (a parabola in
-    all but name).
+    Limited by the closest spline with one knot per sample and the smoothest one, nearly a parabola.
 
     Args:
-        time: strictly increasing (m,) [s], uniform or not; at least `ORDER`.
+        time: strictly increasing (m,) [s]; at least `ORDER`.
         values: (m, c).
-        tolerance: wanted mean squared residual (c,), positive.
-        widest: bandwidth [Hz] that is never exceeded, whatever the tolerance.
+        tolerance: mean squared residual (c,), positive.
+        widest: largest bandwidth [Hz].
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
@@ -83,10 +81,9 @@ def fit_smoothing_spline(
 
 
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
-    """Values (m, c) after the same smoother with a fixed bandwidth [Hz]: linear, zero-phase.
+    """Filter values (m, c) by the same smoother with a fixed bandwidth [Hz]: linear, zero-phase.
 
-    What is applied to a measured torque and to every column of its regressor alike leaves their
-    linear relation as it is.
+    Applied to torque and regressor alike it preserves their linear relation.
     """
     step = float(np.median(np.diff(time)))
     problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
@@ -96,7 +93,7 @@ def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Normal equations of one set of samples, in knot units, and their least smoothed solution."""
+    """Normal equations of samples in knot units, and their least smoothed solution."""
 
     spacing: float  # [s]
     density: float  # samples per knot interval
@@ -109,7 +106,7 @@ class _Problem:
 
     @classmethod
     def of(cls, time: Array, values: Array, spacing: float) -> _Problem:
-        """Problem with about this spacing of the knots [s]."""
+        """Set up the problem with about this knot spacing [s]."""
         span = float(time[-1] - time[0])
         intervals = max(1, round(span / spacing))
         spacing, density = span / intervals, len(time) / intervals
@@ -124,7 +121,7 @@ class _Problem:
         return cls(spacing, density, rows, gram, penalty, closest, residual, _roughness(closest))
 
     def correction(self, channel: int | slice, penalty: float) -> Array:
-        """How the coefficients of a channel, or all, differ from the least smoothed ones."""
+        """Return the change of coefficients from the least smoothed ones."""
         factor = scipy.linalg.cholesky_banded(self.gram + penalty * self.penalty, lower=True)
         excess = penalty - _LIGHTEST * self.density
         return np.asarray(
@@ -132,13 +129,13 @@ class _Problem:
         )
 
     def penalty_at(self, bandwidth: float) -> float:
-        """Penalty that gives a bandwidth [Hz], within what the knots can show."""
+        """Return the penalty of a bandwidth [Hz], within the limits of the knots."""
         cutoff = 2.0 * np.pi * bandwidth * self.spacing  # rad per knot
         share = np.clip(1.0 / max(cutoff, 1e-3) ** 6, _LIGHTEST, _HEAVIEST)
         return float(self.density * share)
 
     def penalty_for(self, channel: int, tolerance: float, widest: float) -> float:
-        """Penalty at which the channel's mean squared residual equals the tolerance."""
+        """Return the penalty at which a channel's mean squared residual equals the tolerance."""
 
         def excess(log_penalty: float) -> float:
             correction = self.correction(channel, float(np.exp(log_penalty)))
@@ -156,7 +153,7 @@ class _Problem:
 
 @cache
 def _pieces(degree: int, derivative: int = 0) -> Array:
-    """Cardinal B-spline on one knot interval: powers of u by its degree + 1 basis functions."""
+    """Return the cardinal B-spline on a knot interval: powers of u by basis functions."""
     pieces = np.zeros((degree + 1, degree + 1))
     for k in range(degree + 1):
         for j in range(degree + 1 - k):
@@ -171,7 +168,7 @@ def _pieces(degree: int, derivative: int = 0) -> Array:
 def _rows(
     start: float, spacing: float, intervals: int, time: Array, derivative: int = 0
 ) -> scipy.sparse.csr_array:
-    """Basis functions, or their derivatives, at each time: sparse (m, intervals + 5)."""
+    """Return the basis functions or derivatives at each time, sparse (m, intervals + 5)."""
     x = (np.asarray(time, dtype=np.float64) - start) / spacing
     interval = np.clip(np.floor(x).astype(np.int64), 0, intervals - 1)
     pieces = _pieces(DEGREE, derivative)
@@ -184,7 +181,7 @@ def _rows(
 
 
 def _gram_band(rows: scipy.sparse.csr_array) -> Array:
-    """Lower band (6, k) of rows' rows."""
+    """Return the lower band (6, k) of rows' rows."""
     columns, weights = rows.indices.reshape(-1, ORDER), rows.data.reshape(-1, ORDER)
     band = np.zeros((ORDER, rows.shape[1]))
     for k in range(ORDER):
@@ -196,7 +193,7 @@ def _gram_band(rows: scipy.sparse.csr_array) -> Array:
 
 
 def _products(pieces: Array) -> Array:
-    """Integrals over one knot interval of the products of two pieces, up to cubics."""
+    """Return integrals over a knot interval of products of two pieces, up to cubics."""
     points, weights = np.polynomial.legendre.leggauss(4)
     values = np.vander((points + 1.0) / 2.0, len(pieces), increasing=True) @ pieces
     return np.asarray(values.T @ (values * (weights / 2.0)[:, None]))
@@ -207,7 +204,7 @@ _QUADRATICS: Final = _products(_pieces(2))
 
 
 def _penalty_band(intervals: int) -> Array:
-    """Lower band (6, k) of the integrals of products of third derivatives, in knot units."""
+    """Return the lower band (6, k) of integrals of third derivatives, in knot units."""
     band = np.zeros((ORDER, intervals + DEGREE))
     for k in range(ORDER):
         for offset in range(ORDER - k):
@@ -216,11 +213,10 @@ def _penalty_band(intervals: int) -> Array:
 
 
 def _roughness(coefficients: Array) -> Array:
-    """Penalty matrix times coefficients (k, c), by way of third differences.
+    """Return the penalty matrix times coefficients (k, c), by third differences.
 
-    The third derivative is a quadratic spline whose coefficients are the third differences.
-    Computed this way the rounding has no part that a parabola could take up, however heavy the
-    penalty; the band times the coefficients would lose eleven digits there.
+    The third derivative is a quadratic spline of the third differences. The band times the
+    coefficients would lose eleven digits with a heavy penalty.
     """
     third = np.diff(coefficients, 3, axis=0)
     intervals = len(third) - 2
@@ -231,24 +227,23 @@ def _roughness(coefficients: Array) -> Array:
     return -np.diff(np.pad(product, ((3, 3), (0, 0))), 3, axis=0)
 
 
-# Of the sampling rate: higher, the filter is none and the bilinear transform bends it.
+# Largest cut-off as a share of the sampling rate.
 _HIGHEST: Final = 0.45
-# A zero-phase filter starts from the signal's point reflection at its end, for so many periods.
+# Periods of point reflection at the ends of a zero-phase filter.
 _PADDING_PERIODS: Final = 1.0
 _UNEVEN: Final = 0.01  # of a step
 
 
 @dataclass(frozen=True)
 class LowPassShape:
-    """How a low-pass falls off above its bandwidth."""
+    """Order and direction of a low-pass."""
 
-    order: int  # number of poles, one way
-    # run forwards only, as a controller does it, so that it lags; it then has 1/sqrt(2) of a sine
-    # at its bandwidth. Otherwise forwards and backwards, without phase: one half
+    order: int  # number of poles
+    # forwards only, gain 1/sqrt(2) at the bandwidth; otherwise forwards and backwards, gain 1/2
     causal: bool = False
 
     def lag(self, bandwidth: float) -> float:
-        """Return the time [s] by which a causal low-pass [Hz] delays slow signals."""
+        """Return the delay [s] of slow signals by a causal low-pass [Hz]."""
         return 1.0 / (2.0 * math.pi * bandwidth * math.sin(math.pi / (2.0 * self.order)))
 
     def __str__(self) -> str:
@@ -257,7 +252,7 @@ class LowPassShape:
 
 
 SMOOTHER: Final = LowPassShape(order=3)
-"""That of the smoothing spline, which takes any time base."""
+"""That of the smoothing spline."""
 WITHOUT_PHASE: Final = (SMOOTHER, *(LowPassShape(order) for order in (1, 2, 4)))
 FORWARDS: Final = tuple(LowPassShape(order, causal=True) for order in (1, 2, 4))
 
@@ -265,10 +260,9 @@ FORWARDS: Final = tuple(LowPassShape(order, causal=True) for order in (1, 2, 4))
 def low_passed(
     time: Array, columns: Array, bandwidth: float, shape: LowPassShape = SMOOTHER
 ) -> Array:
-    """Columns (m, c) of one stretch without a gap through a low-pass [Hz].
+    """Filter columns (m, c) of one segment by a low-pass [Hz].
 
-    Butterworth filters need even samples: columns at uneven times (m,) [s] are interpolated for
-    them, and read again at their own times.
+    Butterworth filters interpolate uneven times (m,) [s].
     """
     if shape == SMOOTHER:
         return low_pass(time, columns, bandwidth)
@@ -276,21 +270,21 @@ def low_passed(
     if np.abs(np.diff(time) - step).max() <= _UNEVEN * step:
         return _filtered(columns, bandwidth * step, shape)
     even = np.arange(time[0], time[-1] + step, step)
-    filtered = _filtered(_read(even, time, columns), bandwidth * step, shape)
-    return _read(time, even, filtered)
+    filtered = _filtered(_interpolated(even, time, columns), bandwidth * step, shape)
+    return _interpolated(time, even, filtered)
 
 
 def _filtered(columns: Array, cycles: float, shape: LowPassShape) -> Array:
-    """Columns (m, c) at even times; the cut-off in cycles per sample."""
+    """Filter columns (m, c) at even times; the cut-off in cycles per sample."""
     cycles = min(cycles, _HIGHEST)
     sections = scipy.signal.butter(shape.order, cycles, fs=1.0, output="sos")
     if shape.causal:
-        # As if it had been at rest with the first sample for ever.
+        # Initially at rest with the first sample.
         state = scipy.signal.sosfilt_zi(sections)[:, :, None] * columns[0]
         return np.asarray(scipy.signal.sosfilt(sections, columns, axis=0, zi=state)[0])
     padding = min(len(columns) - 1, int(np.ceil(_PADDING_PERIODS / cycles)))
     return np.asarray(scipy.signal.sosfiltfilt(sections, columns, axis=0, padlen=padding))
 
 
-def _read(at: Array, time: Array, columns: Array) -> Array:
+def _interpolated(at: Array, time: Array, columns: Array) -> Array:
     return np.column_stack([np.interp(at, time, column) for column in columns.T])

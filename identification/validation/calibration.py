@@ -21,13 +21,13 @@ from identification.factor.factor import Estimate, Factor, augmented_rows
 from identification.factor.phases import (
     FINE_BLOCK,
     PhaseFactor,
-    block_runs,
+    block_slices,
     merged,
     samples_by_cell,
 )
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
-from identification.signals.masks import SATURATED, TORN
+from identification.signals.masks import EDGE, SATURATED
 from identification.signals.samples import Samples
 from identification.validation.residuals import BLOCK, FEWEST_BLOCKS, block_index
 
@@ -167,7 +167,7 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     """Return the fields of :class:`TorqueMeans` of one recording with rows."""
     known = np.ones(samples.torque.shape, dtype=np.bool_)
     if samples.mask is not None:
-        for reason in (TORN, SATURATED):
+        for reason in (EDGE, SATURATED):
             known &= ~samples.mask.reasons[reason]
     index, p = block_index(samples), model.n_parameters
     present = np.unique(index)
@@ -175,7 +175,7 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
     places = [np.append(own, p) for own in model.plan.columns]
     sums = np.zeros((int(index[-1]) + 1, model.n_joints, p + 1))
     for part, chunk in augmented_rows(model, replace(samples, usable=known)):
-        for block, at in block_runs(index[part]):
+        for block, at in block_slices(index[part]):
             for joint, own in enumerate(chunk):
                 sums[block, joint, places[joint]] += own[:, at].sum(axis=1)
     divisor = np.where(count > 0.5 * np.bincount(index).max(), count, np.nan)

@@ -292,7 +292,7 @@ def _tables(model: RobotModel, samples: Samples, values: Array, some: NDArray[np
     """Return the columns of some rows of each joint (n, k, q)."""
     n, p = model.n_joints, model.n_parameters
     payload = RegressorPlan.of_bodies(model.chain, model.gravity, n - 1)
-    filtered = samples.torque_bandwidth is not None or samples.whole is not None
+    filtered = samples.torque_bandwidth is not None or samples.parent is not None
     part = np.arange(len(samples.torque)) if filtered else some
     motion = samples.motion.rows(part)
     loads = payload.evaluate(*motion[1:4]).blocks
@@ -441,7 +441,7 @@ def _corrected(model: RobotModel, samples: Samples, fault: Fault) -> Samples:
     if fault.kind != "position order":
         torque = torque[:, order] * sign
     corrected = replace(samples, motion=motion, torque=torque, usable=usable, mask=None)
-    if samples.whole is not None:
-        whole, part = samples.whole
-        corrected = replace(corrected, whole=(_corrected(model, whole, fault), part))
-    return corrected.directed(model)
+    if samples.parent is not None:
+        parent, part = samples.parent
+        corrected = replace(corrected, parent=(_corrected(model, parent, fault), part))
+    return corrected.with_friction_direction(model)

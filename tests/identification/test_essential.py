@@ -177,7 +177,7 @@ def test_the_estimate_that_is_left_is_one_like_every_other() -> None:
 def test_empty_factors_are_refused() -> None:
     _, unseen = factors(MODEL, TRUTH)
     empty = PhaseFactor.zero(MODEL)
-    with pytest.raises(IdentificationError, match="not one usable fitted"):
+    with pytest.raises(IdentificationError, match="no usable fitted"):
         eliminate(MODEL, empty, unseen)
 
 
@@ -309,5 +309,5 @@ def test_without_held_out_motion_nothing_is_chosen() -> None:
     (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
     with pytest.raises(IdentificationError, match="no held-out motion"):
         choose_essential(MODEL, training, [])
-    with pytest.raises(IdentificationError, match="not one usable held-out sample"):
+    with pytest.raises(IdentificationError, match="no usable held-out sample"):
         choose_essential(MODEL, training, [PhaseFactor.zero(MODEL)])

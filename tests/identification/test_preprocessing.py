@@ -14,12 +14,12 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import (
+    EDGE,
     END_PERIODS,
     LONGEST_END,
     REVERSAL,
     SATURATED,
     STANDSTILL,
-    TORN,
     flat_topped,
     mask_rows,
 )
@@ -262,7 +262,7 @@ def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) ->
     np.testing.assert_array_equal(mask.usable, ~reasons)
     lost = np.sum(list(mask.counts.values()), axis=0)
     np.testing.assert_array_equal(lost + mask.usable.sum(axis=0), len(TIME))
-    for reason in (TORN, STANDSTILL, REVERSAL, SATURATED):
+    for reason in (EDGE, STANDSTILL, REVERSAL, SATURATED):
         assert np.all(mask.counts[reason] > 0)
 
 
@@ -317,7 +317,7 @@ def test_a_row_read_earlier_is_torn_where_it_is_read(model: RobotModel, delay: f
     end = min(LONGEST_END, END_PERIODS / float(samples.position_bandwidth.min()))
     read = recording.time - delay
     inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
-    np.testing.assert_array_equal(samples.mask.reasons[TORN][:, 0], ~inside)
+    np.testing.assert_array_equal(samples.mask.reasons[EDGE][:, 0], ~inside)
     assert not samples.usable[~inside].any()
 
 
@@ -338,7 +338,7 @@ def test_rows_beside_a_gap_and_short_stretches_are_torn(model: RobotModel) -> No
     torn = Recording(
         time=TIME, position=recording.position, joint_names=model.joint_names, gap_before=gap
     )
-    rows = mask_rows(torn, model, motion, np.full(2, 40.0)).reasons[TORN][:, 0]
+    rows = mask_rows(torn, model, motion, np.full(2, 40.0)).reasons[EDGE][:, 0]
     assert rows[1950:2090].all()
     assert not rows[100:1940].any()
     assert not rows[2100:3900].any()

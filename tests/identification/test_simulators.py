@@ -198,7 +198,7 @@ def samples_of(model: RobotModel, bandwidth: float | None = None) -> Samples:
         usable=np.ones((3000, 2), dtype=np.bool_),
         position_bandwidth=np.full(2, 10.0),
         torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
-    ).directed(model)
+    ).with_friction_direction(model)
     return replace(samples, torque=samples.predicted_torque(model, values_of(model)))
 
 

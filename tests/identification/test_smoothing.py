@@ -237,13 +237,13 @@ def test_a_gap_in_one_of_them_is_not_bridged() -> None:
 
 def test_what_are_no_repetitions_is_refused() -> None:
     one = repetition(1)
-    with pytest.raises(IdentificationError, match="takes two"):
+    with pytest.raises(IdentificationError, match="requires two"):
         repetition_noise([one])
     other = Recording(one.time, one.position, ("a", "c"))
-    with pytest.raises(IdentificationError, match="no repetitions"):
+    with pytest.raises(IdentificationError, match="not repetitions"):
         repetition_noise([one, other])
     slower = Recording(2.0 * one.time, one.position, ("a", "b"))
-    with pytest.raises(IdentificationError, match="no repetitions"):
+    with pytest.raises(IdentificationError, match="not repetitions"):
         repetition_noise([one, slower])
     with pytest.raises(IdentificationError, match="in common"):
         repetition_noise([one.between(0, 2000), one.between(4950, 5000)])

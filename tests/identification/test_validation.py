@@ -15,7 +15,7 @@ from identification.errors import IdentificationError, ShapeError
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
-from identification.signals.masks import SATURATED, STANDSTILL, TORN, RowMask
+from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.samples import Samples
 from identification.validation.calibration import Calibration, TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repetition_noise
@@ -281,7 +281,7 @@ class TestTorqueMeans:
         """Where motion or torque are not known no model can be right; at rest it has to be."""
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
         ends[:20], slow[40:60] = True, True
-        reasons = {TORN: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
+        reasons = {EDGE: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}
         mask = RowMask(reasons, (LENGTH, 2), ~(ends | slow))
         error = np.where(ends, 1e3, np.where(slow, 1.0, 0.0))
         samples = replace(recording(error, MOTION), usable=mask.usable, mask=mask)
