@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from hil import Campaign, Cell
 from hil.campaign import design
 from hil.cli import app
 from hil.progress import Silent
-from tests.docs.typed import PAGES, ROOT, commands, parse
+from tests.docs.typed import PAGES, ROOT, commands, options, parse
 
 TYPED_ELSEWHERE = {
     "campaign.md": "tests/hil/test_campaign_day.py",
@@ -178,14 +177,7 @@ OF_OTHER_PROGRAMS = {"archive-format", "batch", "can", "connect", "how-it-is-tes
 def test_every_option_that_a_page_mentions_exists(page: Path) -> None:
     if page.stem not in OF_OTHER_PROGRAMS:
         named = re.findall(r"(?<![\w-])--[a-z]+(?:-[a-z]+)*", page.read_text("utf-8"))
-        assert {*named} - {"--help"} <= options(typer.main.get_command(app))
-
-
-def options(command: Any) -> set[str]:
-    """Those of a command, and of all below it."""
-    below = getattr(command, "commands", {}).values()
-    own = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
-    return own.union(*map(options, below))
+        assert {*named} - {"--help"} <= options()
 
 
 def test_what_is_typed_elsewhere_is() -> None:

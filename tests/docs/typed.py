@@ -57,3 +57,11 @@ def parse(words: Sequence[str]) -> None:
     """Let the command line read words behind `hil`, and do nothing."""
     command, rest = command_of(words)
     command.make_context(command.name, rest)
+
+
+def options(command: Any = None) -> set[str]:
+    """Options of a command and of all below it; by default of the whole command line."""
+    command = command or typer.main.get_command(app)
+    below = getattr(command, "commands", {}).values()
+    own = {option for one in command.params for option in (*one.opts, *one.secondary_opts)}
+    return own.union(*map(options, below))
