@@ -1,4 +1,4 @@
-"""Foreign recordings into archives: logs of numbers (text, arrays) and rosbag2."""
+"""Import of recordings of other programs: logs of numbers (text, arrays) and rosbag2."""
 
 from hil.importers.column_map import ColumnMap, Quantity, TimeColumn
 from hil.importers.dh import Convention, convention_of, urdf_of_dh

@@ -1,4 +1,4 @@
-"""Files of named arrays: .npz and .npy of numpy, .mat of MATLAB, matrices in MATLAB's notation."""
+"""Files of named arrays: .npz and .npy of numpy, .mat and .m of MATLAB, ROS 2 messages in MCAP."""
 
 from __future__ import annotations
 
@@ -31,13 +31,12 @@ from planner.worker import WorkerProcess
 
 
 def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
-    """Arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
+    """Return arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
 
     ``topic/stamp`` is the time of its messages [ns]: that of their header, or else the file's.
 
     Raises:
-        SourceError: the file cannot be read, or holds no topic that can be read so; the text says
-            why for each.
+        SourceError: the file cannot be read, or has no topic that can be read this way.
     """
     known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
     refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
@@ -51,8 +50,7 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
                 definition = known[name].definition.decode(errors="replace")
                 layouts[name] = layout_of(known[name].kind, definition, data)
             size = layouts[name].size
-            # A writer may pad the end of a message to whole words.
-            if len(data) - size not in range(4):
+            if len(data) - size not in range(4):  # a writer may pad the end to whole words
                 raise LayoutError("its messages differ in length")
         except LayoutError as error:
             refused[name] = str(error)
@@ -78,7 +76,7 @@ def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
 def _columns(
     layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
 ) -> dict[str, NDArray[Any]]:
-    """The fields of messages of one topic, given with their log times [ns], and their stamps."""
+    """Return the fields of messages of one topic, given with log times [ns], and their stamps."""
     joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
     data = joined.reshape(len(messages), layout.size)
     if not layout.matches(data):
@@ -98,7 +96,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MOST_NUMBERS: Final = 2**28
-"""In one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
+"""Elements of one array: 2 GiB of doubles, hours of an arm at 5 kHz."""
 
 _NUMBERS: Final = "fiubmM"
 _MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
@@ -109,13 +107,12 @@ _MOST_FIELDS: Final = 10_000  # of all structs of a file
 _MOST_NAMED: Final = 30
 _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
-# Of the process that reads a .mat: the largest array, what it is packed in and its copy.
-_MEMORY: Final = 8 * 2**30
-_PATIENCE: Final = 120.0  # s
+_MEMORY: Final = 8 * 2**30  # bytes of the process that reads a .mat: the largest array and its copy
+_TIMEOUT: Final = 120.0  # s
 
 
 class Stored(NamedTuple):
-    """An array that is still in its file: its shape as the file says, and what reads it."""
+    """An array that is not yet read: its shape as stated in the file, and its reader."""
 
     shape: tuple[int, ...]
     load: Callable[[], NDArray[Any]]
@@ -123,11 +120,11 @@ class Stored(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Arrays of one file, by name; each is read when it is first asked for.
+    """Arrays of one file, by name; each is read on first use.
 
     Attributes:
         path: the file.
-        stored: those of one or two dimensions that hold numbers.
+        stored: arrays of numbers with one or two dimensions.
     """
 
     path: Path
@@ -136,18 +133,18 @@ class ArrayFile:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of its arrays."""
+        """Names of the arrays."""
         return tuple(self.stored)
 
     @classmethod
     def read(cls, path: Path) -> ArrayFile:
-        """Look into a file; its suffix says what it is.
+        """List the arrays of a file; its suffix determines the format.
 
         Raises:
-            SourceError: it cannot be read, or holds no array of numbers.
+            SourceError: it cannot be read, or has no array of numbers.
         """
         with _readable(path):
-            open_file(path).close()  # no pipe, which would be waited for
+            open_file(path).close()  # raises for a pipe, which would block
             found = READERS[path.suffix.lower()](path)
         usable = {
             name: array
@@ -155,16 +152,16 @@ class ArrayFile:
             if len(array.shape) in (1, 2) and math.prod(array.shape) > 0
         }
         if not usable:
-            raise SourceError(path, "holds no array of numbers with one or two dimensions")
+            raise SourceError(path, "has no array of numbers with one or two dimensions")
         return cls(path, usable)
 
     def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
-        """Columns side by side, shape (m, columns).
+        """Return columns side by side, shape (m, columns).
 
         Args:
             columns: names of arrays; or of the named `array`, indices of its columns.
             field: of the map, for errors.
-            array: the matrix that indices count in.
+            array: the matrix of the indices.
 
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
@@ -178,7 +175,7 @@ class ArrayFile:
         return np.column_stack(found)
 
     def matrix(self, name: str | None, field: str) -> Array:
-        """An array of two dimensions as stored; without a name the only one there is.
+        """Return an array of two dimensions; without a name the only one there is.
 
         Raises:
             SourceError: no such array.
@@ -187,7 +184,7 @@ class ArrayFile:
         return array[:, None] if array.ndim == 1 else array
 
     def column(self, column: Column, field: str, array: str | None = None) -> NDArray[Any]:
-        """One column (m,), in its own type.
+        """Return one column (m,), in its own type.
 
         Raises:
             SourceError: no such array or column.
@@ -208,12 +205,12 @@ class ArrayFile:
         return np.asarray(whole[:, column])
 
     def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
-        """Times as whole nanoseconds; dates as they are.
+        """Return times as whole nanoseconds; dates in numpy's types have no `decimals`.
 
         Args:
             column: name or index; an index without `array` is of the only array there is.
             decimals: decimal places between the unit and the second.
-            array: the matrix that an index counts in.
+            array: the matrix of the index.
 
         Raises:
             SourceError: no such array or column, or a time that is not finite.
@@ -233,7 +230,7 @@ class ArrayFile:
             sample = int(np.argmin(np.isfinite(values)))
             problem = f"is {values[sample]} in sample {sample}"
             raise SourceError(self.path, problem, field="time")
-        # Apart, since an epoch in nanoseconds has more digits than a float.
+        # Separately, since an epoch in nanoseconds has more digits than a float.
         whole = np.floor(values)
         part = np.rint((values - whole) * float(factor))
         return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
@@ -259,9 +256,9 @@ class ArrayFile:
         return self._loaded[name]
 
     def _absent(self, name: str | None, field: str) -> SourceError:
-        """That an array is not there, with those that could have been meant."""
+        """Return the error of a missing array, with those that may be meant."""
         if name is None:
-            problem, near = "which of its arrays is not said", [*self.stored]
+            problem, near = "the name of the array is missing", [*self.stored]
         else:
             problem = f"there is no array {name!r}"
             heads = (f"{name}.", f"{name}(", f"{name.rpartition('.')[0]}.")
@@ -275,7 +272,7 @@ class ArrayFile:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file makes numpy, scipy or zlib raise into one sentence."""
+    """Convert any exception of numpy, scipy or zlib on a damaged file to `SourceError`."""
     try:
         yield
     except SourceError:
@@ -313,7 +310,7 @@ def _npy(path: Path) -> dict[str, Stored]:
 
 
 def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
-    """Shape and type of the numbers in a .npy stream; None for a version that is not known."""
+    """Return shape and type of the numbers in a .npy stream; None for an unknown version."""
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     reader = readers.get(npy.read_magic(stream))
     if reader is None:
@@ -323,20 +320,20 @@ def _head(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]] | None:
 
 
 def _mat(path: Path) -> dict[str, Stored]:
-    entries = [one for one in _elsewhere(_variables, str(path)) if not one[0].startswith("__")]
+    entries = [one for one in _in_child(_variables, str(path)) if not one[0].startswith("__")]
     nested = [name for name, _, kind in entries if kind in _MATLAB_NESTED]
     return {
         name: Stored(shape, partial(_matlab_variable, path, name))
         for name, shape, kind in entries
         if kind in _MATLAB_NUMBERS
-    } | _in_memory(_elsewhere(_struct_fields, str(path), nested) if nested else {})
+    } | _in_memory(_in_child(_struct_fields, str(path), nested) if nested else {})
 
 
 def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
-    """Name, shape and class of the variables, without those that only MATLAB can read.
+    """Return name, shape and class of the variables.
 
-    Of these (tables, strings, time series) a file says no shape, and scipy lists none of its
-    variables.
+    Tables, strings and time series of MATLAB have no shape; scipy then lists none of the variables,
+    and each is read by itself.
     """
     try:
         return list(whosmat(path))
@@ -350,7 +347,7 @@ def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
 
 
 def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Every array of numbers within structs, by its path as MATLAB writes it: ``log.joint(2).q``.
+    """Return every array of numbers within structs, by its MATLAB path: ``log.joint(2).q``.
 
     Elements of cell arrays have round brackets as well: braces are for the joint's number.
     """
@@ -381,24 +378,24 @@ def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
 
 
 def _matlab_variable(path: Path, name: str) -> NDArray[Any]:
-    return np.asarray(_elsewhere(loadmat, str(path), variable_names=[name])[name])
+    return np.asarray(_in_child(loadmat, str(path), variable_names=[name])[name])
 
 
-def _elsewhere(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call scipy's reader in a process of its own: a damaged file can kill it."""
+def _in_child(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call scipy's reader in a child process: a damaged file can crash it."""
     with _lock:
         if not _readers:
-            _readers.append(WorkerProcess(timeout=_PATIENCE))
+            _readers.append(WorkerProcess(timeout=_TIMEOUT))
         try:
             return _readers[0].call(_within_memory, partial(function, *args, **kwargs))
         except PlannerCrashed as error:
             raise ValueError("it is damaged") from error
         except PlanningTimedOut as error:
-            raise ValueError(f"that takes longer than {_PATIENCE:g} s") from error
+            raise ValueError(f"reading takes longer than {_TIMEOUT:g} s") from error
 
 
 def _within_memory(read: Callable[[], T]) -> T:
-    """Read where it cannot take all there is: sizes in a file are not to be trusted."""
+    """Read with limited memory: sizes in a file are not trusted."""
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY, _MEMORY))
     return read()
 
@@ -442,4 +439,4 @@ READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
     ".m": _matlab_text,
     ".mcap": _mcap,
 }
-"""By suffix, what looks into a file of arrays; every other file is text in columns."""
+"""Readers of files of arrays by suffix; every other file is text in columns."""

@@ -1,4 +1,4 @@
-"""Robots of which only the Denavit-Hartenberg parameters are known: a URDF of geometry alone."""
+"""URDF without masses from a table of Denavit-Hartenberg parameters."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _OTHER: Final = {
     "alpha": ("alpha_deg", math.pi / 180.0),
     "theta_offset": ("theta_offset_deg", math.pi / 180.0),
 }
-"""What a column in another unit is called, and that unit in m or rad."""
+"""Names of columns in another unit, and that unit in m or rad."""
 _TYPES: Final = {"revolute": "continuous", "prismatic": "prismatic"}
 _LARGEST: Final = {"a": 20.0, "d": 20.0, "alpha": 2.0 * math.pi, "theta_offset": 2.0 * math.pi}
-"""m and rad; what is larger is in mm or degrees."""
+"""m and rad; larger numbers are in mm or degrees."""
 
 
 class _Row(NamedTuple):
@@ -41,33 +41,29 @@ class _Row(NamedTuple):
 
 
 def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
-    r"""The URDF of a table of Denavit-Hartenberg parameters: geometry, no masses, no limits.
+    r"""Return the URDF of a table of Denavit-Hartenberg parameters, without masses and limits.
 
     The table is text with commas or semicolons, a header and a row per joint, base to flange:
     ``joint,type,a,alpha,d,theta_offset``. `type` is revolute or prismatic. Lengths are in m,
-    angles in rad; columns called ``a_mm``, ``d_mm``, ``alpha_deg``, ``theta_offset_deg`` are in mm
-    and degrees. With the angle :math:`\theta = q + \theta_0` of a revolute joint (the length
+    angles in rad; columns ``a_mm``, ``d_mm``, ``alpha_deg``, ``theta_offset_deg`` are in mm and
+    degrees. With the angle :math:`\theta = q + \theta_0` of a revolute joint (the length
     :math:`d + q` of a prismatic one) a row is the transform
 
-    - standard: :math:`R_z(\theta)\, T_z(d)\, T_x(a)\, R_x(\alpha)`, joint k turns about the z axis
+    - standard: :math:`R_z(\theta)\, T_z(d)\, T_x(a)\, R_x(\alpha)`, joint k moves about the z axis
       of frame k-1;
-    - modified (Craig): :math:`R_x(\alpha)\, T_x(a)\, R_z(\theta)\, T_z(d)`, joint k turns about the
+    - modified (Craig): :math:`R_x(\alpha)\, T_x(a)\, R_z(\theta)\, T_z(d)`, joint k moves about the
       z axis of frame k.
 
     Link k is called ``link_k``, the base ``base_link``, the last frame ``flange``.
 
-    Args:
-        path: of the table.
-        convention: of its rows.
-
     Raises:
-        InputError: it cannot be read, or a row says what no joint can be; names the line.
+        InputError: the table cannot be read, or a line of it is invalid.
     """
     path = Path(path)
     rows = _rows(path)
     parts = [f"<robot name={quoteattr(path.stem or 'robot')}>", _link("base_link")]
     parent = "base_link"
-    # Between two joints: what stands behind one joint (standard) or before the next (modified).
+    # The fixed transform follows a joint (standard) or precedes the next one (modified).
     for number, row in enumerate(rows, 1):
         if convention == "modified":
             before = f"before_{number}"
@@ -86,7 +82,7 @@ def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
 
 
 def convention_of(text: str | None) -> Convention:
-    """A convention by its name, which has to be given: the figures of a table do not show it.
+    """Return the convention of a name, which is required: a table does not show it.
 
     Raises:
         InputError: there is no such convention.
@@ -98,8 +94,8 @@ def convention_of(text: str | None) -> Convention:
         None,
         "is not given" if text is None else f"{text!r} is unknown",
         field="--convention",
-        remedy="--dh needs standard (the frame of a row is at the far end of its link) or "
-        "modified (Craig: at the near end)",
+        remedy="--dh needs standard (the frame of a row is at the distal end of its link) or "
+        "modified (Craig: at the proximal end)",
     )
 
 
@@ -110,7 +106,7 @@ def _link(name: str) -> str:
 def _fixed(
     parent: str, child: str, place: tuple[float, float, float], roll: float
 ) -> tuple[str, str]:
-    """A link that is fixed to another one, moved and then turned about x."""
+    """Return a link fixed to another one, translated and then rotated about x."""
     xyz = " ".join(map(repr, place))
     joint = (
         f'<joint name="fixed_{child}" type="fixed"><parent link="{parent}"/>'
@@ -120,7 +116,7 @@ def _fixed(
 
 
 def _moving(row: _Row, parent: str, child: str, lift: float) -> tuple[str, str]:
-    """A link that turns about, or slides along, the z axis of another one."""
+    """Return a link that rotates about, or slides along, the z axis of another one."""
     limit = (
         "" if row.type == "continuous" else '<limit lower="0" upper="0" effort="0" velocity="0"/>'
     )
@@ -156,7 +152,7 @@ def _rows(path: Path) -> list[_Row]:
 
 
 def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
-    """Place and unit of each quantity."""
+    """Return column and unit of each quantity."""
     columns = {}
     for name in _NAMES:
         other, unit = _OTHER.get(name, (name, 1.0))

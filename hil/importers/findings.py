@@ -1,7 +1,7 @@
-"""What a recording looks like, so that a slip in its units is seen before anything is fitted.
+"""Plausibility of an imported recording: units, signs and order of the joints.
 
-Where another order of the joints is possible, both are given with their errors: how far a velocity
-misses the slope of its position, and in how many rows a position is outside the limits of the URDF.
+Where another order of the joints fits better, both are given with their errors: the deviation of
+velocities from the slopes of the positions, and the share of rows outside the URDF's limits.
 """
 
 from __future__ import annotations
@@ -23,24 +23,22 @@ from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]
 
-SLOWEST: Final = 20.0  # Hz; nothing of a robot's dynamics is left below
+SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
 FASTEST: Final = 20_000.0  # Hz
-# Hz, below which no motion can be seen: 5 kHz in ms, read as s, are 5 Hz.
-_NO_MOTION: Final = 10.0
-_TOLERANCE: Final = 0.05  # rad or m that calibration and overshoot may take beyond a limit
-_HARDLY: Final = 0.1  # rad or m of travel, less than which excites nothing
-# Between the velocity and the slope of the position: filters take a few per cent.
-_ALIKE: Final = 0.1
-_FOLLOWS: Final = 0.7  # correlation
+_NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
+_TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
+_LEAST_TRAVEL: Final = 0.1  # rad or m
+_SCALE_TOLERANCE: Final = 0.1  # of velocity over slope of the position, for filters
+_CORRELATED: Final = 0.7
 _TOO_FAST: Final = 3.0  # times the URDF's limit, of speed and of torque
-_NO_LIMIT: Final = 1e4  # what some URDFs write for "none"
+_NO_LIMIT: Final = 1e4  # some URDFs have larger figures for "none"
 
 
 def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
     """Check that stamps (m,) [ns] of a file can be those of a motion.
 
     Raises:
-        SourceError: they run backwards, are all the same, or come too seldom.
+        SourceError: they run backwards, are all the same, or are too far apart.
     """
     steps = np.diff(stamp)
     backward = np.flatnonzero(steps < 0)
@@ -55,16 +53,16 @@ def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
         )
     if steps.size and not steps.any():
         problem = f"all {len(stamp)} samples have the same time"
-        remedy = "name the column of the time, or give sample_rate in its place"
+        remedy = "name the column of the time, or give sample_rate instead"
         raise SourceError(path, problem, field="time", remedy=remedy)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _NO_MOTION:
         raise SourceError(
             path,
-            f"there would be {rate:.2g} samples a second, in which no motion can be seen",
+            f"has {rate:.2g} samples per second, too few for a motion",
             field="time",
             remedy="check its unit ([time] unit, or sample_rate in Hz): milliseconds read as "
-            f"seconds would make it {1e3 * rate:.4g} samples a second; at least {SLOWEST:g} are "
+            f"seconds would give {1e3 * rate:.4g} samples per second; at least {SLOWEST:g} are "
             "needed",
         )
 
@@ -76,13 +74,13 @@ def examine(
     *,
     locked: Mapping[str, float] | None = None,
 ) -> Findings:
-    """Look at samples on the joint side, in SI units, columns in the order of the names.
+    """Return the findings on samples of the joint side, in SI units.
 
     Args:
         samples: of the recording.
-        joint_names: the joints.
-        urdf: their description.
-        locked: positions [rad or m] of joints that are none of the model, by name.
+        joint_names: in the order of the columns.
+        urdf: robot description.
+        locked: positions [rad or m] of joints that are not in the model, by name.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), samples.position
     limits = limits_of(urdf, joint_names)
@@ -97,7 +95,7 @@ def examine(
     lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings = []
     if not SLOWEST <= base.rate <= FASTEST:
-        text = f"{base.rate:.3g} samples a second is unusual: is the unit of the time right?"
+        text = f"{base.rate:.3g} samples per second are unusual: check the unit of the time"
         warnings.append(text)
     warnings += _positions(time, position, joint_names, limits, turning)
     if samples.velocity is not None:
@@ -107,7 +105,7 @@ def examine(
 
 
 def limits_of(urdf: str, names: Sequence[str]) -> UrdfLimits:
-    """Limits of joints; infinite as well where a range is empty, or a figure stands for none."""
+    """Return limits of joints; infinite where the range is empty or a figure means no limit."""
     lower, upper, velocity, effort = urdf_limits(urdf, names)
     bounded = lower < upper
     return UrdfLimits(
@@ -128,13 +126,13 @@ def _range(name: str, position: Array, turns: bool, lower: float, upper: float) 
 
 
 def _outside(position: Array, limits: UrdfLimits) -> str:
-    """Share of the rows (m, n) in which a joint is outside its limits [%]."""
+    """Return the share of the rows (m, n) in which a joint is outside its limits [%]."""
     outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
     return f"{100.0 * float(np.mean(outside.any(axis=1))):.3g} %"
 
 
 def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
-    """Whether each column of the positions lies in the limits of each joint (joints, columns)."""
+    """Return whether each column of positions fits the limits of each joint (joints, columns)."""
     above = limits.lower[:, None] - _TOLERANCE <= position.min(axis=0)
     return np.asarray(above & (position.max(axis=0) <= limits.upper[:, None] + _TOLERANCE))
 
@@ -146,7 +144,7 @@ def _positions(
     limits: UrdfLimits,
     turning: NDArray[np.bool_],
 ) -> Iterator[str]:
-    """Whether a robot could be there, and move so."""
+    """Yield warnings where positions or speeds are outside the limits of the URDF."""
     fits, joints = _fits(position, limits), range(len(names))
     beyond = [joint for joint in joints if not fits[joint, joint]]
     low, high = position.min(axis=0), position.max(axis=0)
@@ -166,18 +164,18 @@ def _positions(
         elif fits[joints, columns].all():
             order = ", ".join(names[int(j)] for j in np.argsort(columns))
             yield (
-                f"{text}; with the columns those of {order}, none would: is that the order of the "
-                f"joints? Otherwise {check}"
+                f"{text}; with the columns those of {order}, none would: check the order of the "
+                f"joints, or {check}"
             )
         else:
             yield f"{text}: {check}"
     travel = float((high - low).max())
-    if travel < _HARDLY:
+    if travel < _LEAST_TRAVEL:
         yield (
-            f"no joint moves further than {travel:.2g} rad or m, {math.degrees(travel):.2g} were "
-            "they degrees: is the unit of the positions right?"
+            f"no joint moves further than {travel:.2g} rad or m ({math.degrees(travel):.2g} if "
+            "these were degrees): check the unit of the positions"
         )
-    stride = max(1, len(time) // 2000)  # noise does not matter over longer steps
+    stride = max(1, len(time) // 2000)  # longer steps, in which noise is negligible
     steps = np.diff(time[::stride])[:, None]
     moved = np.abs(np.diff(position[::stride], axis=0))[steps[:, 0] > 0.0]
     if not len(moved):
@@ -187,39 +185,39 @@ def _positions(
         if speed > _TOO_FAST * limit:
             yield (
                 f"{name} would move at {speed:.3g} rad/s (or m/s), its limit in the URDF is "
-                f"{limit:.3g}: are degrees read as radians, or seconds as milliseconds?"
+                f"{limit:.3g}: check the units of position (degrees?) and time (milliseconds?)"
             )
 
 
 def _velocities(
     time: Array, position: Array, velocity: Array, names: Sequence[str]
 ) -> Iterator[str]:
-    """Whether the velocities are the slopes of the positions: in this order, in these units."""
-    moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _HARDLY]
+    """Yield warnings where velocities are not the slopes of the positions."""
+    moving = [joint for joint in range(len(names)) if np.ptp(position[:, joint]) >= _LEAST_TRAVEL]
     if not moving:
         return
     factor, correlation = _against_position(time, position[:, moving], velocity[:, moving])
     itself = np.diag(correlation)
     columns = linear_sum_assignment(-correlation)[1]
     best = correlation[np.arange(len(moving)), columns]
-    if itself.min() < _FOLLOWS <= best.min():
-        theirs = list(names)
+    if itself.min() < _CORRELATED <= best.min():
+        order = list(names)
         for joint, column in zip(moving, columns, strict=True):
-            theirs[moving[column]] = names[joint]
+            order[moving[column]] = names[joint]
         yield (
-            "the velocities are in another order than the positions: as mapped they miss their "
-            f"slopes by {_missed(itself):.0f} %, as those of {', '.join(theirs)} by "
+            "the velocities are in another order than the positions: as mapped they deviate from "
+            f"the slopes by {_missed(itself):.0f} %, as those of {', '.join(order)} by "
             f"{_missed(best):.0f} %: name the columns of both in the same order"
         )
         return
     off = []
     for k, joint in enumerate(moving):
-        if itself[k] < _FOLLOWS:
+        if itself[k] < _CORRELATED:
             yield (
                 f"the velocity of {names[joint]} does not follow its position (correlation "
-                f"{itself[k]:.2f}): are the joints in the same order?"
+                f"{itself[k]:.2f}): check the order of the joints"
             )
-        elif abs(factor[k] - 1.0) > _ALIKE:
+        elif abs(factor[k] - 1.0) > _SCALE_TOLERANCE:
             off.append(f"{factor[k]:.4g} for {names[joint]}")
     if off:
         yield (
@@ -229,18 +227,17 @@ def _velocities(
 
 
 def _missed(correlation: Array) -> float:
-    """How far velocities miss slopes with which they have these correlations, at best scale [%]."""
+    """Return the deviation of velocities from slopes for these correlations, at best scale [%]."""
     return 100.0 * float(np.sqrt(np.mean(1.0 - np.minimum(correlation, 1.0) ** 2)))
 
 
 def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Array, Array]:
-    """How many times too large each velocity is (n,), and the correlations without sign (n, n).
+    """Return scales of the velocities (n,), and absolute correlations with positions (n, n).
 
-    Rows are positions, columns velocities. The integral is compared, not the slope: noise matters
-    less.
+    Rows are positions, columns velocities. Integrals are compared instead of slopes: less noise.
     """
     steps = np.diff(time)[:, None]
-    known = steps <= 5.0 * np.median(steps)  # over a gap nothing is known of the velocity
+    known = steps <= 5.0 * np.median(steps)  # the velocity in a gap is unknown
     moved = np.where(known, 0.5 * (velocity[1:] + velocity[:-1]) * steps, 0.0).cumsum(axis=0)
     gone = np.where(known, np.diff(position, axis=0), 0.0).cumsum(axis=0)
     moved, gone = moved - moved.mean(axis=0), gone - gone.mean(axis=0)
@@ -256,10 +253,7 @@ def _against_position(time: Array, position: Array, velocity: Array) -> tuple[Ar
 
 def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[str]:
     if samples.torque is None and samples.motor_current is None:
-        yield (
-            "there is neither torque nor motor current in the log: it can be looked at, not "
-            "identified from"
-        )
+        yield ("the log has neither torque nor motor current: nothing can be identified from it")
     if samples.torque is None:
         return
     for name, largest, limit in zip(names, np.abs(samples.torque).max(axis=0), limits, strict=True):
@@ -268,5 +262,5 @@ def _torques(samples: Samples, names: Sequence[str], limits: Array) -> Iterator[
         elif largest > _TOO_FAST * limit:
             yield (
                 f"the torque of {name} reaches {largest:.3g}, its limit in the URDF is "
-                f"{limit:.3g} N·m (or N): is its unit right, and its side (motor or joint)?"
+                f"{limit:.3g} N·m (or N): check its unit and side (motor or joint)"
             )

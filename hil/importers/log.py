@@ -1,4 +1,4 @@
-"""Imports logs of numbers: text in columns, text matrices, files of arrays."""
+"""Import of logs of numbers: text in columns, text matrices, files of arrays."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from hil.importers.table import Table
 
 Array = NDArray[np.float64]
 
-_MORE: Final = 64  # columns or files beyond the joints that are looked for
-_LATEST = 2**31 * 10**9  # ns, what a stamp of an archive can hold
+_MORE: Final = 64  # columns or files beyond the joints that are tried
+_LATEST = 2**31 * 10**9  # ns, largest stamp of an archive
 
 
 def import_log(
@@ -36,30 +36,29 @@ def import_log(
     use: Use = "excitation",
     coupled: bool = True,
 ) -> Path:
-    """Turn a log into an archive of kind ``imported``.
+    """Convert a log to an archive of kind ``imported``.
 
     Args:
-        source: the log; with quantities in several files, the one the others lie beside, or the
-            folder they lie in. Files that end in .npz, .npy, .mat or .m hold arrays, all others
-            text.
+        source: the log; with quantities in several files, one of them or their folder. Files that
+            end in .npz, .npy, .mat or .m hold arrays, all others text.
         output: the archive to write.
-        robot: whose joints these are. Where the map couples joints, its model gets the inertias
-            and the friction of the coupled motors, unless its cell says otherwise.
-        columns: which columns or arrays hold what.
-        held_joints: joints known to have been held still.
-        use: what it is to be used for.
-        coupled: whether the model gets these; angles and torques are those of the map in any case.
+        robot: the robot. Where the map couples joints, its model gets the inertias and the friction
+            of the coupled motors, unless its cell states otherwise or `coupled` is false.
+        columns: which columns or arrays hold which quantity.
+        held_joints: joints that were held still.
+        use: what identification uses it for.
+        coupled: whether the model gets the coupling of the map; angles and torques always do.
 
     Returns:
         The archive's path.
 
     Raises:
-        SourceError: a file cannot be read, a column is missing, a cell is no number, or the map
+        SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
             does not fit the robot.
         ArchiveWriteError: the archive cannot be written.
     """
     log = _Log(Path(source), columns, robot)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is no number is refused by its place
+    with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
     stamp, origin = log.stamps(len(values["position"]))
     log.check_alike({**values, "time": stamp}, "quantities")
@@ -91,7 +90,7 @@ def import_log(
 
 
 class _Log:
-    """The files of a log, and the map that says where things stand in them.
+    """The files of a log with their map.
 
     Attributes:
         path: the log itself.
@@ -111,11 +110,11 @@ class _Log:
 
     @property
     def files(self) -> list[Path]:
-        """The files read, the log itself first."""
+        """The files read, the log first."""
         return list(self._files)
 
     def read(self, name: str) -> Array:
-        """A quantity in SI units, (m, k), columns as in the log's joint order."""
+        """Return a quantity in SI units, (m, k), columns in the log's joint order."""
         quantity = self._map.quantities()[name]
         values = self._numbers(name, quantity)
         factor = UNITS[name][quantity.unit] if quantity.unit else 1.0
@@ -126,7 +125,7 @@ class _Log:
         return np.asarray((values + offset) * (factor * scale))
 
     def stamps(self, count: int) -> tuple[NDArray[np.int64], int]:
-        """The samples' stamps [ns], and what was subtracted to make them storable."""
+        """Return the samples' stamps [ns], and the origin that was subtracted to store them."""
         if self._map.sample_rate is not None:
             return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
         time, (first, *others) = self._map.time, self._clocks()
@@ -135,7 +134,7 @@ class _Log:
         for other in others:
             if other.times(time.column, TIMES[time.unit], time.array) != times:
                 problem = f"has other times than {first.path.name}"
-                remedy = "name the file of the times that hold for all joints: [time] file"
+                remedy = "name one file of times for all joints: [time] file"
                 raise SourceError(other.path, problem, field="time", remedy=remedy)
         origin = 0 if min(times) >= 0 and max(times) < _LATEST else min(times)
         if max(times) - origin >= _LATEST:
@@ -146,11 +145,11 @@ class _Log:
 
     @property
     def clock(self) -> Path:
-        """The file that the times come from, or else the log."""
+        """The file of the times, or else the log."""
         return self.path if self._map.time is None else self._clocks()[0].path
 
     def _clocks(self) -> list[Table | ArrayFile]:
-        """The files with times."""
+        """Return the files with times."""
         time, position = self._map.time, self._map.position
         assert time is not None
         if time.file is None and position.files is not None:
@@ -158,7 +157,7 @@ class _Log:
         return [self._file(time.file or position.file, "time.file")]
 
     def _numbers(self, name: str, quantity: Quantity) -> Array:
-        """The numbers of a quantity as in the file, (m, k)."""
+        """Return the numbers of a quantity as in the file, (m, k)."""
         field, columns, array = f"{name}.columns", quantity.columns, quantity.array
         if quantity.files is not None:
             return self._joint_by_joint(name, quantity, quantity.files)
@@ -168,8 +167,8 @@ class _Log:
         if columns is None or (isinstance(columns, str) and isinstance(file, ArrayFile)):
             return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
         if isinstance(columns, str):
-            problem = f"the pattern {columns!r} has no place for the joint's number"
-            remedy = 'write {} there, as in "q{}"'
+            problem = f"the pattern {columns!r} has no {{}} for the joint's number"
+            remedy = 'write it there, as in "q{}"'
             raise SourceError(file.path, problem, field=field, remedy=remedy)
         self._check_length(columns, field)
         if quantity.joints_along != "rows" or isinstance(file, Table):
@@ -178,12 +177,12 @@ class _Log:
         chosen = [row for row in columns if isinstance(row, int) and row < len(rows)]
         if len(chosen) < len(columns):
             remedy = f"it has {len(rows)}, counted from 0"
-            problem = f"the matrix has not all of the rows {', '.join(map(str, columns))}"
+            problem = f"the matrix does not have all of the rows {', '.join(map(str, columns))}"
             raise SourceError(file.path, problem, field=field, remedy=remedy)
         return np.asarray(rows[chosen].T)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
-        """The numbers of a quantity that has a file per joint, (m, k)."""
+        """Return the numbers of a quantity that has a file per joint, (m, k)."""
         files, columns = self._file_per_joint(names, f"{name}.files"), quantity.columns
         field, found = f"{name}.columns", []
         if isinstance(columns, str):
@@ -198,8 +197,8 @@ class _Log:
             else:
                 values = file.matrix(quantity.array, field)
             if 1 not in values.shape:
-                problem = f"has the shape {values.shape}, where one column is wanted"
-                remedy = "say which one of each file, by name or by index from 0: columns = [1]"
+                problem = f"has the shape {values.shape}, expected one column"
+                remedy = "name one of each file, by name or by index from 0: columns = [1]"
                 raise SourceError(file.path, problem, field=field, remedy=remedy)
             found.append(values.ravel())
         places = [os.path.relpath(file.path, self._folder) for file in files]
@@ -218,10 +217,10 @@ class _Log:
     def _numbered(
         self, pattern: str, known: Collection[str], what: Literal["columns", "files"], field: str
     ) -> list[str]:
-        """Names of columns or files from a pattern, counted from 1, or from 0 where those are.
+        """Return names of columns or files from a pattern, counted from 1, or from 0 if so named.
 
         Raises:
-            SourceError: a joint has none, the joint is named; or there are more than joints.
+            SourceError: a joint has none, or there are more names than joints.
         """
         count = len(self.joints)
         names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
@@ -246,18 +245,18 @@ class _Log:
                 f"{len(present)} {what} are called {pattern!r} ({present[0]} to {present[-1]}), "
                 f"and there are {count} joints: {', '.join(self.joints)}",
                 field=field,
-                remedy=f"say which: the URDF's joint of each in joints (a joint that the URDF does "
+                remedy=f"select: the URDF's joint of each in joints (a joint that the URDF does "
                 f"not have is left out), or a list of {count} {what}",
             )
         return found
 
     def _upright(self, matrix: Array, quantity: Quantity, path: Path, name: str) -> Array:
-        """A whole matrix with time along its rows."""
+        """Return a whole matrix with time along its rows."""
         count, along = len(self.joints), quantity.joints_along
         if along is None:
             if matrix.shape == (count, count):
                 problem = f"{name} is a square matrix"
-                remedy = 'say whether joints lie along "columns" or "rows"'
+                remedy = 'state whether joints are along "columns" or "rows"'
                 raise SourceError(path, problem, field=f"{name}.joints_along", remedy=remedy)
             along = "rows" if matrix.shape[0] < matrix.shape[1] else "columns"
         upright = matrix.T if along == "rows" else matrix
@@ -286,7 +285,7 @@ class _Log:
         return self._files[path]
 
     def _joint_order(self, robot: Robot) -> list[int]:
-        """Which column of the log each joint of the robot has."""
+        """Return the column of the log of each joint of the robot."""
         missing = [name for name in robot.joint_names if name not in self.joints]
         if missing or len(set(self.joints)) < len(self.joints):
             raise SourceError(
@@ -299,7 +298,7 @@ class _Log:
         return [self.joints.index(name) for name in robot.joint_names]
 
     def _motor_from_joint(self) -> Array:
-        """Motor angles per joint angle (k, k), in the log's order."""
+        """Return motor angles per joint angle (k, k), in the log's order."""
         drive, n = self._map.drive, len(self.joints)
         for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
             values = getattr(drive, name)
@@ -319,7 +318,7 @@ class _Log:
             matrix[motor - 1, joint - 1] = ratio
         if np.linalg.matrix_rank(matrix) < n:
             raise SourceError(
-                self.path, "a joint would not be moved by any motor", field="drive.gear_ratio"
+                self.path, "no motor would move one of the joints", field="drive.gear_ratio"
             )
         return matrix
 
@@ -344,7 +343,7 @@ class _Log:
 
 
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:
-    """Bring the quantities to the joint side and into the robot's order; power stays the same.
+    """Convert the quantities to the joint side and the robot's order, conserving power.
 
     With motor angles M q, joint torques are M^T times the motors'.
     """

@@ -1,4 +1,4 @@
-"""Messages of other people's MCAP files, whoever wrote them and with whatever chunks."""
+"""Messages of any MCAP file, of any program and chunk size."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from hil.errors import SourceError
 from hil.reading import open_file
 
 LARGEST_CHUNK: Final = 1 << 28
-"""Bytes of records in one chunk; usual are one to sixteen million."""
+"""Bytes of records in one chunk; usually one to sixteen million."""
 MOST_BYTES: Final = 4 << 30
-"""Of messages that are read, all topics together."""
+"""Bytes of messages that are read, all topics together."""
 _HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _READ: Final = (container.SCHEMA, container.CHANNEL, container.MESSAGE, container.CHUNK)
 
 JOINT_STATES = frozenset({"sensor_msgs/msg/JointState", "sensor_msgs/JointState"})
-"""Names of the type that ROS 2 has for joint states."""
+"""Names of the ROS 2 type of joint states."""
 
 
 @dataclass(frozen=True)
 class Topic:
-    """What a file says of a topic.
+    """Type and encoding of the messages of a topic.
 
     Attributes:
-        kind: type of its messages, such as ``sensor_msgs/msg/JointState``.
+        kind: type, such as ``sensor_msgs/msg/JointState``.
         encoding: of the messages, such as ``cdr``, ``json`` or ``protobuf``.
         schema_encoding: of the definition, such as ``ros2msg``.
         definition: of the type.
@@ -57,18 +57,18 @@ class Topic:
 def read(
     path: Path, wanted: Callable[[str, Topic], bool]
 ) -> tuple[dict[str, Topic], list[tuple[str, int, bytes]]]:
-    """The topics of a file by name, and the messages of those that are wanted, by their time.
+    """Return the topics of a file by name, and the wanted messages in the order of time.
 
     Args:
         path: the file.
-        wanted: given name and topic.
+        wanted: predicate on name and topic.
 
     Returns:
-        Topics; name of the topic, log time [ns] and data of each message.
+        Topics; topic name, log time [ns] and data of each message.
 
     Raises:
-        SourceError: it cannot be read, is no MCAP file or is cut off, or has too many bytes of
-            these messages.
+        SourceError: it cannot be read, is not an MCAP file or is truncated, or the messages are too
+            many.
     """
     schemas: dict[int, Schema] = {}
     topics: dict[str, Topic] = {}
@@ -95,17 +95,17 @@ def read(
             if size > MOST_BYTES:
                 raise SourceError(
                     path,
-                    f"holds more than {MOST_BYTES} bytes of numbers: too large to be read at once",
+                    f"has more than {MOST_BYTES} bytes of numbers: too large to be read at once",
                     remedy="cut it, or leave out topics (`mcap filter`)",
                 )
     return topics, sorted(found, key=lambda message: message[1])
 
 
 def _records(stream: BinaryIO) -> Iterator[Record]:
-    """Schemas, channels and messages in the order of the file, those in chunks as well.
+    """Yield schemas, channels and messages in the order of the file, also those in chunks.
 
     Raises:
-        Damage: it is cut off, or a chunk is not what it claims to be, or too large.
+        Damage: it is truncated, or a chunk is invalid or too large.
     """
     size = os.fstat(stream.fileno()).st_size
     for record in container.records(stream, size, only=_READ):
@@ -121,7 +121,7 @@ def _records(stream: BinaryIO) -> Iterator[Record]:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
-    """The file; whatever reading it says becomes our error."""
+    """Open the file; convert all errors of reading to `SourceError`."""
     try:
         with open_file(path) as stream:
             yield stream
@@ -131,7 +131,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         place = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
         raise SourceError(
             path,
-            f"is no MCAP file, or cut off ({place}{type(error).__name__}: {error})",
+            f"is not an MCAP file, or truncated ({place}{type(error).__name__}: {error})",
             remedy="recover it first (`hil archive repair` for archives of hil, `mcap recover` "
             "for others)",
         ) from error

@@ -1,6 +1,6 @@
-"""Whose recording it is, and the last step of every importer.
+"""The robot of an imported recording, and the last step of every importer.
 
-The URDF and the settings of the model travel in the archive; samples are checked before.
+The archive contains URDF and settings of the model; samples are checked before.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ from planner.toml_text import toml_value
 Use = Literal["excitation", "validation", "standstill"]
 
 _MOST: Final = 1e12
-"""Of any quantity: no arm has more, in whatever unit, and sums of squares of it do not overflow."""
+"""Largest value of any quantity, in any unit; sums of its squares do not overflow."""
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 IMPORTED_LAW: Final = FrictionLaw(third=None, offset=True)
-"""Friction of a robot that is imported without a law of its own. A term in v² or v³ that the motion
-does not need makes the prediction of a faster one worse."""
+"""Default friction law of an imported robot. A term in v² or v³ that the motion does not need makes
+the prediction of a faster one worse."""
 NOT_RECORDED: Final = "lock joints that were not recorded (--locked NAME, or all: --lock-others)"
-"""What the commands advise where the robot has more joints than the recording."""
+"""Remedy where the robot has more joints than the recording."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """The robot of a recording, as two texts that an archive carries.
+    """The robot of a recording.
 
     Attributes:
-        cell: text of a cell file; the robot's table is all that identification needs of it.
+        cell: text of a cell file, of which identification needs the robot's table only.
         urdf: text of the robot description.
         joint_names: its joints that move and are not locked, in the order of the model.
-        locked: position [rad or m] of those that are, by name.
+        locked: position [rad or m] of locked joints, by name.
     """
 
     cell: str
@@ -68,29 +68,27 @@ class Robot:
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
     ) -> Robot:
-        """Describe a robot by its URDF and the settings of its model.
+        """Return a robot by its URDF and the settings of its model.
 
         Args:
             path: the URDF file, or a table of Denavit-Hartenberg parameters, which has no masses.
-            convention: of the rows of such a table, see :func:`hil.importers.dh.urdf_of_dh`; None
-                for a URDF.
+            convention: of such a table, see :func:`hil.importers.dh.urdf_of_dh`; None for a URDF.
             friction: friction law of every joint, None for `IMPORTED_LAW`.
             gravity: in the base frame [m/s²].
-            rotor_inertia: give every joint a rotor inertia.
-            locked: position [rad or m] of joints that are none of the model, such as those of a
-                gripper that was not recorded.
-            recorded: the joints that were; all others are locked at zero, or at the middle of
-                their range where zero is outside. None: none but those in `locked`.
+            rotor_inertia: whether every joint has a rotor inertia.
+            locked: position [rad or m] of joints that are not in the model, such as a gripper's.
+            recorded: recorded joints; all others are locked at zero, or at the middle of their
+                range if that excludes zero. None: only those in `locked` are.
 
         Raises:
-            InputError: the file cannot be read, is no usable URDF, or has no such joint.
+            InputError: the file cannot be read, is not a valid URDF, or has no such joint.
         """
         path = Path(path)
         otherwise = "name a URDF file"
         urdf = read_input(path, otherwise) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
-        except ModelError as error:  # about this file, and not about a cell that nobody wrote
+        except ModelError as error:  # an error of this file, not of a cell file
             raise SourceError(path, str(error), remedy=otherwise) from error
         held = _held(urdf, locked or {}, recorded, path)
         law = friction or IMPORTED_LAW
@@ -106,16 +104,16 @@ class Robot:
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
     ) -> Robot:
-        """Describe a robot by a cell file; see `from_urdf` for `locked` and `recorded`.
+        """Return a robot by a cell file; see `from_urdf` for `locked` and `recorded`.
 
         Args:
             path: the cell file.
             gravity: in the base frame [m/s²]; None for that of the cell.
-            locked: besides those that the cell locks.
-            recorded: see there.
+            locked: in addition to those of the cell.
+            recorded: recorded joints.
 
         Raises:
-            InputError: the cell file or its URDF cannot be used, or has no such joint.
+            InputError: the cell file or its URDF is invalid, or has no such joint.
         """
         path = Path(path)
         cell = Cell.load(path)
@@ -128,13 +126,9 @@ class Robot:
         return cls._checked(text, cell.urdf, path)
 
     def with_coupling(self, motor_from_joint: NDArray[np.float64]) -> Robot:
-        """This robot with motors that turn with several joints, unless it says so itself.
+        """Return this robot with coupled motors, unless its cell states a coupling.
 
-        Args:
-            motor_from_joint: motor angles per joint angle (n, n), in the order of its joints.
-
-        Raises:
-            InputError: the matrix does not fit.
+        `motor_from_joint` are motor angles per joint angle (n, n), in the order of its joints.
         """
         path = Path("cell.toml")
         if Cell.from_texts(self.cell, self.urdf, path).file.robot.coupling is not None:
@@ -149,7 +143,7 @@ class Robot:
         return cls(text, urdf, cell.joint_names, cell.file.robot.locked)
 
     def attachments(self) -> dict[str, bytes]:
-        """The texts as files of an archive."""
+        """Return the texts as attachments of an archive."""
         return {"cell.toml": self.cell.encode(), "robot.urdf": self.urdf.encode()}
 
 
@@ -160,7 +154,7 @@ def _cell_text(
     rotor_inertia: bool,
     locked: Mapping[str, float],
 ) -> str:
-    """The smallest cell file: the robot alone, without limits, drive train or controller."""
+    """Return a minimal cell file: the robot, without limits, drive train or controller."""
     lines = [
         "[cell]",
         f"name = {toml_value(_writable(name)[:80] or 'robot')}",
@@ -180,7 +174,7 @@ def _cell_text(
 def _held(
     urdf: str, locked: Mapping[str, float], recorded: Collection[str] | None, path: Path
 ) -> dict[str, float]:
-    """Positions of joints that are none of the model: those given, and all that were not recorded.
+    """Return the positions of locked joints: those given, and all that were not recorded.
 
     Raises:
         SourceError: none of the robot's joints was recorded.
@@ -213,7 +207,7 @@ def _inline(table: Mapping[str, float]) -> str:
 
 
 def _writable(name: str) -> str:
-    """Return a name without what UTF-8 cannot hold, as names of files can."""
+    """Return a file name with characters that UTF-8 cannot hold replaced."""
     return name.encode("utf-8", "replace").decode("utf-8")
 
 
@@ -238,22 +232,21 @@ def write_imported(
 ) -> Path:
     """Write the samples of a recording, joints in the order of the robot's, as an archive.
 
-    What they look like (:mod:`hil.importers.findings`) goes into its metadata.
+    Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
 
     Args:
         output: the archive.
         samples: joint side, SI units.
         source: the files they come from.
-        robot: whose they are.
-        metadata: what else is to be stored of them.
-        held_joints: joints known to have been held still.
-        period: step [s] of a recording at a fixed rate.
-        use: what identification may do with them: fit, only predict, or take the noise from.
+        robot: the robot.
+        metadata: further metadata.
+        held_joints: joints that were held still.
+        period: sampling step [s] of a recording at a fixed rate.
+        use: whether identification fits them, predicts them, or takes the noise from them.
         clock: the file that the stamps come from; None for the first.
 
     Raises:
-        SourceError: no sample, a value that is not finite or beyond 1e12, or a clock that stands
-            still, runs backwards or steps too seldom for a motion.
+        SourceError: no sample, a value that is not finite or above 1e12, or an invalid clock.
         ArchiveWriteError: the archive cannot be written.
     """
     _check(samples, source[0], robot.joint_names)
@@ -284,7 +277,7 @@ def write_imported(
 
 def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
     if not len(samples.stamp):
-        raise SourceError(source, "holds no sample")
+        raise SourceError(source, "has no sample")
     quantities = {
         "position": samples.position,
         "velocity": samples.velocity,

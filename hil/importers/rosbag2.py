@@ -1,4 +1,4 @@
-"""Imports joint states from a rosbag2 recording, or from any MCAP file with ROS 2 messages."""
+"""Import of joint states from a rosbag2 recording, or any MCAP file with ROS 2 messages."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ZSTD = b"\x28\xb5\x2f\xfd"  # begins no CDR message
 
 
 def bag_files(source: Path) -> list[Path]:
-    """The files of a bag in the order they were written.
+    """Return the files of a bag in the order of writing.
 
     Raises:
         SourceError: there is none.
@@ -60,7 +60,7 @@ def bag_files(source: Path) -> list[Path]:
 
 
 def _regular(file: Path) -> Path:
-    """The same; no pipe, which would be waited for."""
+    """Return the file, which must be a regular one: a pipe would block."""
     try:
         open_file(file).close()
     except OSError as error:
@@ -69,10 +69,10 @@ def _regular(file: Path) -> Path:
 
 
 def topics(file: Path) -> dict[str, Topic]:
-    """The topics of one file by name.
+    """Return the topics of one file by name.
 
     Raises:
-        SourceError: it is no bag.
+        SourceError: it is not a bag.
     """
     if file.suffix == ".mcap":
         return mcap_messages.read(file, lambda *_: False)[0]
@@ -82,7 +82,7 @@ def topics(file: Path) -> dict[str, Topic]:
 
 
 def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
-    """Time of receipt [ns] and data of the messages of one topic, by their time.
+    """Yield time of receipt [ns] and data of the messages of one topic, in the order of time.
 
     Raises:
         SourceError: the file cannot be read.
@@ -97,7 +97,7 @@ def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 @contextmanager
 def unpacked(files: list[Path]) -> Iterator[list[Path]]:
-    """The same files, those that are compressed as a whole decompressed for as long as this lasts.
+    """Yield the files, compressed ones as temporary decompressed copies.
 
     Raises:
         SourceError: one cannot be decompressed.
@@ -123,7 +123,7 @@ def _unpacked(file: Path, target: Path) -> Path:
 
 
 def _decompressed(data: bytes, file: Path) -> bytes:
-    """A message that was compressed by itself."""
+    """Decompress a message that was compressed by itself."""
     try:
         size = zstandard.frame_content_size(data)
         if size > _LONGEST_MESSAGE:
@@ -134,12 +134,12 @@ def _decompressed(data: bytes, file: Path) -> bytes:
 
 
 def _storage(path: Path) -> str:
-    """The suffix that tells the storage."""
+    """Return the suffix of the storage format."""
     return Path(path.stem).suffix if path.suffix in _PACKED else path.suffix
 
 
 def _place(path: Path) -> list[tuple[int, str]]:
-    """Sorts ``x_10`` behind ``x_2``."""
+    """Return a key that sorts ``x_10`` behind ``x_2``."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
@@ -154,23 +154,23 @@ def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
         for number, (stamp, data) in enumerate(bag.execute(query, (topic,))):
             if not isinstance(stamp, int) or not isinstance(data, bytes):
                 problem = f"message {number} has no time or no data"
-                remedy = "take it out, or record again"
+                remedy = "remove it, or record again"
                 raise SourceError(file, problem, field=topic, remedy=remedy)
             yield stamp, data
 
 
 @contextmanager
 def _connected(file: Path) -> Iterator[sqlite3.Connection]:
-    """The bag, for reading only; no side files are left beside one that nobody writes.
+    """Open the bag read-only, without side files unless another process is writing it.
 
     Raises:
-        SourceError: it is no bag, or is found damaged while this lasts.
+        SourceError: it is not a bag, or is damaged.
     """
     options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)) as bag:
             bag.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LONGEST_ROW)
-            # A view could make rows without end.
+            # A view could produce rows without end.
             tables = {name for (name,) in bag.execute(_TABLES)}
             absent = sorted({"topics", "messages"} - tables)
             if absent:
@@ -199,22 +199,20 @@ def import_rosbag2(
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
 ) -> Path:
-    """Turn the joint states of a bag into an archive of kind ``imported``.
+    """Convert the joint states of a bag to an archive of kind ``imported``.
 
-    Joints are found by name and put into the order of the robot's. Messages that have none of them
-    (a gripper on the same topic) are passed over. Stamps are those in the messages' headers; where
-    all headers are empty, the bag's.
+    Joints are found by name. Messages with none of them (a gripper on the same topic) are ignored.
+    Stamps are those in the messages' headers; where all are empty, the bag's.
 
     Args:
         source: a ``.db3`` or ``.mcap`` file, or the folder of a bag; compressed ones as well.
         output: the archive to write.
-        robot: whose joints these are.
+        robot: the robot.
         topic: the topic, None where only one carries joint states.
-        effort: what the messages' effort is: joint torque [N·m] as the message defines it, motor
-            current [A] as some drivers have it, or nothing to be relied on.
-        joint_names: name in the URDF by name in the bag, for the joints where they differ.
-        held_joints: joints known to have been held still.
-        use: what it is to be used for.
+        effort: meaning of the messages' effort: joint torque [N·m], motor current [A], or nothing.
+        joint_names: name in the URDF by name in the bag, where they differ.
+        held_joints: joints that were held still.
+        use: what identification uses it for.
 
     Returns:
         The archive's path.
@@ -243,12 +241,9 @@ def recorded_joints(
     topic: str | None = None,
     joint_names: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
-    """The joints of a bag: those of the first message with most of them.
+    """Return the joints of a bag, by their names in the URDF: those of its longest message.
 
-    Args:
-        source: as for `import_rosbag2`.
-        topic: likewise.
-        joint_names: likewise; the names returned are those in the URDF.
+    Arguments are those of `import_rosbag2`.
 
     Raises:
         SourceError: no bag, no such topic, or no message.
@@ -266,7 +261,7 @@ def recorded_joints(
 def _messages(
     files: list[Path], topic: str | None
 ) -> Iterator[tuple[str, Iterator[tuple[int, bytes]]]]:
-    """The topic of the joint states, and time of receipt [ns] and data of its messages."""
+    """Open the topic of the joint states: yield time of receipt [ns] and data of its messages."""
     with unpacked(files) as unpacked_file:
         known = [topics(file) for file in unpacked_file]
         chosen = _choose(
@@ -288,21 +283,21 @@ def _typestore() -> Typestore:
 
 
 def _decoded(data: bytes, file: Path, number: int) -> Any:
-    """A joint state.
+    """Return a joint state.
 
     Raises:
-        SourceError: it is none.
+        SourceError: it cannot be decoded.
     """
     try:
         return _typestore().deserialize_cdr(data, JOINT_STATE)
-    except Exception as error:  # rosbags does not list what it raises for other bytes
+    except Exception as error:  # rosbags does not document what it raises
         raise SourceError(
             file, f"message {number} cannot be decoded ({error or type(error).__name__})"
         ) from error
 
 
 def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
-    """The topic asked for, or the only one that carries joint states."""
+    """Return the requested topic, or the only one that carries joint states."""
     fitting = [
         name for name, found in topics.items() if found.is_ros2 and found.kind in JOINT_STATES
     ]
@@ -327,7 +322,7 @@ def _samples(
     renamed: Mapping[str, str],
     effort: Effort,
 ) -> tuple[Samples, str]:
-    """Joint states with the joints in this order, and whose stamps they have: header or bag."""
+    """Return joint states with the joints in this order, and their clock: header or bag."""
     stamps: dict[str, list[int]] = {"header": [], "bag": []}
     rows: dict[str, list[Array]] = {"position": [], "velocity": [], "effort": []}
     orders: dict[tuple[str, ...], list[int]] = {}
@@ -356,8 +351,7 @@ def _samples(
             source,
             f"none of the joints {', '.join(joints)} was recorded; {recorded}",
             field="joints",
-            remedy="give the URDF of this robot, or say which joint is which: --rename "
-            "RECORDED=URDF",
+            remedy="give the URDF of this robot, or map its joints: --rename RECORDED=URDF",
         )
     columns: dict[str, Array | None] = {}
     if effort == "ignore":
@@ -386,11 +380,11 @@ def _samples(
 def _order(
     names: tuple[str, ...], source: Path, joints: Sequence[str], renamed: Mapping[str, str]
 ) -> list[int]:
-    """Where the wanted joints are in a message; empty when it has none of them."""
-    ours = [renamed.get(name, name) for name in names]
-    missing = [joint for joint in joints if joint not in ours]
+    """Return the places of the wanted joints in a message; empty when it has none of them."""
+    known = [renamed.get(name, name) for name in names]
+    missing = [joint for joint in joints if joint not in known]
     if missing and len(missing) < len(joints):
         problem = f"joint {missing[0]} was not recorded; recorded are {', '.join(names)}"
         remedy = f"give a URDF with the recorded names, or {NOT_RECORDED}"
         raise SourceError(source, problem, field="joints", remedy=remedy)
-    return [] if missing else [ours.index(joint) for joint in joints]
+    return [] if missing else [known.index(joint) for joint in joints]

@@ -1,4 +1,4 @@
-"""A text file of numbers in columns, read by column name or index."""
+"""Text files of numbers in columns, read by column name or index."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from hil.reading import read_text
 Array = NDArray[np.float64]
 
 _COMMENTS = ("#", "%", "//")
-# Tried in this order; a decimal comma only where the comma separates nothing.
+# Tried in this order; a decimal comma only where the comma is not the delimiter.
 _WRITTEN = (
     (",", "."), (";", "."), ("\t", "."), ("|", "."), (None, "."),
     (";", ","), ("\t", ","), ("|", ","), (None, ","),
 )  # fmt: skip
 _PROBED = 20  # lines
-_LONGEST = 1 << 31  # bytes, which become some times as many in memory
-_LONGEST_TIME = 30  # digits before the point, more than nanoseconds since 1970 have
+_LONGEST = 1 << 31  # bytes; several times as many in memory
+_LONGEST_TIME = 30  # digits before the point, more than of nanoseconds since 1970
 # 1.0D+03: double precision as Fortran writes it.
 _FORTRAN = re.compile(r"(?<=[\d.])[dD](?=[+-]?\d)")
 _MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
@@ -34,14 +34,14 @@ _MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A log of numbers, not yet converted.
+    """A text file of numbers, not yet converted.
 
     Attributes:
         path: the file.
         names: column names, empty when the file has none.
         width: number of columns.
         lines: the rows of numbers as text, with decimal points and exponents as Python reads them.
-        numbered: the number in the file of each of them, from 1.
+        numbered: line numbers in the file, from 1.
         delimiter: between columns, None for white space.
         gaps: whether rows may lack numbers.
     """
@@ -56,16 +56,16 @@ class Table:
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
-        """Read a file and find out its delimiter, decimal mark and header.
+        """Read a file and detect its delimiter, decimal mark and header.
 
         Raises:
-            SourceError: it cannot be read, has no row of numbers, or a line without any.
+            SourceError: it cannot be read, or has no row of numbers.
         """
         try:
             text = read_text(path, _LONGEST).removeprefix("\ufeff")
         except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
-            problem = f"cannot be read ({why})"
+            reason = error.strerror if isinstance(error, OSError) else error
+            problem = f"cannot be read ({reason})"
             remedy = "name a text file, or one that ends in .npz, .npy, .mat or .m"
             raise SourceError(path, problem, remedy=remedy) from error
         numbered = [
@@ -97,16 +97,16 @@ class Table:
             raise SourceError(
                 path,
                 f"has {len(names)} names ({', '.join(names)}) above rows of {width} numbers",
-                remedy="give the others their names, or count columns from 0: [format] header = "
+                remedy="name the other columns, or count columns from 0: [format] header = "
                 "false and skip_rows",
             )
         return cls(path, names, width, lines, numbers, delimiter, form.missing == "drop")
 
     def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
-        """Columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
+        """Return columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
 
         Raises:
-            SourceError: no such column, or a cell that is no finite number.
+            SourceError: no such column, or a cell that is not a finite number.
         """
         self._no_arrays(array, field)
         indices = [self._index(column, field) for column in columns]
@@ -126,24 +126,24 @@ class Table:
         return np.asarray(values)
 
     def matrix(self, name: str | None, field: str) -> Array:
-        """All columns, as they stand in the file.
+        """Return all columns.
 
         Raises:
-            SourceError: a cell is no finite number.
+            SourceError: a cell is not a finite number.
         """
         self._no_arrays(name, field)
         return self.numbers(range(self.width), field)
 
     def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
-        """A column of times as whole nanoseconds, exactly as written; of a single line, the line.
+        """Return a column of times as whole nanoseconds, exactly; of a single line, that line.
 
         Args:
             column: name or index.
             decimals: decimal places between the column's unit and the second.
-            array: None, since text has none.
+            array: None, since text has no arrays.
 
         Raises:
-            SourceError: no such column, or a time that is no number.
+            SourceError: no such column, or a time that is not a number.
         """
         self._no_arrays(array, "time")
         index = self._index(column, "time")
@@ -161,10 +161,10 @@ class Table:
             try:
                 found.append(_nanoseconds(text, decimals))
             except (ArithmeticError, ValueError) as error:
-                found_there = repr(text.strip()) if text.strip() else "nothing"
+                shown = repr(text.strip()) if text.strip() else "nothing"
                 raise SourceError(
                     self.path,
-                    f"line {number} has {found_there} for the time",
+                    f"line {number} has {shown} for the time",
                     field="time",
                 ) from error
         return found
@@ -189,7 +189,7 @@ class Table:
         raise SourceError(self.path, f"there is no column {column!r}", field=field, remedy=remedy)
 
     def _cell_by_cell(self, indices: Sequence[int], field: str) -> Array:
-        """What `numbers` returns; raises the error that names the first bad cell."""
+        """Return what `numbers` does, or raise the error that names the first invalid cell."""
         values = np.full((len(self.lines), len(indices)), np.nan)
         for row, line in enumerate(self.lines):
             cells = _cells(line, self.delimiter)
@@ -214,7 +214,7 @@ class Table:
 
 
 def _between(numbered: list[tuple[int, str]], path: Path, form: Format) -> list[tuple[int, str]]:
-    """Without empty lines before and after the numbers; one between them may be a lost row."""
+    """Remove empty lines before and after the numbers; one between them may be a lost row."""
     filled = [place for place, (_, line) in enumerate(numbered) if line.strip()]
     if not filled:
         raise SourceError(path, "has no row of numbers")
@@ -228,8 +228,8 @@ def _between(numbered: list[tuple[int, str]], path: Path, form: Format) -> list[
         raise SourceError(
             path,
             f"line {empty} is empty",
-            remedy="take it out, or cut the log there; where empty lines mean nothing, leave them "
-            "out: [format] skip_empty = true; skip lines of a header: [format] skip_rows",
+            remedy="remove it, or cut the log there; where empty lines mean nothing: [format] "
+            "skip_empty = true; to skip lines of a header: [format] skip_rows",
         )
     return numbered
 
@@ -237,7 +237,7 @@ def _between(numbered: list[tuple[int, str]], path: Path, form: Format) -> list[
 def _transposed(
     numbered: list[tuple[int, str]], delimiter: str | None, path: Path
 ) -> list[tuple[int, str]]:
-    """Columns as lines, numbered by sample."""
+    """Return columns as lines, numbered by sample."""
     cells = [_cells(line, delimiter) for _, line in numbered]
     widths = {len(row) for row in cells}
     if len(widths) > 1:
@@ -250,9 +250,9 @@ def _transposed(
 
 
 def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
-    """Delimiter (None for white space) and decimal mark: the first pair that makes numbers of all.
+    """Return delimiter (None for white space) and decimal mark: the first pair that gives numbers.
 
-    The first line may be a header; where nothing fits, the delimiter that all lines have alike.
+    The first line may be a header; if no pair fits, the delimiter that all lines have.
     """
     marks = [form.decimal] if form.decimal else [".", ","]
     tried = [(d, m) for d, m in _WRITTEN if m in marks and form.delimiter in (None, d)]
@@ -273,10 +273,10 @@ def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
 
 
 def _nanoseconds(text: str, decimals: int) -> int:
-    """A time as written; ValueError or ArithmeticError where it is none of any clock."""
+    """Return a time exactly; raise ValueError or ArithmeticError where it is invalid."""
     time = Decimal(text.strip())
     if time and time.adjusted() > _LONGEST_TIME:
-        raise ValueError(f"{text!r} is no time")
+        raise ValueError(f"{text!r} is not a time")
     return int(time.scaleb(9 - decimals).to_integral())
 
 
@@ -293,7 +293,7 @@ def _is_number(text: str) -> bool:
 
 
 def _are_numbers(cells: Sequence[str], decimal: str) -> bool:
-    """Whether every cell that is filled is a number, and some cell is."""
+    """Return whether there are cells with content, all of them numbers."""
     filled = [cell.strip() for cell in cells if cell.strip().lower() not in _MISSING]
     if decimal == "," and any("." in cell for cell in filled):
         return False

@@ -195,10 +195,10 @@ class TestBadInput:
             ),
             ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
             ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
-            ({"torque": {"columns": "tau"}}, "no place for the joint's number"),
+            ({"torque": {"columns": "tau"}}, "has no {} for the joint's number"),
             ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
             ({"drive": {"gear_ratio": (1, 2)}}, "drive.gear_ratio: has 2 entries"),
-            ({"drive": {"gear_ratio": (1, 0, 2)}}, "would not be moved by any motor"),
+            ({"drive": {"gear_ratio": (1, 0, 2)}}, "no motor would move one of the joints"),
             ({"time": {"column": "time"}}, "time: there is no column 'time'"),
             ({"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
         ],
@@ -235,7 +235,7 @@ class TestBadInput:
     def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
         """Which of the numbers have no name cannot be known: the first, as pandas writes them?"""
         file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3")
-        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; give the others"):
+        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name the other"):
             read(file, robot)
 
     def test_files_of_no_row_or_another_length_are_refused(self, tmp_path, file, robot):
@@ -308,7 +308,7 @@ class TestFilePerJoint:
     @pytest.mark.parametrize(
         ("position", "sentence"),
         [
-            ({"files": "q_{}.txt"}, r"q_1\.txt: .*shape \(20, 2\), where one column is wanted"),
+            ({"files": "q_{}.txt"}, r"q_1\.txt: .*shape \(20, 2\), expected one column"),
             ({"files": "p{}.txt"}, r"position.files: there is no file 'p1.txt' for hip, joint 1"),
             ({"files": ("q_1.txt",)}, "position.files: has 1 entries; one for each of the joints"),
             ({"files": ("t.txt", "q_1.txt", "nowhere.txt"), "columns": (0,)}, "nowhere.txt: cann"),
@@ -325,7 +325,7 @@ class TestFilePerJoint:
     @pytest.mark.parametrize(
         ("position", "sentence"),
         [
-            ({"files": "q.txt"}, "position.files has no place for the joint's number"),
+            ({"files": "q.txt"}, "position.files has no {} for the joint"),
             ({"files": "q{}.txt", "file": "q.txt"}, "position has files, so it has neither file"),
         ],
     )
@@ -387,14 +387,14 @@ class TestMapFile:
         [
             (RATE, "position: is missing"),
             (POSITION, "either a time column or sample_rate"),
-            (f"{RATE}{POSITION}unit = 'inch'\n", "'inch' is no unit"),
+            (f"{RATE}{POSITION}unit = 'inch'\n", "'inch' is not a unit"),
             (f"{RATE}[position]\ncolumn = 'q{{}}'\n", "position.column"),
-            (f"sample_rate = -5\n{POSITION}", "sample_rate: must be a number"),
+            (f"sample_rate = -5\n{POSITION}", "sample_rate: .* must be a number"),
             (f"{RATE}{POSITION}side = 'motor'\n", "drive.gear_ratio is needed"),
-            (f"{RATE}[position]\ncolumns = -1\n", "position.columns: must be a name"),
-            (f"{RATE}[position]\nscale = 'x'\n", "position.scale: must be a number"),
-            (f"{RATE}position = 3\n", "position: must be a table"),
-            (f"{RATE}[position]\nfiles = 3\n", "position.files: must be a name with"),
+            (f"{RATE}[position]\ncolumns = -1\n", "position.columns: .* must be a name"),
+            (f"{RATE}[position]\nscale = 'x'\n", "position.scale: .* must be a number"),
+            (f"{RATE}position = 3\n", "position: .* must be a table"),
+            (f"{RATE}[position]\nfiles = 3\n", "position.files: .* must be a name with"),
             ("sample_rate = \n", "cannot be read"),
             (f"{RATE}{POSITION}scale = 0.0\n", "position.scale"),
             (f"{RATE}{POSITION}{COUPLED}", "another joint"),
@@ -493,13 +493,13 @@ class TestArrays:
         ("arrays", "position", "sentence"),
         [
             ({"p": Q}, {"columns": "q"}, r"there is no array 'q'; its arrays are p \(40, 3\)"),
-            ({"p": Q, "r": Q}, {}, "which of its arrays is not said; its arrays are p"),
-            ({"p": Q[:3]}, {}, 'square matrix; say whether joints lie along "columns" or "rows"'),
+            ({"p": Q, "r": Q}, {}, "the name of the array is missing; its arrays are p"),
+            ({"p": Q[:3]}, {}, 'square matrix; state whether joints are along "columns" or "rows"'),
             ({"p": Q[:, :2]}, {}, r"shape \(40, 2\), joints along its columns, and there are 3"),
             ({"p": Q}, {"columns": (0, 1, 7), "array": "p"}, r"'p' has no column 7; it has 3"),
             ({"p": Q.T}, {"columns": (0, 9, 1), "joints_along": "rows"}, "rows 0, 9, 1; it has 3"),
             ({"a": TIME, "b": TIME[1:]}, {"columns": ("a", "b", "a")}, "a 40, b 39, a 40"),
-            ({"p": np.array(["x"])}, {}, "holds no array of numbers"),
+            ({"p": np.array(["x"])}, {}, "has no array of numbers"),
         ],
     )
     def test_what_does_not_fit_is_refused_with_what_is_there(
@@ -793,11 +793,11 @@ def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
 
 
 def test_the_process_that_reads_for_us_never_takes_all_memory_also_when_it_is_another() -> None:
-    pid = array_files._elsewhere(os.getpid)
+    pid = array_files._in_child(os.getpid)
     os.kill(pid, signal.SIGKILL)
     assert array_files._readers[0].connection.poll(5.0)
-    assert array_files._elsewhere(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
-    assert array_files._elsewhere(os.getpid) != pid
+    assert array_files._in_child(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
+    assert array_files._in_child(os.getpid) != pid
 
 
 # Robots of which only the Denavit-Hartenberg parameters are known
@@ -1039,10 +1039,10 @@ class TestSlips:
             ({"position": DEGREES}, "degrees read as radians"),
             ({"position": 1 / DEGREES}, "no joint moves further than"),
             ({"velocity": 0.0}, "does not follow its position"),
-            ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): is its unit right"),
+            ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
             ({"torque": 0.0}, "is zero throughout"),
-            ({"clock": 1e3}, "0.1 samples a second is unusual"),
-            ({"clock": 1e-3}, "1e+05 samples a second is unusual"),
+            ({"clock": 1e3}, "0.1 samples per second are unusual"),
+            ({"clock": 1e-3}, "1e+05 samples per second are unusual"),
         ],
     )
     def test_is_named(self, arm: Simulated, slip: dict[str, float], sentence: str) -> None:
@@ -1077,7 +1077,7 @@ class TestOrder:
         (sentence,) = warnings(arm, order=(1, 2, 0, 3, 4, 5))
         right = [names[1], names[2], names[0], *names[3:]]
         assert f"as those of {', '.join(right)} by 0 %" in sentence
-        assert "as mapped they miss their slopes by" in sentence
+        assert "as mapped they deviate from the slopes by" in sentence
 
     def test_positions_of_another_order_and_a_zero_that_is_off(self, panda: Simulated) -> None:
         """Joint 4 of this arm bends one way only, joint 6 the other way."""
@@ -1117,7 +1117,7 @@ class TestClock:
         [
             (
                 range(0, 1000, 10),
-                r"x: time: there would be 0\.1 samples .* would make it 100 samples a second",
+                r"x: time: has 0\.1 samples .* would give 100 samples per second",
             ),
             (
                 (0.0, 0.01, 0.02, 0.005, 0.015),
@@ -1136,7 +1136,7 @@ class TestClock:
         columns = ColumnMap.model_validate(
             {"time": {"column": 0, "file": "t.txt"}, "position": {"file": "q.txt"}}
         )
-        with pytest.raises(SourceError, match=r"t\.txt: time: there would be 0\.1 samples"):
+        with pytest.raises(SourceError, match=r"t\.txt: time: has 0\.1 samples"):
             import_log(
                 tmp_path, tmp_path / "a.mcap", robot=Robot.from_urdf(arm.urdf), columns=columns
             )

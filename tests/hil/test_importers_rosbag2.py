@@ -482,7 +482,7 @@ def test_files_that_are_cut_off_or_damaged_are_refused(
     if length is None:
         data[data.index(POSITION[150, ::-1].tobytes())] ^= 1
     source.write_bytes(data[:length])
-    with pytest.raises(SourceError, match="no MCAP file, or cut off"):
+    with pytest.raises(SourceError, match="not an MCAP file, or truncated"):
         import_rosbag2(source, tmp_path / "out.mcap", robot=robot)
 
 
