@@ -1,12 +1,12 @@
-"""Everything the driver can complain about, as one tree below `DriverError`.
+"""Errors of the driver, all below `DriverError`.
 
-A `RefusalError` is a set-point that never left, and why; a `GuardError` among them a number outside
-its bound. Beside them: `drivers.transports.base.TransportError` (a link that cannot be opened) and
-`drivers.exchange.process.ExchangeError`. All survive pickling with message and attributes, though
-without their cause.
+A `RefusalError` states why a set-point was not sent; a `GuardError` among them names a quantity
+outside its bound. `drivers.transports.base.TransportError` and
+`drivers.exchange.process.ExchangeError` are defined there. All errors survive pickling with message
+and attributes, without their cause.
 """
 
-# ruff: noqa: N818  the leaves are named for what is wrong; their roots end in Error
+# ruff: noqa: N818  leaves are named after the fault; their roots end in Error
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from typing import Any
 
 
 class DriverError(Exception):
-    """Root of every error raised on purpose by this package."""
+    """Root of the errors of this package."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # An exception is unpickled by calling its class with `args`, here the message alone.
+        # By default an exception is unpickled by calling its class with `args`, here the message.
         return _restored, (type(self), self.args, self.__dict__)
 
 
@@ -30,12 +30,12 @@ def _restored(
 
 
 class _FieldError(DriverError):
-    """A field with a value that it cannot have.
+    """A field with an invalid value.
 
     Attributes:
         field: its name.
         value: what was found.
-        expected: what would have been valid, in words.
+        expected: what would have been valid.
     """
 
     what = ""
@@ -48,43 +48,41 @@ class _FieldError(DriverError):
 
 
 class PacketError(_FieldError):
-    """Bytes that are not the packet they should be."""
+    """Bytes that are not a valid packet."""
 
     what = "packet"
 
 
 class DriveTrainError(_FieldError):
-    """A drive train that cannot be: a gear ratio of zero, coupling without a wrist."""
+    """Invalid drive train: a gear ratio of zero, coupling without a wrist."""
 
     what = "drive train"
 
 
 class RequestError(DriverError):
-    """A motion, or a change of its speed, was requested when none can be promised.
+    """A motion, or a change of its speed, was requested in a state that does not allow it.
 
     Attributes:
         state: name of the session's state.
-        reason: why not, and what has to happen first.
-        what: was requested.
+        reason: why it is refused, and what has to happen first.
     """
 
     def __init__(self, state: str, reason: str, what: str = "motion") -> None:
         super().__init__(f"no {what} can be requested in state '{state}': {reason}")
         self.state = state
         self.reason = reason
-        self.what = what
 
 
 class TransportClosed(DriverError):
-    """The link was closed on this side, or its far end is gone for good."""
+    """The link was closed on this side, or its peer has ended."""
 
 
 class RefusalError(DriverError):
-    """Why a set-point did not leave.
+    """Why a set-point was not sent.
 
     Attributes:
-        cycle: the controller's cycle in which it would have left.
-        remedy: what to do about it, for a person at the controller.
+        cycle: the controller's cycle in which it was due.
+        remedy: what the operator should do.
     """
 
     remedy = "look at the arm, close open mode and switch the drive on again at the controller"
@@ -95,7 +93,7 @@ class RefusalError(DriverError):
 
 
 class SourceFailed(RefusalError):
-    """The motion source raised, or gave arrays of the wrong shape; the cause is chained."""
+    """The motion source raised, or returned arrays of the wrong shape; the cause is chained."""
 
 
 class AxisNotInMode(RefusalError):
@@ -115,7 +113,7 @@ class AxisNotInMode(RefusalError):
 
 
 class ModeRefused(RefusalError):
-    """An axis is in a mode that no answer is known to, or open before it was seen closed.
+    """An axis reports an unknown mode, or is open without having been closed before.
 
     Attributes:
         joint: index from 0.
@@ -125,42 +123,39 @@ class ModeRefused(RefusalError):
     remedy = "have the controller's program go from mode 0 to the open mode of the cell file"
 
     def __init__(self, joint: int, mode: int, known: bool, cycle: int) -> None:
-        why = "was not seen closed before" if known else "no answer is known to that mode"
-        super().__init__(f"joint {joint + 1} is in mode {mode}: {why}", cycle)
+        reason = "it was not closed before" if known else "the reply to that mode is unknown"
+        super().__init__(f"joint {joint + 1} is in mode {mode}: {reason}", cycle)
         self.joint = joint
         self.mode = mode
 
 
 class SessionFailed(RefusalError):
-    """Something in the session raised that must not: a defect. The cause is chained."""
-
-    def __init__(self, cause: BaseException, cycle: int) -> None:
-        super().__init__(f"the session failed: {in_words(cause)}", cycle)
+    """Unexpected exception inside the session: a defect. The cause is chained."""
 
 
 def as_refusal(error: BaseException, cycle: int) -> RefusalError:
-    """The error itself where it is a refusal, else one that says what happened."""
+    """Return the error itself if it is a refusal, else a `SessionFailed` caused by it."""
     if isinstance(error, RefusalError):
         return error
-    failed = SessionFailed(error, cycle)
+    failed = SessionFailed(f"the session failed: {error_text(error)}", cycle)
     failed.__cause__ = error
     return failed
 
 
-def in_words(error: BaseException) -> str:
-    """Kind and message of any error, even one that cannot say what it is."""
+def error_text(error: BaseException) -> str:
+    """Return type and message of any error, even of one whose `__str__` raises."""
     kind = type(error).__name__
     try:
         return f"{kind}: {error}"
     except BaseException:
-        return f"{kind}, whose message could not be made"
+        return f"{kind} without a message"
 
 
 class ExitTimeout(RefusalError):
-    """The controller keeps axes in open mode although their end of open mode was asked for.
+    """The controller did not end open mode although the session asked for it.
 
     Attributes:
-        cycles: for so many of the controller's cycles.
+        cycles: the controller's cycles since the request.
     """
 
     def __init__(self, cycles: int, cycle: int) -> None:
@@ -171,7 +166,7 @@ class ExitTimeout(RefusalError):
 
 
 class GuardError(RefusalError):
-    """A number outside its bound.
+    """A quantity outside its bound.
 
     Attributes:
         check: name of the check.
@@ -179,7 +174,6 @@ class GuardError(RefusalError):
         value: what was found, in `unit`.
         bound: largest magnitude allowed (or the nearer position limit), in `unit`.
         unit: unit of both.
-        cycle: the controller's cycle.
     """
 
     check = "guard"
@@ -206,7 +200,7 @@ class GuardError(RefusalError):
 
 
 class NotFinite(GuardError, check="finiteness"):
-    """NaN or infinity where a number must be."""
+    """NaN or infinity where a finite number is required."""
 
     def __init__(
         self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
@@ -216,7 +210,7 @@ class NotFinite(GuardError, check="finiteness"):
 
 
 class TargetNotFinite(NotFinite):
-    """An axis that is open, but no joint of the cell, would be answered a target that is no number.
+    """The target received of an open axis that is not a joint of the cell is not finite.
 
     Attributes:
         arm: from 1.
@@ -230,7 +224,7 @@ class TargetNotFinite(NotFinite):
 
 
 _BEYOND = (
-    "the motion itself is beyond the limits and would be refused again: rehearse or design anew"
+    "the motion exceeds the limits and would be refused again: rehearse it, or design another one"
 )
 
 
@@ -260,9 +254,9 @@ class FollowingError(
     GuardError,
     check="following error",
     unit="motor revolutions",
-    remedy="see whether the axis is free, then its following_error in [drive_train]",
+    remedy="check that the axis is free, then its following_error in [drive_train]",
 ):
-    """The axis does not follow; the controller is informed by mode 508 in this axis."""
+    """The axis does not follow; the reply reports mode 508 in this axis."""
 
 
 class CurrentLimit(
@@ -271,11 +265,11 @@ class CurrentLimit(
     unit="A",
     remedy="check that the arm is free, check its payload, then go slower",
 ):
-    """The servo asks for more current than the narrower of cell and controller allows."""
+    """The servo's target current exceeds the narrower of the cell's and controller's limits."""
 
 
 class CommandedCurrentLimit(CurrentLimit, check="commanded current"):
-    """Fed forward, or together with the servo's own, a current is more than is allowed."""
+    """A current fed forward, or its sum with the servo's own, exceeds the limit."""
 
 
 class CommandedCurrentStep(CommandedCurrentLimit, check="change of commanded current in one cycle"):
@@ -283,7 +277,7 @@ class CommandedCurrentStep(CommandedCurrentLimit, check="change of commanded cur
 
 
 class CorrectionNotEnded(GuardError, check="correction at the end"):
-    """A source says that it is finished while a correction of its, or feed-forward, is not zero."""
+    """The source is finished while its correction or feed-forward is not zero."""
 
 
 class FirstSetPoint(
@@ -298,7 +292,7 @@ class FirstSetPoint(
 class NotAtStandstill(
     FirstSetPoint, check="velocity at the first set-point", unit="motor revolutions per cycle"
 ):
-    """The axis moves in the cycle in which it would get its first set-point."""
+    """The axis moves in the cycle of its first set-point."""
 
 
 class FirstSetPointUnknown(
@@ -315,7 +309,7 @@ class SetPointNotAccepted(
     unit="motor revolutions",
     remedy="look for lost packets: the cable, other traffic, hil doctor",
 ):
-    """The controller's target is none of the set-points sent last: it does not take them."""
+    """The controller's target is none of the set-points sent last."""
 
 
 class VelocityAfterGap(
@@ -323,7 +317,7 @@ class VelocityAfterGap(
     check="difference, after a gap, between received velocity and the one sent last",
     unit="motor revolutions per cycle",
 ):
-    """After a long gap the axis rests, or moves otherwise than the set-point sent last."""
+    """After a long gap the axis rests, or its velocity is not that of the set-point sent last."""
 
 
 class VelocityAfterPause(
@@ -331,7 +325,7 @@ class VelocityAfterPause(
     check="difference, after a pause, between the velocity received and the one sent last",
     unit="rad/s",
 ):
-    """After a pause by the clock the arm moves otherwise than the set-points sent last."""
+    """After a pause by the clock the arm's velocity is not that of the set-points sent last."""
 
 
 class AgeAfterGap(
@@ -341,4 +335,4 @@ class AgeAfterGap(
 
 
 class CorrectionUnconfirmed(SetPointNotAccepted, check="correction sent last before a gap"):
-    """After a long gap nothing tells whether the controller applied the correction sent last."""
+    """After a long gap it is unknown whether the controller applied the correction sent last."""

@@ -1,7 +1,4 @@
-"""What a session tells whoever runs it. Drained by `Session.events`, in order.
-
-Every event survives pickling, so that another process may receive it.
-"""
+"""Events of a session, drained by `Session.events` in order. All of them can be pickled."""
 
 from __future__ import annotations
 
@@ -20,10 +17,10 @@ Outcome = Literal["completed", "stopped", "refused", "lost"]
 
 @dataclass
 class Counters:
-    """How many packets had which fate since the session was made.
+    """Packets since the session was created.
 
     `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...);
-    `unanswered` are answers of ours that the controller did not take, see `AnswersLost`.
+    `unanswered` are replies that the controller did not accept, see `AnswersLost`.
     """
 
     answered: int = 0
@@ -43,9 +40,9 @@ class InitReceived:
 
     Attributes:
         init: its init packet.
-        unusable: why this session cannot move the arm, or None if it can.
-        differences: from what the cell says of the arm, each naming the axis and both values.
-        adopted: the controller's gear ratios, calibration and coupling are in force.
+        unusable: why the arm cannot be moved in this session, or None.
+        differences: from the cell, each naming the axis and both values.
+        adopted: the controller's gear ratios, calibration and coupling are used.
     """
 
     init: InitPacket = field(repr=False)
@@ -56,7 +53,7 @@ class InitReceived:
 
 @dataclass(frozen=True)
 class StateChanged:
-    """The session went from one state to another in `cycle`."""
+    """The session changed its state in `cycle`."""
 
     before: State
     after: State
@@ -65,7 +62,7 @@ class StateChanged:
 
 @dataclass(frozen=True)
 class GapSeen:
-    """`missed` packets before the one of `cycle` never arrived."""
+    """`missed` packets before the one of `cycle` did not arrive."""
 
     missed: int
     cycle: int
@@ -73,10 +70,10 @@ class GapSeen:
 
 @dataclass(frozen=True)
 class AnswersLost:
-    """The target received in `cycle` is older than the last set-point; `count` were not accepted.
+    """The target received in `cycle` is that of an earlier set-point; `count` were not accepted.
 
-    Seen only in modes 1, 4 and 5, where a joint moves by more than what counts as standstill in
-    each cycle, and where the controller then holds its target rather than carry it on.
+    Detected only in modes 1, 4 and 5, while a joint moves by more than the standstill threshold per
+    cycle and the controller holds its target.
     """
 
     count: int
@@ -85,7 +82,7 @@ class AnswersLost:
 
 @dataclass(frozen=True)
 class MotionStarted:
-    """The first set-point left in `cycle`; records carry `interval`."""
+    """The first set-point was sent in `cycle`; its records have this `interval`."""
 
     interval: int
     cycle: int
@@ -93,7 +90,7 @@ class MotionStarted:
 
 @dataclass(frozen=True)
 class OverrideChanged:
-    """From `cycle` on the requested motion was to go on at this fraction of its planned speed."""
+    """From `cycle` on the requested motion runs at this fraction of its planned speed."""
 
     fraction: float
     cycle: int
@@ -101,7 +98,7 @@ class OverrideChanged:
 
 @dataclass(frozen=True)
 class HoldChanged:
-    """In `cycle` the requested motion was asked to rest on its path, or (not `held`) to go on."""
+    """In `cycle` a hold of the requested motion was requested, or (not `held`) its end."""
 
     held: bool
     cycle: int
@@ -113,10 +110,10 @@ class MotionEnded:
 
     Attributes:
         outcome: "completed" and "stopped": open mode was left after coming to rest; "refused":
-            a set-point was refused; "lost": drive, open mode or link went away.
-        reason: in words.
-        interval: of its records, -1 if it never saw open mode.
-        cycle: when.
+            a set-point was refused; "lost": drive, open mode or link was lost.
+        reason: text.
+        interval: of its records, -1 if open mode was never reached.
+        cycle: the controller's cycle.
     """
 
     outcome: Outcome
@@ -127,11 +124,11 @@ class MotionEnded:
 
 @dataclass(frozen=True)
 class PacketRejected:
-    """`count` packets since the last drain got no answer.
+    """`count` packets since the last drain got no reply.
 
     Attributes:
-        kind: "malformed", "stale" or "ended", or what the link discarded them for.
-        count: how many.
+        kind: "malformed", "stale" or "ended", or the link's reason to discard them.
+        count: number of packets.
         reason: of the last one; "" if unknown.
     """
 
@@ -142,10 +139,10 @@ class PacketRejected:
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A set-point did not leave.
+    """A set-point was not sent.
 
     Attributes:
-        error: why.
+        error: the reason.
         flight_recorder: (k,) of `cycle_dtype`, the last records up to and including this cycle.
     """
 
@@ -155,9 +152,9 @@ class Refused:
 
 @dataclass(frozen=True)
 class LinkLost:
-    """Nothing was heard for `silence` s; `state` is the state in which that happened.
+    """No valid packet arrived for `silence` s in this state.
 
-    Or nothing new: `stale` packets came meanwhile that cannot follow the last one.
+    `stale` packets arrived meanwhile whose numbers cannot follow the last one.
     """
 
     silence: float

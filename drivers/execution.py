@@ -1,11 +1,10 @@
-"""The life of one requested motion or correction, from request to rest.
+"""Execution of one requested motion or correction, from request to rest.
 
-A source is foreign code inside the cycle: whatever it raises (SystemExit and the like included),
-any array that is not (n,) numbers, and bounds wider than what it was granted become
-`SourceFailed`. It is granted the bounds of a plan; those of an override from the first change of
-override on, and those of a stop from `stop` or the first `hold` on; a correction, whose bounds
-nobody names, has the latter until it is at rest. A stop that takes too long is a failure too. A
-hold may last, but a source that does not come to rest in it is stopped.
+A source is foreign code inside the cycle: anything it raises (SystemExit included), any array that
+is not (n,) numbers, and bounds wider than allowed become `SourceFailed`. Allowed are the bounds of
+a plan; those of an override from the first change of override on; those of a stop from `stop` or
+the first `hold` on. A correction, whose bounds have no name, may use those of a stop until it is at
+rest. A stop that takes too long is a failure; a hold that does not come to rest becomes a stop.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import SourceFailed, in_words
+from drivers.errors import SourceFailed, error_text
 from drivers.events import Outcome
 from drivers.guard import RANK
 from drivers.motion_source import (
@@ -34,26 +33,26 @@ from drivers.states import CORRECTION_MODES, POSITION_MODES
 Array = NDArray[np.float64]
 
 _AT_REST: Final = 1e-9
-"""rad per cycle and rad/s: what rounding leaves of standstill."""
+"""Rounding of standstill, rad per cycle and rad/s."""
 
 
 class Execution(ABC):
-    """What motions and corrections have in common.
+    """Common part of motions and corrections.
 
     Args:
         source: the motion or correction.
         n_joints: n.
-        settle_cycles: how long its end is held.
-        stop_cycles: how many of the controller's cycles it may take to rest once asked to.
+        settle_cycles: cycles for which the end is held.
+        stop_cycles: cycles that a stop or hold may take.
 
     Attributes:
-        started: the first set-point was taken.
-        fraction: of the planned speed, asked for last; None before.
-        held: whether a hold stands.
+        started: the first set-point was sent.
+        fraction: of the planned speed, last requested; None before.
+        held: a hold is active.
         leaving: the motion came to rest and open mode is being left.
-        finished: the source said so.
-        outcome: what it will be called when open mode has been left.
-        reason: in words.
+        finished: the source is finished.
+        outcome: of the motion once open mode has been left.
+        reason: of the outcome.
     """
 
     def __init__(
@@ -68,8 +67,8 @@ class Execution(ABC):
         self._still = np.zeros(n_joints)
         self._settle_cycles = settle_cycles
         self._stop_cycles = stop_cycles
-        self._granted: tuple[BoundsName, ...] = ("plan",)
-        self._rest_by: int | None = None  # the cycle from which on it takes too long
+        self._allowed: tuple[BoundsName, ...] = ("plan",)
+        self._rest_by: int | None = None  # first cycle in which it takes too long
         self._resting = 0
         self.finished = False
         self.started = False
@@ -77,20 +76,20 @@ class Execution(ABC):
         self.held = False
         self.leaving = False
         self.outcome: Outcome = "completed"
-        self.reason = "the motion came to its end"
+        self.reason = "the motion is complete"
 
     @property
     def settled(self) -> bool:
-        """Whether the end was held for as long as was asked."""
+        """Whether the end was held for `settle_cycles`."""
         return self.finished and self._resting >= self._settle_cycles
 
     @property
-    def granted(self) -> BoundsName:
-        """The widest bounds granted so far."""
-        return self._granted[-1]
+    def widest(self) -> BoundsName:
+        """The widest bounds allowed now."""
+        return self._allowed[-1]
 
     def begin(self, position: Array, cycle: int) -> None:
-        """Take the first set-point, (n,) rad; held at once if that was asked for before.
+        """Begin at the first set-point, (n,) rad; hold at once if that was requested before.
 
         Raises:
             SourceFailed: the source does not begin there, or does not hold.
@@ -106,7 +105,7 @@ class Execution(ABC):
 
     @abstractmethod
     def _begin_source(self, position: Array) -> None:
-        """Begin the source at this position (n,) [rad]."""
+        """Begin the source at this position, (n,) rad."""
 
     def stop(self, reason: str, cycle: int) -> None:
         """Come to rest on the path. The first reason stays.
@@ -120,33 +119,33 @@ class Execution(ABC):
         self.reason = reason
         self.held = False
         self._rest_by = cycle + self._stop_cycles
-        self._grant("stop")
+        self._allow("stop")
         try:
             self._source.stop()
         except BaseException as error:
             raise _failed("failed to stop", error, cycle) from error
 
     def override(self, fraction: float) -> str | None:
-        """Pass a change of override on; says why that cannot be, or None."""
+        """Change the override; return why that is not possible, or None."""
         try:
             change = getattr(self._source, "override", None)
             if not callable(change):
-                return "this motion knows no override"
+                return "this motion has no override"
             if self.outcome == "stopped":
                 return "the motion is being stopped"
             if not 0.0 <= fraction <= 1.0:
                 return f"an override of {fraction!r} is not one of 0..1"
             change(float(fraction))
         except BaseException as error:
-            return f"the motion source refused it: {in_words(error)}"
-        self._grant("override")
+            return f"the motion source refused it: {error_text(error)}"
+        self._allow("override")
         self.fraction = float(fraction)
         return None
 
     def hold(self, cycle: int) -> str | None:
-        """Come to rest on the path until `resume`; says why that cannot be, or None.
+        """Come to rest on the path until `resume`; return why that is not possible, or None.
 
-        Before the beginning it is kept: the motion begins at rest, and stays there.
+        Before its begin the request is stored: the motion begins at rest, and stays there.
         """
         if self.outcome == "stopped" or self.finished:
             return None
@@ -154,23 +153,23 @@ class Execution(ABC):
         try:
             if not is_holdable(source):
                 return "held, which this motion cannot: it was stopped instead"
-            if self.started:  # what a source is told before, it may forget when it begins
-                self._grant("stop")
+            if self.started:  # a source may reset itself when it begins
+                self._allow("stop")
                 source.hold()
         except BaseException as error:
-            return f"the motion source failed to hold: {in_words(error)}"
+            return f"the motion source failed to hold: {error_text(error)}"
         self.held = True
         if self._rest_by is None and self.started:
             self._rest_by = cycle + 1 + self._stop_cycles
         return None
 
-    def rested(self) -> None:
-        """It is at rest: as far as a hold goes, that is what was asked for."""
+    def mark_at_rest(self) -> None:
+        """The motion is at rest, which completes a hold."""
         if self.outcome != "stopped":
             self._rest_by = None
 
     def resume(self) -> str | None:
-        """Go on after a hold; says why that cannot be, or None."""
+        """Continue after a hold; return why that is not possible, or None."""
         source: object = self._source
         try:
             if not is_holdable(source):
@@ -180,13 +179,13 @@ class Execution(ABC):
             if self.started:
                 source.resume()
         except BaseException as error:
-            return f"the motion source refused it: {in_words(error)}"
+            return f"the motion source refused it: {error_text(error)}"
         self._rest_by, self.held = None, False
         return None
 
-    def _grant(self, bounds: BoundsName) -> None:
-        if bounds not in self._granted:
-            self._granted = tuple(sorted((*self._granted, bounds), key=RANK.__getitem__))
+    def _allow(self, bounds: BoundsName) -> None:
+        if bounds not in self._allowed:
+            self._allowed = tuple(sorted((*self._allowed, bounds), key=RANK.__getitem__))
 
     def _checked(self, values: object, what: str, cycle: int) -> Array:
         array = np.asarray(values, dtype=np.float64)
@@ -197,7 +196,7 @@ class Execution(ABC):
         return array
 
     def _require_rest(self, cycle: int) -> None:
-        """A stop that takes too long is a failure, and a hold that does becomes a stop."""
+        """Raise for a stop that takes too long; stop a hold that does."""
         if self._rest_by is None or cycle < self._rest_by:
             return
         if self.outcome != "stopped":
@@ -211,10 +210,10 @@ class Execution(ABC):
 
 
 class MotionExecution(Execution):
-    """Asks a `MotionSource` for set-points.
+    """Set-points of a `MotionSource`.
 
     Attributes:
-        position: (n,) rad, the set-point given last.
+        position: (n,) rad, the last set-point.
         feeds_forward: the source is a `FeedForwardSource`.
     """
 
@@ -232,10 +231,10 @@ class MotionExecution(Execution):
         self._source.begin(position.copy())
 
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
-        """The next set-point (n,) rad, rad/s, and the bounds it keeps; the end is held.
+        """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held.
 
         Raises:
-            SourceFailed: the source raised or gave no proper set-point.
+            SourceFailed: the source raised or gave no valid set-point.
         """
         try:
             if self.finished:
@@ -250,37 +249,37 @@ class MotionExecution(Execution):
             raise
         except BaseException as error:
             raise _failed("failed", error, cycle) from error
-        if self._rest_by is not None and self._stands(position, velocity):
-            self.rested()
+        if self._rest_by is not None and self._is_at_rest(position, velocity):
+            self.mark_at_rest()
         self._require_rest(cycle)
         # The source may reuse its arrays.
         self.position = position.copy()
         return self.position, velocity, bounds
 
     @property
-    def follows(self) -> bool:
-        """Whether the source goes on from where a controller carried the motion."""
-        going = self.started and not self.finished
-        return going and callable(getattr(self._source, "resume_from", None))
+    def is_resumable(self) -> bool:
+        """Whether the source is a running `ResumableSource`."""
+        running = self.started and not self.finished
+        return running and callable(getattr(self._source, "resume_from", None))
 
     def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
-        """The controller carried the motion on by itself: see `ResumableSource`.
+        """Continue from the controller's target, see `ResumableSource`.
 
         Raises:
-            SourceFailed: the source cannot go on from there.
+            SourceFailed: the source cannot continue from there.
         """
         try:
-            # What the guard checks against is not the source's to change.
+            # Copies, because the guard compares with these arrays.
             source = cast(ResumableSource, self._source)
             source.resume_from(position.copy(), velocity.copy(), cycles)
         except BaseException as error:
-            raise _failed("cannot go on", error, cycle) from error
+            raise _failed("cannot continue", error, cycle) from error
 
     def feed_forward(self, cycle: int) -> tuple[Array, Array]:
-        """Velocity (n,) rad/s and motor current (n,) A of the set-point given last.
+        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
 
         Raises:
-            SourceFailed: the source raised or gave none.
+            SourceFailed: the source raised or gave no valid arrays.
         """
         if self._resting:
             return self._still, self._still
@@ -295,37 +294,37 @@ class MotionExecution(Execution):
         except BaseException as error:
             raise _failed("failed to feed forward", error, cycle) from error
 
-    def _stands(self, position: Array, velocity: Array) -> bool:
+    def _is_at_rest(self, position: Array, velocity: Array) -> bool:
         step = np.abs(position - self.position).max()
         return bool(max(step, np.abs(velocity).max()) <= _AT_REST)
 
     def _bounds(self, cycle: int) -> BoundsName:
         bounds = self._source.bounds
-        if not isinstance(bounds, str) or bounds not in self._granted:
-            granted = " or ".join(self._granted)
-            raise SourceFailed(f"the motion source named bounds {bounds!r}, not {granted}", cycle)
+        if not isinstance(bounds, str) or bounds not in self._allowed:
+            allowed = " or ".join(self._allowed)
+            raise SourceFailed(f"the motion source named bounds {bounds!r}, not {allowed}", cycle)
         return bounds
 
 
 class CorrectionExecution(Execution):
-    """Asks a `CorrectionSource` for corrections; after its end they stay zero."""
+    """Corrections of a `CorrectionSource`; after its end they are zero."""
 
     _source: CorrectionSource
 
-    def rested(self) -> None:
-        """Nobody names the bounds of a correction: those granted for a hold end here."""
-        super().rested()
+    def mark_at_rest(self) -> None:
+        """End the bounds allowed for a hold, because a correction does not name its bounds."""
+        super().mark_at_rest()
         if self.outcome != "stopped":
-            self._granted = tuple(name for name in self._granted if name != "stop")
+            self._allowed = tuple(name for name in self._allowed if name != "stop")
 
-    def _begin_source(self, position: Array) -> None:  # noqa: ARG002  nobody asks where
+    def _begin_source(self, position: Array) -> None:  # noqa: ARG002  a correction has no position
         self._source.begin()
 
     def advance(self, cycle: int) -> tuple[Array, Array]:
-        """The next correction: motion (n,), see `CorrectionSource`, and motor current (n,) A.
+        """Return the next correction: motion (n,), see `CorrectionSource`, and current (n,) A.
 
         Raises:
-            SourceFailed: the source raised or gave no proper correction.
+            SourceFailed: the source raised or gave no valid correction.
         """
         if self.finished:
             self._resting += 1
@@ -350,16 +349,16 @@ def execution_of(
     settle_cycles: int,
     stop_cycles: int,
 ) -> Execution | str:
-    """The execution of a source of the kind that the open mode needs; else why there is none."""
+    """Return the execution of a source, or why the open mode cannot run it."""
     try:
         if mode in CORRECTION_MODES and is_correction(source):
             return CorrectionExecution(source, n_joints, settle_cycles, stop_cycles)
         if mode in POSITION_MODES and is_motion(source):
             return MotionExecution(source, n_joints, settle_cycles, stop_cycles)
     except BaseException as error:
-        return f"the motion source cannot be looked at: {in_words(error)}"
+        return f"the motion source cannot be inspected: {error_text(error)}"
     return f"a {type(source).__name__} is not the kind of source mode {mode} needs"
 
 
 def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
-    return SourceFailed(f"the motion source {what}: {in_words(error)}", cycle)
+    return SourceFailed(f"the motion source {what}: {error_text(error)}", cycle)

@@ -1,13 +1,11 @@
-"""What every set-point has to pass before it leaves.
+"""Checks of every set-point before it is sent.
 
-Rates are differences of the joint-side float64 set-points that were really *sent*, taken before
-encoding: a float32 motor position near 100 revolutions moves in steps of 8e-6, which over T³ look
-like a jerk as large as the limit itself. For a motion q(t) sampled at the cycle, the k-th
-difference over T^k is a mean of the k-th derivative over k cycles: it never exceeds what the
-derivative keeps, and a motion that runs *at* a limit hits the bound exactly. Hence a relative
-tolerance of 1e-6, which is how well planners keep their limits and far below anything a drive
-could feel, plus the rounding of the difference itself, which 1/T³ makes visible at joint angles
-of many turns.
+Rates are differences of the joint-side float64 set-points that were *sent*, before encoding: a
+float32 motor position near 100 revolutions has steps of 8e-6, which over T³ is a jerk as large as
+the limit. For a motion q(t) sampled at the cycle, the k-th difference over T^k is a mean of the
+k-th derivative over k cycles: it never exceeds the bound of the derivative, and a motion *at* a
+limit reaches the bound exactly. Hence a relative tolerance of 1e-6, the accuracy of planners, plus
+the rounding of the difference itself, which 1/T³ amplifies at joint angles of many turns.
 
 All comparisons are written so that NaN fails them.
 """
@@ -47,7 +45,7 @@ Array = NDArray[np.float64]
 
 
 def require_finite(values: Array, where: NDArray[np.bool_], cycle: int) -> None:
-    """Raise `NotFinite` for the first joint of `where` (n,) whose value (n,) is no number."""
+    """Raise `NotFinite` for the first joint of `where` (n,) whose value (n,) is not finite."""
     bad = where & ~np.isfinite(values)
     if bad.any():
         joint = int(np.argmax(bad))
@@ -78,7 +76,7 @@ def report(
     cycle: int,
     position_limits: Callable[[int, float], tuple[float, float]] | None = None,
 ) -> NoReturn:
-    """Raise for the first row and joint outside its bound; NaN before everything else.
+    """Raise for the first row and joint outside its bound; values that are not finite come first.
 
     Args:
         magnitude: (k, n) compared with `allowed`.
@@ -86,7 +84,7 @@ def report(
         allowed: (k, n).
         checks: (k,) error of each row.
         cycle: for the error.
-        position_limits: turns joint and value of a position into those to be reported.
+        position_limits: (joint, value) of a position to the value and bound to be reported.
     """
     not_finite = ~np.isfinite(magnitude)
     bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
@@ -99,24 +97,24 @@ def report(
 
 
 DEFAULT_STANDSTILL: Final = 5e-4
-"""Motor revolutions per cycle below which an axis stands still.
+"""Motor revolutions per cycle below which an axis is at standstill.
 
-An encoder at rest toggles between two increments, so a velocity formed over one cycle shows one
-increment per cycle at worst and two with a little servo dither. Two increments of a coarse 12-bit
-encoder are 4.9e-4; at 2 ms this is some 0.5 % of a drive's full speed.
+An encoder at rest toggles between two increments, so its velocity over one cycle is at most one
+increment per cycle, two with servo dither. Two increments of a coarse 12-bit encoder are 4.9e-4;
+at 2 ms this is some 0.5 % of a drive's full speed.
 """
 
 RANK: Final[Mapping[BoundsName, int]] = {"plan": 0, "override": 1, "stop": 2}
-CARRIED_ON: Final = 3
-"""Rank of the bounds of a stop without one on jerk: the steps that a controller made by itself have
-none of the motion's acceleration, so that returning to it is a jump of acceleration."""
+EXTRAPOLATED: Final = 3
+"""Rank of the bounds of a stop without one on jerk: the steps that a controller extrapolates have
+no acceleration, so that returning to the motion is a jump of acceleration."""
 MEMORY: Final = 2
-"""Cycles for which wider bounds stay: a third difference reaches over three cycles."""
+"""Cycles for which wider bounds stay active: a third difference spans three cycles."""
 
 
 @dataclass(frozen=True, eq=False)
 class GuardLimits:
-    """What the guard enforces; arrays (n,).
+    """Limits that the guard enforces; arrays (n,).
 
     Attributes:
         lower: rad, smallest joint position.
@@ -124,14 +122,14 @@ class GuardLimits:
         velocity: rad/s, magnitude, in all three sets of bounds.
         acceleration: rad/s², of the set "plan".
         jerk: rad/s³, of the set "plan".
-        following_error: motor revolutions, as the controller states its thresholds.
+        following_error: motor revolutions.
         current: A.
         override_acceleration: factor on acceleration while an override changes.
         override_jerk: factor on jerk while an override changes.
         stop_acceleration: factor on acceleration during hold and stop.
         stop_jerk: factor on jerk during hold and stop.
         standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
-        current_rise: s that a commanded current takes, at least, from zero to its limit.
+        current_rise: shortest rise time of a commanded current from zero to its limit, s.
 
     Raises:
         ValueError: a shape, sign or order is wrong; names the field.
@@ -183,7 +181,7 @@ class GuardLimits:
         return len(self.lower)
 
     def factors(self, rank: int) -> tuple[float, float]:
-        """Factors on acceleration and jerk of a set of bounds, by its `RANK` or `CARRIED_ON`."""
+        """Return the factors on acceleration and jerk of a set of bounds, by rank."""
         stop = self.stop_acceleration
         return (
             (1.0, self.override_acceleration, stop, stop)[rank],
@@ -191,11 +189,11 @@ class GuardLimits:
         )
 
 
-class BoundsInForce:
-    """Wider bounds stay in force until no difference reaches back to them.
+class ActiveBounds:
+    """The active set of bounds: wider ones stay active until no difference reaches back to them.
 
     Attributes:
-        rank: of the set in force.
+        rank: of the active set.
     """
 
     def __init__(self) -> None:
@@ -203,11 +201,11 @@ class BoundsInForce:
         self._age = 0
 
     def reset(self, rank: int = 0, cycles: int = 0) -> None:
-        """Nothing was sent yet; or a set comes into force that applies for so many cycles more."""
+        """Activate a set for `cycles` more than `MEMORY`."""
         self.rank, self._age = rank, -cycles
 
-    def take(self, bounds: BoundsName) -> int:
-        """The set that the next set-point belongs to; returns the rank of the one in force."""
+    def update(self, bounds: BoundsName) -> int:
+        """Return the rank of the active set for a next set-point within `bounds`."""
         rank = RANK[bounds]
         if rank >= self.rank:
             self.rank, self._age = rank, 0
@@ -221,10 +219,10 @@ class BoundsInForce:
 RELATIVE_TOLERANCE: Final = 1e-6
 FIRST_FRACTION: Final = 0.1
 """Share of the following-error threshold allowed between target and arm at the first set-point,
-and between the target and the set-points sent last from then on."""
+and later between the target and the set-points sent last."""
 LAG: Final = 0.05
-"""s that the velocity of an arm may lag behind that of its set-points: position loops of robots
-have a gain of 20 to 50 /s."""
+"""Lag of the arm's velocity behind that of its set-points, s: position loops of robots have a gain
+of 20 to 50 /s."""
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.
 _SET_POINT_CHECKS: Final[tuple[type[GuardError], ...]] = (
@@ -246,7 +244,7 @@ class Guard:
     """Checks feedback and set-points of one arm, cycle by cycle.
 
     Attributes:
-        limits: what is enforced.
+        limits: of the arm.
         period: s, the controller's cycle.
     """
 
@@ -258,9 +256,9 @@ class Guard:
         n = limits.n_joints
         self._middle = 0.5 * (limits.lower + limits.upper)
         self._every = np.ones(n, dtype=np.bool_)
-        self._sets = {rank: self._bounds(rank) for rank in range(CARRIED_ON + 1)}
-        self._in_force = BoundsInForce()
-        # Three sent set-points (oldest first), the candidate, and its stated velocity.
+        self._sets = {rank: self._bounds(rank) for rank in range(EXTRAPOLATED + 1)}
+        self._active = ActiveBounds()
+        # Three sent set-points (oldest first), the next one, and its stated velocity.
         self._history = np.zeros((5, n))
         self._quantities = np.zeros((len(_SET_POINT_CHECKS), n))
         T = period
@@ -300,16 +298,16 @@ class Guard:
 
     @property
     def following_error(self) -> Array:
-        """Threshold in force, (n,) motor revolutions."""
+        """Threshold, (n,) motor revolutions: the narrower of limits and controller."""
         return self._threshold
 
     @property
     def current(self) -> Array:
-        """Limit in force, (n,) A."""
+        """Limit, (n,) A: the narrower of limits and controller."""
         return self._current
 
     def narrow(self, following_error: Array, current: Array) -> None:
-        """Take the controller's own limits where they are narrower; NaN means it has none.
+        """Use the controller's own limits where they are narrower; NaN where it has none.
 
         Args:
             following_error: (n,) motor revolutions.
@@ -323,7 +321,7 @@ class Guard:
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
     def check_hold(self, target: Array, actual: Array, held: NDArray[np.bool_], cycle: int) -> None:
-        """Axes `held` (n,) at the target received, while others are not open yet.
+        """Check that axes `held` (n,) can hold the target received while others are closed.
 
         Args:
             target: (n,) D1, motor revolutions.
@@ -332,14 +330,14 @@ class Guard:
             cycle: for the error.
 
         Raises:
-            NotFinite, FollowingError: a target that cannot be held.
+            NotFinite, FollowingError: they cannot.
         """
         require_finite(target, held, cycle)
         error = np.abs(actual - target)
         require(held, error, self._threshold * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle)
 
     def begin(self, q: Array, target: Array, actual: Array, step: Array, cycle: int) -> None:
-        """First set-point: the target received in the packet in which the last axis opened.
+        """Check the first set-point: the target received when the last axis opened.
 
         Args:
             q: (n,) rad, that target on the joint side.
@@ -352,20 +350,20 @@ class Guard:
             NotFinite, PositionLimit, FirstSetPoint, NotAtStandstill: it must not be sent.
         """
         self.check_start(target, actual, step, cycle)
-        self._in_force.reset()
+        self._active.reset()
         self._history[:4] = q
         self.check_set_point(q, np.zeros_like(q), "plan", cycle)
 
     def resume_from(self, q: Array, qd: Array, cycles: int) -> None:
-        """The controller moved by itself: its target, (n,) rad, and velocity, rad/s, count as sent.
+        """Treat the controller's target (n,) rad and velocity, rad/s, as sent.
 
-        For so many cycles jerk has no bound.
+        Jerk is unbounded for this number of cycles.
         """
-        self._in_force.reset(CARRIED_ON, cycles)
+        self._active.reset(EXTRAPOLATED, cycles)
         self._history[:4] = q - np.arange(3.0, -1.0, -1.0)[:, None] * (self.period * qd)
 
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
-        """What holds in the cycle in which the arm may begin to move.
+        """Check that the arm may begin to move in this cycle.
 
         Args:
             target: (n,) D1, motor revolutions.
@@ -374,7 +372,7 @@ class Guard:
             cycle: for the error.
 
         Raises:
-            NotFinite, FirstSetPoint, NotAtStandstill: it may not.
+            NotFinite, FirstSetPoint, NotAtStandstill: it must not.
         """
         every = self._every
         require_finite(target, every, cycle)
@@ -393,21 +391,21 @@ class Guard:
         cycle: int,
         where: NDArray[np.bool_] | None = None,
     ) -> None:
-        """What the packet says of the arm, before the next set-point is asked for.
+        """Check following error and current, before the next set-point is computed.
 
-        Following error is held against both the target the controller reports and the one sent
-        last; they differ where an answer was lost.
+        The following error is measured from both the target received and the one sent last; they
+        differ where a reply was lost.
 
         Args:
             target: (n,) D1, motor revolutions.
             actual: (n,) D3, motor revolutions.
             current: (n,) D5, A.
-            commanded: (n,) D1 of the answer sent last, motor revolutions.
+            commanded: (n,) D1 of the last reply, motor revolutions.
             cycle: for the error.
             where: (n,) which joints; None for all.
 
         Raises:
-            NotFinite, FollowingError, CurrentLimit: the motion must not go on.
+            NotFinite, FollowingError, CurrentLimit: the motion must not continue.
         """
         found = self._feedback
         np.subtract(actual, commanded, out=found[0])
@@ -428,21 +426,21 @@ class Guard:
         cycle: int,
         where: NDArray[np.bool_],
     ) -> None:
-        """The first packet after a long gap, before an axis goes on from the set-point sent last.
+        """Check the first packet after a long gap, before an axis continues.
 
-        A velocity may be off by half the step sent last, or by what counts as standstill. The
-        target's is always held against that; the arm's lags behind, so only where it stands.
+        The target's velocity may differ by half the step sent last, or by the standstill
+        threshold; so may the arm's, which lags behind, where it is at standstill.
 
         Args:
             target: (n,) D1, motor revolutions.
             velocity: (2, n) D2 and D4, motor revolutions per cycle.
-            commanded: (n,) where the target should be, motor revolutions.
-            step: (n,) D2 of the answer sent last, motor revolutions per cycle.
+            commanded: (n,) expected target, motor revolutions.
+            step: (n,) D2 of the last reply, motor revolutions per cycle.
             cycle: for the error.
             where: (n,) which joints.
 
         Raises:
-            NotFinite, SetPointNotAccepted, VelocityAfterGap: going on would be a jump.
+            NotFinite, SetPointNotAccepted, VelocityAfterGap: to continue would be a jump.
         """
         bound = FIRST_FRACTION * self._threshold
         require(where, np.abs(target - commanded), bound, SetPointNotAccepted, cycle)
@@ -453,9 +451,9 @@ class Guard:
             require(joints, np.abs(found - step), bound, VelocityAfterGap, cycle)
 
     def check_after_pause(self, velocity: Array, cycle: int, where: NDArray[np.bool_]) -> None:
-        """A packet came late by the clock: the arm moves as the set-points sent last.
+        """Check after a late packet that the arm moves as the set-points sent last.
 
-        A servo lags behind; what it gains in `LAG` at the acceleration allowed is no pause.
+        The servo may lag behind by what it gains in `LAG` at the allowed acceleration.
 
         Args:
             velocity: (n,) of the arm, rad/s.
@@ -463,20 +461,20 @@ class Guard:
             where: (n,) which joints.
 
         Raises:
-            NotFinite, VelocityAfterPause: it does not, so that the next set-point would be a jump.
+            NotFinite, VelocityAfterPause: it does not; to continue would be a jump.
         """
         sent = (self._history[3] - self._history[2]) / self.period
-        factor, _ = self.limits.factors(self._in_force.rank)
+        factor, _ = self.limits.factors(self._active.rank)
         bound = LAG * factor * self.limits.acceleration
         require(where, np.abs(velocity - sent), bound, VelocityAfterPause, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
-        """The next set-point; if it passes, it counts as sent.
+        """Check the next set-point, which then counts as sent.
 
         Args:
             q: (n,) rad.
             qd: (n,) rad/s.
-            bounds: the set that applies from this set-point on. Wider bounds stay in force until
+            bounds: the set that applies from this set-point on. Wider bounds stay active until
                 no difference reaches back to them.
             cycle: for the error.
 
@@ -492,12 +490,12 @@ class Guard:
         np.matmul(self._differences, history, out=found)
         found[0] -= self._middle
         magnitude = np.abs(found)
-        allowed = self._sets[self._in_force.take(bounds)]
+        allowed = self._sets[self._active.update(bounds)]
         if not (magnitude <= allowed).all():
             report(magnitude, found, allowed, _SET_POINT_CHECKS, cycle, self.position_limits)
 
     def position_limits(self, joint: int, value: float) -> tuple[float, float]:
-        """The position meant by `value` off the middle of the range, and the limit nearest it."""
+        """Return the position `value` off the middle of the range, and the nearest limit."""
         limit = self.limits.upper if value > 0.0 else self.limits.lower
         return float(self._middle[joint] + value), float(limit[joint])
 
@@ -509,16 +507,15 @@ _UNIT: Final = {"velocity": "rad/s", "offset": "rad"}
 class CorrectionGuard:
     """Checks corrections of one arm, cycle by cycle, from zero to zero.
 
-    A velocity fed forward and an offset from the controller's target are held to the same three
-    sets of bounds as set-points, by their differences from one answer to the next: the differences
-    of a velocity are mean accelerations and jerks, those of an offset one order further up. An
-    offset is held to those of a velocity as well, as if the controller added it up cycle by cycle;
-    so is the target together with it. A current has a limit and, per cycle, a largest step. Nothing
-    is clamped.
+    A velocity fed forward and an offset from the controller's target have the same three sets of
+    bounds as set-points, on their differences from one reply to the next: the differences of a
+    velocity are mean accelerations and jerks, those of an offset one order higher. An offset also
+    has the bounds of a velocity, as if the controller added it up cycle by cycle; so has its sum
+    with the target. A current has a limit and a largest step per cycle. Nothing is clamped.
 
     Args:
-        guard: whose limits and period apply.
-        kind: what the motion part is: a "velocity" rad/s, or an "offset" rad of positions.
+        guard: provides limits and period.
+        kind: of the motion: a "velocity", rad/s, or an "offset" of positions, rad.
     """
 
     def __init__(self, guard: Guard, kind: Literal["velocity", "offset"]) -> None:
@@ -539,13 +536,13 @@ class CorrectionGuard:
         )
         self._checks = _CHECKS * (len(self._differences) // 3)
         self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
-        self._in_force = BoundsInForce()
+        self._active = ActiveBounds()
         self._history = np.zeros((4, n))
         self._quantities = np.zeros((len(self._differences), n))
         self._current = np.zeros(n)
         self._target = self._offset = self._sent_in = np.zeros(n)
         self._rise = T / limits.current_rise
-        # What rounding leaves of a zero: a millionth of a limit, for an offset of one step.
+        # Rounding of zero: a millionth of a limit, for an offset of one step.
         step = T if kind == "offset" else 1.0
         self._nothing = RELATIVE_TOLERANCE * limits.velocity * step
 
@@ -557,13 +554,13 @@ class CorrectionGuard:
         return allowed * (1.0 + RELATIVE_TOLERANCE)
 
     def begin(self) -> None:
-        """Zero was sent."""
+        """Begin with a correction of zero."""
         self._history[...] = 0.0
         self._current[...] = 0.0
-        self._in_force.reset()
+        self._active.reset()
 
     def check_motion(self, motion: Array, bounds: BoundsName, cycle: int) -> None:
-        """The next velocity or offset (n,); if it passes, it counts as sent.
+        """Check the next velocity or offset (n,), which then counts as sent.
 
         Raises:
             NotFinite, VelocityLimit, AccelerationLimit, JerkLimit: it must not be sent.
@@ -573,7 +570,7 @@ class CorrectionGuard:
         history[3] = motion
         found = self._quantities
         np.matmul(self._differences, history, out=found)
-        allowed = self._sets[self._in_force.take(bounds)]
+        allowed = self._sets[self._active.update(bounds)]
         magnitude = np.abs(found)
         if not (magnitude <= allowed).all():
             report(magnitude, found, allowed, self._checks, cycle)
@@ -585,14 +582,14 @@ class CorrectionGuard:
         rates = history if self._is_velocity else np.diff(history, axis=0)
         return bool((np.abs(rates) <= self._nothing).all())
 
-    def note_target(self, target: Array, offset: Array, sent_in: Array) -> None:
-        """The controller's target (n,) rad, the offset from it, the cycle each joint's is of."""
+    def set_target(self, target: Array, offset: Array, sent_in: Array) -> None:
+        """Store the controller's target (n,) rad, the offset from it, and its cycle, (n,)."""
         self._target, self._offset, self._sent_in = target, offset, sent_in
 
     def check_target(
         self, target: Array, offset: Array, sent_in: Array, rounding: Array, cycle: int
     ) -> None:
-        """How fast target and offset move the arm; if they pass, they are noted.
+        """Check the speed of target and offset together, which then count as sent.
 
         Args:
             target: (n,) rad, received.
@@ -602,7 +599,7 @@ class CorrectionGuard:
             cycle: for the error.
 
         Raises:
-            NotFinite, VelocityLimit: too fast, the offset being a position or a step.
+            NotFinite, VelocityLimit: too fast, with the offset as a position or as a step.
         """
         T = self._guard.period
         elapsed = T * np.maximum(sent_in - self._sent_in, 1.0)
@@ -610,10 +607,10 @@ class CorrectionGuard:
         bound = self._guard.limits.velocity * (1.0 + RELATIVE_TOLERANCE) + rounding / elapsed
         for step in (offset - self._offset, offset):
             require(self._every, np.abs(speed + step / T), bound, VelocityLimit, cycle)
-        self.note_target(target, offset, sent_in)
+        self.set_target(target, offset, sent_in)
 
     def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
-        """The next current (n,) A; if it passes, it counts as sent.
+        """Check the next current (n,) A, which then counts as sent.
 
         Args:
             current: fed forward, or added to the servo's own.
@@ -631,7 +628,7 @@ class CorrectionGuard:
         self._current[...] = current
 
     def check_position(self, q: Array, cycle: int) -> None:
-        """Where the correction leads the arm, (n,) rad.
+        """Check the position that the correction leads to, (n,) rad.
 
         Raises:
             NotFinite, PositionLimit: outside the range of a joint.
@@ -646,18 +643,18 @@ class CorrectionGuard:
             raise PositionLimit(joint, float(q[joint]), float(limit[joint]), cycle)
 
     def check_end(self, cycle: int) -> None:
-        """The source says that it is finished.
+        """Check that a finished source gave zero last.
 
         Raises:
-            CorrectionNotEnded: what it gave last is not zero.
+            CorrectionNotEnded: it did not.
         """
         self._require_zero(CorrectionNotEnded, cycle)
 
     def check_after_gap(self, cycle: int) -> None:
-        """After a long gap, whether the controller applied a correction cannot be seen.
+        """Check after a long gap that the last correction is zero, as it may not be applied.
 
         Raises:
-            CorrectionUnconfirmed: the one sent last is not zero.
+            CorrectionUnconfirmed: it is not.
         """
         self._require_zero(CorrectionUnconfirmed, cycle)
 

@@ -1,4 +1,4 @@
-"""What the session asks for the next set-point, or the next correction.
+"""Sources of set-points and corrections for a session.
 
 ===========  ==========================================================  ====================
 open mode    who generates the targets                                   source
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final, Literal, Protocol, TypeGuard
+from typing import Literal, Protocol, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +26,14 @@ BoundsName = Literal["plan", "override", "stop"]
 class MotionSource(Protocol):
     """One motion, given cycle by cycle. Joint arrays are (n,), rad and rad/s.
 
-    The session calls `begin` once, in the cycle that carries the first set-point (the position
-    given, at zero velocity), then `advance` once for each later packet that it answers. Nothing
-    here knows a clock: after a gap the motion goes on where it was.
+    The session calls `begin` once, in the cycle of the first set-point (the position given, at zero
+    velocity), then `advance` once for each later packet that it replies to. A source has no clock:
+    after a gap the motion continues where it was.
     """
 
     @property
     def start(self) -> Array:
-        """Where the motion wants to begin."""
+        """Planned start of the motion."""
 
     @property
     def finished(self) -> bool:
@@ -41,44 +41,44 @@ class MotionSource(Protocol):
 
     @property
     def bounds(self) -> BoundsName:
-        """Which set of bounds the set-points keep from now on.
+        """Set of bounds that the set-points satisfy from now on.
 
-        "override" is granted from the first change of override on (`OverridableSource`), "stop"
+        "override" is allowed from the first change of override on (`OverridableSource`), "stop"
         from `stop`, or the first `hold` (`HoldableSource`), on.
         """
 
     def begin(self, position: Array) -> None:
-        """Take `position` as the first set-point; raise if the motion cannot begin there."""
+        """Begin at `position`, the first set-point; raise if that is not possible."""
 
     def advance(self) -> tuple[Array, Array]:
-        """The next set-point, one period on: position and velocity."""
+        """Return position and velocity of the next set-point, one period on."""
 
     def stop(self) -> None:
-        """Come to rest on the path; `finished` tells when. Calling it again changes nothing.
+        """Come to rest on the path; then `finished` is true. Calling it again changes nothing.
 
-        The session asks for drive-off if that takes longer than `session.STOP_TIMEOUT`.
+        The session requests drive-off if that takes longer than `session.STOP_TIMEOUT`.
         """
 
 
 class FeedForwardSource(MotionSource, Protocol):
-    """A motion that knows what it takes to follow it, for open mode 1."""
+    """A motion with velocity and current for feed-forward, in open mode 1."""
 
     def feed_forward(self) -> tuple[Array, Array]:
-        """Velocity (n,) rad/s and motor current (n,) A that go with the set-point given last.
+        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
 
-        Asked for once after each `advance`. Both start at zero with the first set-point and have
-        to be back at zero when the motion says that it is finished. Without this method the
-        velocity fed forward is that of the set-points, and the current zero.
+        Called once after each `advance`. Both are zero at the first set-point and when the motion
+        is finished. For a source without this method the velocity fed forward is that of the
+        set-points, and the current zero.
         """
 
 
 class CorrectionSource(Protocol):
     """Corrections of a motion that the controller itself generates. Joint arrays are (n,).
 
-    Like a `MotionSource`, it is asked once per answered packet. A correction starts at zero,
-    keeps the bounds of a plan (those of a stop after `stop`, and from `hold` until it rests: a
-    velocity at zero, an offset unchanged), and has to be back at zero when it
-    says that it is finished; the session never clamps or fades it.
+    Like a `MotionSource`, it is called once per packet replied to. A correction starts at zero,
+    satisfies the bounds of a plan (those of a stop after `stop`, and from `hold` until it rests: a
+    velocity at zero, an offset unchanged), and is zero again when it is finished. The session
+    never clamps or fades it.
     """
 
     @property
@@ -86,10 +86,10 @@ class CorrectionSource(Protocol):
         """Whether the corrections given last were the end, zero."""
 
     def begin(self) -> None:
-        """The first packet with every axis open is answered by zeros; raise to refuse."""
+        """Begin: the reply to the first packet with every axis open is zero. Raise to refuse."""
 
     def advance(self) -> tuple[Array, Array]:
-        """The next correction: motion and motor current, A.
+        """Return the next correction: motion and motor current, A.
 
         ====  ===========================================  ======================================
         mode  motion                                       current
@@ -102,63 +102,60 @@ class CorrectionSource(Protocol):
         """
 
     def stop(self) -> None:
-        """Take the correction back to zero; `finished` tells when."""
+        """Bring the correction back to zero; then `finished` is true."""
 
 
 class OverridableSource(Protocol):
     """A source whose speed can be changed while it runs."""
 
     def override(self, fraction: float) -> None:
-        """Go on at this fraction (0..1) of the planned speed, within the bounds "override"."""
+        """Continue at this fraction (0..1) of the planned speed, within the bounds "override"."""
 
 
 class HoldableSource(Protocol):
-    """A source that can rest on its path and go on from there."""
+    """A source that can rest on its path and continue from there."""
 
     def hold(self) -> None:
         """Come to rest on the path, within the bounds of a stop, and wait; not `finished`.
 
-        A hold may last for ever; `stop` may follow it. A source that goes on instead is stopped
-        after `session.STOP_TIMEOUT`.
+        `stop` may follow a hold. A source that does not come to rest is stopped after
+        `session.STOP_TIMEOUT`.
         """
 
     def resume(self) -> None:
-        """Go on, within the bounds of a stop until the speed is what it was."""
+        """Continue, within the bounds of a stop until the former speed is reached."""
 
 
 class ResumableSource(Protocol):
-    """A source that can go on from where a controller carried its motion by itself."""
+    """A source that can continue where a controller has extrapolated its motion."""
 
     def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
-        """The controller's target is here, (n,) rad and rad/s: go on along the path, as asked for.
+        """Continue along the path from the controller's target, (n,) rad and rad/s.
 
-        A velocity across the path dies away in so many cycles. Raises if it is not on the path.
+        A velocity across the path decays within `cycles`. Raises if the target is off the path.
         """
 
 
-_OF_MOTIONS: Final = ("begin", "advance", "finished", "bounds", "stop")
-_OF_CORRECTIONS: Final = ("begin", "advance", "finished", "stop")
-
-
 def is_motion(source: object) -> TypeGuard[MotionSource]:
-    """Whether it has what a `MotionSource` is asked for; nothing of it is called."""
-    return _has(source, _OF_MOTIONS)
+    """Whether a source has the members of a `MotionSource`; none of them is called."""
+    return _has(source, ("begin", "advance", "finished", "bounds", "stop"))
 
 
 def is_correction(source: object) -> TypeGuard[CorrectionSource]:
-    """Whether it has what a `CorrectionSource` is asked for and no bounds, as motions have."""
-    return _has(source, _OF_CORRECTIONS) and not _has(source, ("bounds",))
+    """Whether a source has the members of a `CorrectionSource`, and no bounds."""
+    members = _has(source, ("begin", "advance", "finished", "stop"))
+    return members and not _has(source, ("bounds",))
 
 
 def is_holdable(source: object) -> TypeGuard[HoldableSource]:
-    """Whether it has what a `HoldableSource` is asked for."""
+    """Whether a source has the members of a `HoldableSource`."""
     return _has(source, ("hold", "resume"))
 
 
 def progress_of(source: object) -> tuple[float, float]:
-    """Motion time, s, and how fast it runs (1 as planned); NaN where a source does not tell.
+    """Return motion time, s, and rate (1 as planned); NaN where a source does not give them.
 
-    Nothing in the cycle depends on them, so whatever a source raises counts as not telling.
+    A source that raises counts as not giving them: the cycle does not depend on either.
     """
     return _number_of(source, "motion_time"), _number_of(source, "rate")
 

@@ -1,4 +1,4 @@
-"""One interval in open mode: set-points asked for, guarded, written into the answer."""
+"""One interval in open mode: set-points are computed, checked and written into the reply."""
 
 from __future__ import annotations
 
@@ -26,34 +26,33 @@ Array = NDArray[np.float64]
 LEAP_FRACTION: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
 SLOW: Final = 4.0
-"""Times what counts as standstill: some 2 % of full speed. Of such steps several may be made up in
-one cycle."""
+"""Multiple of the standstill threshold, some 2 % of full speed. Several such steps in one cycle are
+permissible."""
 REPETITIONS: Final = 100
 """Times that a set-point is sent again, at most, to a controller that does not accept it."""
 
 
 class SentSetPoints:
-    """Whether the controller accepts our set-points: its target against those sent last, motor rev.
+    """The set-points sent last, compared with the controller's target, motor revolutions.
 
-    While answers are lost the controller holds its target. Were the motion to go on meanwhile, the
-    next set-point that it hears would be as many steps away. So the last one is sent again until
-    the target shows that it was accepted: the motion waits, as it does for packets. A packet that
-    never arrived is no answer either: a controller that carries its target on meanwhile reports one
-    ahead of those sent.
+    While replies are lost the controller holds its target. If the motion continued, the next
+    set-point received would be as many steps away. So the last one is sent again until the target
+    shows that it was accepted; the motion waits, as it does for packets. After missed packets a
+    controller that extrapolates reports a target ahead of those sent.
 
-    A controller that reports its target a cycle late looks the same in its first cycle, and to a
-    repetition of the last set-point in every second one. It is known by the first steps of a
-    motion, which are small (`SLOW`): there nothing is sent again, and what the target is behind by
-    then is no loss from then on. A link that becomes so late at speed is a loss in every second
-    cycle, which soon brings the motion to rest; on that way it counts as late.
+    A controller that reports its target a cycle late cannot be distinguished from a lost reply in
+    its first cycle. It is recognised in the first steps of a motion, which are small (`SLOW`):
+    there nothing is sent again, and the lag of the target is not a loss from then on. A link that
+    becomes late at speed is a loss in every second cycle, which soon stops the motion; while
+    stopping it counts as late.
 
     Args:
-        guard: whose following-error threshold and standstill apply.
-        depth: how many of them the target received may be.
+        guard: provides following-error threshold and standstill.
+        depth: number of set-points that the target received may be one of.
 
     Attributes:
         again: the controller did not accept the last one: it is to be sent once more.
-        lag: cycles that the controller is known to report its target late.
+        lag: cycles by which the controller reports its target late.
     """
 
     def __init__(self, guard: Guard, depth: int) -> None:
@@ -67,30 +66,30 @@ class SentSetPoints:
         self._newest = 0
         self.lag = 0
         self._repeated = 0
-        self._unsure = False
+        self._repeated_before = False
         self.again = False
         self._every = np.ones(n, dtype=np.bool_)
 
     def begin(self, target: Array) -> None:
-        """The first set-point (n,) was sent, the target received."""
+        """Record that the first set-point (n,), the target received, was sent."""
         self._sent[...] = target
         self.lag = self._repeated = 0
-        self._unsure = self.again = False
+        self._repeated_before = self.again = False
 
     def resume_from(self, target: Array, step: Array) -> None:
-        """The controller carried on to this target (n,) by this step (n,); as late as before."""
+        """Record that the controller extrapolated to this target (n,) by this step (n,)."""
         self._sent[(self._newest - self._back) % len(self._sent)] = (
             target - self._back[:, None] * step
         )
-        self._repeated, self._unsure, self.again = 0, False, False
+        self._repeated, self._repeated_before, self.again = 0, False, False
 
     def repeat(self) -> None:
-        """The last set-point was sent once more."""
+        """Record that the last set-point was sent once more."""
         self._repeated += 1
 
     def add(self, target: Array) -> None:
-        """The next set-point (n,) was sent."""
-        self._unsure, self._repeated = self._repeated > 0, 0
+        """Record that the next set-point (n,) was sent."""
+        self._repeated_before, self._repeated = self._repeated > 0, 0
         self._newest = newest = (self._newest + 1) % len(self._sent)
         self._sent[newest] = target
 
@@ -103,38 +102,38 @@ class SentSetPoints:
         *,
         stopping: bool = False,
     ) -> int:
-        """Each joint's target has to be one of the set-points sent last, or the last carried on.
+        """Require each joint's target to be one of the last set-points, or the last extrapolated.
 
         Args:
             target: (n,) D1 received, motor revolutions.
-            missed: packets before this one that were not answered: for so many steps, but less
-                than `depth`, the controller may have carried on.
+            missed: packets before this one without a reply: the controller may have extrapolated
+                by as many steps, but less than `depth`.
             cycle: for the error.
             where: (n,) which joints; None for all.
             stopping: the motion is being brought to rest.
 
         Returns:
-            How many answers more than in the cycle before were not accepted. What a joint at
-            standstill moves in a cycle hides one.
+            Number of replies not accepted, beyond those of the cycle before. A joint that moves by
+            less than the standstill threshold per cycle does not show one.
 
         Raises:
             NotFinite, SetPointNotAccepted: a target further than `FIRST_FRACTION` of the
                 following-error threshold from all of them, or than `LEAP_FRACTION` from the last,
-                or that is not the last one though this was sent `REPETITIONS` times.
+                or not the last one although this was sent `REPETITIONS` times.
         """
         sent, standstill = self._sent, self._guard.limits.standstill
         newest = sent[self._newest]
         self.again = False
-        # As always: the set-point sent last. All else may take its time.
+        # Usual case: the set-point sent last.
         if np.abs(target - newest).max() <= standstill:
-            # Where hardly anything moves, a target reported late looks the same.
+            # At standstill a target reported late is equal to it as well.
             step = np.abs(newest - sent[self._newest - 1]).max()
             if self.lag and not self._repeated and step > standstill:
                 self.lag = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
-        carried = newest + self._ahead[:missed] * (newest - rows[1])
-        late, ahead = np.abs(rows - target), np.abs(carried - target)
+        extrapolated = newest + self._ahead[:missed] * (newest - rows[1])
+        late, ahead = np.abs(rows - target), np.abs(extrapolated - target)
         where = self._every if where is None else where
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
@@ -144,7 +143,7 @@ class SentSetPoints:
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
         more = max(0, lag - self.lag)
-        known_late = stopping and self._unsure
+        known_late = stopping and self._repeated_before
         if not more or known_late or np.abs(newest - rows[1]).max() <= SLOW * standstill:
             self.lag = lag
             return 0 if known_late else more
@@ -161,24 +160,22 @@ TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
 _NEEDED_FIRST: Final = (TARGET, ACTUAL, ACTUAL_VELOCITY)
 _NEEDED_AFTER_GAP: Final = (TARGET, TARGET_VELOCITY, ACTUAL_VELOCITY)
 SPREAD: Final = 2
-"""Cycles for each step that a controller made by itself in which the motion returns to its path.
+"""Cycles, per step that a controller extrapolated, in which the motion returns to its path.
 Where the motion accelerates, each step leaves the velocity of one cycle of that acceleration across
-the path; so spread it is half of that acceleration, within the bounds of a stop."""
+the path; spread over two cycles this is half of that acceleration, within the bounds of a stop."""
 RETURN: Final = 0.03
-"""s that this takes at most, and jerk has no bound. A path that the controller left for longer than
-half of it bends so little, at less than 10 rad/s² within 1e-3 rad, that spread no further it is
-well within those bounds; and nothing goes on beside the path for as long as a gap may last."""
+"""Longest duration of that return, during which jerk has no bound, s. A path that was left for more
+than half of it has so little curvature, less than 10 rad/s² within 1e-3 rad, that no longer return
+is needed; and the motion does not stay beside its path for as long as a gap may last."""
 
 
 class _OpenMode:
-    """Writes into `frame` what is sent, and into the record (2, n) what was commanded.
-
-    The frame holds the safe answer already.
+    """Writes set-points into `frame`, which holds the safe reply, and into a record (2, n).
 
     Attributes:
         held: (n,) rad, the set-point sent last.
-        lost: answers that the packet read last shows not to have been accepted.
-        missed: packets before that one that were not answered; to be set for each.
+        lost: replies that were not accepted according to the last packet.
+        missed: packets before that one without a reply; to be set for each packet.
     """
 
     def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame) -> None:
@@ -192,33 +189,36 @@ class _OpenMode:
         self.missed = 0
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Some axes are open: the safe answer holds them, if they can be held.
+        """Hold the axes that are open already, by the safe reply.
 
         Raises:
-            GuardError: they cannot.
+            GuardError: they cannot be held.
         """
-        self.lost = 0  # what was sent in an earlier interval is no longer asked for
-        held = reading.held
-        self.require_holdable(held, held | reading.ready, cycle)
-        commanded[0] = np.where(held, measured[0], np.nan)
-        commanded[1] = np.where(held, 0.0, np.nan)
+        self.lost = 0  # set-points of an earlier interval do not matter
+        self._hold(reading.held, reading.held | reading.ready, measured, commanded, cycle)
 
-    def require_holdable(self, given: Joints, where: Joints, cycle: int) -> None:
-        """Joints `given` (n,) back the target received, and all of `where` near theirs.
+    def _hold(
+        self, held: Joints, where: Joints, measured: Array, commanded: Array, cycle: int
+    ) -> None:
+        self.require_holdable(held, where, cycle)
+        _command_targets(held, measured, commanded)
+
+    def require_holdable(self, held: Joints, where: Joints, cycle: int) -> None:
+        """Require new targets for joints `held` (n,), and all of `where` near their targets.
 
         Raises:
             FirstSetPointUnknown: the target was sent in an earlier cycle.
-            NotFinite, FollowingError: it is no number, or the arm is elsewhere.
+            NotFinite, FollowingError: it is not finite, or the arm is elsewhere.
         """
-        self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, given)
+        self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, held)
         raw = self._wire.raw
         self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
 
     def require_start(self, cycle: int) -> None:
-        """A motion begins where the arm was held: the conditions of the first set-point.
+        """Require the conditions of the first set-point, for a motion that begins where it is held.
 
         Raises:
-            NotFinite, FirstSetPoint: they do not hold.
+            NotFinite, FirstSetPoint: they are not met.
         """
         self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
         raw = self._wire.raw
@@ -239,6 +239,12 @@ class _OpenMode:
             require(where, age[row].astype(np.float64), self._still, error, cycle)
 
 
+def _command_targets(held: Joints, measured: Array, commanded: Array) -> None:
+    """Record the targets of `held` joints as commanded, at rest."""
+    commanded[0] = np.where(held, measured[0], np.nan)
+    commanded[1] = np.where(held, 0.0, np.nan)
+
+
 class PositionMode(_OpenMode):
     """Modes 1, 4 and 5: the PC generates the targets."""
 
@@ -252,14 +258,14 @@ class PositionMode(_OpenMode):
         self._step = self._still
         self._velocity = self._still
         self._slots = wire.joint_slots[wire.opened]
-        self._answer = frame.floats[self._slots].copy()
+        self._last_reply = frame.floats[self._slots].copy()
         self._continuing = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
 
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """The last wanted axis opened: the target received is the first set-point, at rest.
+        """Send the target received as the first set-point, at rest.
 
         Raises:
             GuardError: it must not be sent.
@@ -280,7 +286,7 @@ class PositionMode(_OpenMode):
         self._rest(commanded)
 
     def require_start(self, cycle: int) -> None:
-        """The arm has to stand at the set-point that was held, too."""
+        """Require the arm at rest at the set-point that was held, too."""
         super().require_start(cycle)
         raw = self._wire.raw
         self._guard.check_start(self._sent, raw[ACTUAL], raw[1:4:2], cycle)
@@ -288,14 +294,14 @@ class PositionMode(_OpenMode):
     def next(
         self,
         execution: Execution | None,
-        measured: Array,  # noqa: ARG002  the motion does not come from there
+        measured: Array,  # noqa: ARG002  needed for corrections only
         commanded: Array,
         cycle: int,
     ) -> None:
-        """The motion's next set-point, or the last one where nothing moves.
+        """Send the motion's next set-point, or the last one without a motion.
 
         Raises:
-            RefusalError: the arm does not follow, the source failed or the guard said no.
+            RefusalError: the arm does not follow, the source failed or the guard refused.
         """
         raw = self._wire.raw
         self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
@@ -324,18 +330,18 @@ class PositionMode(_OpenMode):
         self.held = position
         self._sent = motor
         self._history.add(motor)
-        self._answer = frame[self._slots].copy()
+        self._last_reply = frame[self._slots].copy()
         self._velocity = commanded[1].copy()
 
     def _repeat(self, commanded: Array) -> None:
-        """The answer sent last once more: the controller holds the target before it."""
-        self._frame.floats[self._slots] = self._answer
+        """Send the last reply once more, because the controller holds the target before it."""
+        self._frame.floats[self._slots] = self._last_reply
         self._history.repeat()
         commanded[0] = self.held
         commanded[1] = self._velocity
 
     def _require_closed_still(self, motor: Array, cycle: int) -> None:
-        """Axes that stay closed are where the controller holds them, wrist couplings included."""
+        """Require closed axes to stay where the controller holds them, wrist couplings included."""
         opened = self._wire.opened
         if opened.all():
             return
@@ -346,14 +352,11 @@ class PositionMode(_OpenMode):
     def _check_accepted(
         self, cycle: int, where: Joints | None = None, *, stopping: bool = False
     ) -> None:
-        """Whether the controller accepts the set-points sent.
-
-        An older target, or answers lost for longer than `max_gap`, would make a leap of the next.
-        """
+        """Check the target received against the set-points sent, and count lost replies."""
         target, age = self._wire.raw[TARGET], self._wire.age
         lost = self._history.check(target, self.missed, cycle, where, stopping=stopping)
         if age is not None and age[TARGET].any():
-            # The answer to the packet may have been accepted all the same if the target is older.
+            # An old target does not show whether the last reply was accepted.
             lost, self._history.again = 0, False
         self.lost = lost
 
@@ -365,35 +368,35 @@ class PositionMode(_OpenMode):
             wire.put(frame, D4, step)
             return
         velocity, current = execution.feed_forward(cycle)
-        guard.check_motion(velocity, execution.granted, cycle)
+        guard.check_motion(velocity, execution.widest, cycle)
         guard.check_current(current, None, cycle)
         if execution.finished:
             guard.check_end(cycle)
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def require_carried_on(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
-        """After a long gap: target and velocity received against the set-point sent last.
+    def check_after_gap(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
+        """Compare target and velocity with the set-point sent last, after a long gap.
 
-        A motion goes on from there: some steps further on its path, or at rest. Axes that have
-        closed, or did so since the first set-point, do not matter.
+        A motion continues from the target, some steps further on its path, or at rest. Axes that
+        have closed since the first set-point are left out.
 
         Raises:
-            NotFinite, SetPointNotAccepted, VelocityAfterGap, SourceFailed: resuming would jump.
+            NotFinite, SetPointNotAccepted, VelocityAfterGap, SourceFailed: it cannot continue.
         """
         where = self._continuing & reading.ready
         self._require_fresh(_NEEDED_AFTER_GAP, AgeAfterGap, cycle, where)
         raw, step = self._wire.raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
-        if not (isinstance(execution, MotionExecution) and execution.follows and step.any()):
+        if not (isinstance(execution, MotionExecution) and execution.is_resumable and step.any()):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
-        # One that is reported late is further on by now.
+        # A target that is reported late is further on by now.
         target = target + self._history.lag * velocity[0]
         ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
-        # What counts as standstill does not say whether a slow motion was held; its target does.
+        # For a motion slower than standstill, the target shows whether it was held.
         step = self._still if not moves and (moved or steps == 0) else step
         self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
         step = velocity[0] if moves else step
@@ -405,11 +408,11 @@ class PositionMode(_OpenMode):
         self._history.resume_from(target, step)
         self.held, self._sent = position, target
 
-    def require_no_pause(self, reading: Reading, cycle: int) -> None:
-        """A packet came late by the clock: the arm moves as the set-points sent last.
+    def check_after_pause(self, reading: Reading, cycle: int) -> None:
+        """Require after a late packet that the arm moves as the set-points sent last.
 
         Raises:
-            NotFinite, VelocityAfterPause: going on would be a jump.
+            NotFinite, VelocityAfterPause: it does not.
         """
         where = self._continuing & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), AgeAfterGap, cycle, where)
@@ -417,22 +420,21 @@ class PositionMode(_OpenMode):
         self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Axes open all the time keep the last set-point; those open again, their target.
+        """Hold axes that were always open at the last set-point, reopened ones at their target.
 
         Raises:
-            GuardError: an axis still open does not follow, or takes too much current.
+            GuardError: an axis still open does not follow, or its current is too large.
         """
         raw, continuing, held = self._wire.raw, self._continuing, reading.held
         continuing &= reading.ready
         self.require_holdable(held & ~continuing, held | reading.ready, cycle)
-        commanded[0] = np.where(held, measured[0], np.nan)
-        commanded[1] = np.where(held, 0.0, np.nan)
+        _command_targets(held, measured, commanded)
         self._guard.check_feedback(
             raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=continuing
         )
         self._check_accepted(cycle, continuing)
         if np.array_equal(continuing, self._wire.opened):
-            # A source that ends in mid-motion would leave a jump to rest.
+            # A source that ends while moving would cause a jump to rest.
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
         self._history.add(self._sent)
         self._step = self._still
@@ -453,10 +455,10 @@ _CURRENT_FIELD: Final = 5
 
 
 class CorrectionMode(_OpenMode):
-    """Zeros, until a source corrects what the controller does.
+    """Modes 2, 7, 8 and 9: corrections of targets that the controller generates, or zeros.
 
     ====  ==============================  ===================================================
-    mode  answered                        read as
+    mode  reply                           effect in the controller
     ====  ==============================  ===================================================
     2     D4 velocity, D5 current         fed forward beside the controller's own loop
     7     D1 offset                       added to the controller's own target of this cycle
@@ -464,12 +466,12 @@ class CorrectionMode(_OpenMode):
     9     D5 current                      added to the current the servo asks for (D5 received)
     ====  ==============================  ===================================================
 
-    How the controller uses an offset in mode 7 (for one cycle, or summed up) is documented
-    nowhere. Hence it keeps the bounds under both readings: as a position beside the target, and
-    as a step made anew in every cycle, which allows no more than the way of one cycle at full
-    speed. So does the target with it, of which it is known how fast the controller moves it.
+    Whether the controller applies an offset in mode 7 for one cycle or adds it up is not
+    documented. Hence it satisfies the bounds in both cases: as a position beside the target, and
+    as a step in every cycle, which limits it to the distance of one cycle at full speed. So does
+    its sum with the target.
 
-    Following error is |D1 - D3| as received: there is no target of ours to compare with.
+    Following error is |D1 - D3| as received, because the PC sends no target.
     """
 
     def __init__(
@@ -478,7 +480,7 @@ class CorrectionMode(_OpenMode):
         wire: ArmWire,
         frame: ReplyFrame,
         mode: int,
-        max_gap: int,  # noqa: ARG002  no target is ours
+        max_gap: int,  # noqa: ARG002  needed for targets of the PC only
     ) -> None:
         super().__init__(guard, wire, frame)
         self._mode = mode
@@ -489,33 +491,35 @@ class CorrectionMode(_OpenMode):
         self._corrections = CorrectionGuard(guard, "offset" if self._offset else "velocity")
 
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """The first answer is zero; the arm has to stand where the controller wants it."""
+        """Send zero; require the arm at rest at the controller's target."""
         self.require_start(cycle)
         self._check_arm(cycle)
         self.held = measured[0].copy()
         self._corrections.check_position(self.held, cycle)
         self._corrections.begin()
-        self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
-        self._note(self._still, measured, commanded)
+        self._send_zero(measured, commanded, cycle)
+
+    def _send_zero(self, measured: Array, commanded: Array, cycle: int) -> None:
+        self._corrections.set_target(self.held, self._still, self._sent_in(cycle))
+        self._record(self._still, measured, commanded)
 
     def next(
         self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
     ) -> None:
-        """The next correction, or none."""
+        """Send the next correction, or zero without a motion."""
         self._check_arm(cycle)
         self.held = measured[0].copy()
         if execution is None:
             self._corrections.check_position(self.held, cycle)
-            self._corrections.note_target(self.held, self._still, self._sent_in(cycle))
-            self._note(self._still, measured, commanded)
+            self._send_zero(measured, commanded, cycle)
             return
         assert isinstance(execution, CorrectionExecution)
         motion, current = execution.advance(cycle)
         self._require_fields(motion, current, cycle)
         guard = self._corrections
-        guard.check_motion(motion, execution.granted, cycle)
-        if execution.granted == "stop" and guard.resting:
-            execution.rested()
+        guard.check_motion(motion, execution.widest, cycle)
+        if execution.widest == "stop" and guard.resting:
+            execution.mark_at_rest()
         guard.check_position(self.held + motion if self._offset else self.held, cycle)
         if self._offset:
             rounding = self._wire.joint_rounding(self._wire.raw[TARGET])
@@ -525,37 +529,28 @@ class CorrectionMode(_OpenMode):
         if execution.finished:
             guard.check_end(cycle)
         self._write(motion, current)
-        self._note(motion, measured, commanded)
+        self._record(motion, measured, commanded)
 
-    def require_carried_on(
+    def check_after_gap(
         self,
-        execution: Execution | None,  # noqa: ARG002  the motion is the controller's
-        reading: Reading,  # noqa: ARG002  zero is zero in every axis
+        execution: Execution | None,  # noqa: ARG002  needed for targets of the PC only
+        reading: Reading,  # noqa: ARG002
         cycle: int,
     ) -> None:
-        """A correction that was not zero may have been applied or dropped: nothing tells."""
+        """Require the last correction to be zero: it is unknown whether it was applied."""
         self._corrections.check_after_gap(cycle)
 
-    def require_no_pause(self, reading: Reading, cycle: int) -> None:
-        """The controller generates the motion: what it should be is not known here."""
+    def check_after_pause(self, reading: Reading, cycle: int) -> None:
+        """Check nothing: the controller generates the motion."""
 
-    def leaving(
-        self,
-        reading: Reading,
-        measured: Array,
-        commanded: Array,
-        cycle: int,
-    ) -> None:
-        """Zeros, as the safe answer says; an axis in a mode of positions, its target."""
-        held = reading.held
-        if held.any():
-            self.require_holdable(held, held, cycle)
-            commanded[0] = np.where(held, measured[0], np.nan)
-            commanded[1] = np.where(held, 0.0, np.nan)
+    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
+        """Send zeros, by the safe reply; the target to an axis in a position mode."""
+        if reading.held.any():
+            self._hold(reading.held, reading.held, measured, commanded, cycle)
         self._check_arm(cycle, where=reading.ready)
 
     def _sent_in(self, cycle: int) -> Array:
-        """The cycle in which each target received was sent."""
+        """Return the cycle in which each target received was sent."""
         age = self._wire.age
         return self._still + cycle if age is None else cycle - age[TARGET].astype(np.float64)
 
@@ -565,7 +560,7 @@ class CorrectionMode(_OpenMode):
         self._guard.check_feedback(target, raw[ACTUAL], raw[CURRENT], target, cycle, where)
 
     def _require_fields(self, motion: Array, current: Array, cycle: int) -> None:
-        """What this mode has no field for is a misunderstanding, not something to drop."""
+        """Refuse a correction that this mode has no field for."""
         if not (self._offset or self._velocity) and np.any(motion):
             raise SourceFailed(f"mode {self._mode} has no field for a motion: {motion}", cycle)
         if not self._current and np.any(current):
@@ -580,7 +575,7 @@ class CorrectionMode(_OpenMode):
         if self._current:
             wire.put(frame, D5, current)
 
-    def _note(self, motion: Array, measured: Array, commanded: Array) -> None:
+    def _record(self, motion: Array, measured: Array, commanded: Array) -> None:
         if self._offset:
             np.add(measured[0], motion, out=commanded[0])
         elif self._velocity:

@@ -1,12 +1,11 @@
-"""Answers to cyclic packets: the safe one for every state, and the frame they are built in.
+"""Safe replies to cyclic packets, and the frame in which replies are built.
 
-The safe answer is the one that an independent program gave on real robots (facts on the C4G Open
-wire, section 6): everything echoed while the drive is off, target position and velocity given
-back in modes 501 and 0, a mode that is not available answered by mode 0 and zeros. An axis in an
-open mode that nobody moves gets the target received, at zero velocity; zeros where the answer
-would be a correction, whatever the status byte says of the drive, because an echo would make an
-offset of a position. Each axis is answered by
-its own mode, because axes change modes in different cycles.
+The safe reply is the one that an independent program gave on real robots (facts on the C4G Open
+wire, section 6): everything echoed while the drive is off, target position and velocity returned in
+modes 501 and 0, a mode that is not available replied to with mode 0 and zeros. An axis in an open
+mode without motion gets the target received, at zero velocity; zeros where the reply would be a
+correction, with any status byte, because an echo would make an offset of a position. Each axis is
+handled by its own mode, because axes change modes in different cycles.
 """
 
 from __future__ import annotations
@@ -58,14 +57,14 @@ _RETURNED_WORDS: Final[dict[int, tuple[int, ...]]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class SafeAnswer:
-    """The safe answer to every packet with certain status bytes and modes.
+class SafeReply:
+    """Safe reply to every packet with certain status bytes and modes.
 
     Attributes:
         status: 4 bytes.
-        modes: (n,) modes answered.
-        mask: (n, 9) all bits set in the words that are given back as received, none elsewhere.
-        held: slots in an open mode with their drive on that are given back their target.
+        modes: (n,) modes of the reply.
+        mask: (n, 9) all bits set in the words that are returned as received, none elsewhere.
+        held: slots in an open mode with their drive on whose target is returned.
     """
 
     status: bytes
@@ -74,8 +73,8 @@ class SafeAnswer:
     held: tuple[int, ...]
 
 
-def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeAnswer:
-    """Work it out.
+def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeReply:
+    """Compute the safe reply.
 
     Args:
         status: 4 status bytes received.
@@ -87,32 +86,32 @@ def safe_answer(status: bytes, modes: Words, arms: Sequence[int] | None) -> Safe
     if arms is None:
         arms = (1,) * n
         on = [any(on)] * N_ARMS
-    answered = np.zeros(n, np.int32)
+    replied = np.zeros(n, np.int32)
     mask = np.zeros((n, WORDS_PER_AXIS), np.int32)
     held = []
     for slot in range(n):
         mode = int(modes[slot])
         if not on[arms[slot] - 1] and mode not in INCREMENTAL:
-            answered[slot] = mode
+            replied[slot] = mode
             mask[slot, D1:] = _ALL_BITS
         elif mode in _RETURNED_WORDS:
-            answered[slot] = mode
+            replied[slot] = mode
             mask[slot, list(_RETURNED_WORDS[mode])] = _ALL_BITS
             if mode in HOLDABLE:
                 held.append(slot)
-    given_back = bytes(
+    returned = bytes(
         status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
     )
-    return SafeAnswer(given_back, answered, mask, tuple(held))
+    return SafeReply(returned, replied, mask, tuple(held))
 
 
 def words_of(packet: CyclicPacket) -> Words:
-    """The axis blocks as (n, 9) words; a view, which moves NaN payloads unharmed."""
+    """Return the axis blocks as (n, 9) words, a view, which preserves NaN payloads."""
     return packet.axes.view(np.int32).reshape(-1, WORDS_PER_AXIS)
 
 
 class ReplyFrame:
-    """The bytes of one answer, built in place: 12 + 36 n, whatever the length received.
+    """The 12 + 36 n bytes of one reply, built in place.
 
     Attributes:
         floats: the axis blocks as (n, 9) numbers, to write set-points into.
@@ -124,65 +123,65 @@ class ReplyFrame:
         self._words = words.reshape(n_axes, WORDS_PER_AXIS)
         self.floats: Floats = self._words.view(np.float32)
 
-    def safe(self, answer: SafeAnswer, received: Words) -> None:
-        """The safe answer in every slot."""
-        np.bitwise_and(received, answer.mask, out=self._words)
-        self._words[:, MODE] = answer.modes
+    def safe(self, reply: SafeReply, received: Words) -> None:
+        """Fill in the safe reply in every slot."""
+        np.bitwise_and(received, reply.mask, out=self._words)
+        self._words[:, MODE] = reply.modes
 
-    def drive_off(self, answer: SafeAnswer, received: Words) -> None:
+    def drive_off(self, reply: SafeReply, received: Words) -> None:
         """Request drive-off: 505 in every slot.
 
-        The controller is to ignore the targets in such an answer; in case it does not, they are
-        where it had them.
+        The controller should ignore the targets in such a reply; in case it does not, they are
+        those it sent.
         """
-        self._safe_and_finite(answer, received)
+        self._safe_and_finite(reply, received)
         self._words[:, MODE] = Mode.DRIVE_OFF_REQUEST
 
     def following_error(
-        self, answer: SafeAnswer, received: Words, offending: NDArray[np.intp]
+        self, reply: SafeReply, received: Words, offending: NDArray[np.intp]
     ) -> None:
         """Report 508 in the offending slots; the others keep their mode and their target."""
-        self._safe_and_finite(answer, received)
+        self._safe_and_finite(reply, received)
         self._words[offending, MODE] = Mode.FOLLOWING_ERROR
 
-    def _safe_and_finite(self, answer: SafeAnswer, received: Words) -> None:
-        self.safe(answer, received)
+    def _safe_and_finite(self, reply: SafeReply, received: Words) -> None:
+        self.safe(reply, received)
         data = self.floats[:, D1:]
         data[~np.isfinite(data)] = 0.0
 
     def finish(self, number: int, status: bytes) -> bytes:
-        """The answer to packet `number`. Functionality is always zero."""
+        """Return the reply to packet `number`; functionality is always zero."""
         _HEADER.pack_into(self._buffer, 0, next_number(number), status, 0)
         return bytes(self._buffer)
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Status bytes and modes of a packet, understood.
+    """Status bytes and modes of a packet, interpreted.
 
     Attributes:
-        input: what it is to the state machine.
-        answer: the safe answer.
+        input: of the state machine.
+        reply: the safe reply.
         status: status byte of the arm.
         modes: (n,) mode of each joint.
-        ready: (n,) joints in the mode wanted; closed ones where they are to stay closed.
-        held: (n,) joints in an open mode whose safe answer is the target received.
+        ready: (n,) joints in the wanted mode; closed ones where they are to stay closed.
+        held: (n,) joints in an open mode whose safe reply is the target received.
         powered: some wanted axis is in an open mode and the drive is on.
         any_open: some wanted axis is in an open mode.
-        strayed: first joint in an open mode that is not wanted of it, or None.
-        others: slots given back their target in an open mode that are no joint of the arm.
+        unwanted: first joint in an open mode other than the wanted one, or None.
+        other_slots: slots in `reply.held` that are not joints of the arm.
     """
 
     input: Input
-    answer: SafeAnswer
+    reply: SafeReply
     status: int
     modes: NDArray[np.int32]
     ready: NDArray[np.bool_]
     held: NDArray[np.bool_]
     powered: bool
     any_open: bool
-    strayed: int | None
-    others: tuple[int, ...]
+    unwanted: int | None
+    other_slots: tuple[int, ...]
 
     @property
     def faulty(self) -> tuple[int, int, bool]:
@@ -193,13 +192,13 @@ class Reading:
 
 
 class Reader:
-    """Reads packets of one session; remembers the last, because modes rarely change.
+    """Interprets status and modes of packets; caches the last, because modes rarely change.
 
     Args:
         slots: (n,) slot of each wanted axis; none if the arm has no open axis.
         arms: arm of each slot, from 1; None if unknown: any drive that is on counts.
         arm: the arm that is moved, from 1.
-        mode: the open mode wanted.
+        mode: wanted open mode.
         opened: (n,) which axes are to be open; None for all.
     """
 
@@ -220,31 +219,31 @@ class Reader:
         self._last: Reading | None = None
 
     def read(self, status: bytes, modes: Words) -> Reading:
-        """Understand 4 status bytes and the modes of all slots."""
+        """Interpret 4 status bytes and the modes of all slots."""
         key = (status, modes.tobytes())
         if self._last is None or key != self._key:
             self._key = key
-            self._last = self._understand(status, modes.copy())
+            self._last = self._interpret(status, modes.copy())
         return self._last
 
-    def _understand(self, status: bytes, modes: Words) -> Reading:
+    def _interpret(self, status: bytes, modes: Words) -> Reading:
         wanted = modes[self._slots]
         drive_on = (DRIVE_ON in status) if self._arms is None else status[self._arm - 1] == DRIVE_ON
         is_open = np.isin(wanted, list(OPEN_MODES))
         closed = ~self._opened & np.isin(wanted, list(CLOSED_MODES))
         ready = closed | (self._opened & (wanted == self._mode))
-        strayed = np.flatnonzero(is_open & ~ready)
-        answer = safe_answer(status, modes, self._arms)
+        unwanted = np.flatnonzero(is_open & ~ready)
+        reply = safe_reply(status, modes, self._arms)
         joints = set(self._slots.tolist())
         return Reading(
             input=read_input(drive_on, modes.tolist(), wanted[~closed].tolist(), self._mode),
-            answer=answer,
+            reply=reply,
             status=status[self._arm - 1],
             modes=wanted,
             ready=ready,
             held=np.isin(wanted, list(HOLDABLE)),
             powered=drive_on and bool(is_open.any()),
             any_open=bool(is_open.any()),
-            strayed=int(strayed[0]) if strayed.size else None,
-            others=tuple(slot for slot in answer.held if slot not in joints),
+            unwanted=int(unwanted[0]) if unwanted.size else None,
+            other_slots=tuple(slot for slot in reply.held if slot not in joints),
         )

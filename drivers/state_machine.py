@@ -27,47 +27,41 @@ from drivers.replies import Reading
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
 _LOSS: Final = {
-    Input.SYNC: "the controller started anew",
-    Input.INIT: "the controller started over",
+    Input.SYNC: "the controller restarted",
+    Input.INIT: "the controller restarted",
     Input.OFF: "the drive went off",
     Input.DRIVING_ON: "the drive was switched on again",
     Input.CLOSED: "the controller closed open mode",
     Input.PARTLY_OPEN: "axes were open before the controller reported them closed",
     Input.OPEN: "axes were open before the controller reported them closed",
     Input.PAUSE: "the controller paused the exchange",
-    Input.UNAVAILABLE: "the controller reports a mode that is not known here",
+    Input.UNAVAILABLE: "the controller reports an unknown mode",
     Input.END: "the controller ended the session",
-    Input.SILENCE: "nothing was heard from the controller",
+    Input.SILENCE: "nothing was received from the controller",
 }
-
-
-_NONE: Final = "no motion was requested"
-
+"""Reason for the loss of a motion."""
+_NO_MOTION: Final = "no motion was requested"
 LOSS_WINDOW: Final = 100
-"""Cycles over which lost answers are added up."""
+"""Cycles over which lost replies are added up."""
 
 
 class StateMachine:
-    """Walks the state table and says what that does to the motion.
-
-    Args:
-        counters: where missed packets and lost answers are counted.
+    """Follows the state table and ends the motion where a transition requires it.
 
     Attributes:
-        state: where the session stands.
+        state: current state.
         cycle: the controller's cycle, for events.
         entered_at: the cycle in which the state was entered.
         interval: index of the last interval in open mode, -1 before the first.
-        in_interval: whether that interval goes on.
-        entering: open mode was reached and the first set-point is still to be taken.
-        execution: the motion requested, None without one.
-        stop_reason: why open mode is to be left, None while it is not.
-        offending: joint whose following error was reported, None where drive-off is asked for.
+        in_interval: whether that interval continues.
+        entering: open mode was reached and the first set-point is still to be sent.
+        execution: the requested motion, or None.
+        stop_reason: why open mode is to be left, or None.
+        offending: joint whose following error was reported, None where drive-off is requested.
         events: since they were last drained.
     """
 
     def __init__(self, counters: Counters) -> None:
-        self.counters = counters
         self.state = State.SYNC
         self.cycle = 0
         self.entered_at = 0
@@ -78,14 +72,15 @@ class StateMachine:
         self.stop_reason: str | None = None
         self.offending: int | None = None
         self.events: list[Event] = []
+        self._counters = counters
         self._losses: deque[tuple[int, int]] = deque()
         self._first_interval = 0
 
     def request(self, execution: Execution, unusable: str | None) -> None:
-        """Keep a motion for the next time in open mode.
+        """Store a motion for the next time in open mode.
 
         Raises:
-            RequestError: none can be promised now.
+            RequestError: the state does not allow one.
         """
         reason = None
         if self.execution is not None:
@@ -99,13 +94,16 @@ class StateMachine:
         elif unusable is not None:
             reason = unusable
         if reason is not None:
-            raise RequestError(self.state.name.lower(), reason)
+            raise self._request_error(reason)
         self.execution = execution
-        # Axes may still be open in an interval that was another motion's.
+        # Axes may still be open in the interval of an earlier motion.
         self._first_interval = self.interval + (self.state is not State.OPEN)
 
+    def _request_error(self, reason: str, what: str = "motion") -> RequestError:
+        return RequestError(self.state.name.lower(), reason, what)
+
     def stop(self, reason: str) -> None:
-        """Leave open mode, after coming to rest; drop a motion that has not begun."""
+        """Leave open mode after coming to rest; drop a motion that has not begun."""
         if self.execution is not None and not self.execution.started:
             self.end("stopped", reason)
         if self.state in (State.OPENING, State.OPEN):
@@ -119,23 +117,21 @@ class StateMachine:
         """
         execution = self.execution
         before = None if execution is None else execution.fraction
-        reason = _NONE if execution is None else execution.override(fraction)
+        reason = _NO_MOTION if execution is None else execution.override(fraction)
         if reason is not None:
-            raise RequestError(self.state.name.lower(), reason, "change of override")
+            raise self._request_error(reason, "change of override")
         if fraction != before:
             self.events.append(OverrideChanged(float(fraction), self.cycle))
 
     def hold(self) -> None:
-        """Come to rest on the path and wait there; a stop where the source cannot.
-
-        A motion not begun begins at rest.
+        """Come to rest on the path and wait there; stop if the source cannot hold.
 
         Raises:
-            RequestError: there is none. Nothing is kept for one to come.
+            RequestError: there is no motion.
         """
         execution = self.execution
         if execution is None:
-            raise RequestError(self.state.name.lower(), _NONE, "hold")
+            raise self._request_error(_NO_MOTION, "hold")
         if self.stop_reason is not None:
             return
         before, reason = execution.held, execution.hold(self.cycle)
@@ -145,28 +141,28 @@ class StateMachine:
             self.events.append(HoldChanged(True, self.cycle))
 
     def resume(self) -> None:
-        """Go on after a hold.
+        """Continue after a hold.
 
         Raises:
             RequestError: there is no motion, or it cannot.
         """
         execution = self.execution
         before = execution is not None and execution.held
-        reason = _NONE if execution is None else execution.resume()
+        reason = _NO_MOTION if execution is None else execution.resume()
         if reason is not None:
-            raise RequestError(self.state.name.lower(), reason, "resumption")
+            raise self._request_error(reason, "resumption")
         if before:
             self.events.append(HoldChanged(False, self.cycle))
 
-    def note_lost(self, lost: int, max_gap: int) -> None:
-        """So many of our last answers did not reach the controller, or it did not take them.
+    def record_lost(self, lost: int, max_gap: int) -> None:
+        """Count `lost` replies that the controller did not accept.
 
-        More than `max_gap` of them in `LOSS_WINDOW` cycles end a motion on its path: the target
-        comes in leaps then, each of which a controller might put up with.
+        More than `max_gap` of them in `LOSS_WINDOW` cycles stop a motion on its path, because the
+        controller's target then moves in jumps.
         """
         if not lost:
             return
-        self.counters.unanswered += lost
+        self._counters.unanswered += lost
         self.events.append(AnswersLost(lost, self.cycle))
         self._losses.append((self.cycle, lost))
         while self._losses[0][0] <= self.cycle - LOSS_WINDOW:
@@ -176,15 +172,15 @@ class StateMachine:
             self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
 
     def record_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
-        """`missed` packets never arrived; `unanswered` above `max_gap` end a motion on its path."""
+        """Count `missed` packets; more than `max_gap` `unanswered` ones stop a motion."""
         if missed:
-            self.counters.missed += missed
+            self._counters.missed += missed
             self.events.append(GapSeen(missed, self.cycle))
         if unanswered > max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{unanswered} packets were missed in a row")
 
     def require_axes(self, reading: Reading, mode: int) -> None:
-        """A motion needs every wanted axis in its mode, from its beginning to its end.
+        """Require every wanted axis in its mode, from begin to end of a motion.
 
         Raises:
             AxisNotInMode: one is not.
@@ -192,15 +188,16 @@ class StateMachine:
         execution = self.execution
         if execution is None or not reading.powered:
             return
-        joint = reading.strayed
+        joint = reading.unwanted
         if execution.started and self.state is State.OPEN and reading.input is not Input.OPEN:
             joint = int(np.argmin(reading.ready))
         if joint is not None:
             found = int(reading.modes[joint])
-            raise AxisNotInMode(joint, found, Mode.CLOSED if found == mode else mode, self.cycle)
+            wanted = Mode.CLOSED if found == mode else mode
+            raise AxisNotInMode(joint, found, wanted, self.cycle)
 
     def begin_motion(self, position: Array) -> None:
-        """The first set-point of the motion is `position`, (n,) rad.
+        """Begin the motion at its first set-point, (n,) rad.
 
         Raises:
             SourceFailed: it cannot begin there.
@@ -209,30 +206,30 @@ class StateMachine:
         self.execution.begin(position, self.cycle)
         self.events.append(MotionStarted(self.interval, self.cycle))
 
-    def take(self, what: Input, why: str = "") -> None:
-        """Go to the state that follows, and end a motion that does not survive it.
+    def apply(self, cause: Input, reason: str = "") -> None:
+        """Change to the next state, and end a motion that the transition does not allow.
 
         Args:
-            what: happened.
-            why: more exactly, in words; "" for the words that every such input has.
+            cause: input of the state table.
+            reason: of the loss of the motion; "" for that of the input.
         """
-        before, after = self.state, TRANSITIONS[self.state][what]
+        before, after = self.state, TRANSITIONS[self.state][cause]
         if after is not before:
             self._enter(before, after)
-        if what in (Input.INIT, Input.SILENCE):
+        if cause in (Input.INIT, Input.SILENCE):
             self.in_interval = False
         execution = self.execution
-        if execution is None or what is Input.REFUSAL:
+        if execution is None or cause is Input.REFUSAL:
             return
         if not execution.started:
-            # Whatever a controller does that was silent for so long, nobody waits for it now.
-            if what is Input.SILENCE or not keeps_request(before, after):
-                self.end("lost", why or _LOSS[what])
+            # After such a silence the request may be outdated, whatever the controller does next.
+            if cause is Input.SILENCE or not keeps_request(before, after):
+                self.end("lost", reason or _LOSS[cause])
         elif after not in HAS_SET_POINTS:
             if execution.leaving:
                 self.end(execution.outcome, execution.reason)
             else:
-                self.end("lost", why or _LOSS[what])
+                self.end("lost", reason or _LOSS[cause])
 
     def _enter(self, before: State, after: State) -> None:
         self.state = after
@@ -247,12 +244,8 @@ class StateMachine:
             self.stop_reason = None
         self.offending = None
 
-    def forget_request(self) -> None:
-        """The controller that a motion was to wait for was started over."""
-        self.end("lost", _LOSS[Input.INIT])
-
     def end(self, outcome: Outcome, reason: str) -> None:
-        """The requested motion, if there is one, is over."""
+        """End the requested motion, if there is one."""
         if self.execution is None:
             return
         # A motion refused at its first set-point was in the interval without having begun.

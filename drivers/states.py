@@ -1,8 +1,8 @@
-"""The session's state machine, as a table.
+"""State table of a session.
 
-A cyclic packet is first read as one `Input`, by `read_input`; the table then says which state
-follows. What else the session notices (an init packet, silence, its own refusal, its own exit)
-are inputs too, so that every change of state is a line here.
+A cyclic packet is first classified as one `Input` by `read_input`; the table gives the state that
+follows. Init packets, silence, refusals and exits are inputs as well, so that every change of
+state is an entry of the table.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from drivers.packets import MODE_FIELDS, Mode
 
 
 class State(IntEnum):
-    """Where a session stands."""
+    """State of a session."""
 
     SYNC = 0
     INIT = 1
@@ -31,26 +31,26 @@ class State(IntEnum):
 
 
 class Input(IntEnum):
-    """What makes a state follow another."""
+    """Cause of a change of state."""
 
     SYNC = 0
-    """A packet before the init packet, or the two after it."""
+    """A packet before the init packet, or one of the two after it."""
     INIT = 1
     """An init packet."""
     OFF = 2
-    """The arm's drive is not on, whatever the modes."""
+    """The arm's drive is not on, in any mode."""
     DRIVING_ON = 3
     """Mode 501 in a wanted axis."""
     CLOSED = 4
     """Every wanted axis in mode 0 or 10."""
     PARTLY_OPEN = 5
-    """Some wanted axis in an open mode, not all of them in the mode wanted."""
+    """A wanted axis in an open mode, but not all of them in the wanted mode."""
     OPEN = 6
-    """Every wanted axis in the mode wanted."""
+    """Every wanted axis in the wanted mode."""
     PAUSE = 7
-    """Mode 500 or 502 in a wanted axis: the exchange rests."""
+    """Mode 500 or 502 in a wanted axis: the controller pauses the exchange."""
     UNAVAILABLE = 8
-    """A mode that nobody here knows an answer to, in any wanted axis."""
+    """A wanted axis in a mode to which the reply is unknown."""
     END = 9
     """Mode 504 in every axis."""
     REFUSAL = 10
@@ -58,14 +58,14 @@ class Input(IntEnum):
     EXIT = 11
     """The session asked for the end of open mode."""
     SILENCE = 12
-    """Nothing came for too long."""
+    """No packet before the deadline."""
 
 
 OPEN_MODES: Final = frozenset(MODE_FIELDS)
 HOLDABLE: Final = frozenset(mode for mode, d in MODE_FIELDS.items() if d[:2] == (1, 2))
-"""Open modes in which D1 is an absolute position: the target received is the safe answer."""
+"""Open modes in which D1 is an absolute position: the target received is the safe reply."""
 INCREMENTAL: Final = OPEN_MODES - HOLDABLE
-"""Open modes in which zero is the safe answer."""
+"""Open modes in which zero is the safe reply."""
 POSITION_MODES: Final = frozenset(
     {Mode.POSITION_FEED_FORWARD, Mode.POSITION, Mode.POSITION_RELATIVE}
 )
@@ -77,19 +77,19 @@ CORRECTION_MODES: Final = frozenset(
 CLOSED_MODES: Final = frozenset({Mode.CLOSED, Mode.CLOSED_MIRRORED})
 PAUSE_MODES: Final = frozenset({Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER})
 KNOWN_MODES: Final = OPEN_MODES | CLOSED_MODES | PAUSE_MODES | {Mode.DRIVING_ON}
-"""Modes that an answer is known to."""
+"""Modes to which the reply is known."""
 
 
 def read_input(
     drive_on: bool, all_modes: Sequence[int], wanted_modes: Sequence[int], mode: int
 ) -> Input:
-    """What a cyclic packet says.
+    """Classify a cyclic packet.
 
     Args:
         drive_on: whether the arm's status byte is 5.
         all_modes: mode of every slot.
-        wanted_modes: modes of the axes that are to be moved; none is open if there are none.
-        mode: the open mode they are wanted in.
+        wanted_modes: modes of the axes to be moved, may be empty.
+        mode: open mode in which they are to be moved.
     """
     if all(m == Mode.END_OF_SESSION for m in all_modes):
         return Input.END
@@ -122,8 +122,7 @@ _ANY: Final[Mapping[Input, State]] = {
     Input.SILENCE: State.FAULTED,
 }
 _MAY_OPEN: Final = {Input.PARTLY_OPEN: State.OPENING, Input.OPEN: State.OPEN}
-_MUST_CLOSE_FIRST: Final = {Input.PARTLY_OPEN: State.FAULTED, Input.OPEN: State.FAULTED}
-_LEAVING: Final = {Input.PARTLY_OPEN: State.EXITING, Input.OPEN: State.EXITING}
+_MUST_CLOSE_FIRST: Final = dict.fromkeys((Input.PARTLY_OPEN, Input.OPEN), State.FAULTED)
 
 TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
     State.SYNC: {
@@ -142,34 +141,37 @@ TRANSITIONS: Final[Mapping[State, Mapping[Input, State]]] = {
         Input.PARTLY_OPEN: State.EXITING,
         Input.EXIT: State.EXITING,
     },
-    State.EXITING: {**_ANY, **_LEAVING, Input.EXIT: State.EXITING},
-    # Nobody knows what a pause leaves behind, nor what came before it has to be remembered.
+    State.EXITING: {
+        **_ANY,
+        **dict.fromkeys((Input.PARTLY_OPEN, Input.OPEN, Input.EXIT), State.EXITING),
+    },
+    # The modes after a pause are not documented, so axes have to close first.
     State.FREEZING: {**_ANY, **_MUST_CLOSE_FIRST},
     # A cold start of the controller begins with sync packets, after a silence.
     State.FAULTED: {**_ANY, **_MUST_CLOSE_FIRST, Input.SYNC: State.SYNC},
     State.ENDED: {},
 }
-"""`TRANSITIONS[state][input]` is the state that follows; what is missing cannot happen."""
+"""`TRANSITIONS[state][input]` is the next state; missing entries cannot occur."""
 
 HAS_SET_POINTS: Final = frozenset({State.OPENING, State.OPEN, State.EXITING})
-"""States in which open axes are given set-points."""
+"""States in which open axes are sent set-points."""
 
-_BEFORE_THE_DRIVE: Final = frozenset({State.INIT, State.DRIVE_OFF})
+_BEFORE_DRIVE_ON: Final = frozenset({State.INIT, State.DRIVE_OFF})
 
 
 def keeps_request(before: State, after: State) -> bool:
-    """Whether a motion that was requested but has not begun survives this step.
+    """Return whether a requested motion that has not begun stays requested over this transition.
 
-    It waits for the controller to start, for the drive and for open mode; it does not survive a
-    restart, a fault, a pause that begins, a drive that was on and goes off (or is switched on
-    again, its going off having been missed), or an opening that is given up.
+    It waits for the start of the controller, for the drive and for open mode. It is dropped by a
+    restart, a fault, the begin of a pause, a drive that goes off (or is switched on again) and an
+    opening that is abandoned.
     """
     if after in (State.SYNC, State.INIT):
         return before in (State.SYNC, State.INIT)
     if after is State.DRIVE_OFF:
-        return before in _BEFORE_THE_DRIVE
+        return before in _BEFORE_DRIVE_ON
     if after is State.DRIVING_ON:
-        return before in _BEFORE_THE_DRIVE or before is State.DRIVING_ON
+        return before in _BEFORE_DRIVE_ON or before is State.DRIVING_ON
     if after is State.CLOSED:
         return before not in HAS_SET_POINTS
     if after is State.FREEZING:

@@ -242,12 +242,12 @@ class TestHold:
         execution = execution_of(source, Mode.POSITION, N, SETTLE, STOP)
         assert isinstance(execution, MotionExecution)
         assert execution.hold(0) is None
-        assert (execution.held, source.told, execution.granted) == (True, [], "plan")
+        assert (execution.held, source.told, execution.widest) == (True, [], "plan")
         assert execution.resume() is None
         assert (execution.held, source.told) == (False, [])
         execution.hold(0)
         execution.begin(HERE, 0)
-        assert (source.told, execution.granted) == (["hold"], "stop")
+        assert (source.told, execution.widest) == (["hold"], "stop")
         for cycle in range(STOP + 1):
             execution.advance(1 + cycle)
         assert execution.outcome == "stopped"
@@ -275,11 +275,11 @@ class TestBounds:
             source.bounds = needs
             fails(execution, f"named bounds '{needs}'")
             assert call() is None
-            assert execution.granted == needs
+            assert execution.widest == needs
             assert execution.advance(2)[2] == needs
         source.bounds = "override"
         assert execution.advance(3)[2] == "override"
-        assert execution.granted == "stop"
+        assert execution.widest == "stop"
 
     @pytest.mark.parametrize("wrong", ["wide", None, 7, ["plan"]])
     def test_what_is_no_name_of_any_is_refused(self, wrong):
@@ -293,18 +293,18 @@ class TestBounds:
         execution = begun(Correction())
         assert isinstance(execution, CorrectionExecution)
         execution.hold(0)
-        assert execution.granted == "stop"
-        execution.rested()
-        assert execution.granted == "plan"
+        assert execution.widest == "stop"
+        execution.mark_at_rest()
+        assert execution.widest == "plan"
         execution.stop("enough", 3)
-        execution.rested()
-        assert execution.granted == "stop"
+        execution.mark_at_rest()
+        assert execution.widest == "stop"
 
     @pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
     def test_an_override_is_a_share(self, fraction):
         execution = begun(Motion())
         assert "is not one of 0..1" in execution.override(fraction)
-        assert execution.granted == "plan"
+        assert execution.widest == "plan"
         for share in (0.0, 1.0, 1):
             assert execution.override(share) is None
             assert execution.fraction == share

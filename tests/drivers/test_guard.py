@@ -733,7 +733,7 @@ class TestTarget:
 
     def checks(self, offset=REST) -> CorrectionGuard:
         checks = correcting_only("offset", velocity=V)
-        checks.note_target(self.HERE, offset, np.full(N, 7.0))
+        checks.set_target(self.HERE, offset, np.full(N, 7.0))
         return checks
 
     @joints

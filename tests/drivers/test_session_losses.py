@@ -124,7 +124,7 @@ class TestLostMotion:
         reply = rig.send(rig.init.encode())
         assert reply[:4] == bytes([11, 0, 0, 0])
         assert rig.state is State.INIT
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the controller started over")
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the controller restarted")
         assert len(rig.seen(InitReceived)) == 2
         rig.number = 10
         advances = source.advances
@@ -212,7 +212,7 @@ class TestNextStep:
         assert rig.session.counters.unanswered == lost
         rig.session.stop()
         rig.run_to("stopped")
-        assert (rig.ended.reason == "a stop was asked for") is goes_on
+        assert (rig.ended.reason == "a stop was requested") is goes_on
 
     def test_the_motion_waits_and_leaves_nothing_out(self):
         """Without what was sent again, the set-points are those of a motion that lost nothing."""
@@ -609,7 +609,7 @@ class TestStop:
         rig.session.stop("once more")
         rig.run()
         assert source.stops == 1
-        assert rig.ended == MotionEnded("stopped", "a stop was asked for", 0, rig.ended.cycle)
+        assert rig.ended == MotionEnded("stopped", "a stop was requested", 0, rig.ended.cycle)
         commanded = rig.records["commanded_position"]
         moved = commanded[np.isfinite(commanded[:, 0])]
         np.testing.assert_allclose(moved[:, 1:], START[1:] + 0 * moved[:, 1:], atol=1e-6)

@@ -571,7 +571,7 @@ class TestSourcesThatRaiseAnything:
         [
             (failing(error=SystemExit(), override=property(no)), "SystemExit: no"),
             (failing(error=SystemExit(), resume=property(no)), "SystemExit: no"),
-            (failing("override", error=Unspeakable()), "Unspeakable, whose message"),
+            (failing("override", error=Unspeakable()), "Unspeakable without a message"),
             (failing("override", error=ZeroDivisionError("not now")), "ZeroDivisionError: not now"),
         ],
     )
@@ -646,7 +646,7 @@ def test_the_bounds_of_an_override_are_granted_from_then_on_and_enforced():
 
 NOT_FITTING = [
     (lambda: Rig(), "override", "no change of override can be requested"),
-    (lambda: moving(10)[0], "override", "knows no override"),
+    (lambda: moving(10)[0], "override", "has no override"),
     (lambda: stopping(Overridable(np.tile(START, (20, 1)))), "override", "is being stopped"),
     (lambda: Rig(), "resume", "no motion was requested"),
     (lambda: moving(10)[0], "resume", "cannot be held"),

@@ -349,7 +349,7 @@ class TestModesRefused:
         rig.cycle(3)
         assert [type(event.error) for event in rig.seen(Refused)] == [ModeRefused]
         assert (rig.refusal.joint, rig.refusal.mode) == (2, 3)
-        assert "joint 3 is in mode 3: no answer is known to that mode" in str(rig.refusal)
+        assert "joint 3 is in mode 3: the reply to that mode is unknown" in str(rig.refusal)
         assert rig.session.counters.refused == 1
         assert (rig.state, rig.ended.outcome) == (State.FAULTED, "lost")
 
@@ -358,7 +358,7 @@ class TestModesRefused:
         answer = rig.cycle(mode=Mode.POSITION)
         assert all_drive_off(answer)
         assert type(rig.refusal) is ModeRefused
-        assert "joint 1 is in mode 4: was not seen closed before" in str(rig.refusal)
+        assert "joint 1 is in mode 4: it was not closed before" in str(rig.refusal)
 
     def test_every_refusal_has_a_remedy(self):
         def leaves(kind):

@@ -22,7 +22,7 @@ from drivers import (
 )
 from drivers.init_check import ControllerLimits, InitCheck, compare, float32_text, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
-from drivers.replies import D1, Reader, safe_answer
+from drivers.replies import D1, Reader, safe_reply
 from drivers.session import MAX_GAP
 from tests.drivers.rig import (
     MOVE,
@@ -262,7 +262,7 @@ class TestARequestThatWaitsForTheController:
         assert not rig.session.requested
         ended = [event for event in rig.session.events() if isinstance(event, MotionEnded)]
         assert [(event.outcome, event.reason) for event in ended] == [
-            ("lost", "nothing was heard from the controller")
+            ("lost", "nothing was received from the controller")
         ]
 
     @pytest.mark.parametrize(
@@ -283,7 +283,7 @@ class TestARequestThatWaitsForTheController:
         assert rig.session.requested is kept
         if not kept:
             assert rig.ended.outcome == "lost"
-            assert rig.ended.reason == "the controller started over"
+            assert rig.ended.reason == "the controller restarted"
 
     def test_is_kept_if_made_after_the_silence(self):
         rig = self.waiting()
@@ -414,7 +414,7 @@ def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
 def test_slots_of_unknown_arms_are_driven_if_any_drive_is_on(arms, status, powered, back):
     """Then nothing is echoed; four status bytes go back, none of which says drive on."""
     modes = np.full(2, Mode.CLOSED, np.int32)
-    answer = safe_answer(bytes(status), modes, arms)
+    answer = safe_reply(bytes(status), modes, arms)
     assert answer.status == bytes(back)
     assert answer.mask[:, D1:].all() == (not powered)
     opened = np.full(2, Mode.POSITION, np.int32)

@@ -110,14 +110,13 @@ HAS_OPEN_AXES: Final = ("opening", "open at rest", "moving", "exiting")
 
 
 _SHORT: Final[Mapping[str, str]] = {
-    "the controller started over": "restart",
-    "the controller started anew": "restart",
+    "the controller restarted": "restart",
     "the drive went off": "drive off",
     "the drive was switched on again": "drive off",
     "the controller closed open mode": "closed",
     "the controller paused the exchange": "pause",
-    "the controller reports a mode that is not known here": "mode",
-    "nothing was heard from the controller": "silence",
+    "the controller reports an unknown mode": "mode",
+    "nothing was received from the controller": "silence",
 }
 
 

@@ -141,7 +141,7 @@ def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
     done = record(
         link, cell, tmp_path / NAME, kind="excitation", stop=Stop(), duration=1.0, durable=False
     )
-    cause = "joint 1 is in mode 3: no answer is known to that mode"
+    cause = "joint 1 is in mode 3: the reply to that mode is unknown"
     assert (done.outcome, done.reason.partition(" (cycle")[0]) == ("refused", cause)
     assert [line.partition(" (cycle")[0] for line in lines] == [f"REFUSED: {cause}"]
     assert lines[0].endswith(ModeRefused.remedy)

@@ -75,11 +75,11 @@ def test_only_the_newest_archive_may_be_torn_by_a_death(
     [
         ("exchange", "the exchange process ended; the controller gets no answers", True),
         ("exchange", "the exchange process is gone: no such process", True),
-        ("exchange", "repetition 1 was lost: nothing was heard from the controller", False),
+        ("exchange", "repetition 1 was lost: nothing was received from the controller", False),
         ("exchange", "the controller did not answer the exchange process", False),
         ("archive", "the archive process ended (exit status -9); nothing was sent", True),
         ("archive", "the disk of the archive process is full", False),
-        ("controller", "move 1 was lost: nothing was heard from the controller", True),
+        ("controller", "move 1 was lost: nothing was received from the controller", True),
         ("controller", "the exchange process ended", False),
     ],
 )

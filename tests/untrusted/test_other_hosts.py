@@ -352,7 +352,7 @@ class TestAsController:
     def test_a_start_ends_the_run(self, what: str, as_controller: Attack) -> None:
         found = as_controller(what)
         ended(found)
-        assert "the controller started over" in found.move["error"]
+        assert "the controller restarted" in found.move["error"]
 
     def test_an_arm_elsewhere_ends_the_run(self, as_controller: Attack) -> None:
         """Numbers that the controller has not come to yet, of when the arm had arrived."""
