@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 
 from hil.cell import Cell
 from hil.design import DesignSettings, preset, run_search
-from hil.design.advice import NoExcitationError, forbidden
+from hil.design.advice import NoExcitationError, infeasible_text
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.motion_checks import MotionChecks, planned
@@ -233,7 +233,7 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotio
             currents=planned(checks.currents),
         )
     except NoFeasibleMotionError as error:
-        reason = forbidden(error, checks.frame)
+        reason = infeasible_text(error, checks.frame)
         raise NoExcitationError(f"no motion to test the result with: {reason}") from error
 
 

@@ -21,7 +21,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, NoExcitationError, criteria_text, margins, weakest
-from hil.design.earlier import known_from
+from hil.design.earlier import estimate_earlier
 from hil.design.result import references
 from hil.design.run import Designed, DesignFolder, require_same, run_design
 from hil.design.settings import preset_text
@@ -199,7 +199,7 @@ def design(
     reporter = make_reporter(quiet=quiet or json)
     loaded, folder = Cell.load(cell).with_campaign(repetitions=repetitions), DesignFolder(output)
     require_replaceable(output)
-    there = folder.interrupted() if resume else None
+    there = folder.resumed_settings() if resume else None
     if quick:
         asked = quick_settings(loaded)
     elif settings is not None:
@@ -215,7 +215,7 @@ def design(
     if there is not None:
         require_same(asked, there, folder.settings)
     beside = references(compare or [], loaded, asked, together=bool(earlier))
-    known = known_from(earlier, loaded, reporter) if earlier else None
+    estimate = estimate_earlier(earlier, loaded, reporter) if earlier else None
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
@@ -247,7 +247,7 @@ def design(
                     f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
-        _draw(folder, done, loaded, beside, together=known is not None)
+        _draw(folder, done, loaded, beside, together=estimate is not None)
 
     with _stoppable(folder) as stop:
         try:
@@ -257,7 +257,7 @@ def design(
                 asked,
                 reporter,
                 workers=workers or len(os.sched_getaffinity(0)),
-                known=known,
+                earlier=estimate,
                 stop=lambda: stop.requested,
                 resume=resume,
                 force=force,

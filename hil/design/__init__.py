@@ -1,4 +1,4 @@
-"""Designing an excitation for a cell: settings, search, and the file that comes of it."""
+"""Design of an excitation for a cell: settings, search, result file."""
 
 from .problem import problem_of, search_settings
 from .result import DesignResult, load_design

@@ -1,7 +1,6 @@
-"""What earlier archives say already, for a design that concentrates on what is still uncertain.
+"""Information of earlier archives, to be added to that of the motion in a sequential design.
 
-The Gram matrix of all that the arm moved in, held out or not, joins that of the motion to be
-designed, each joint weighted by what its torque noise turned out to be.
+It is the Gram matrix of all motions, held out or not, weighted by the torque noise of each joint.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from hil.progress import Reporter
 from identification.excitation import SAMPLE_PERIOD
 from identification.factor.factor import Factor
 
-from .problem import Knowledge
+from .problem import EarlierEstimate
 from .result import fingerprint
 
 Array = NDArray[np.float64]
@@ -34,11 +33,8 @@ Array = NDArray[np.float64]
 _MOTIONS: Final = ("excitation", "imported", "validation")
 
 
-def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowledge:
-    """Identify from archives, and return what they say about each parameter.
-
-    Archives, or folders of them, of campaigns the whole ones; a motion for the cell is going to be
-    designed.
+def estimate_earlier(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> EarlierEstimate:
+    """Identify the parameters of a cell from archives, folders of them, or campaigns.
 
     Raises:
         InputError: archives that cannot be identified from, or of another robot.
@@ -46,19 +42,17 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
     archives = list(archives_in(paths))
     recorded = cell_of(open_archive(archives[0]))
     theirs, ours = fingerprint(recorded), fingerprint(cell)
-    for part in ("urdf", "robot"):  # else the parameters are other ones
+    for part in ("urdf", "robot"):  # these determine the parameters
         if theirs[part] != ours[part]:
             problem = f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}"
-            remedy = "name archives of this robot, in the same description"
+            remedy = "name archives of this robot with the same URDF and [robot]"
             raise InputError(archives[0], problem, field="--earlier", remedy=remedy)
-    # Of all that was recorded: nothing has to be predicted here. The law is that of the cell, whose
-    # parameters the design is for.
     sources = gather_sources(archives, FIXED.split, in_sample=True)
     prepared = prepare_sources(sources, FIXED, reporter)
     pooled = estimate_with(prepared, FIXED, reporter).result.pooled
     weights = _weights(pooled.noise_std, cell, reporter)
     gram, samples = _information(prepared, weights, reporter)
-    return Knowledge(
+    return EarlierEstimate(
         names=pooled.names,
         values=pooled.values,
         std=pooled.std,
@@ -75,18 +69,16 @@ def known_from(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> Knowled
 
 
 def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tuple[Array, int]:
-    """Return the information (p, p) of all motions as if sampled every SAMPLE_PERIOD, and their N.
+    """Return the information (p, p) of all motions at one sample per SAMPLE_PERIOD, and their N.
 
-    It is that of the motion itself, as that of a motion to be designed: what the torque's channel
-    does to it (delay, filter) has no part in it.
+    As for a planned motion without delay and low-pass of the torque.
     """
     cell = prepared.sources.cell
     model, motions = cell.model, prepared.sources.training
     settings = prepared.settings.preprocessed(torque_delay=0.0, torque_bandwidth=None)
     gram, samples = np.zeros((model.n_parameters, model.n_parameters)), 0.0
-    with reporter.task("adding up earlier information", len(motions)) as task:
+    with reporter.task("adding earlier information", len(motions)) as task:
         for source in motions:
-            # A second is to count alike, whatever the rate of an archive.
             share = float(np.median(np.diff(source.recording.time))) / SAMPLE_PERIOD
             factor = Factor.of(model, samples_of(source, cell, settings))
             gram += share * factor.weighted(weights).A
@@ -96,10 +88,10 @@ def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tupl
 
 
 def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
-    """1 / variance of each joint's torque residual (n,).
+    """Return 1 / variance of each joint's torque residual (n,).
 
-    A joint that stood in all archives is assumed to be as noisy as the others: by the median, as a
-    share of the torque that its motors can give; where the cell does not say that, by the median.
+    A joint that was at rest in all archives gets the median of the others, relative to the torque
+    of their motors, if that is known.
     """
     noise = noise_std.copy()
     known = np.isfinite(noise) & (noise > 0.0)
@@ -112,7 +104,7 @@ def _weights(noise_std: Array, cell: Cell, reporter: Reporter) -> Array:
         noise[~known] = strength[~known] * np.median(noise[known] / strength[known])
         names = ", ".join(cell.joint_names[j] for j in np.flatnonzero(~known))
         reporter.say(
-            f"warning: {names} never moved in the earlier archives: its torque noise is "
-            "assumed to be that of the others, in proportion to what its motors can give"
+            f"warning: {names} never moved in the earlier archives; its torque noise is assumed "
+            "to be that of the others, in proportion to the torque of its motors"
         )
     return np.asarray(noise**-2.0)

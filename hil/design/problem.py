@@ -1,4 +1,4 @@
-"""From a cell and settings to the problem that a search solves."""
+"""The search problem of a cell and design settings."""
 
 from __future__ import annotations
 
@@ -29,98 +29,98 @@ from .settings import DesignSettings, SettingsError
 
 Array = NDArray[np.float64]
 
-# States that excite every parameter of a load that an arm feels, and the share of the largest from
-# which on one is independent of the others.
+# Random states, and smallest pivot of an independent parameter relative to the largest.
 _STATES: Final = 300
 _SEED: Final = 20140901
 _INDEPENDENT: Final = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Knowledge:
-    """An earlier estimate, and the information that it came from."""
+class EarlierEstimate:
+    """An earlier estimate and its information."""
 
     names: tuple[str, ...]  #: of the model's parameters (p,)
-    values: Array  #: their estimates (p,)
-    std: Array  #: their standard deviations (p,), infinite for one that was not determined
+    values: Array  #: estimates (p,)
+    std: Array  #: standard deviations (p,), infinite if undetermined
     joint_weights: Array  #: 1 / variance of each joint's torque residual (n,)
-    #: information (p, p) of all that was moved, held out or not, weighted by these, as if sampled
-    #: every `identification.excitation.SAMPLE_PERIOD`, as motions of a search are
+    #: information (p, p) of all motions with these weights, at one sample per
+    #: `identification.excitation.SAMPLE_PERIOD`
     gram: Array
-    samples: int  #: time samples in it, of equal weight
-    repetitions: int  #: how often the new motion is going to be run
-    #: name and SHA-256 of each file whose motion is in it
-    archives: tuple[tuple[str, str], ...] = ()
+    samples: int  #: time samples in it
+    repetitions: int  #: planned runs of the new motion
+    archives: tuple[tuple[str, str], ...] = ()  #: name and SHA-256 of each file
 
     @property
     def relative_std(self) -> Array:
-        """Standard deviation as a share of the value's size (p,), infinite for a value of 0."""
+        """Standard deviation relative to the absolute value (p,), infinite for 0."""
         size = np.abs(self.values)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(size > 0.0, self.std / size, np.inf)
 
 
-def problem_of(cell: Cell, settings: DesignSettings, known: Knowledge | None = None) -> Problem:
-    """Which motions are searched, what they must keep, and what they are to be good at.
-
-    The motion is to add to what is `known` from an earlier estimate.
+def problem_of(
+    cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None = None
+) -> Problem:
+    """Return genome, objective and constraints of a search.
 
     Raises:
         SettingsError: settings that do not fit the cell.
-        CellError: the cell file lacks a table that the settings need.
-        NoExcitationError: where the motion is to begin, home or the middle of sines, is not clear,
-            or the motors cannot hold the arm there.
+        CellError: the cell file lacks a required table.
+        NoExcitationError: the initial posture collides, or exceeds the current limits at rest.
     """
     constraints = settings.constraints
     checker = collision_checker(cell) if constraints.collision else None
     currents = planned(current_model(cell)) if constraints.current else None
     genome = _genome(cell, settings, checker)
-    _require_beginning(cell, genome, checker, currents)
+    _require_start(cell, genome, checker, currents)
     return Problem(
         genome=genome,
-        objective=_objective(cell, settings, known),
+        objective=_objective(cell, settings, earlier),
         constraints=Constraints(
             limits=cell.joint_limits,
             min_duration=constraints.min_duration,
             max_duration=constraints.max_duration,
             checker=checker,
             currents=currents,
-            # A series without a ramp rests nowhere; whoever asks for one wants to look at it.
             at_rest=settings.sines is None or settings.sines.ramp > 0.0,
         ),
     )
 
 
-def _require_beginning(
+def _require_start(
     cell: Cell,
     genome: ViaPointGenome | SineGenome,
     checker: CollisionChecker | None,
     currents: CurrentModel | None,
 ) -> None:
-    """Refuse, before any motion is tried, a posture in which every one of them begins."""
+    """Check the initial posture of all motions."""
     if isinstance(genome, SineGenome):
-        where, posture, elsewhere = "where the sines swing about", genome.centre, "[sines] offset"
+        where, posture, setting = (
+            "in the mean posture of the sines",
+            genome.centre,
+            "[sines] offset",
+        )
     elif genome.home is not None:
-        where, posture, elsewhere = "at home", genome.home, "home_deg in [campaign]"
+        where, posture, setting = "at home", genome.home, "home_deg in [campaign]"
     else:
         return
-    still, frame = np.zeros_like(posture[None]), AngleFrame.of(cell)
+    zero, frame = np.zeros_like(posture[None]), AngleFrame.of(cell)
     contact = None if checker is None else clearance(checker, posture[None])
-    too_much = currents.check(Motion(np.zeros(1), posture[None], still, still)) if currents else []
+    exceeded = currents.check(Motion(np.zeros(1), posture[None], zero, zero)) if currents else []
     if checker is not None and contact is not None:
         reason = violation_text(contact, frame)
-        remedy = always_so(contact, checker) or f"correct [workspace] or {elsewhere}"
-    elif too_much:
-        worst = replace(max(too_much, key=lambda violation: violation.excess), time=None)
+        remedy = always_so(contact, checker) or f"correct [workspace] or {setting}"
+    elif exceeded:
+        worst = replace(max(exceeded, key=lambda violation: violation.excess), time=None)
         reason = f"at rest there, {violation_text(worst, frame)}"
-        remedy = f"correct [drive_train], [nominal] with its uncertainty, or {elsewhere}"
+        remedy = f"correct [drive_train], [nominal] with its uncertainty, or {setting}"
     else:
         return
     raise NoExcitationError(f"no motion can begin {where}: {reason}; {remedy} ({cell.path})")
 
 
 def search_settings(settings: DesignSettings) -> SearchSettings:
-    """Return the part of the settings that the search itself reads."""
+    """Return the settings of the search itself."""
     table = settings.search.model_dump()
     return SearchSettings(method=settings.method, seed=settings.seed, **table)
 
@@ -140,10 +140,10 @@ def _genome(
             checker=checker,
         )
     sines = settings.sines
-    assert sines is not None  # the settings hold one of the two
+    assert sines is not None  # the settings have one of the two
 
     def per_joint(name: str, values: list[float]) -> Array:
-        """One value for each joint (n,); one alone is for all."""
+        """Return one value per joint (n,); a single one is for all joints."""
         joints = cell.joint_names
         if len(values) not in (1, len(joints)):
             raise SettingsError(
@@ -170,43 +170,43 @@ def _genome(
 
 
 def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
-    """URDF angles (n,) of a posture inside the limits that is stated in their frame."""
+    """Return the URDF angles (n,) of a posture that must be within the limits."""
     frame, limits = AngleFrame.of(cell), cell.joint_limits
     angles = frame.urdf(shown)
     for joint in np.flatnonzero(~((angles > limits.lower) & (angles < limits.upper))).tolist():
         ends = sorted(float(frame.shown(end)[joint]) for end in (limits.lower, limits.upper))
         raise SettingsError(
             None,
-            f"{cell.joint_names[joint]} is not inside its limits, {ends[0]:g} to {ends[1]:g} deg, "
-            f"at {shown[joint]:g} deg ({frame.whose})",
+            f"{cell.joint_names[joint]} = {shown[joint]:g} deg is outside its limits, {ends[0]:g} "
+            f"to {ends[1]:g} deg ({frame.whose})",
             field=f"sines.offset = {asked}",
-            remedy="swing about a posture inside the limits",
+            remedy="choose a posture within the limits",
         )
     return np.asarray(angles)
 
 
-def _objective(cell: Cell, settings: DesignSettings, known: Knowledge | None) -> Objective:
+def _objective(cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None) -> Objective:
     if settings.objective.parameters == "payload":
-        return _payload_objective(cell, known)
-    chosen = _essential(cell, settings, known)
-    if known is None:
+        return _payload_objective(cell, earlier)
+    chosen = _essential(cell, settings, earlier)
+    if earlier is None:
         return Objective(cell.model, parameters=chosen)
     return Objective(
         cell.model,
         parameters=chosen,
-        joint_weights=known.joint_weights,
-        earlier=known.gram,
-        earlier_samples=known.samples,
-        repetitions=known.repetitions,
+        joint_weights=earlier.joint_weights,
+        earlier=earlier.gram,
+        earlier_samples=earlier.samples,
+        repetitions=earlier.repetitions,
     )
 
 
-def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
-    """Of a body on the last link, by those of its parameters that some motion distinguishes."""
-    if known is not None:
+def _payload_objective(cell: Cell, earlier: EarlierEstimate | None) -> Objective:
+    """Return the objective of a payload, with its identifiable parameters."""
+    if earlier is not None:
         raise SettingsError(
             None,
-            "assumes the arm's parameters as known: earlier archives add nothing",
+            "assumes the arm's parameters as known, so that earlier archives have no effect",
             field='objective.parameters = "payload"',
             remedy="leave out --earlier",
         )
@@ -223,20 +223,20 @@ def _payload_objective(cell: Cell, known: Knowledge | None) -> Objective:
 
 
 def _essential(
-    cell: Cell, settings: DesignSettings, known: Knowledge | None
+    cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None
 ) -> NDArray[np.intp] | None:
-    """Which parameters count, None for all."""
+    """Return the indices of the parameters in the criteria, None for all."""
     names, named = cell.model.parameter_names, settings.objective.named
     percent = settings.objective.max_relative_std
     if percent is not None:
         field = f"objective.max_relative_std = {percent:g}"
-        if known is None:
+        if earlier is None:
             problem, remedy = "needs an earlier estimate", "name archives with --earlier"
             raise SettingsError(None, problem, field=field, remedy=remedy)
-        chosen = np.flatnonzero(known.relative_std <= percent / 100.0)
+        chosen = np.flatnonzero(earlier.relative_std <= percent / 100.0)
         if len(chosen) < 2:
-            problem = f"leaves {len(chosen)} parameters, and a design needs two"
-            remedy = f"at {100.0 * np.sort(known.relative_std)[1]:.3g} % two would be left"
+            problem = f"leaves {len(chosen)} parameters, a design needs two"
+            remedy = f"at {100.0 * np.sort(earlier.relative_std)[1]:.3g} % two would be left"
             raise SettingsError(None, problem, field=field, remedy=remedy)
         return np.asarray(chosen, dtype=np.intp)
     if named is None:
@@ -245,7 +245,7 @@ def _essential(
         if name not in names or named.count(name) > 1:
             raise SettingsError(
                 None,
-                f"is {'named twice' if name in names else 'no parameter of this robot'}",
+                f"is {'named twice' if name in names else 'not a parameter of this robot'}",
                 field=f"objective.parameters = {name!r}",
                 remedy=f"known are: {', '.join(names)}",
             )

@@ -1,4 +1,4 @@
-"""The file a design leaves behind: the motion, how good it is, and all that it came from."""
+"""The result file of a design: motion, criteria, settings and provenance."""
 
 from __future__ import annotations
 
@@ -36,45 +36,42 @@ Array = NDArray[np.float64]
 VERSION: Final = 1
 RESULT: Final = "excitation.toml"
 DECISIVE: Final = ("urdf", "robot", "limits")
-"""What a motion and its criteria are made from. A change of the rest (walls, motors, home) leaves
-them what they are: whether the motion may be sent is checked before it is, in the cell as it is
-then."""
+"""Parts of a cell that determine a motion and its criteria. The others (walls, motors, home) are
+checked before the motion is sent."""
 
 _DIGITS: Final = 16
-# Planned on another machine a motion may differ in its last digits, at so many instants by no more.
-_SAME: Final = 1e-9  # rad
+# Largest difference of a motion planned on another computer [rad], and number of compared instants.
+_SAME: Final = 1e-9
 _INSTANTS: Final = 9
 _LIMITS: Final = ("lower", "upper", "velocity", "acceleration", "jerk")
 _REMEDY: Final = "design it again (`hil design`)"
 _HEAD: Final = """\
-# An excitation that `hil design` found. Names that end in _deg hold degrees, degrees/s,
-# degrees/s^2, degrees/s^3 of the URDF's angles. `hil demo --excitation` runs it. Do not change
-# anything here: the seal at the end would break.
+# Result of `hil design`. Values of names that end in _deg are in degrees, degrees/s, degrees/s^2
+# or degrees/s^3 of the URDF's angles. `hil demo --excitation` runs the motion. Do not edit this
+# file: its seal would not match.
 """
 _COMMENTS: Final = {
     "criteria": "Of the motion sampled every millisecond. Compare log10_det only between motions "
-    "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has none.",
-    "search": "How it was found. Of the motions tried so many broke a constraint of each kind.",
-    "front": "Motions of which none is better than another in all, by rising coupling index, as "
-    "the\nsearch sampled them. chosen, counting from 0, is the motion of this file; without it a "
-    "polish\nmade the motion from one, see polished_from.",
-    "polished_from": "The point of the front, counting from 0, that the motion grew from, and its "
-    "criteria by\nthe millisecond.",
-    "settings": "As the search was asked; `hil design --settings` takes them from this file.",
-    "cell": "The cell it was designed for: its name, and a fingerprint of what the design rests "
-    "on.",
-    "plan": "The motion: planning these moves gives it to the last bit.",
+    "of one\nrobot in the same units; coupling_index (0 to coupling_index_max) has no unit.",
+    "search": "infeasible: number of motions that violated each kind of constraint.",
+    "front": "Pareto front by rising coupling index, at the sample period of the search. chosen: "
+    "index\n(from 0) of the motion in this file; without it the motion was polished, see "
+    "polished_from.",
+    "polished_from": "Index (from 0) in the front of the motion that the polish started from, and "
+    "its criteria,\nsampled every millisecond.",
+    "settings": "Settings of the search; `hil design --settings` can read them from this file.",
+    "cell": "Name of the cell, and digests of its parts.",
+    "plan": "The motion: planning these moves gives it bit for bit.",
     "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
     "earlier": "Archives whose information was added.",
-    "seal": "What the lines above and the motion are recognised by.",
+    "seal": "Digests of the lines above and of the motion.",
 }
 
 
 def fingerprint(cell: Cell) -> dict[str, str]:
-    """Return a digest of each part of a cell that a design may depend on, by the part's name.
+    """Return a digest of each part of a cell that affects a design, by the part's name.
 
-    Tables are compared by content, so that comments, order and spelling of numbers do not count.
-    The limits are those in URDF angles.
+    Tables are compared by content, limits in URDF angles.
     """
     file, limits, home = cell.file, cell.joint_limits, cell.file.campaign
     parts: dict[str, Any] = {
@@ -91,7 +88,7 @@ def fingerprint(cell: Cell) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """What `excitation.toml` says."""
+    """Content of `excitation.toml`."""
 
     data: Mapping[str, Any]  #: its tables, without the seal
     settings: DesignSettings  #: of the design
@@ -99,7 +96,7 @@ class DesignResult:
 
     @property
     def complete(self) -> bool:
-        """Whether the search came to its end."""
+        """Whether the search ran to its end."""
         return bool(self.data["complete"])
 
     @classmethod
@@ -111,9 +108,9 @@ class DesignResult:
         objective: Objective,
         archives: tuple[tuple[str, str], ...] = (),
     ) -> Self:
-        """Return the record of a design; `archives` are names and SHA-256 of earlier ones."""
-        names, judged, front = objective.model.parameter_names, objective.parameters, design.front
-        excitation, grown = design.excitation, design.origin_criteria
+        """Return the result of a design; `archives` are names and SHA-256 of earlier archives."""
+        names, chosen, front = objective.model.parameter_names, objective.parameters, design.front
+        excitation, origin = design.excitation, design.origin_criteria
         data: dict[str, Any] = {
             "format": RESULT_FORMAT,
             "version": VERSION,
@@ -129,7 +126,7 @@ class DesignResult:
                 "tried": excitation.tried,
                 "generations": len(design.history),
                 "n_parameters": objective.n_parameters,
-                "parameters": None if judged is None else [names[k] for k in judged],
+                "parameters": None if chosen is None else [names[k] for k in chosen],
                 "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
             },
             "front": {"chosen": design.chosen}
@@ -137,7 +134,7 @@ class DesignResult:
             | {"duration": front.duration.tolist()},
         }
         if design.chosen is None:
-            measures = dict(zip(CRITERIA, grown.measures, strict=True))
+            measures = dict(zip(CRITERIA, origin.measures, strict=True))
             data["polished_from"] = {"point": design.origin, **measures}
         data["settings"] = settings.to_dict()
         if archives:
@@ -164,25 +161,25 @@ class DesignResult:
         except OSError as error:
             raise InputError(
                 path,
-                f"the motion is found but cannot be written ({error.strerror})",
-                remedy="make room, then repeat the command with --resume: what was scored is in "
-                "the journal",
+                f"cannot be written ({error.strerror})",
+                remedy="free disk space, then repeat the command with --resume, which reads the "
+                "scores from the journal",
             ) from error
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read the file, or that of a folder, and plan its motion again.
+        """Read the file, or that in a folder, and plan its motion again.
 
         Raises:
-            InputError: it cannot be read, was changed, or its motion does not come out again.
+            InputError: it cannot be read, was changed, or its moves plan to another motion.
         """
         path = path / RESULT if path.is_dir() else path
         try:
             text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
-            why = error.strerror if isinstance(error, OSError) else error
+            reason = error.strerror if isinstance(error, OSError) else error
             remedy = "name a file that `hil design` wrote"
-            raise InputError(path, f"cannot be read ({why})", remedy=remedy) from error
+            raise InputError(path, f"cannot be read ({reason})", remedy=remedy) from error
         try:
             data = from_text(text)
             for key, known in (("format", RESULT_FORMAT), ("version", VERSION)):
@@ -196,14 +193,15 @@ class DesignResult:
                 )
             result = cls._from_data(data, path)
         except (PlannerError, *DAMAGED) as error:
-            why = " ".join(str(error).split())
-            problem = f"is not a designed excitation ({why:.200})"
+            problem = f"is not a designed excitation ({' '.join(str(error).split()):.200})"
             raise InputError(path, problem, remedy=_REMEDY) from error
-        again, now = _positions(result.excitation.trajectory), software()
-        alike = positions.shape == again.shape and np.all(np.abs(again - positions) <= _SAME)
-        if _motion_digest(result.excitation.trajectory) != motion and not alike:
-            then = data["software"].items()
-            other = [f"{k} {v} (here {now.get(k)})" for k, v in then if now.get(k) != v]
+        planned, installed = _positions(result.excitation.trajectory), software()
+        equal = positions.shape == planned.shape and np.all(np.abs(planned - positions) <= _SAME)
+        if _motion_digest(result.excitation.trajectory) != motion and not equal:
+            versions = data["software"].items()
+            other = [
+                f"{k} {v} (here {installed.get(k)})" for k, v in versions if installed.get(k) != v
+            ]
             raise InputError(
                 path,
                 "its moves do not plan to the motion that was designed",
@@ -213,10 +211,10 @@ class DesignResult:
         return result
 
     def require_cell(self, cell: Cell, path: Path, parts: Sequence[str] = DECISIVE) -> None:
-        """Refuse a cell whose robot or limits are not those that the motion was designed for.
+        """Check that the motion was designed for the parts of a cell.
 
         Raises:
-            InputError: names the two cells and what differs.
+            InputError: names the cells and the parts that differ.
         """
         now, then = fingerprint(cell), self.data["cell"]
         different = [part for part in parts if now[part] != then.get(part)]
@@ -248,13 +246,13 @@ class DesignResult:
 
 
 def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
-    """The table `plan` (as a plan file has it, without the motion) or `sines`."""
+    """Return the table `plan` (a plan file without the motion) or `sines`."""
     trajectory = excitation.trajectory
     if isinstance(trajectory, FourierSeries):
         data = {"joints": list(cell.joint_names)} | trajectory.to_dict()
         return {"sines": data | {name: Angles(data[name]) for name in ("offset", "amplitude")}}
     moves, points = excitation.moves, excitation.via_points
-    assert moves is not None and points is not None  # a search plans pieces from moves
+    assert moves is not None and points is not None
     plan = PlanFile(cell.joint_names, points[0], moves, limits=cell.joint_limits).to_dict()
     plan["start"] = Angles(plan["start"])
     plan["limits"] = {name: Angles(plan["limits"][name]) for name in _LIMITS}
@@ -263,7 +261,7 @@ def _motion_data(excitation: Excitation, cell: Cell) -> dict[str, Any]:
 
 
 def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, Any]:
-    """The trajectory, and what it was planned from, as arguments of an `Excitation`."""
+    """Return trajectory, via points, speed and fly as arguments of an `Excitation`."""
     if "sines" in data:
         sines = {name: value for name, value in data["sines"].items() if name != "joints"}
         return {"trajectory": FourierSeries.from_dict(sines)}
@@ -273,7 +271,7 @@ def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, A
         raise ValueError("the moves lack fly or speed")
     points = np.array([file.start, *(move.target for move in file.moves)])
     return {
-        "trajectory": in_child(file.plan).trajectory,  # the solver can take its process with it
+        "trajectory": in_child(file.plan).trajectory,  # the solver can crash its process
         "via_points": points,
         "speed": np.broadcast_to(np.asarray(speed, dtype=np.float64), points[0].shape).copy(),
         "fly": fly,
@@ -281,16 +279,16 @@ def _motion_from_data(data: Mapping[str, Any], fly: float | None) -> dict[str, A
 
 
 def _motion_digest(trajectory: PiecewiseCubic | FourierSeries) -> str:
-    """Return what two motions share only if they are the same to the last bit."""
+    """Return the digest of a motion with all its bits."""
     return digest(json.dumps(trajectory.to_dict()))
 
 
 def load_design(path: Path, cell: Cell | None = None) -> Excitation:
-    """Read the motion of a design for a cell, or for any, from its file or folder.
+    """Read the motion of a design from its file or folder, and check that it is for a cell.
 
     Raises:
-        InputError: the file cannot be read, was changed, is for another cell, or its motion does
-            not come out again.
+        InputError: the file cannot be read, was changed, is for another cell, or its moves plan to
+            another motion.
     """
     result = DesignResult.load(path)
     if cell is not None:
@@ -299,12 +297,12 @@ def load_design(path: Path, cell: Cell | None = None) -> Excitation:
 
 
 def _positions(trajectory: PiecewiseCubic | FourierSeries) -> Array:
-    """Where the motion is at some instants from beginning to end (9, n) [rad]."""
+    """Return the positions at some instants from start to end (9, n) [rad]."""
     return trajectory.sample(np.linspace(0.0, trajectory.duration, _INSTANTS))[0]
 
 
 def _seal(text: str) -> str:
-    """Return a digest of what a text says; comments, blanks and the seal itself do not count."""
+    """Return a digest of the content of a TOML text without its seal."""
     data = tomllib.loads(text, parse_float=str)
     data.pop("seal", None)
     return json_digest(data)
@@ -313,41 +311,38 @@ def _seal(text: str) -> str:
 def references(
     paths: Sequence[Path], cell: Cell, settings: DesignSettings, *, together: bool
 ) -> dict[str, tuple[float, ...]]:
-    """`CRITERIA` of earlier designs by name, whose numbers mean what those of a new one will mean.
+    """Return the `CRITERIA` of designs by name, for comparison with a new one.
 
-    Those that were searched without looking at everything are marked as kinematic. The new design
-    is of `cell` and `settings`; `together` says whether it adds to earlier archives.
+    Those without all checks are marked as kinematic. The new design has `cell` and `settings`, and
+    with `together` adds to earlier archives.
 
     Raises:
-        InputError: a file cannot be read, or its numbers must not be compared.
+        InputError: a file cannot be read, or its criteria are not comparable.
     """
 
     def refused(path: Path | None, problem: str, remedy: str) -> InputError:
         return InputError(path, problem, field="--compare", remedy=remedy)
 
-    def judged(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
+    def parameters_of(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
         if asked.objective.parameters == "payload":
             return {"payload"}
         return set(named or cell.model.parameter_names)
 
     if paths and together:
-        problem = "would be compared with what --earlier adds up, weighted, over all archives"
+        problem = "cannot be combined with --earlier, which adds the information of other archives"
         raise refused(None, problem, "leave out one of the two")
     found: dict[str, tuple[float, ...]] = {}
-    ours = judged(settings, settings.objective.named)
+    ours = parameters_of(settings, settings.objective.named)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
         if "earlier" in result.data:
-            problem = (
-                "was designed with --earlier: its numbers are of all archives together, weighted, "
-                "not of its motion alone"
-            )
-            raise refused(path, problem, "name designs made without --earlier")
-        theirs = judged(result.settings, result.data["search"].get("parameters"))
+            problem = "was designed with --earlier: its criteria include the earlier archives"
+            raise refused(path, problem, "name designs without --earlier")
+        theirs = parameters_of(result.settings, result.data["search"].get("parameters"))
         if ours != theirs:
             problem = (
-                f"was judged by {len(theirs)} parameters, this design by {len(ours)}, of which "
+                f"has criteria of {len(theirs)} parameters, this design of {len(ours)}, of which "
                 f"{len(ours & theirs)} are the same"
             )
             raise refused(path, problem, "name designs with the same [objective]")

@@ -1,4 +1,4 @@
-"""A design in its folder from beginning to end: search, check once more, write down."""
+"""A design in its folder: search, final check, result file."""
 
 from __future__ import annotations
 
@@ -18,99 +18,99 @@ from hil.reading import open_file
 from identification import excitation
 from planner.toml_text import to_text
 
-from .advice import criteria_text, forbidden, no_excitation
-from .problem import Knowledge, problem_of, search_settings
+from .advice import criteria_text, infeasible_text, no_excitation
+from .problem import EarlierEstimate, problem_of, search_settings
 from .result import RESULT, DesignResult, fingerprint
 from .settings import DesignSettings, SettingsError, load_settings
 
 PICTURE, SETTINGS, JOURNAL = "excitation.png", "settings.toml", "search.journal"
 DESIGN_FILES = frozenset((RESULT, PICTURE, SETTINGS, JOURNAL))
-"""What a design leaves; a campaign of its motion may lie beside it."""
+"""Files of a design; the folder may contain a campaign too."""
 
-_HEAD = "# The settings of the search in this folder; `hil design --resume` goes on with them.\n"
+_MARK = "# The settings of the search in this folder"
+_HEAD = f"{_MARK}, for `hil design --resume`.\n"
 
 
 class DesignFolder:
-    """Paths of a design's files below one folder, and who may write them."""
+    """Paths of a design's files in a folder, and their lock."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.result, self.picture = root / RESULT, root / PICTURE
         self.settings, self.journal = root / SETTINGS, root / JOURNAL
 
-    def held(self) -> AbstractContextManager[None]:
-        """Make the folder, and keep every other search out of it until this is left."""
+    def locked(self) -> AbstractContextManager[None]:
+        """Create the folder, and lock it against other searches."""
         return lock_folder(self.root, "search", "-o")
 
-    def begin(self, settings: DesignSettings, *, force: bool) -> None:
-        """Make room for a new design, and write down what is asked for; the folder is held.
+    def create(self, settings: DesignSettings, *, force: bool) -> None:
+        """Write the settings of a new design; with `force` remove an earlier one.
 
         Raises:
-            InputError: there is a design already and it is not to be replaced, or the folder
-                cannot be written to.
+            InputError: there is a design already, or the folder cannot be written to.
         """
-        ours = [path for path in (self.result, self.journal) if path.exists()]
-        if self._begun():
-            ours.append(self.settings)
+        present = [path for path in (self.result, self.journal) if path.exists()]
+        if self._has_settings():
+            present.append(self.settings)
         elif self.settings.exists():
-            problem = "is in the way: the settings of the design are to be written there"
+            problem = "exists and is not of a design, which would write its settings there"
             remedy = "name another folder (-o), or move the file"
             raise InputError(self.settings, problem, remedy=remedy)
-        if ours and not force:
-            problem = f"holds a design already ({ours[0].name})"
-            remedy = "go on with it (--resume), name another folder (-o), or add --force"
+        if present and not force:
+            problem = f"has a design already ({present[0].name})"
+            remedy = "resume it (--resume), name another folder (-o), or add --force"
             raise InputError(self.root, problem, remedy=remedy)
-        with self._written():
+        with self._write_errors():
             for path in (self.result, self.picture, self.journal, self.settings):
                 path.unlink(missing_ok=True)
             write_atomically(self.settings, _HEAD + "\n" + to_text(settings.to_dict(), {}))
 
-    def interrupted(self) -> DesignSettings:
+    def resumed_settings(self) -> DesignSettings:
         """Return the settings of the design in this folder.
 
         Raises:
             InputError: there is none.
         """
-        if not self._begun():
-            remedy = "begin one without --resume, or name its folder (-o)"
-            raise InputError(self.root, "holds no design to go on with", remedy=remedy)
+        if not self._has_settings():
+            remedy = "start one without --resume, or name its folder (-o)"
+            raise InputError(self.root, "has no design to resume", remedy=remedy)
         return load_settings(self.settings)
 
-    def _begun(self) -> bool:
-        """Whether the settings in the folder are those of a design, not a person's own."""
+    def _has_settings(self) -> bool:
+        """Whether the folder has settings that a design wrote."""
         try:
             with open_file(self.settings) as file:
-                return file.read(len(_HEAD)) == _HEAD.encode()
+                return file.read(len(_MARK)) == _MARK.encode()
         except OSError:
             return False
 
     @contextmanager
     def opened_journal(self) -> Iterator[BinaryIO]:
-        """Open the journal, a new one if there is none; the folder is held.
+        """Open or create the journal.
 
         Raises:
-            InputError: the disk refuses.
+            InputError: it cannot be opened.
         """
-        with self._written():
-            # Without a buffer nothing is left that closing the file would fail to write.
+        with self._write_errors():
             if self.journal.exists():
-                open_file(self.journal).close()  # which refuses what is no file
+                open_file(self.journal).close()  # regular files only
+            # unbuffered, so that closing the file cannot fail
             file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
         with file:
             yield cast(BinaryIO, file)
 
     @contextmanager
-    def _written(self) -> Iterator[None]:
+    def _write_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
             problem = f"cannot be written to ({error.strerror})"
-            remedy = "make room, or name another folder (-o)"
+            remedy = "free disk space, or name another folder (-o)"
             raise InputError(self.root, problem, remedy=remedy) from error
 
 
 def _flat(settings: DesignSettings) -> dict[str, Any]:
-    """Return settings by their dotted names."""
+    """Return settings by dotted names."""
     return {
         f"{name}.{key}" if key else name: entry
         for name, table in settings.to_dict().items()
@@ -118,26 +118,26 @@ def _flat(settings: DesignSettings) -> dict[str, Any]:
     }
 
 
-def require_same(asked: DesignSettings, there: DesignSettings, path: Path) -> None:
-    """Refuse to go on with a search under other settings than those it began with.
+def require_same(asked: DesignSettings, stored: DesignSettings, path: Path) -> None:
+    """Check that a search is resumed with the settings that it was started with.
 
     Raises:
         SettingsError: names the first field that differs.
     """
-    ours, theirs = _flat(asked), _flat(there)
-    for field in sorted(ours.keys() | theirs.keys()):
-        if ours.get(field) != theirs.get(field):
+    new, old = _flat(asked), _flat(stored)
+    for field in sorted(new.keys() | old.keys()):
+        if new.get(field) != old.get(field):
             raise SettingsError(
                 path,
-                f"was {theirs.get(field)!r} when the search began",
-                field=f"{field} = {ours.get(field)!r}",
-                remedy="resume it without other settings, or begin anew in another folder (-o)",
+                f"was {old.get(field)!r} when the search began",
+                field=f"{field} = {new.get(field)!r}",
+                remedy="resume it without other settings, or start one in another folder (-o)",
             )
 
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A search that came to an end, and what was written down of it."""
+    """Problem, design and stored result of a search."""
 
     problem: excitation.Problem
     design: excitation.Design
@@ -150,23 +150,21 @@ def run_search(
     reporter: Reporter,
     *,
     workers: int = 2,
-    known: Knowledge | None = None,
+    earlier: EarlierEstimate | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> excitation.Design:
     """Search a motion for a cell.
 
-    The result does not depend on the number of `workers`, processes that score motions. The motion
-    is to add to what is `known` from an earlier estimate. `stop` is asked between generations; true
-    ends the search with the best motion so far. A motion that hangs holds a generation up for a
-    minute or two.
+    The result does not depend on the number of `workers`, processes that score motions. `stop` is
+    called between generations; true ends the search with the best motion so far.
 
     Raises:
-        NoExcitationError: no motion keeps every constraint: which forbids it, where, by how much.
-        OperatorStopError: it was stopped before there was one.
-        SettingsError, CellError: settings and cell do not fit together.
+        NoExcitationError: no motion satisfies all constraints.
+        OperatorStopError: it was stopped before there was a feasible motion.
+        SettingsError, CellError: the settings do not fit the cell.
     """
-    problem = problem_of(cell, settings, known)
-    return _searched(problem, cell, settings, reporter, workers, stop)
+    problem = problem_of(cell, settings, earlier)
+    return _search(problem, cell, settings, reporter, workers, stop)
 
 
 def run_design(
@@ -176,7 +174,7 @@ def run_design(
     reporter: Reporter,
     *,
     workers: int = 2,
-    known: Knowledge | None = None,
+    earlier: EarlierEstimate | None = None,
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
     force: bool = False,
@@ -184,44 +182,42 @@ def run_design(
 ) -> Designed:
     """Search a motion for a cell as :func:`run_search` does, and write it into a folder.
 
-    A search that was stopped leaves its best motion, marked as incomplete, and a journal to go on
-    from. With `resume` it goes on with the journal in the folder; with `force` it replaces a
-    design that is there. No other search gets into the folder until `then`, called with what was
-    written, has returned.
+    A stopped search writes its best motion, marked as incomplete, and a journal, with which
+    `resume` continues it; `force` replaces an existing design. The folder is locked until `then`,
+    called with the result, has returned.
 
     Raises:
-        InputError: there is a design in the folder and it is neither to be replaced nor resumed,
-            another search is at work in it, or the disk refuses.
-        UnsafeError: the motion found does not pass the check before it is written down.
+        InputError: the folder has a design already, is locked, or cannot be written to.
+        UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    problem = problem_of(cell, settings, known)  # before anything is replaced by what cannot be
-    archives = () if known is None else known.archives
-    with folder.held():
-        if resume:  # another search may have been there since they were read
-            require_same(settings, folder.interrupted(), folder.settings)
+    problem = problem_of(cell, settings, earlier)  # before anything is replaced
+    archives = () if earlier is None else earlier.archives
+    with folder.locked():
+        if resume:  # another search may have changed them since they were read
+            require_same(settings, folder.resumed_settings(), folder.settings)
         else:
-            folder.begin(settings, force=force)
-        earlier = {} if known is None else dict(archives) | {"repetitions": known.repetitions}
-        identity = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": earlier}
+            folder.create(settings, force=force)
+        added = {} if earlier is None else dict(archives) | {"repetitions": earlier.repetitions}
+        identity = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": added}
         with folder.opened_journal() as file:
             journal = _journal(file, identity, reporter)
             try:
-                design = _searched(problem, cell, settings, reporter, workers, stop, journal)
+                design = _search(problem, cell, settings, reporter, workers, stop, journal)
             finally:
                 journal.close()
         if journal.recalled:
-            reporter.say(f"{journal.recalled} motions were known from the journal")
+            reporter.say(f"{journal.recalled} scores were read from the journal")
         if journal.error is not None:
             reporter.say(
-                f"the journal lacks the last motions ({journal.error.strerror}); a search "
-                "resumed from it scores them anew"
+                f"the last scores are not in the journal ({journal.error.strerror}); a resumed "
+                "search computes them again"
             )
-        trajectory = design.excitation.trajectory  # as it is going to be run
+        trajectory = design.excitation.trajectory
         broken = problem.constraints.violations(trajectory, excitation.sampled(trajectory))
         if broken:
             reason = violation_text(broken[0], AngleFrame.of(cell))
-            raise UnsafeError(f"the motion found does not pass its last check: {reason}")
+            raise UnsafeError(f"the motion does not pass the final check: {reason}")
         result = DesignResult.of(cell, settings, design, problem.objective, archives)
         result.save(folder.result)
         done = Designed(problem, design, result)
@@ -229,7 +225,7 @@ def run_design(
     return done
 
 
-def _searched(
+def _search(
     problem: excitation.Problem,
     cell: Cell,
     asked: DesignSettings,
@@ -242,10 +238,10 @@ def _searched(
     frame, total = AngleFrame.of(cell), excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
-    done, note, troubled = 0, "scoring the first motions", False
+    done, note, warned = 0, "scoring the first motions", False
     with (
         reporter.task("designing (motions)", total) as task,
-        excitation.Population(problem, workers) as found,
+        excitation.Population(problem, workers) as population,
     ):
         task.advance(0, note)
 
@@ -254,43 +250,41 @@ def _searched(
             done += count
             task.advance(count, note)
 
-        def entered(progress: excitation.Progress) -> None:
-            """A generation is scored, or was in the journal."""
-            nonlocal note, troubled
+        def update(progress: excitation.Progress) -> None:
+            """Report a generation, whose scores may be from the journal."""
+            nonlocal note, warned
             note = _note(progress)
             scored(progress.evaluated - done)
-            if journal is not None and journal.error is not None and not troubled:
-                troubled = True
+            if journal is not None and journal.error is not None and not warned:
+                warned = True
                 reporter.say(
-                    f"the journal cannot be written ({journal.error.strerror}); the search goes "
-                    "on, and writes it as soon as there is room"
+                    f"the journal cannot be written ({journal.error.strerror}); the search "
+                    "continues and tries to write it again"
                 )
 
         try:
             design = excitation.search(
-                found, settings, journal=journal, progress=entered, scored=scored, stop=stop
+                population, settings, journal=journal, progress=update, scored=scored, stop=stop
             )
         except excitation.NoFeasibleMotionError as error:
             if error.stopped:
                 raise OperatorStopError(
-                    "stopped before there was a motion that keeps every constraint: "
-                    f"{forbidden(error, frame)}"
+                    f"stopped before a feasible motion was found: {infeasible_text(error, frame)}"
                 ) from error
             raise no_excitation(error, frame, checker, asked) from error
-        if design.complete:  # a polish or a mating that found nothing new needed fewer
+        if design.complete:  # with fewer motions than the limit
             task.advance(total - done, "done")
     if design.exhausted:
         reporter.say(
             f"ended after {len(design.history)} of {settings.generations} generations: mating "
-            "brought no motion that was not there before; raise mutation, crossover or population "
-            "in [search]"
+            "gave no new motions; raise mutation, crossover or population in [search]"
         )
     return design
 
 
 def _note(progress: excitation.Progress) -> str:
     where = {
-        "sample": "looking at random motions",
+        "sample": "scoring random motions",
         "search": f"generation {progress.generation} of {progress.generations}",
         "polish": "polishing",
     }[progress.phase]
@@ -303,14 +297,14 @@ def _journal(file: BinaryIO, identity: Mapping[str, Any], reporter: Reporter) ->
     try:
         journal = excitation.Journal(file, identity)
     except excitation.JournalError as error:
-        remedy = "resume with the same cell, settings and archives, or begin anew (--force)"
+        remedy = "resume with the same cell, settings and archives, or start again (--force)"
         raise InputError(file.name, str(error), remedy=remedy) from error
     except OSError as error:
         problem = f"cannot be read or written ({error.strerror})"
-        remedy = "make room or mend the disk, then try again (--resume)"
+        remedy = "free disk space or repair the disk, then try again (--resume)"
         raise InputError(file.name, problem, remedy=remedy) from error
     if journal.damaged:
         reporter.say(
-            f"{journal.damaged} bytes of the journal are damaged; what they held is scored anew"
+            f"{journal.damaged} bytes of the journal are damaged; their scores are computed again"
         )
     return journal

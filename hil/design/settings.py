@@ -1,7 +1,6 @@
-"""What a design may be asked for: one TOML file, one preset per method.
+"""Settings of a design: a TOML file, and a preset for each method as its defaults.
 
-The description of a field is also the remedy that an error prints, so it says what the value must
-be. A file may leave out whatever its method's preset says already.
+The description of a field is also the remedy in error messages.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from hil.reading import parse_toml, read_text
 Method = Literal["a", "b", "balanced", "front"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 
-# A text or a truth value is no number: pydantic would read "24" as 24 and true as 1.
+# Strict: pydantic would read "24" as 24 and true as 1.
 Number = Annotated[FiniteFloat, Field(strict=True)]
 Whole = Annotated[int, Field(strict=True)]
 Choice = Annotated[bool, Field(strict=True)]
@@ -40,16 +39,17 @@ AboveZero = Annotated[Number, Field(gt=0)]
 Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
 _MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
 RESULT_FORMAT: Final = "designed excitation"
-"""What the file that a design leaves calls itself; the settings are a table in it."""
+"""Key `format` of a result file, which has a table of the settings."""
 PAYLOAD_DURATION: Final = 10.0
-"""s; a load is weighed by a short motion, since the arm carries it and people wait."""
-PAYLOAD_POINTS: Final = 5  #: Via points that fit into it
+"""Longest motion for a payload, s."""
+PAYLOAD_POINTS: Final = 5
+"""Largest number of via points of such a motion."""
 SHORTEST_RAMP: Final = 0.05
-"""s; sines that grow faster are a blow to any arm, and their contacts cannot be determined."""
+"""Shortest ramp of sines, s; a shorter one is a jerk whose contacts cannot be determined."""
 
 
 class SettingsError(InputError):
-    """The settings of a design cannot be used: names file, field, value and remedy."""
+    """Invalid settings of a design: names file, field, value and remedy."""
 
 
 def _one_or_many(value: Any) -> Any:
@@ -61,19 +61,19 @@ class _Table(BaseModel):
 
 
 class SearchTable(_Table):
-    """`[search]`: how hard is searched, and for what."""
+    """`[search]`: effort and weights of the search."""
 
     population: Whole = Field(ge=4, le=10_000, description="a number of individuals, 4 to 10000")
     generations: Whole = Field(
         ge=1, le=100_000, description="a number of generations, the first one included, 1 to 100000"
     )
-    crossover: Share = Field(description="the probability that two parents are mixed, 0 to 1")
-    mutation: Share = Field(description="the probability that one gene is changed, 0 to 1")
+    crossover: Share = Field(description="the probability that two parents are crossed, 0 to 1")
+    mutation: Share = Field(description="the probability that a gene is mutated, 0 to 1")
     crossover_eta: Eta = Field(
-        default=15.0, description="how close children stay to their parents (SBX), 1 to 1000"
+        default=15.0, description="the distribution index of the crossover (SBX), 1 to 1000"
     )
     mutation_eta: Eta = Field(
-        default=20.0, description="how close a changed gene stays to what it was, 1 to 1000"
+        default=20.0, description="the distribution index of the mutation, 1 to 1000"
     )
     weights: tuple[Share, Share] = Field(
         default=(0.7, 0.3),
@@ -84,7 +84,7 @@ class SearchTable(_Table):
         default=0,
         ge=0,
         le=10_000_000,
-        description="a number of individuals to polish the winner with, 0 for no polish",
+        description="a number of motions for the local search from the best one, 0 for none",
     )
 
     @model_validator(mode="after")
@@ -103,12 +103,11 @@ class ViaPointTable(_Table):
     n_via: Whole = Field(ge=2, le=60, description="a number of via points to search, 2 to 60")
     fly: Share = Field(description="a fly-by fraction, 0 (stop at every via point) to 1")
     slowest: Annotated[Number, Field(gt=0, le=1)] = Field(
-        description="the smallest share of a joint's speed that is tried, above 0, at most 1"
+        description="the smallest fraction of a joint's speed limit, above 0, at most 1"
     )
     range_share: Annotated[Number, Field(gt=0, le=1)] = Field(
         default=1.0,
-        description="the share of each joint's range, about its middle, that via points lie in, "
-        "above 0, at most 1",
+        description="the central fraction of each joint's range for via points, above 0, at most 1",
     )
 
 
@@ -116,60 +115,57 @@ class SineTable(_Table):
     """`[sines]`: a sum of sines for each joint (eq. 8 of the paper)."""
 
     harmonics: Whole = Field(ge=1, le=20, description="a number of sines for each joint, 1 to 20")
-    length: AboveZero = Field(description="the time from beginning to end in s, above 0")
+    length: AboveZero = Field(description="the duration of the motion in s, above 0")
     ramp: Annotated[Number, Field(ge=0)] = Field(
-        description="the time in s in which the sines grow at the beginning and fade at the end, "
-        "0 for none (which no controller can execute)"
+        description="the duration of fade-in and fade-out in s, 0 for none (such a motion cannot "
+        "be run)"
     )
     slowest: Annotated[Frequencies, BeforeValidator(_one_or_many)] = Field(
-        description="the lowest angular frequency in rad/s, above 0: one figure, or one for each "
-        "joint"
+        description="the lowest angular frequency in rad/s, above 0: one, or one for each joint"
     )
     fastest: Frequencies | Literal["from limits"] = Field(
         description='the highest angular frequency in rad/s, one for each joint, or "from limits": '
-        "the square root of acceleration limit over room, as in the paper's appendix"
+        "sqrt(acceleration limit / distance of offset and limit), as in the paper's appendix"
     )
     offset: Literal["middle", "home"] | list[Number] = Field(
         default="middle",
-        description='"middle" of the joints\' ranges, "home" of the cell, or angles in degrees, '
-        "one for each joint, in the frame of the cell's [limits]: where the joints swing about",
+        description='the mean posture: "middle" of the joints\' ranges, "home" of the cell, or '
+        "angles in degrees, one for each joint, in the frame of the cell's [limits]",
     )
 
     @model_validator(mode="after")
     def _ramps_fit(self) -> SineTable:
         if 0.0 < self.ramp < SHORTEST_RAMP:
             raise ValueError(
-                f"a ramp of {self.ramp:g} s is a blow, not a ramp; make it {SHORTEST_RAMP:g} s or "
-                "longer, or 0 for none"
+                f"a ramp of {self.ramp:g} s is too short; make it {SHORTEST_RAMP:g} s or longer, "
+                "or 0 for none"
             )
         if 2.0 * self.ramp > self.length:
             raise ValueError(
-                f"two ramps of {self.ramp:g} s do not fit into {self.length:g} s; make the ramp "
-                "shorter, or the motion longer"
+                f"two ramps of {self.ramp:g} s are longer than the motion, {self.length:g} s; make "
+                "the ramp shorter, or the motion longer"
             )
         return self
 
 
 class ConstraintTable(_Table):
-    """`[constraints]`: what the motion must keep beside the joint limits."""
+    """`[constraints]`: constraints beside the joint limits."""
 
     min_duration: Annotated[Number, Field(ge=0)] = Field(
-        default=0.0, description="the duration of the shortest motion in s, 0 for any"
+        default=0.0, description="the shortest duration in s, 0 for any"
     )
-    max_duration: AboveZero = Field(
-        default=20.0, description="the duration of the longest motion in s, above 0"
-    )
+    max_duration: AboveZero = Field(default=20.0, description="the longest duration in s, above 0")
     closed: Choice = Field(
         default=True,
-        description="true or false: a motion through via points begins and ends in the cell's home",
+        description="true or false: motions through via points begin and end in the cell's home",
     )
     collision: Choice = Field(
         default=True,
-        description="true or false: keep clear of floor, walls and the arm itself ([workspace])",
+        description="true or false: check clearance from floor, walls and the arm ([workspace])",
     )
     current: Choice = Field(
         default=True,
-        description="true or false: keep the motors' current limits by the nominal model",
+        description="true or false: check the motors' current limits with the nominal model",
     )
 
     @model_validator(mode="after")
@@ -183,32 +179,31 @@ class ConstraintTable(_Table):
 
 
 class ObjectiveTable(_Table):
-    """`[objective]`: which parameters count."""
+    """`[objective]`: parameters in the criteria."""
 
     parameters: Literal["all", "payload"] | list[str] = Field(
         default="all",
-        description='"all"; "payload", a body on the last link with the arm known; or a list of at '
+        description='"all"; "payload", a body on the last link of a known arm; or a list of at '
         "least two names of parameters as `hil identify` reports them",
     )
     max_relative_std: Annotated[Number, Field(gt=0)] | None = Field(
         default=None,
-        description="a percentage: parameters whose standard deviation in the earlier estimate is "
-        "a larger share of their value are left out; needs --earlier",
+        description="the largest relative standard deviation of a parameter in the earlier "
+        "estimate in percent; others are left out; needs --earlier",
     )
 
     @property
     def named(self) -> list[str] | None:
-        """Names of the parameters, None where they are not named one by one."""
+        """Names of the parameters, None if they are not listed."""
         return None if isinstance(self.parameters, str) else self.parameters
 
     @field_validator("parameters")
     @classmethod
     def _two_at_least(cls, parameters: str | list[str]) -> str | list[str]:
         if isinstance(parameters, list) and len(parameters) < 2:
-            named = "one parameter" if parameters else "no parameter"
             raise ValueError(
-                f'names {named}, and a design needs two; give "all", or at least two names as '
-                "`hil identify` reports them"
+                f'has {len(parameters)} of two or more names; give "all", or at least two '
+                "names as `hil identify` reports them"
             )
         return parameters
 
@@ -216,7 +211,7 @@ class ObjectiveTable(_Table):
     def _one_choice(self) -> ObjectiveTable:
         if self.max_relative_std is not None and self.parameters != "all":
             raise ValueError(
-                "both parameters and max_relative_std choose what counts; leave one of them out"
+                "both parameters and max_relative_std select parameters; leave one of them out"
             )
         return self
 
@@ -237,11 +232,8 @@ class DesignSettings(_Table):
     @model_validator(mode="after")
     def _one_motion(self) -> DesignSettings:
         if (self.via_points is None) == (self.sines is None):
-            given = "there are neither" if self.via_points is None else "there are both"
-            raise ValueError(
-                f"{given} [via_points] and [sines]; a motion is one of the two, so give one of them"
-            )
-        # Sines last as long as they are asked to: what is not allowed needs no search.
+            given = "neither" if self.via_points is None else "both"
+            raise ValueError(f"has {given} of [via_points] and [sines]; give one of the two")
         asked, length = self.constraints, None if self.sines is None else self.sines.length
         if length is not None and not asked.min_duration <= length <= asked.max_duration:
             raise ValueError(
@@ -251,7 +243,7 @@ class DesignSettings(_Table):
         return self
 
     def replaced(self, **changes: Any) -> DesignSettings:
-        """These settings with some replaced, tables merged field by field, all checked again.
+        """Return the settings with changes, tables merged field by field.
 
         Raises:
             SettingsError: names field, value and remedy.
@@ -259,7 +251,7 @@ class DesignSettings(_Table):
         return _validated(None, _merged(self.to_dict(), changes))
 
     def for_payload(self) -> DesignSettings:
-        """These settings for a short motion that weighs what the arm carries."""
+        """Return the settings for a short motion to identify a payload."""
         changes: dict[str, dict[str, object]] = {
             "objective": {"parameters": "payload"},
             "constraints": {"max_duration": min(self.constraints.max_duration, PAYLOAD_DURATION)},
@@ -271,14 +263,14 @@ class DesignSettings(_Table):
         return self.replaced(**changes)
 
     def kinematic(self) -> DesignSettings:
-        """These settings with nothing but joint limits and durations to keep, the path open."""
+        """Return the settings with only joint limits and durations as constraints."""
         return self.replaced(
             constraints={"closed": False, "collision": False, "current": False},
         )
 
     @property
     def unchecked(self) -> tuple[str, ...]:
-        """What a search with these settings does not look at; empty for a robot's motion."""
+        """Constraints of a robot's motion that these settings do not check."""
         constraints = self.constraints
         bare = self.sines is not None and self.sines.ramp == 0.0
         return (
@@ -288,24 +280,22 @@ class DesignSettings(_Table):
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Return data without what is not given."""
+        """Return data for JSON, without None."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def preset(method: Method) -> DesignSettings:
-    """Return the settings a method comes with."""
+    """Return the default settings of a method."""
     return _validated(None, tomllib.loads(preset_text(method)))
 
 
 def preset_text(method: Method) -> str:
-    """Return a preset as the commented TOML file it is written in, for a person to change."""
+    """Return the commented TOML file of a preset."""
     return (files(f"{__package__}.presets") / f"{method}.toml").read_text("utf-8")
 
 
 def load_settings(path: Path) -> DesignSettings:
-    """Read settings; what the file leaves out is as in the preset of its method ("front").
-
-    Of a file that a design left behind, its table of settings is read.
+    """Read settings, with the preset of the method as defaults; also from a result file.
 
     Raises:
         SettingsError: names file, field, value and remedy.
@@ -329,13 +319,13 @@ def settings_of(raw: Mapping[str, Any], path: Path | None = None) -> DesignSetti
     if method not in METHODS:
         raise SettingsError(
             path,
-            "is no method",
+            "is not a method",
             field=f"method = {method!r:.60}",
             remedy=f"known are: {', '.join(METHODS)}",
         )
     base = tomllib.loads(preset_text(method))
     given = [name for name in _MOTIONS if name in raw]
-    if given:  # a motion of another kind than the method's is as in the paper's method with it
+    if given:  # defaults for a motion of another kind are those of the paper's method
         base = {
             name: table for name, table in base.items() if name not in _MOTIONS or name in given
         }
@@ -357,13 +347,12 @@ def _validated(path: Path | None, raw: Mapping[str, Any]) -> DesignSettings:
     try:
         return DesignSettings.model_validate(raw)
     except ValidationError as error:
-        complaint = first_error(path or Path(), error, DesignSettings)
-        value = complaint.value
-        found = "" if value is None else f" = {value!r:.60}"
-        no_table = error.errors(include_url=False)[0]["type"] == "model_type"
+        first = first_error(path or Path(), error, DesignSettings)
+        found = "" if first.value is None else f" = {first.value!r:.60}"
+        not_table = error.errors(include_url=False)[0]["type"] == "model_type"
         raise SettingsError(
             path,
-            "is no table" if no_table else complaint.problem,
-            field=f"{complaint.field}{found}",
-            remedy=complaint.remedy,
+            "is not a table" if not_table else first.problem,
+            field=f"{first.field}{found}",
+            remedy=first.remedy,
         ) from error

@@ -140,7 +140,7 @@ def test_one_seed_is_one_file_whatever_the_number_of_processes(invoke, made, set
 def test_an_earlier_design_is_not_overwritten_unless_asked_to(invoke, settings, copied):
     arguments = (CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--seed", 5)
     before = (copied / "excitation.toml").read_bytes()
-    with pytest.raises(InputError, match=r"holds a design already.*--resume.*--force"):
+    with pytest.raises(InputError, match=r"has a design already.*--resume.*--force"):
         invoke(*arguments)
     assert (copied / "excitation.toml").read_bytes() == before
     (copied / "notes.txt").write_text("mine")
@@ -161,7 +161,7 @@ def test_what_is_not_a_design_is_never_removed(invoke, settings, tmp_path):
     out.mkdir()
     (out / "settings.toml").write_text("mine = true\n")
     for arguments in ((), ("--force",)):
-        with pytest.raises(InputError, match=r"settings\.toml: is in the way"):
+        with pytest.raises(InputError, match=r"settings\.toml: exists and is not of a design"):
             invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", out, *arguments)
     assert (out / "settings.toml").read_text() == "mine = true\n"
 
@@ -174,7 +174,7 @@ def test_a_folder_in_which_a_search_is_running_is_left_alone(invoke, settings, c
     before = content()
     given = () if option == ("--resume",) else ("--settings", settings, "--kinematic")
     with (
-        DesignFolder(copied).held(),
+        DesignFolder(copied).locked(),
         pytest.raises(InputError, match=r"copied: a search is running in it; wait") as caught,
     ):
         invoke(CELL_PATH, *given, "-o", copied, *option)
@@ -185,7 +185,7 @@ def test_a_folder_in_which_a_search_is_running_is_left_alone(invoke, settings, c
 
 def test_the_folder_is_held_until_the_picture_is_drawn(invoke, copied):
     def meanwhile(*_, **__):
-        with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).held():
+        with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).locked():
             pass
         return Figure()
 
@@ -206,7 +206,7 @@ def test_a_result_that_cannot_be_written_names_file_and_remedy(invoke, copied, m
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr("hil.design.result.write_atomically", full)
-    words = r"excitation\.toml: the motion is found but cannot be written \(No space.*--resume"
+    words = r"excitation\.toml: cannot be written \(No space.*--resume"
     with pytest.raises(InputError, match=words):
         invoke(CELL_PATH, "--resume", "-o", copied)
 
@@ -227,7 +227,7 @@ def test_a_search_that_ends_early_says_why(invoke, settings, tmp_path):
     settings.write_text(SETTINGS + "crossover = 0.0\nmutation = 0.0\n")
     given = (CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
     output = invoke(*given).output
-    assert "ended after 1 of 2 generations: mating brought no motion" in output
+    assert "ended after 1 of 2 generations: mating gave no new motions" in output
     assert "100 %" in output
 
 
@@ -272,9 +272,9 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
     said = str(caught.value)
     assert "duration excludes 16" in said and "0.5" in said
-    lasts = r"the shortest motion tried lasts [\d.]+ s, where 0 to 0.5 s are asked for: allow more "
+    lasts = r"the shortest motion lasts [\d.]+ s, allowed are 0 to 0.5 s: allow more "
     assert re.search(lasts + r"time \(\[constraints\] max_duration\)", said)
-    assert "search longer" not in said
+    assert "evaluate more" not in said
     assert "repeat the command with --force, or with --resume if cell and settings" in said
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
@@ -302,7 +302,7 @@ def test_a_wall_that_home_touches_is_named_with_depth_before_anything_is_tried(
             "--method and --settings: exclude each other",
         ),
         ([CELL_PATH, "--resume", "--force"], "exclude each other"),
-        ([CELL_PATH, "--resume", "-o", "NOWHERE"], "holds no design to go on with"),
+        ([CELL_PATH, "--resume", "-o", "NOWHERE"], "has no design to resume"),
         ([CELL_PATH, "--settings", "NOWHERE"], "cannot be read"),
         (["NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
@@ -395,14 +395,14 @@ def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeyp
     invoke(CELL_PATH, "--resume", "-o", copied)
     monkeypatch.setattr("hil.cli.design.WEAK", 1.0)
     monkeypatch.setattr("hil.cli.design.weakest", lambda *_: ("I6zz", "f1_6"))
-    assert "hardly separates I6zz, f1_6: take more via points" in (
+    assert "hardly separates I6zz, f1_6: use more via points" in (
         invoke(CELL_PATH, "--resume", "-o", copied).output
     )
 
 
 def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
     settings = preset("b").kinematic()
-    with pytest.raises(OperatorStopError, match="stopped before there was a motion") as caught:
+    with pytest.raises(OperatorStopError, match="stopped before a feasible motion") as caught:
         run_search(Cell.load(CELL_PATH), settings, Silent(), workers=1, stop=lambda: True)
     assert caught.value.exit_code == 130
 

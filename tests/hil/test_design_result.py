@@ -20,8 +20,8 @@ from hil.campaign import plan_around
 from hil.cell import Cell
 from hil.cli.design import design
 from hil.design import DesignResult, load_design, preset, problem_of
-from hil.design.earlier import known_from
-from hil.design.problem import Knowledge
+from hil.design.earlier import estimate_earlier
+from hil.design.problem import EarlierEstimate
 from hil.design.result import _seal, fingerprint, references
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
@@ -210,8 +210,8 @@ def test_a_subset_and_a_polish_are_recorded(ns16, tmp_path):
 def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
     folder = DesignFolder(tmp_path)
     os.mkfifo(folder.settings)
-    with pytest.raises(InputError, match="holds no design to go on with"):
-        folder.interrupted()
+    with pytest.raises(InputError, match="has no design to resume"):
+        folder.resumed_settings()
     for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
         make(folder.journal)
         with pytest.raises(InputError, match="cannot be written to"), folder.opened_journal():
@@ -270,22 +270,22 @@ def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(ns16, result, s
 def test_other_parameters_are_not_drawn_beside_all(ns16, result, saved):
     names = list(ns16.model.parameter_names)
     some = preset("b").replaced(objective={"parameters": names[:3]})
-    words = r"excitation\.toml: --compare: was judged by 58 parameters, this design by 3, of which"
+    words = r"excitation\.toml: --compare: has criteria of 58 parameters, this design of 3, of which"
     with pytest.raises(InputError, match=words + " 3 are the same; .*same \\[objective\\]"):
         references([saved(result)], ns16, some, together=False)
     search = result.data["search"] | {"parameters": names[:3], "n_parameters": 3}
     subset = changed(result, search=search)
     assert references([saved(subset)], ns16, some, together=False)
     others = preset("b").replaced(objective={"parameters": names[1:4]})
-    with pytest.raises(InputError, match="by 3 parameters, this design by 3, of which 2 are"):
+    with pytest.raises(InputError, match="of 3 parameters, this design of 3, of which 2 are"):
         references([saved(subset)], ns16, others, together=False)
     everything = preset("b").replaced(objective={"parameters": names})
     assert references([saved(result)], ns16, everything, together=False)
 
 
 @pytest.fixture(scope="module")
-def known(campaign, cell) -> Knowledge:
-    return known_from([campaign.folder.root], cell, Silent())
+def known(campaign, cell) -> EarlierEstimate:
+    return estimate_earlier([campaign.folder.root], cell, Silent())
 
 
 @pytest.mark.slow
@@ -303,7 +303,7 @@ def test_running_the_same_motion_again_says_about_the_same_again(excitations, ce
     # The archives hold a sample for each cycle of 1 ms, the search takes one every 8 ms. A fit
     # also leaves out rows near reversals, where a smoothed acceleration says little: up to one in
     # twenty of those in which a joint accelerates.
-    known = known_from(excitations, cell, Silent())
+    known = estimate_earlier(excitations, cell, Silent())
     objective = problem_of(cell, preset("b").kinematic(), known).objective
     assert objective.repetitions == len(excitations) == 3
     both = objective.information(midpoints(plan.excitation.trajectory))
@@ -315,7 +315,7 @@ def excitations(campaign) -> list[Path]:
     return campaign.folder.completed("excitation")
 
 
-def rows(found: Knowledge) -> np.ndarray:
+def rows(found: EarlierEstimate) -> np.ndarray:
     """Squares of each joint's friction columns; they depend on no weight."""
     of_friction = [k for k, name in enumerate(found.names) if name.startswith("f")]
     joints = [int(found.names[k].rpartition("_")[2]) - 1 for k in of_friction]
@@ -325,14 +325,14 @@ def rows(found: Knowledge) -> np.ndarray:
 @pytest.mark.slow
 def test_every_motion_counts_whether_fitted_or_held_out(known, excitations, campaign, cell):
     """Of three repetitions alone one is held out, of one the end; a campaign has other motions."""
-    three = known_from(excitations, cell, Silent())
-    one = known_from(excitations[:1], cell, Silent())
+    three = estimate_earlier(excitations, cell, Silent())
+    one = estimate_earlier(excitations[:1], cell, Silent())
     assert one.samples == pytest.approx(three.samples / 3.0, rel=0.01)
     np.testing.assert_allclose(rows(one), rows(three) / 3.0, rtol=0.02)
     assert [name for name, _ in one.archives] == [excitations[0].name]
     validation = campaign.folder.completed("validation")
     assert {name for name, _ in known.archives} == {p.name for p in [*excitations, *validation]}
-    whole = known_from([*excitations, *validation[:1]], cell, Silent())
+    whole = estimate_earlier([*excitations, *validation[:1]], cell, Silent())
     assert np.all(rows(whole) > 1.05 * rows(three))
     assert np.all(rows(known) > 1.05 * rows(whole))
 
@@ -362,7 +362,7 @@ def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell
     excitation = Excitation(series, unknown, method="a", seed=7, tried=1, rejected={})
     folder = run(tmp_path / "campaign", short, plan_around(short, excitation)).folder
     reporter = Listening()
-    known = known_from(folder.completed("excitation"), cell, reporter)
+    known = estimate_earlier(folder.completed("excitation"), cell, reporter)
     (warning,) = (text for text in reporter.said if text.startswith("warning: "))
     assert f"{cell.joint_names[5]} never moved" in warning
     assert not any(name in warning for name in cell.joint_names[:5])
@@ -381,7 +381,7 @@ def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell
 def test_archives_can_be_named_one_by_one(known, campaign, cell):
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
-    again = known_from(paths, cell, Silent())
+    again = estimate_earlier(paths, cell, Silent())
     np.testing.assert_array_equal(again.gram, known.gram)
     assert again.archives == known.archives
     assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in known.archives)
@@ -391,12 +391,12 @@ def test_archives_of_another_robot_are_refused(campaign, cell):
     text = cell.text.replace('third = "quadratic"', 'third = "cubic"')
     other = Cell.from_texts(text, cell.urdf, cell.path)
     with pytest.raises(InputError, match="whose robot is not that of"):
-        known_from([campaign.folder.root], other, Silent())
+        estimate_earlier([campaign.folder.root], other, Silent())
 
 
 def test_a_folder_without_archives_is_refused(tmp_path, cell):
     with pytest.raises(InputError, match="contains no complete archive"):
-        known_from([tmp_path], cell, Silent())
+        estimate_earlier([tmp_path], cell, Silent())
 
 
 @pytest.mark.slow

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hil.cell import AngleFrame, Cell
 from hil.design import METHODS, DesignSettings, load_settings, preset, problem_of, search_settings
 from hil.design.advice import NoExcitationError, margins, no_excitation, weakest
-from hil.design.problem import Knowledge
+from hil.design.problem import EarlierEstimate
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.motion_checks import MotionChecks
 from identification.excitation import (
@@ -97,20 +97,20 @@ def test_a_file_may_leave_out_what_its_method_says_already():
         ("[via_points]\nn = 6", ["via_points.n", "valid fields", "n_via"]),
         ("[via_points]\nslowest = 0.0", ["via_points.slowest = 0.0", "above 0, at most 1"]),
         ("[via_points]\n[sines]", ["both", "[via_points]", "[sines]", "give one"]),
-        ("[sines]\nramp = 0.04", ["sines", "a ramp of 0.04 s is a blow", "0.05 s or longer"]),
+        ("[sines]\nramp = 0.04", ["sines", "a ramp of 0.04 s is too short", "0.05 s or longer"]),
         ("[sines]\nramp = 11.0", ["sines", "two ramps of 11 s", "20 s"]),
         ("[sines]\nfastest = [1.0, -1.0]", ["sines.fastest", "rad/s"]),
         ('[sines]\noffset = "nowhere"', ["sines.offset = 'nowhere'", '"middle"', '"home"']),
         ("[constraints]\nmin_duration = 30.0", ["min_duration = 30 s", "max_duration = 20 s"]),
         ("[constraints]\nmax_duration = inf", ["constraints.max_duration", "above 0"]),
-        ("[[search]]\n", ["search", "is no table", "a table [search]"]),
+        ("[[search]]\n", ["search", "is not a table", "a table [search]"]),
         (
             'method = "a"\n[constraints]\nmax_duration = 10.0',
             ["[sines] length = 20 s is not between [constraints] min_duration = 0 s and max_dur"],
         ),
         ("seed = -1", ["seed = -1", "0 or more"]),
         ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
-        ('[objective]\nparameters = ["mc2y"]', ["names one parameter", "hil identify"]),
+        ('[objective]\nparameters = ["mc2y"]', ["has 1 of two or more names", "hil identify"]),
         (
             '[objective]\nparameters = ["mc2y", "mc2z"]\nmax_relative_std = 30.0',
             ["objective", "leave one of them out"],
@@ -165,7 +165,7 @@ def test_an_offset_outside_the_limits_is_named_as_it_was_written(cell):
         problem_of(cell, preset("a").kinematic().replaced(sines={"offset": offset}))
     text = str(caught.value)
     assert f"sines.offset = {offset}" in text
-    assert "joint_3 is not inside its limits, -170 to 110 deg, at 120 deg" in text
+    assert "joint_3 = 120 deg is outside its limits, -170 to 110 deg" in text
     assert "teach pendant angles" in text and "rad" not in text
 
 
@@ -183,7 +183,7 @@ def test_named_parameters_are_the_ones_that_count(cell):
     chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
     objective = problem_of(cell, chosen).objective
     np.testing.assert_array_equal(objective.parameters, [2, 9])
-    for wrong, words in (([names[0], "m9"], "no parameter.*I1yy"), ([names[0]] * 2, "named twice")):
+    for wrong, words in (([names[0], "m9"], "not a parameter.*I1yy"), ([names[0]] * 2, "named twice")):
         with pytest.raises(SettingsError, match=words):
             problem_of(cell, settings.replaced(objective={"parameters": wrong}))
 
@@ -197,9 +197,9 @@ def test_a_cell_without_drives_can_be_designed_for_as_far_as_its_joints_go():
         problem_of(without, preset("b"))
 
 
-def known_of(names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> Knowledge:
+def known_of(names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> EarlierEstimate:
     p = len(names)
-    return Knowledge(names, values, std, np.ones(6), np.eye(p), samples=100, repetitions=30)
+    return EarlierEstimate(names, values, std, np.ones(6), np.eye(p), samples=100, repetitions=30)
 
 
 def test_what_is_known_too_badly_is_left_out(cell):
@@ -296,7 +296,7 @@ def said(cell: Cell, settings: DesignSettings, rejected: dict, nearest: list, **
 
 
 def advised(*arguments, **more) -> str:
-    return said(*arguments, **more).partition("What can be changed: ")[2]
+    return said(*arguments, **more).partition("Possible changes: ")[2]
 
 
 @pytest.mark.parametrize(
@@ -306,13 +306,13 @@ def advised(*arguments, **more) -> str:
         (VIA, {"collision": 900, "current": 501}, {}, ("range_share", "current limits"), ""),
         (VIA, {"collision": 900, "current": 500}, {}, ("range_share",), "current limits"),
         (VIA, {"collision": 400, "current": 450}, {}, ("current limits",), "range_share"),
-        (VIA, {"collision": 1000}, {}, ("[via_points]",), "search longer"),
-        (VIA, {"current": 1000}, {}, ("[via_points]",), "search longer"),
+        (VIA, {"collision": 1000}, {}, ("[via_points]",), "evaluate more"),
+        (VIA, {"current": 1000}, {}, ("[via_points]",), "evaluate more"),
         # About sines for sines, and after a tiny search a longer one.
         (SINES, {"collision": 1000}, {}, ("[sines] offset",), "via"),
         (SINES, {"current": 1000}, {}, ("[sines] slowest, fastest",), "via"),
-        (VIA, {"collision": 24}, {"tried": 24}, ("search longer, 24 motions are few",), "nan"),
-        (VIA, {"collision": 100}, {"unexciting": 900}, ("more via points or judge by fewer",),
+        (VIA, {"collision": 24}, {"tried": 24}, ("evaluate more than 24 motions",), "nan"),
+        (VIA, {"collision": 100}, {"unexciting": 900}, ("more via points or fewer parameters",),
          "range_share"),
     ],
 )  # fmt: skip
@@ -326,17 +326,17 @@ def test_what_forbids_most_gets_advice(cell, settings, rejected, more, words, ab
 @pytest.mark.parametrize(
     ("value", "asked", "words", "longer"),
     [
-        (18.5, (0.0, 0.5), "the shortest motion tried lasts 18.5 s, where 0 to 0.5 s", False),
+        (18.5, (0.0, 0.5), "the shortest motion lasts 18.5 s, allowed are 0 to 0.5 s", False),
         (22.0, (0.0, 20.0), "allow more time", True),
-        (12.0, (60.0, 100.0), "the longest motion tried lasts 12 s, where 60 to 100 s", False),
-        (20.3, (19.9, 20.0), "where 19.9 to 20 s are asked for: allow more time", True),
+        (12.0, (60.0, 100.0), "the longest motion lasts 12 s, allowed are 60 to 100 s", False),
+        (20.3, (19.9, 20.0), "allowed are 19.9 to 20 s: allow more time", True),
     ],
 )
 def test_a_duration_is_reported_with_what_is_asked_for(cell, value, asked, words, longer):
     settings = VIA.replaced(constraints={"min_duration": asked[0], "max_duration": asked[1]})
     bound = asked[value > asked[1]]
     advice = advised(cell, settings, {"duration": 100}, [duration(value, bound)], tried=100)
-    assert words in advice and ("search longer" in advice) is longer
+    assert words in advice and ("evaluate more" in advice) is longer
 
 
 def test_the_closest_motion_has_one_violation_of_each_kind(cell):
@@ -355,11 +355,11 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))
-    with pytest.raises(NoExcitationError, match=r"where the sines swing about.*\[sines\] offset"):
+    with pytest.raises(NoExcitationError, match=r"in the mean posture of the sines.*\[sines\] offset"):
         problem_of(weak, SINES.replaced(sines={"offset": "home"}))
     problem_of(weak, VIA.kinematic())
     folded = SINES.replaced(sines={"offset": [0.0, 90.0, -165.0, 0.0, 90.0, 0.0]})
-    with pytest.raises(NoExcitationError, match=r"where the sines swing about: collision of"):
+    with pytest.raises(NoExcitationError, match=r"in the mean posture of the sines: collision of"):
         problem_of(cell, folded)
 
 

@@ -1,1 +1,1 @@
-"""The settings each method comes with, as files for people."""
+"""Default settings of each method."""
