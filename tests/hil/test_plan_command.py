@@ -140,7 +140,7 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ([], "--via or --random: one of them is needed"),
+        ([], "--via or --random: one of them is required"),
         (["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
         (["--via", "missing.csv"], "cannot be read"),
         (["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
