@@ -270,7 +270,7 @@ def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(ns16, result, s
 def test_other_parameters_are_not_drawn_beside_all(ns16, result, saved):
     names = list(ns16.model.parameter_names)
     some = preset("b").replaced(objective={"parameters": names[:3]})
-    words = r"excitation\.toml: --compare: has criteria of 58 parameters, this design of 3, of which"
+    words = r"\.toml: --compare: has criteria of 58 parameters, this design of 3, of which"
     with pytest.raises(InputError, match=words + " 3 are the same; .*same \\[objective\\]"):
         references([saved(result)], ns16, some, together=False)
     search = result.data["search"] | {"parameters": names[:3], "n_parameters": 3}

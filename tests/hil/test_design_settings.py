@@ -183,7 +183,7 @@ def test_named_parameters_are_the_ones_that_count(cell):
     chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
     objective = problem_of(cell, chosen).objective
     np.testing.assert_array_equal(objective.parameters, [2, 9])
-    for wrong, words in (([names[0], "m9"], "not a parameter.*I1yy"), ([names[0]] * 2, "named twice")):
+    for wrong, words in (([names[0], "m9"], "a parameter.*I1yy"), ([names[0]] * 2, "named twice")):
         with pytest.raises(SettingsError, match=words):
             problem_of(cell, settings.replaced(objective={"parameters": wrong}))
 
@@ -355,7 +355,7 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
     with pytest.raises(NoExcitationError, match=words) as caught:
         problem_of(weak, VIA)
     assert re.search(r"correct \[drive_train\].*home_deg in \[campaign\]", str(caught.value))
-    with pytest.raises(NoExcitationError, match=r"in the mean posture of the sines.*\[sines\] offset"):
+    with pytest.raises(NoExcitationError, match=r"mean posture of the sines.*\[sines\] offset"):
         problem_of(weak, SINES.replaced(sines={"offset": "home"}))
     problem_of(weak, VIA.kinematic())
     folded = SINES.replaced(sines={"offset": [0.0, 90.0, -165.0, 0.0, 90.0, 0.0]})
