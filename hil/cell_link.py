@@ -1,4 +1,4 @@
-"""The link that a cell file names, opened: a real one, or the simulated controller."""
+"""Open the link of a cell: a real one, or a simulated controller."""
 
 from __future__ import annotations
 
@@ -20,39 +20,34 @@ def cell_link(
     only_axis: int | None = None,
     live: LiveView | None = None,
 ) -> Iterator[MotionLink]:
-    """Open the cell's own link; leaving it brings the arm to rest and ends the connection.
+    """Open the link of a cell; leaving the context stops the arm and closes the link.
 
-    With transport "simulated" the controller is simulated in this process, in virtual time, and
-    forgets everything afterwards.
+    With transport "simulated" the controller is simulated in this process, in virtual time.
 
     Args:
-        cell: names the link.
-        accept_init: use the controller's gear ratios, calibration and coupling where they differ
+        cell: with the settings of the link.
+        accept_init: use the controller's gear ratios, calibration and coupling if they differ
             from the cell's.
-        only_axis: the axis, from 1, that alone is to be open; None for all.
-        live: lets viewers look at what is recorded, in real time.
+        only_axis: the only axis to be open, from 1; None for all.
+        live: settings of a live view.
 
     Raises:
         ControllerFault: the link cannot be opened.
         LiveViewError: the live view cannot be served, or time is virtual.
     """
     if cell.controller.transport == "simulated":
-        require_watchable(cell, live)
+        require_real_time(cell, live)
         yield simulated_link(cell, only_axis=only_axis)
         return
     with LiveLink.open(cell, accept_init=accept_init, only_axis=only_axis, live=live) as link:
         yield link
 
 
-def require_watchable(cell: Cell, live: LiveView | None) -> None:
-    """Refuse a live view of what is simulated in virtual time.
-
-    Raises:
-        LiveViewError: one is wanted of a cell with the transport "simulated".
-    """
+def require_real_time(cell: Cell, live: LiveView | None) -> None:
+    """Raise `LiveViewError` for a live view of a cell simulated in virtual time."""
     if live is not None and cell.controller.transport == "simulated":
         raise LiveViewError(
             None,
-            "--live shows real time; this run is simulated in virtual time",
+            "--live needs real time; this run is simulated in virtual time",
             remedy="leave it out, or run against `hil simulate` over the loopback",
         )

@@ -1,4 +1,4 @@
-"""A simulated controller on a real link, from the first packet to the operator's last button."""
+"""A simulated controller on a real link, with the buttons of its operator."""
 
 from __future__ import annotations
 
@@ -27,18 +27,21 @@ _PR_SET_TIMERSLACK: Final = 29
 def open_controller_link(
     udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
 ) -> serve.ControllerLink:
-    """The controller's end of the link a person names.
+    """Open the controller's end of a link.
 
-    `udp` is "HOST:PORT" of the PC program, `can` "INTERFACE:CHANNEL", ":fd" or ":classic" behind
-    it; a bus is asked whether it can carry the controller's cycle and mode.
+    Args:
+        udp: "HOST:PORT" of the PC program.
+        can: "INTERFACE:CHANNEL", optionally with ":fd" or ":classic".
+        settings: of the controller; cycle and mode must fit a CAN bus.
+        n_axes: of the arm.
 
     Raises:
-        InputError: neither or both, or not of that form.
-        ControllerLinkError: impossible to open, or unfit for the session.
+        InputError: neither or both links, or an invalid one.
+        ControllerLinkError: it cannot be opened, or cannot carry the session.
     """
     if (udp is None) == (can is None):
         remedy = "give --udp or --can, not both"
-        raise InputError(None, "a link has to be named, one of them", remedy=remedy)
+        raise InputError(None, "one link is needed", remedy=remedy)
     if can is not None:
         return _bus(can, settings, n_axes)
     host, _, port_text = (udp or "").rpartition(":")
@@ -53,10 +56,8 @@ def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.Controll
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
     if profile not in ("fd", "classic"):
-        problem = (
-            f"--can {text!r} ends in {profile!r}, which is neither of the profiles fd and classic"
-        )
-        remedy = "end it with :fd or :classic (a channel with a colon in it needs one of them)"
+        problem = f"--can {text!r} ends in {profile!r}, which is neither fd nor classic"
+        remedy = "end it with :fd or :classic (required for a channel with a colon)"
         raise InputError(None, problem, remedy=remedy)
     if not (interface and channel):
         remedy = "write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic"
@@ -70,10 +71,10 @@ def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.Controll
 
 
 class Buttons:
-    """What the person in front of the cabinet wants, set by signals and by a time limit.
+    """Requests of the operator at the controller, by signals and a time limit.
 
     Attributes:
-        interrupted: whether a signal asked for the end.
+        interrupted: whether a signal requested the end.
     """
 
     def __init__(self, duration: float | None = None) -> None:
@@ -82,22 +83,22 @@ class Buttons:
         self._pressed: set[int] = set()
 
     def request(self) -> serve.Request:
-        """Go on; or end, by a signal or because the time is over; or give up."""
+        """Return whether to continue, to end (by a signal or the time limit), or to give up."""
         if self._at_once:
             return serve.Request.ABORT
         over = self._until is not None and time.monotonic() >= self._until
         return serve.Request.END if self.interrupted or over else serve.Request.CONTINUE
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
-        """Take a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
+        """Handle a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
         del frame
         if signum in (signal.SIGUSR1, signal.SIGUSR2):
             self._pressed.add(signum)
         else:
             self._at_once, self.interrupted = self.interrupted, True
 
-    def pass_on(self, controller: SimulatedController) -> None:
-        """Press on the controller what was pressed here: drive on, or the emergency stop."""
+    def apply(self, controller: SimulatedController) -> None:
+        """Apply pressed buttons to the controller: drive on, or the emergency stop."""
         if signal.SIGUSR1 in self._pressed:
             self._pressed.discard(signal.SIGUSR1)
             controller.drive_on()
@@ -108,7 +109,7 @@ class Buttons:
 
 @contextmanager
 def buttons(duration: float | None) -> Iterator[Buttons]:
-    """Signals as buttons, for as long as this lasts; see `Buttons.press`."""
+    """Install signal handlers that press buttons, see `Buttons.press`."""
     pressed = Buttons(duration)
     signals = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2)
     previous = {number: signal.signal(number, pressed.press) for number in signals}
@@ -120,8 +121,8 @@ def buttons(duration: float | None) -> Iterator[Buttons]:
 
 
 @contextmanager
-def undisturbed(priority: int | None) -> Iterator[None]:
-    """No garbage collection, exact timers, and a real-time priority if one is given.
+def realtime_process(priority: int | None) -> Iterator[None]:
+    """Run without garbage collection, with exact timers and, if given, a real-time priority.
 
     Raises:
         InputError: the system refuses the priority.
@@ -133,7 +134,7 @@ def undisturbed(priority: int | None) -> Iterator[None]:
             problem = f"the system refuses a real-time priority of {priority} ({error.strerror})"
             remedy = "leave --priority out, or raise the limit (ulimit -r) or run as root"
             raise InputError(None, problem, remedy=remedy) from error
-    with suppress(OSError, AttributeError):  # else timers are batched with others, 50 µs
+    with suppress(OSError, AttributeError):  # the default slack is 50 µs
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.collect()
     gc.freeze()
@@ -147,18 +148,18 @@ def undisturbed(priority: int | None) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Served:
-    """How a session on a real link came out: controller and counts are of the last start."""
+    """Result of a session on a real link; controller and counts are of the last start."""
 
     controller: SimulatedController
     summary: serve.ServeCounts
-    intervals: int  #: how often all axes have been open
-    starts: int  #: how often the start was begun
-    foreign: int  #: datagrams from elsewhere; 0 where the link cannot tell
+    intervals: int  #: times that all axes were open
+    starts: int  #: number of starts
+    foreign: int  #: datagrams of other hosts; 0 on other links
 
 
 def serve_session(
     build: Callable[[], SimulatedController],
-    far_end: serve.ControllerLink,
+    link: serve.ControllerLink,
     pressed: Buttons,
     *,
     faults: FaultyLink | None = None,
@@ -166,15 +167,20 @@ def serve_session(
     stretch: float = 0.0,
     watch: Callable[[SimulatedController, serve.ServeCounts], None] = lambda *_: None,
 ) -> Served:
-    """Serve until a session has ended; a start that the PC breaks off begins anew after a second.
+    """Serve until a session has ended; a start aborted by the PC is repeated after a second.
 
-    `build` makes a controller that has just been switched on. Faults are counted from each start.
-    The arm has `patience` to come to rest at the end, and a cycle may be made longer by `stretch`
-    to wait for its answer [s]. `watch` is called every cycle with the counts so far.
+    Args:
+        build: creates a controller that was just switched on.
+        link: its end of the link.
+        pressed: buttons.
+        faults: of the link, by cycle of each start.
+        patience: time for the arm to come to rest at the end, s.
+        stretch: longest extension of a cycle to wait for its reply, s.
+        watch: called every cycle with controller and counts.
 
     Raises:
         InputError: the link cannot carry the session.
-        ControllerFault: the simulated arm left the finite numbers.
+        ControllerFault: the state of the simulated arm is not finite.
     """
     starts = 0
     while True:
@@ -189,12 +195,12 @@ def serve_session(
         ) -> None:
             if controller.phase is not phases[-1]:
                 phases.append(controller.phase)
-            pressed.pass_on(controller)
+            pressed.apply(controller)
             watch(controller, tally)
 
         try:
             summary = serve.serve(
-                controller, far_end, faults=faults, request=pressed.request, watch=observe,
+                controller, link, faults=faults, request=pressed.request, watch=observe,
                 patience=patience, stretch=stretch,
             )  # fmt: skip
         except DriverError as error:
@@ -203,7 +209,7 @@ def serve_session(
             raise ControllerFault(str(error)) from error
         begun = Phase.DRIVE_OFF in phases[1:]
         if begun or not summary.ended or pressed.request() is not serve.Request.CONTINUE:
-            opened, foreign = phases[1:].count(Phase.OPEN), getattr(far_end, "foreign", 0)
+            opened, foreign = phases[1:].count(Phase.OPEN), getattr(link, "foreign", 0)
             return Served(controller, summary, opened, starts, foreign)
         until = time.monotonic() + serve.KNOCK_INTERVAL
         while time.monotonic() < until and pressed.request() is serve.Request.CONTINUE:

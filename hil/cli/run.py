@@ -14,7 +14,7 @@ from hil.archive import ArchiveName
 from hil.archive.live import LiveView
 from hil.campaign import Campaign, Link, stop_on_interrupt
 from hil.campaign.run import RunResult
-from hil.cell_link import require_watchable
+from hil.cell_link import require_real_time
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.cli.payload import payload_lines
 from hil.cli.verdict import NOT_GOOD, as_json, finish
@@ -134,7 +134,7 @@ def _run(
     """Run with the screen; Ctrl-C stops the arm, then the program."""
     name = campaign.folder.root.resolve().name
     view = None if live is None else LiveView.parse(live)
-    require_watchable(campaign.cell, view)  # also where nothing is left to run
+    require_real_time(campaign.cell, view)  # also where nothing is left to run
     with (
         stop_on_interrupt() as stop,
         Screen.of(campaign.cell, stop, title=name, quiet=quiet) as operator,

@@ -16,7 +16,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.move import joint_index
-from hil.serving import Served, buttons, open_controller_link, serve_session, undisturbed
+from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, SimulatedController
@@ -237,7 +237,7 @@ def simulate(
     far_end = open_controller_link(udp, can, settings, len(loaded.joint_names))
     status = Status(udp or can or "", settings, quiet=json, stretch=patience)
     try:
-        with buttons(duration) as pressed, undisturbed(priority):
+        with buttons(duration) as pressed, realtime_process(priority):
             status.introduce(loaded.name)
             served = serve_session(
                 build,

@@ -1,4 +1,4 @@
-"""One thing looked at and what follows from it; the machine as text, or a test's own."""
+"""The result of a check, and access to files and commands of the system."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, ParamSpec
 
 
 class Status(StrEnum):
-    """How a check came out: it works, costs latency or depends on chance, fails, is not known."""
+    """Result of a check: works, may cost latency, fails, is not known."""
 
     OK = "ok"
     WARN = "warn"
@@ -24,14 +24,14 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """The outcome of one check.
+    """The result of one check.
 
     Attributes:
-        name: what was looked at.
-        status: how it came out.
-        found: what was found, in words.
-        remedy: commands to type, one a line, each to be typed as it stands; empty if none.
-        why: what it matters for.
+        name: of the check.
+        status: ok, warn, bad or unknown.
+        found: the facts.
+        remedy: shell commands, one a line.
+        why: reason of the check.
     """
 
     name: str
@@ -46,17 +46,17 @@ P = ParamSpec("P")
 
 
 def _with_status(status: Status) -> Outcome:
-    def made(found: str, *remedy: str) -> Check:
+    def check(found: str, *remedy: str) -> Check:
         return Check("", status, found, remedy)
 
-    return made
+    return check
 
 
 ok, warn, bad, unknown = map(_with_status, Status)
 
 
 def named(name: str) -> Callable[[Callable[P, Check]], Callable[P, Check]]:
-    """Name the outcome of a check, with its arguments by number; its docstring is the reason."""
+    """Set the name of a check, formatted with its arguments; its docstring is the reason."""
 
     def decorate(check: Callable[P, Check]) -> Callable[P, Check]:
         why = " ".join((check.__doc__ or "").split()).removesuffix(".")
@@ -72,12 +72,12 @@ def named(name: str) -> Callable[[Callable[P, Check]], Callable[P, Check]]:
 
 
 COMMAND_TIMEOUT = 3.0
-"""s that a command may take before its answer counts as not given."""
+"""Time limit of a command, s."""
 _LARGEST = 4_000_000
 
 
 class Answer(NamedTuple):
-    """What a command said: exit status and both streams."""
+    """Exit status and output of a command."""
 
     status: int
     output: str
@@ -85,7 +85,7 @@ class Answer(NamedTuple):
 
 
 def run_command(command: Sequence[str]) -> Answer | None:
-    """Run a command without input; None if it is not installed or does not end in time."""
+    """Run a command without input; None if it is not installed or exceeds the time limit."""
     path = shutil.which(command[0], path="/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/bin")
     if path is None:
         return None
@@ -106,7 +106,7 @@ def run_command(command: Sequence[str]) -> Answer | None:
 
 @dataclass(frozen=True)
 class System:
-    """Where facts are read from.
+    """Source of facts.
 
     Attributes:
         root: prefix of every path.
@@ -117,11 +117,11 @@ class System:
     run: Callable[[Sequence[str]], Answer | None] = run_command
 
     def path(self, name: str) -> Path:
-        """The file called `name` (absolute) on this system."""
+        """Return the path of the file `name` (absolute)."""
         return self.root / name.lstrip("/")
 
     def text(self, name: str) -> str | None:
-        """The stripped text of a file; None if it is not there or may not be read."""
+        """Return the stripped text of a file; None if it cannot be read."""
         try:
             with self.path(name).open("rb") as file:
                 return file.read(_LARGEST).decode("utf-8", errors="replace").strip()
@@ -129,21 +129,21 @@ class System:
             return None
 
     def number(self, name: str) -> int | None:
-        """The integer in a file; None if there is none."""
+        """Return the integer in a file; None if there is none."""
         try:
             return int(self.text(name) or "")
         except ValueError:
             return None
 
     def names(self, folder: str) -> list[str]:
-        """Names in a folder, sorted; none if it cannot be listed."""
+        """Return the sorted names in a folder; none if it cannot be read."""
         try:
             return sorted(path.name for path in self.path(folder).iterdir())
         except OSError:
             return []
 
     def ip(self, *words: str) -> list[dict[str, Any]] | None:
-        """What `ip` of iproute2 lists; nothing where it refuses, None where it is not installed."""
+        """Return the output of `ip`; empty if it fails, None if it is not installed."""
         answer = self.run(["ip", "-json", *words])
         try:
             return None if answer is None else [*json.loads(answer.output)]

@@ -1,7 +1,6 @@
-"""Everything looked at and measured, in order; as a page for a person, and a table for a script.
+"""All checks and measurements of a PC; output as text and as JSON.
 
-What is measured is measured by `probe`, in processes of their own; one that hangs is ended, never
-waited for.
+Latencies are measured by `probe` in separate processes; one that hangs is killed.
 """
 
 from __future__ import annotations
@@ -39,40 +38,40 @@ if TYPE_CHECKING:
     from hil.cell.schema import ControllerTable
 
 RESERVE: Final = 100e-6
-"""s of a cycle for what a bare measurement leaves out: session and guard (20 µs, at most 40), the
-packet on the wire both ways (25 µs each at 100 Mbit/s), the card's interrupt."""
+"""Part of a cycle for session and guard (20 µs, at most 40), transmission both ways (25 µs each at
+100 Mbit/s) and the interrupt of the network card, s."""
 EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]) * 1e-6
-"""s, bounds of the histogram's bars."""
+"""Bounds of the bars of the histogram, s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Latency:
-    """Latencies (m,) [s] of one kind, "wake-up" or "turnaround", and how long was measured."""
+    """Latencies (m,) [s], their kind ("wake-up" or "turnaround") and time of measurement [s]."""
 
     name: str
     samples: NDArray[np.float64]
     seconds: float
 
     def percentile(self, percent: float) -> float:
-        """The smallest sample that `percent` of all do not exceed, s."""
+        """Return the smallest sample that `percent` of all do not exceed, s."""
         return float(np.percentile(self.samples, percent, method="inverted_cdf"))
 
     def late_cycles(self, period: float) -> int:
-        """Cycles of `period` s that would have ended before their answer.
+        """Return the number of cycles of `period` s without a reply in time.
 
-        A latency of several cycles costs each of them: a stall counts by its length.
+        A latency of several cycles counts for each of them.
         """
         return int(np.floor((self.samples + RESERVE) / period).sum())
 
     def histogram(self) -> dict[str, int]:
-        """How many samples lie within bounds in µs, lower bound included."""
+        """Return the number of samples by bounds in µs, lower bound included."""
         counts, _ = np.histogram(self.samples, EDGES)
         finite = (1e6 * EDGES[:-1]).tolist()
         bounds = [f"{low:.0f}-{high:.0f}" for low, high in pairwise(finite)]
         return dict(zip([*bounds, f"over {finite[-1]:.0f}"], counts.tolist(), strict=True))
 
     def summary(self) -> dict[str, float | int]:
-        """Figures for scripts, µs."""
+        """Return percentiles, µs, and late cycles."""
         percentiles = {"p50_us": 50.0, "p99_us": 99.0, "p999_us": 99.9, "max_us": 100.0}
         return {
             **{name: round(1e6 * self.percentile(p), 1) for name, p in percentiles.items()},
@@ -87,18 +86,18 @@ CRITERIA: Final = (
     "reserved for packet work and wire, and 99.9 % of the latencies used at most half of it"
 )
 ENOUGH_SECONDS: Final = 60.0
-"""s of measurement below which a verdict is provisional."""
+"""Time of measurement below which a verdict is provisional, s."""
 _CONFIDENCE: Final = 0.95
 
 
 @dataclass(frozen=True)
 class Fitness:
-    """The verdict on one cycle by `CRITERIA`; figures are None if nothing was measured.
+    """The verdict on one cycle by `CRITERIA`; numbers are None if nothing was measured.
 
     Attributes:
         share_used: largest 99.9 % latency plus reserve, as a share of the cycle.
-        late_per_hour_upper_95: upper bound of the rate with 95 % confidence, one-sided, for late
-            cycles that come independently of each other (Poisson). Those of one long stall do not.
+        late_per_hour_upper_95: one-sided upper bound of the rate with 95 % confidence, for
+            independent late cycles (Poisson), which those of one stall are not.
     """
 
     cycle_ms: int
@@ -110,7 +109,7 @@ class Fitness:
 
 
 def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
-    """Judge a cycle by the worse of the latencies; without any, it is not fit."""
+    """Return the verdict by the worst of the latencies; without any the cycle is not fit."""
     if not latencies:
         return Fitness(cycle_ms, False, 0, None, None, "nothing was measured")
     period = cycle_ms / 1000
@@ -118,7 +117,7 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     slow = max(latencies, key=lambda each: each.percentile(99.9))
     late, used = worst.late_cycles(period), (slow.percentile(99.9) + RESERVE) / period
     hours = worst.seconds / 3600.0
-    # The mean whose Poisson distribution gives `late` or fewer with 5 % probability only.
+    # The mean at which a Poisson distribution gives `late` or fewer with 5 % probability.
     bound = float(gammaincinv(late + 1, _CONFIDENCE)) / hours
     if late:
         reason = (
@@ -137,25 +136,25 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
 
 
 TURNAROUND_PERIOD = 1e-3
-"""s between two questions."""
+"""Time between two packets, s."""
 _GRACE = 15.0
-"""s that a probe may take beyond its measurement (start-up on a slow disk)."""
+"""Time limit of a probe beyond its measurement (start-up on a slow disk), s."""
 
 
-def obtained() -> RealTimeReport | None:
-    """What a real-time process is given here; None if the probe failed."""
+def realtime_permissions() -> RealTimeReport | None:
+    """Return the permissions of a real-time process; None if the probe failed."""
     answer = run_probe(["permissions"], 0.0)
     return None if answer is None else RealTimeReport(**answer)
 
 
 def disk_trial(place: Path) -> DiskTrial | None:
-    """Room and write times at `place`; None if the disk did not answer."""
+    """Measure free space and write times at `place`; None if the disk did not respond."""
     answer = run_probe(["disk", str(place)], 0.0)
     return None if answer is None else DiskTrial(**answer)
 
 
 def measure(name: str, period: float, seconds: float, reporter: Reporter) -> Latency | None:
-    """Run a latency probe (`wake-up` or `turnaround`) under a progress bar; None if it failed."""
+    """Run a latency probe (`wake-up` or `turnaround`) with a progress bar; None if it failed."""
     with tempfile.TemporaryDirectory() as folder, reporter.task(name, seconds) as task:
         file = Path(folder) / "latency.npy"
         if run_probe([name, repr(period), repr(seconds), str(file)], seconds, task.advance) is None:
@@ -164,14 +163,17 @@ def measure(name: str, period: float, seconds: float, reporter: Reporter) -> Lat
 
 
 def run_probe(
-    words: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
+    arguments: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any] | None:
-    """The JSON answer of `hil.doctor.probe`; None if it failed or took `_GRACE` s too long.
+    """Run `hil.doctor.probe` for `seconds`; None if it failed or took `_GRACE` s longer.
 
-    It measures for `seconds`; `advance` is called with those that passed meanwhile.
+    `advance` is called with the seconds elapsed since its last call.
+
+    Returns:
+        Its JSON output.
     """
     probe = subprocess.Popen(
-        [sys.executable, "-m", "hil.doctor.probe", *words],
+        [sys.executable, "-m", "hil.doctor.probe", *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
@@ -187,7 +189,7 @@ def run_probe(
         advance(seconds - shown)
     finally:
         probe.kill()
-        with suppress(subprocess.TimeoutExpired):  # one caught in a dead disk is not waited for
+        with suppress(subprocess.TimeoutExpired):  # one blocked by a dead disk is left behind
             probe.wait(timeout=1.0)
         if probe.stdout is not None:
             probe.stdout.close()
@@ -199,7 +201,7 @@ def run_probe(
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found: verdicts on 1 and 2 ms, of which `cycle_ms` has to be fit."""
+    """All results: verdicts on 1 and 2 ms, of which `cycle_ms` has to be fit."""
 
     checks: tuple[Check, ...]
     latencies: tuple[Latency, ...]
@@ -209,12 +211,12 @@ class Diagnosis:
 
     @property
     def cycle_fit(self) -> bool:
-        """Whether the cycle is fit that has to be."""
+        """Whether the required cycle is fit."""
         return self.cycles[CYCLES_MS.index(self.cycle_ms)].fit
 
     @property
     def fit(self) -> bool:
-        """Whether the cell's link can be run from this PC: cycle fit, and no check bad."""
+        """Whether the cycle is fit and no check is bad."""
         return self.cycle_fit and not self._bad
 
     @property
@@ -223,25 +225,25 @@ class Diagnosis:
 
     @property
     def provisional(self) -> bool:
-        """Whether too little was measured for the verdict to be relied upon."""
+        """Whether the measurement was too short for a reliable verdict."""
         return self.seconds < ENOUGH_SECONDS
 
     @property
     def line(self) -> str:
         """The verdict in one or two sentences."""
         one, two = (verdict.fit for verdict in self.cycles)
-        words = "2 ms is fit; 1 ms is not." if two else "Neither 1 ms nor 2 ms is fit."
+        text = "2 ms is fit; 1 ms is not." if two else "Neither 1 ms nor 2 ms is fit."
         if one:  # and then 2 ms is
-            words = "1 ms is fit, and so is 2 ms."
+            text = "1 ms is fit, and so is 2 ms."
         if self.fit:
-            words += f" This PC can answer a controller at {self.cycle_ms} ms."
+            text += f" This PC can answer a controller at {self.cycle_ms} ms."
         elif self.cycle_fit:
-            words += f" But the link will not work as it is: {', '.join(self._bad)}."
+            text += f" But the link will not work: {', '.join(self._bad)}."
         else:
-            words += f" Do not connect an arm at {self.cycle_ms} ms."
+            text += f" Do not connect an arm at {self.cycle_ms} ms."
         if self.provisional:
-            words += f" Provisional: measured for {self.seconds:g} s only, 60 s are the least."
-        return words
+            text += f" Provisional: measured for {self.seconds:g} s; at least 60 s are needed."
+        return text
 
 
 def examine(
@@ -251,13 +253,13 @@ def examine(
     place: Path,
     reporter: Reporter,
 ) -> Diagnosis:
-    """Look at this PC and measure it for twice `seconds`; archives will be written to `place`.
+    """Run all checks, and measure for twice `seconds`; archives will be written to `place`.
 
-    The wake-up timer runs at `cycle_ms`, the cycle that has to be fit.
+    The wake-up timer runs at `cycle_ms`, the required cycle.
     """
     system = System()
-    reporter.say("looking at this PC; no packet is sent to the controller")
-    given = obtained()
+    reporter.say("checking this PC; no packet is sent to the controller")
+    given = realtime_permissions()
     checks = [
         *machine.permissions(given, system),
         *machine.computer(system, no_sleep=given is not None and given.cpu_awake),
@@ -277,10 +279,10 @@ def examine(
 
 @named("{0} latency")
 def _unmeasured(name: str) -> Check:
-    """Without it nothing is known."""
+    """Without it there is no verdict."""
     del name
-    look = "python -m hil.doctor.probe permissions   # says why"
-    return bad("the probe gave no figures", look)
+    command = "python -m hil.doctor.probe permissions   # prints the error"
+    return bad("the probe failed", command)
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
@@ -315,7 +317,7 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
 
 
 def histogram(latency: Latency) -> Iterator[str]:
-    """Percentiles and bars on a logarithmic scale: rare stalls are what matters."""
+    """Yield percentiles and bars; logarithmic, so that rare stalls are visible."""
     p50, p99, p999, worst = (1e6 * latency.percentile(p) for p in (50, 99, 99.9, 100))
     yield (
         f"{latency.name}: p50 {p50:.0f}  p99 {p99:.0f}  p99.9 {p999:.0f}  max {worst:.0f} µs, "
@@ -327,7 +329,7 @@ def histogram(latency: Latency) -> Iterator[str]:
 
 
 def remedies(checks: Sequence[Check]) -> Iterator[str]:
-    """What to change, worst first: reason, then commands, each of them once."""
+    """Yield reason and commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()
     for status in (Status.BAD, Status.WARN, Status.UNKNOWN):
         for check in checks:
@@ -338,7 +340,7 @@ def remedies(checks: Sequence[Check]) -> Iterator[str]:
 
 
 def as_json(diagnosis: Diagnosis) -> dict[str, object]:
-    """Everything, for scripts; keys are stable."""
+    """Return all results; the keys are stable."""
     return {
         "fit": diagnosis.fit,
         "provisional": diagnosis.provisional,

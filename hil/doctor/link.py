@@ -1,4 +1,4 @@
-"""The link to the controller: port or bus, card, route, and what lies on the way."""
+"""Checks of the link to the controller: port or bus, network card, route, firewall."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 
 def controller_in(path: Path) -> ControllerTable:
-    """`[controller]` of a cell file, which may have other figures still to be filled in.
+    """Return `[controller]` of a cell file, which may be incomplete elsewhere.
 
     Raises:
-        CellError: the file cannot be used, or `[controller]` is not known.
+        CellError: the file is invalid, or `[controller]` is incomplete.
     """
     from hil.cell import Cell
     from hil.cell.errors import UnknownFieldsError
@@ -46,8 +46,8 @@ _ARPHRD_CAN = "280"
 
 @named("CAN {0.interface} {0.channel}")
 def can_check(bus: CanTable, system: System) -> Check:
-    """A node at another bit rate disturbs every frame on the bus."""
-    # Opening an adapter puts it on the bus, which acknowledges frames: left to the exchange.
+    """A node at another bit rate corrupts every frame on the bus."""
+    # An adapter is not opened here: on the bus it would acknowledge frames.
     fd = bus.profile == "fd"
     if bus.interface != "socketcan":
         return unknown("not a kernel device; it is opened by the exchange only")
@@ -56,7 +56,7 @@ def can_check(bus: CanTable, system: System) -> Check:
         driver = "sudo modprobe can_raw   # and the card's driver"
         return bad("does not exist", "ip -brief link show type can", driver)
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
-        return bad("is no CAN interface", "ip -brief link")
+        return bad("is not a CAN interface", "ip -brief link")
     rates = f"bitrate {bus.bitrate or 1_000_000}"
     if fd:
         rates += f" dbitrate {bus.data_bitrate or 5_000_000} fd on"
@@ -77,13 +77,13 @@ def can_check(bus: CanTable, system: System) -> Check:
     if nominal == (bus.bitrate or nominal) and data == wanted and (data or not fd):
         return ok(found)
     down = f"sudo ip link set {bus.channel} down"
-    return bad(f"{found}; the cell needs otherwise", down, bring_up)
+    return bad(f"{found}; the cell needs {rates}", down, bring_up)
 
 
 def try_port(bind: str, port: int) -> int:
-    """Bind the address for an instant; the number of the error, 0 if it worked.
+    """Bind the address and release it; returns the number of the error, 0 without one.
 
-    A running exchange has the port and is not disturbed.
+    A running exchange that uses the port is not disturbed.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
         try:
@@ -95,7 +95,7 @@ def try_port(bind: str, port: int) -> int:
 
 @named("UDP port {1}")
 def port_check(bind: str, port: int, error: int, system: System) -> Check:
-    """The controller sends to this port and no other."""
+    """The controller sends to this port only."""
     # `error` is that of `try_port`.
     if error == 0:
         return ok(f"can be bound on {bind}")
@@ -106,20 +106,20 @@ def port_check(bind: str, port: int, error: int, system: System) -> Check:
         return bad(f"in use by {who}", f"sudo ss -lunp sport = :{port}")
     if error == errno.EADDRNOTAVAIL:
         look = "ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0"
-        return bad(f"{bind} is no address of this PC", look)
+        return bad(f"{bind} is not an address of this PC", look)
     if error in (errno.EACCES, errno.EPERM):
         start = system.number("/proc/sys/net/ipv4/ip_unprivileged_port_start")
         setting = f"net.ipv4.ip_unprivileged_port_start={port}"
         return bad(
             f"ports below {start} need a privilege" if start is not None else "not permitted",
             f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
-            "# once, and for good: hil itself then needs no privilege for it",
+            "# once; hil then needs no privilege for this port",
         )
     return bad(f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})")
 
 
 def address_of(host: str, system: System) -> str | None:
-    """An IPv4 address as written, or by name from /etc/hosts; None otherwise. No DNS."""
+    """Return an IPv4 address, or that of a name in /etc/hosts; None otherwise. No DNS."""
     lines = (line.split("#")[0].split() for line in (system.text("/etc/hosts") or "").splitlines())
     for text in (host, *(words[0] for words in lines if host in words[1:])):
         try:
@@ -130,16 +130,16 @@ def address_of(host: str, system: System) -> str | None:
 
 
 _SPARE_USECS = 50
-"""µs that a card may gather packets before it interrupts."""
+"""Longest interrupt coalescing, µs."""
 
 
 @named("route to the controller")
 def route_check(host: str, address: str | None, route: Mapping[str, Any] | None) -> Check:
-    """A router or a wrong card in between adds delay, or loses all."""
-    # `route` as `ip route get` has it: empty where there is none, None where nobody can say.
+    """A router or a wrong network card adds delay or loses all packets."""
+    # `route` is that of `ip route get`: empty without a route, None if `ip` is not installed.
     if address is None:
         remedy = f"# write the address in the cell file: host = 10.2.12.150 or the like, not {host}"
-        return bad(f"{host!r} is no IPv4 address nor in /etc/hosts", remedy)
+        return bad(f"{host!r} is neither an IPv4 address nor in /etc/hosts", remedy)
     if route is None:
         return unknown("ip is not installed", "sudo apt install iproute2")
     add = f"sudo ip addr add {_neighbouring(address)}/24 dev CARD"
@@ -156,7 +156,7 @@ def route_check(host: str, address: str | None, route: Mapping[str, Any] | None)
 
 @named("card {0}")
 def device_check(device: str, system: System) -> Check:
-    """Packets of the controller come every millisecond; nothing else should share the card."""
+    """Packets of the controller come every millisecond; other traffic delays them."""
     folder = f"/sys/class/net/{device}"
     if not system.path(folder).exists():
         return bad("does not exist", "ip -brief link")
@@ -166,11 +166,11 @@ def device_check(device: str, system: System) -> Check:
     if any(system.path(f"{folder}/{name}").exists() for name in ("wireless", "phy80211")):
         return bad("is wireless", "# use a cable")
     speed, duplex = system.number(f"{folder}/speed"), system.text(f"{folder}/duplex")
-    words = [state, f"{speed} Mbit/s" if speed and speed > 0 else "speed not stated"]
-    words += [f"{duplex} duplex"] if duplex in ("half", "full") else []
+    facts = [state, f"{speed} Mbit/s" if speed and speed > 0 else "speed not stated"]
+    facts += [f"{duplex} duplex"] if duplex in ("half", "full") else []
     driver = system.path(f"{folder}/device/driver")
-    words.append(f"driver {driver.resolve().name if driver.exists() else 'none (virtual)'}")
-    found = ", ".join(words)
+    facts.append(f"driver {driver.resolve().name if driver.exists() else 'none (virtual)'}")
+    found = ", ".join(facts)
     if duplex == "half" or (speed is not None and 0 < speed < 100):
         return bad(found, f"sudo ethtool -s {device} autoneg on")
     if any(one.get("dev") == device for one in system.ip("route", "show", "default") or ()):
@@ -181,7 +181,7 @@ def device_check(device: str, system: System) -> Check:
 
 @named("interrupt coalescing of {0}")
 def coalescing(device: str, system: System) -> Check:
-    """A card that gathers packets delays each."""
+    """A network card that collects packets before an interrupt delays each."""
     answer = system.run(["ethtool", "-c", device])
     if answer is None:
         remedy = "sudo apt install ethtool", f"ethtool -c {device}"
@@ -189,33 +189,33 @@ def coalescing(device: str, system: System) -> Check:
     if answer.status != 0:
         if "not supported" in answer.errors.lower():
             return ok("the card has none")
-        found = answer.errors.strip().splitlines()[-1:] or ["ethtool failed"]
-        return unknown(found[0], f"sudo ethtool -c {device}")
+        errors = answer.errors.strip().splitlines() or ["ethtool failed"]
+        return unknown(errors[-1], f"sudo ethtool -c {device}")
     usecs = re.search(r"^rx-usecs:\s*(\d+)", answer.output, re.MULTILINE)
     adaptive = re.search(r"^Adaptive RX:\s*on", answer.output, re.MULTILINE) is not None
-    words = f"rx-usecs {usecs[1] if usecs else 'not stated'}{', adaptive' * adaptive}"
+    found = f"rx-usecs {usecs[1] if usecs else 'not stated'}{', adaptive' * adaptive}"
     if adaptive or (usecs and int(usecs[1]) > _SPARE_USECS):
-        return warn(words, f"sudo ethtool -C {device} adaptive-rx off rx-usecs 0")
-    return ok(words)
+        return warn(found, f"sudo ethtool -C {device} adaptive-rx off rx-usecs 0")
+    return ok(found)
 
 
 @named("ARP entry of the controller")
 def neighbour_check(address: str, device: str, system: System) -> Check:
-    """An entry that expires is asked for anew in mid-motion, and answers wait for it."""
+    """An entry that expires during a motion is requested again, and replies wait for it."""
     entries = system.ip("neigh", "show", "to", address, "dev", device) or []
     entry = next((one for one in entries if "lladdr" in one), {})
     mac = entry.get("lladdr", "MAC")
     remedy = f"sudo ip neigh replace {address} lladdr {mac} dev {device} nud permanent"
     if not entry:
         hint = "# MAC: read it off the controller; a C4G's begins with 00:04:50"
-        return warn("none (the table was read, no request was sent)", remedy, hint)
+        return warn("none (no request was sent)", remedy, hint)
     permanent = "PERMANENT" in entry.get("state", ())
     return ok(f"{mac}, permanent") if permanent else warn(f"{mac}, will expire", remedy)
 
 
 @named("firewall")
 def firewall(address: str, port: int, system: System) -> Check:
-    """A filtered controller looks exactly like one that is switched off."""
+    """Packets of a blocked controller do not arrive, as if it were switched off."""
     commands = (["nft", "list", "ruleset"], ["iptables", "-S"])  # only root can read them
     outputs = [answer for command in commands if (answer := system.run(command)) is not None]
     look = "sudo nft list ruleset; sudo iptables -S"
@@ -224,11 +224,11 @@ def firewall(address: str, port: int, system: System) -> Check:
             "there are rules that drop or reject incoming packets",
             look,
             f"sudo nft insert rule inet filter input ip saddr {address} udp dport {port} accept"
-            "   # if table and chain are called so",
+            "   # if table and chain have these names",
             f"# with ufw: sudo ufw allow from {address} to any port {port} proto udp",
         )
     if any(answer.status != 0 for answer in outputs):
-        return unknown("its rules may be read by root only", look)
+        return unknown("its rules are readable by root only", look)
     if outputs:
         return ok("no rule drops incoming packets")
     if not system.path("/proc/net/netfilter").exists():
@@ -238,7 +238,7 @@ def firewall(address: str, port: int, system: System) -> Check:
 
 
 def _may_drop(rules: str) -> bool:
-    """Whether nft or iptables hold a rule that may drop what comes in, in any chain jumped to."""
+    """Whether rules of nft or iptables, in any chain, may drop incoming packets."""
     nft = "hook input" in rules and re.search(r"\b(drop|reject)\b", rules) is not None
     policy = re.search(r"^-P INPUT (DROP|REJECT)", rules, re.MULTILINE)
     input_rule = re.search(r"^-A INPUT\b", rules, re.MULTILINE)
@@ -247,18 +247,18 @@ def _may_drop(rules: str) -> bool:
 
 
 def _neighbouring(address: str) -> str:
-    """An address for this PC on the controller's network, beside the controller's own."""
+    """Return an address for this PC in the controller's network."""
     head, last = address.rsplit(".", 1)
     return f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
 
 
 def network_checks(host: str, port: int, system: System) -> list[Check]:
-    """Everything between this PC and the controller."""
+    """Check the network between this PC and the controller."""
     address, route = address_of(host, system), None
     if address is not None and (routes := system.ip("route", "get", address)) is not None:
         route = next(iter(routes), {})
     first = route_check(host, address, route)
-    # The card of a wrong route is not the one that matters.
+    # Without a direct route the network card is not known.
     if address is None or not route or first.status is not Status.OK or "type" in route:
         return [first]
     device = route["dev"]
@@ -272,9 +272,9 @@ def network_checks(host: str, port: int, system: System) -> list[Check]:
 
 
 def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
-    """What lies between this PC and the controller of a cell; None for no cell."""
+    """Check the link of a cell; None without a cell."""
     if table is None or table.transport == "simulated":
-        why = "routes, ports and buses are looked at for a cell with a real link"
+        why = "routes, ports and buses are checked for a cell with a real link"
         return [replace(ok("none: no cell, or a simulated one"), name="controller link", why=why)]
     if table.can is not None and table.transport == "can":
         return [can_check(table.can, system)]

@@ -1,4 +1,4 @@
-"""The computer itself: permissions, disk, clock, processor, kernel, load."""
+"""Checks of the computer: permissions, disk, clock, processor, kernel, load."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOG_IN_AGAIN = "# log out and in again, then: ulimit -r; ulimit -l"
 
 
 def permissions(given: RealTimeReport | None, system: System) -> list[Check]:
-    """What the operating system allows; `given` is None where the probe failed."""
+    """Check permissions; `given` is None if the probe failed."""
     return [
         user(os.geteuid()),
         scheduling(given, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]),
@@ -32,7 +32,7 @@ def permissions(given: RealTimeReport | None, system: System) -> list[Check]:
 
 @named("user")
 def user(uid: int) -> Check:
-    """Nothing of hil needs root, and what root may do says nothing about other users."""
+    """Hil does not need root, and the permissions of root are not those of other users."""
     if uid:
         return ok(f"number {uid}, not root")
     return warn("root", "# run hil doctor as the user who will run hil")
@@ -40,7 +40,7 @@ def user(uid: int) -> Check:
 
 @named("real-time priority")
 def scheduling(given: RealTimeReport | None, limit: int) -> Check:
-    """Without it other programs may run before the packet is answered."""
+    """Without it other programs delay replies."""
     limited = "no limit" if limit < 0 else f"rtprio limit {limit}"
     if given is None:
         return unknown(f"the probe gave no answer; {limited}")
@@ -55,7 +55,7 @@ def scheduling(given: RealTimeReport | None, limit: int) -> Check:
 
 @named("memory lock")
 def memory_lock(given: RealTimeReport | None, limit: int) -> Check:
-    """A page that has to be fetched from disk costs many cycles."""
+    """A page fault costs many cycles."""
     limited = "no limit" if limit < 0 else f"memlock limit {limit // 1024} KiB"
     if given is None:
         return unknown(f"the probe gave no answer; {limited}")
@@ -69,7 +69,7 @@ def memory_lock(given: RealTimeReport | None, limit: int) -> Check:
 
 @named("processor idle latency")
 def processor_awake(given: RealTimeReport | None, system: System) -> Check:
-    """Halves the usual wake-up time."""
+    """Excluding idle states halves the usual wake-up time."""
     if given is not None and given.cpu_awake:
         return ok("/dev/cpu_dma_latency can be held at 0")
     if not system.path("/dev/cpu_dma_latency").exists():
@@ -92,17 +92,17 @@ def _limit_lines(item: str, value: str) -> tuple[str, ...]:
 
 
 BYTES_PER_CYCLE = 400
-"""Archived bytes per cycle of six axes, generously."""
+"""Upper bound of the archived bytes per cycle of six axes."""
 _SLOW, _TOO_SLOW = 0.1 * STALL_LIMIT, 0.5 * STALL_LIMIT
-"""s of one write."""
+"""Limits of the time of one write, s."""
 _MOVE = "# or put the campaign folder on another, local disk"
 
 
 @dataclass(frozen=True)
 class DiskTrial:
-    """What came of writing to the place of the archives: free bytes, seconds of each write.
+    """Result of writing to the folder of the archives: free bytes, times of the writes [s].
 
-    `seconds` is empty if writing failed, and `error` says why.
+    `seconds` is empty if writing failed with `error`.
     """
 
     folder: str
@@ -112,13 +112,13 @@ class DiskTrial:
 
 
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
-    """Room and write time; None stands for a disk that gave no answer in time."""
+    """Check free space and write time; `trial` is None if the disk did not respond."""
     return [*([] if trial is None else [disk_space(trial)]), disk_write(place, trial)]
 
 
 @named("disk space")
 def disk_space(trial: DiskTrial) -> Check:
-    """A full disk ends the motion: the arm is stopped, what was archived is whole."""
+    """A full disk stops the motion; what was archived is complete."""
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
     if hours >= 2:
@@ -128,24 +128,24 @@ def disk_space(trial: DiskTrial) -> Check:
 
 @named("disk write")
 def disk_write(place: Path, trial: DiskTrial | None) -> Check:
-    """A motion is stopped if the disk keeps the archive waiting for seconds."""
+    """A motion is stopped if a write takes several seconds."""
     if trial is None:
-        return bad(f"no answer from the disk of {place}", f"df -h {place}", _MOVE)
+        return bad(f"the disk of {place} does not respond", f"df -h {place}", _MOVE)
     if not trial.seconds:
-        refused = f"cannot write to {trial.folder}: {trial.error or 'no figures'}"
+        refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
         return bad(refused, f"ls -ld {trial.folder}; id", _MOVE)
     worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
-    found = f"64 KiB are safe after {1e3 * middle:.1f} ms, {1e3 * worst:.1f} ms at worst"
+    found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
     return ok(found) if worst < _SLOW else (warn if worst < _TOO_SLOW else bad)(found, _MOVE)
 
 
 _CPU = "/sys/devices/system/cpu"
 _GOOD_CLOCKS = {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page"}
-_UNSTATED = "not stated by the kernel"
+_UNSTATED = "not reported by the kernel"
 
 
 def computer(system: System, *, no_sleep: bool) -> list[Check]:
-    """Processor, kernel and host; `no_sleep` says that an exchange prevents idle states."""
+    """Check processor, kernel and host; `no_sleep`: an exchange prevents idle states."""
     return [
         clock_source(system),
         governor(system),
@@ -157,13 +157,13 @@ def computer(system: System, *, no_sleep: bool) -> list[Check]:
 
 
 def cpus(system: System) -> list[str]:
-    """Names of the processors ("cpu0", ...)."""
+    """Return the names of the processors ("cpu0", ...)."""
     return [name for name in system.names(_CPU) if re.fullmatch(r"cpu\d+", name)]
 
 
 @named("clock source")
 def clock_source(system: System) -> Check:
-    """The clock is read several times a cycle; a slow one costs µs each time."""
+    """The clock is read several times a cycle; a slow source costs µs each time."""
     folder = "/sys/devices/system/clocksource/clocksource0"
     source = system.text(f"{folder}/current_clocksource")
     if not source:
@@ -177,7 +177,7 @@ def clock_source(system: System) -> Check:
 
 @named("frequency governor")
 def governor(system: System) -> Check:
-    """A processor that clocks down answers its first packet late."""
+    """A processor at reduced frequency replies late."""
     found = {system.text(f"{_CPU}/{cpu}/cpufreq/scaling_governor") for cpu in cpus(system)}
     names = sorted(filter(None, found))
     if names in ([], ["performance"]):
@@ -188,7 +188,7 @@ def governor(system: System) -> Check:
 
 @named("idle states")
 def idle_states(system: System, *, no_sleep: bool) -> Check:
-    """A sleeping processor has to wake before it can answer."""
+    """A processor in an idle state has to wake before it can reply."""
     latencies = {}
     for cpu in cpus(system):
         for state in system.names(f"{_CPU}/{cpu}/cpuidle"):
@@ -206,18 +206,20 @@ def idle_states(system: System, *, no_sleep: bool) -> Check:
         return ok(f"{found}; not entered during an exchange")
     if latencies[deepest] <= 50:
         return ok(found)
-    return warn(found, "# see 'processor idle latency': with that right, no idle state matters")
+    return warn(
+        found, "# see 'processor idle latency': with that permission idle states are not entered"
+    )
 
 
 @named("isolated processors")
 def isolation(system: System) -> Check:
-    """Other programs stay off an isolated processor; worth it only if the latency is too large."""
+    """No other program runs on an isolated processor; of use only if the latency is too large."""
     if names := system.text(f"{_CPU}/isolated"):
         return ok(names)
     count = len(cpus(system))
     last = count - 1
     if count < 4:
-        return ok(f"none; with {count} there is none to spare")
+        return ok(f"none; not useful with {count}")
     return warn(
         f"none of {count}",
         f"# add to GRUB_CMDLINE_LINUX_DEFAULT in /etc/default/grub: "
@@ -228,7 +230,7 @@ def isolation(system: System) -> Check:
 
 @named("kernel preemption")
 def preemption(system: System) -> Check:
-    """How long the kernel finishes its own work before a waiting program runs."""
+    """Without it the kernel completes its own work before a waiting program runs."""
     version = system.text("/proc/version") or ""
     if "PREEMPT_RT" in version or system.text("/sys/kernel/realtime") == "1":
         return ok("PREEMPT_RT")
@@ -249,7 +251,7 @@ def preemption(system: System) -> Check:
 
 
 def _preemption_model(system: System) -> str | None:
-    """From the scheduler's own file (root), the command line, or how the kernel was built."""
+    """Read the model from the scheduler (root), the command line, or the build configuration."""
     release = system.text("/proc/sys/kernel/osrelease") or ""
     try:
         with gzip.open(system.path("/proc/config.gz"), "rt", errors="replace") as file:
@@ -268,22 +270,22 @@ def _preemption_model(system: System) -> str | None:
 
 @named("virtual machine")
 def virtualisation(system: System) -> Check:
-    """The host may stop it for milliseconds, and no program in it can tell."""
+    """The host may suspend it for milliseconds without notice."""
     flags = re.search(r"^flags\s*:(.*)$", system.text("/proc/cpuinfo") or "", re.MULTILINE)
     product = system.text("/sys/class/dmi/id/product_name") or ""
     makers = r"\b(KVM|QEMU|VirtualBox|VMware|Virtual Machine)\b"
     in_one = flags is not None and "hypervisor" in flags[1].split()
     if not in_one and not re.search(makers, product, re.IGNORECASE):
-        return ok("no sign of one")
+        return ok("not detected")
     share = stolen_share(system.text("/proc/stat") or "")
     found = "yes" if share is None else f"yes; {100 * share:.2f} % of its time stolen since boot"
-    return warn(found, "# for simulated controllers only; run an arm from a PC of its own")
+    return warn(found, "# for simulated controllers only; use a dedicated PC for an arm")
 
 
 def stolen_share(stat: str, since: str = "") -> float | None:
-    """Share of processor time that the host gave to others, from texts of /proc/stat.
+    """Return the share of processor time used by the host, from two texts of /proc/stat.
 
-    That of now, and an earlier one; since boot if left out.
+    Without the earlier one it is the share since boot.
     """
     lines = (re.search(r"^cpu +((?:\d+ +){7}\d+)", text, re.MULTILINE) for text in (stat, since))
     now, before = ([int(word) for word in line[1].split()] if line else [0] * 8 for line in lines)
@@ -293,23 +295,27 @@ def stolen_share(stat: str, since: str = "") -> float | None:
 
 @named("stolen time while measuring")
 def stolen(before: str, after: str) -> Check:
-    """Time in which a virtual machine did not run."""
+    """The host suspends a virtual machine in this time."""
     share = stolen_share(after, before)
     if share is None:
         return unknown(_UNSTATED)
     found = f"{100 * share:.2f} %"
     if share < 1e-4:
         return ok(found)
-    return warn(found, "# ask for dedicated processors, or use a PC of its own")
+    return warn(found, "# use dedicated processors or a dedicated PC")
 
 
 @named("other load")
 def load(system: System) -> Check:
-    """Real-time priority goes before other programs, not before interrupts and disk."""
+    """Real-time priority has precedence over programs, not over interrupts and disk."""
     try:
         minute = float((system.text("/proc/loadavg") or "").split()[0])
     except (IndexError, ValueError):
         return unknown(_UNSTATED, "uptime")
     count = max(len(cpus(system)), 1)
-    found = f"{minute:g} waiting or running over the last minute, {count} processors"
-    return ok(found) if minute <= 0.5 * count else warn(found, "top   # and end what is not needed")
+    found = f"{minute:g} programs running or waiting over the last minute, {count} processors"
+    return (
+        ok(found)
+        if minute <= 0.5 * count
+        else warn(found, "top   # end programs that are not needed")
+    )

@@ -1,10 +1,7 @@
-"""Measures in a process of its own, with the real-time settings of the exchange.
+"""Measurements in separate processes with the real-time settings of the exchange.
 
-The command line itself so never runs in real time. `python -m hil.doctor.probe KIND ...` prints
-one JSON line.
-
-Latencies go to a file of float32 seconds, written after the measurement: fine enough for any of
-them, and a night of cycles still fits into locked memory.
+`python -m hil.doctor.probe KIND ...` prints one JSON line. Latencies are written to a file of
+float32 seconds after the measurement, so that a night of cycles fits into locked memory.
 """
 
 from __future__ import annotations
@@ -27,16 +24,16 @@ from drivers.exchange.realtime import RealTimeSettings, enter
 
 PACKET = 228
 """Bytes of a cyclic packet of six axes."""
-PATIENCE = 0.5
-"""s after which a question counts as never answered."""
+TIMEOUT = 0.5
+"""Time after which a packet counts as lost, s."""
 _BLOCK = 64 * 1024
 _WRITES = 20
 
 
 def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
-    """How late a timer wakes this process, s, at absolute deadlines `period` apart.
+    """Return the delays of a timer, s, at absolute deadlines `period` apart.
 
-    A deadline that passed while the process was late is skipped, not made up for.
+    Deadlines that passed during a delay are skipped.
     """
     late = np.empty(max(round(seconds / period), 1), dtype=np.float32)
     count, clock, sleep = 0, time.perf_counter, time.sleep
@@ -50,46 +47,46 @@ def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
     return np.maximum(late[:count], 0.0)
 
 
-def ask(port: int, period: float, seconds: float) -> NDArray[np.float32]:
-    """Times from question to answer, s; one that never comes counts `PATIENCE`.
+def round_trips(port: int, period: float, seconds: float) -> NDArray[np.float32]:
+    """Return the times from packet to reply, s; `TIMEOUT` for a lost one.
 
-    The next question waits for the answer, so a stall shows as one long time, as long as it was.
+    The next packet waits for the reply, so a stall is one long time.
     """
     took = np.empty(max(round(seconds / period), 1), dtype=np.float32)
     count, clock, sleep = 0, time.perf_counter, time.sleep
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.connect(("127.0.0.1", port))
-        link.settimeout(PATIENCE)
+        link.settimeout(TIMEOUT)
         deadline = clock() + period
         end = deadline + seconds
         while deadline < end and count < len(took):
             sleep(max(deadline - clock(), 0.0))
             sent = clock()
             link.send(count.to_bytes(4, "little") + bytes(PACKET - 4))
-            took[count] = _answered(link, count, sent)
+            took[count] = _wait_for_reply(link, count, sent)
             count += 1
             deadline += period * (1 + int(max(clock() - deadline, 0.0) / period))
         link.send(b"end")
     return took[:count]
 
 
-def _answered(link: socket.socket, number: int, sent: float) -> float:
-    while time.perf_counter() - sent < PATIENCE:
+def _wait_for_reply(link: socket.socket, number: int, sent: float) -> float:
+    while time.perf_counter() - sent < TIMEOUT:
         try:
             if int.from_bytes(link.recv(PACKET)[:4], "little") == number:
                 return time.perf_counter() - sent
-        except OSError:  # a time-out, or the far end is gone
+        except OSError:  # a time-out, or the other process has ended
             break
-    return PATIENCE
+    return TIMEOUT
 
 
 def echo() -> None:
-    """Answer every packet on a free loopback port (printed first) until asked to end."""
+    """Return every packet on a free loopback port (printed first) until one is "end"."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind(("127.0.0.1", 0))
         link.settimeout(5.0)
         enter(RealTimeSettings())
-        _say({"port": link.getsockname()[1]})
+        _print_json({"port": link.getsockname()[1]})
         while True:
             try:
                 packet, peer = link.recvfrom(PACKET)
@@ -101,22 +98,22 @@ def echo() -> None:
 
 
 def turnaround(period: float, seconds: float) -> NDArray[np.float32]:
-    """Question and answer between two real-time processes over loopback UDP."""
+    """Measure round trips between two real-time processes over loopback UDP."""
     command = [sys.executable, "-m", "hil.doctor.probe", "echo"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as far_end:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL) as peer:
         try:
-            assert far_end.stdout is not None
-            port = json.loads(far_end.stdout.readline())["port"]
+            assert peer.stdout is not None
+            port = json.loads(peer.stdout.readline())["port"]
             enter(RealTimeSettings())
-            return ask(int(port), period, seconds)
+            return round_trips(int(port), period, seconds)
         finally:
-            far_end.kill()
+            peer.kill()
 
 
 def disk(place: Path) -> dict[str, object]:
-    """Room at `place` (or the nearest folder above it that exists), and times of writes, s.
+    """Measure free space and times of writes, s, at `place` or its nearest existing parent.
 
-    A write is 64 KiB and the wait until the disk has it, as the archive does it.
+    A write is 64 KiB with `fdatasync`, as for an archive.
     """
     folder = nearest_folder(place)
     answer: dict[str, object] = {"folder": str(folder), "free": shutil.disk_usage(folder).free}
@@ -136,14 +133,14 @@ def disk(place: Path) -> dict[str, object]:
 
 
 def nearest_folder(place: Path) -> Path:
-    """`place`, or the nearest folder above it that exists."""
+    """Return `place` or its nearest existing parent."""
     place = place.absolute()
     while not place.is_dir() and place != place.parent:
         place = place.parent
     return place
 
 
-def _say(answer: object) -> None:
+def _print_json(answer: object) -> None:
     sys.stdout.write(json.dumps(answer) + "\n")
     sys.stdout.flush()
 
@@ -152,9 +149,9 @@ def main(words: list[str]) -> None:
     """Run one probe."""
     kind, *rest = words
     if kind == "permissions":
-        _say(asdict(enter(RealTimeSettings())))
+        _print_json(asdict(enter(RealTimeSettings())))
     elif kind == "disk":
-        _say(disk(Path(rest[0])))
+        _print_json(disk(Path(rest[0])))
     elif kind == "echo":
         echo()
     else:
@@ -162,7 +159,7 @@ def main(words: list[str]) -> None:
         if kind == "wake-up":
             enter(RealTimeSettings())
         np.save(rest[2], measure(float(rest[0]), float(rest[1])))
-        _say({"file": rest[2]})
+        _print_json({"file": rest[2]})
 
 
 if __name__ == "__main__":

@@ -193,8 +193,8 @@ def far_end() -> Iterator[Callable[[int | None], int]]:
 def test_a_question_never_answered_counts_its_whole_wait_and_the_next_is_asked(
     far_end: Callable[[int | None], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(probe, "PATIENCE", 0.05)
-    took = probe.ask(far_end(3), 1e-3, 0.2)
+    monkeypatch.setattr(probe, "TIMEOUT", 0.05)
+    took = probe.round_trips(far_end(3), 1e-3, 0.2)
     assert took[3] == pytest.approx(0.05)
     assert len(took) > 4
     assert np.median(np.delete(took, 3)) < 0.05
@@ -380,7 +380,7 @@ JUDGED = [
         ({f"{CLOCK}/current_clocksource": "hpet",
           f"{CLOCK}/available_clocksource": "tsc hpet"}, WARN, "echo tsc"),
         ({f"{CLOCK}/current_clocksource": "tsc"}, OK, "tsc"),
-        ({}, UNKNOWN, "not stated"),
+        ({}, UNKNOWN, "not reported"),
     ),
     *of(
         machine.governor,
@@ -394,7 +394,7 @@ JUDGED = [
     *of(lambda s: machine.idle_states(s, no_sleep=True), (deep("0"), OK, "C6")),
     *of(
         machine.isolation,
-        (processors(2, uevent=""), OK, "none to spare"),
+        (processors(2, uevent=""), OK, "not useful with"),
         (processors(8, uevent=""), WARN, "isolcpus=managed_irq,domain,7"),
         (processors(8, uevent="") | {f"{CPU}/isolated": "7"}, OK, "7"),
     ),
@@ -407,11 +407,11 @@ JUDGED = [
          WARN, "none"),
         ({"/proc/version": "PREEMPT_DYNAMIC", "/proc/cmdline": "preempt=none"},
          WARN, "preempt=full"),
-        ({"/proc/version": "Linux"}, UNKNOWN, "not stated by the kernel"),
+        ({"/proc/version": "Linux"}, UNKNOWN, "not reported by the kernel"),
     ),
     *of(
         machine.virtualisation,
-        ({"/proc/cpuinfo": "flags\t\t: fpu vme\n"}, OK, "no sign"),
+        ({"/proc/cpuinfo": "flags\t\t: fpu vme\n"}, OK, "not detected"),
         ({"/proc/cpuinfo": "flags\t\t: fpu hypervisor vme\n",
           "/proc/stat": "cpu  50 0 0 40 0 0 0 10 0 0\ncpu0 1 2 3\n"}, WARN, "10.00 %"),
     ),
@@ -480,7 +480,7 @@ JUDGED = [
     *of(
         lambda s: link.can_check(FD, s),
         ({}, BAD, "does not exist"),
-        (BUS | {"/sys/class/net/can0/type": "1"}, BAD, "is no CAN interface"),
+        (BUS | {"/sys/class/net/can0/type": "1"}, BAD, "is not a CAN interface"),
         (BUS | {"/sys/class/net/can0/operstate": "down"}, BAD,
          "bitrate 1000000 dbitrate 5000000 fd on"),
         (BUS, OK, "5000000", rates(1_000_000, 5_000_000)),
@@ -496,7 +496,7 @@ JUDGED = [
         ({}, BAD, "net.ipv4.ip_unprivileged_port_start=1000")),
     *of(lambda s: link.port_check("0.0.0.0", 1000, errno.EADDRINUSE, s), ({}, BAD, "another user")),
     *of(lambda s: link.port_check("10.1.1.1", 1000, errno.EADDRNOTAVAIL, s),
-        ({}, BAD, "10.1.1.1 is no address")),
+        ({}, BAD, "10.1.1.1 is not an address")),
     *of(lambda s: link.port_check("0.0.0.0", 1000, -1, s), ({}, BAD, "error -1")),
     *of(lambda s: link.port_check("0.0.0.0", 1000, errno.ENOBUFS, s), ({}, BAD, "ENOBUFS")),
     *of(lambda s: link.port_check("0.0.0.0", 1000, 0, s), ({}, OK, "0.0.0.0")),
@@ -504,7 +504,7 @@ JUDGED = [
                                  "cpu  200 0 0 200 0 0 0 500 0 0\n"), ({}, OK, "0.00 %")),
     *of(lambda s: machine.stolen("cpu  100 0 0 100 0 0 0 500 0 0\n",
                                  "cpu  145 0 0 145 0 0 0 510 0 0\n"), ({}, WARN, "10.00 %")),
-    *of(lambda s: machine.stolen("nonsense", ""), ({}, UNKNOWN, "not stated")),
+    *of(lambda s: machine.stolen("nonsense", ""), ({}, UNKNOWN, "not reported")),
 ]  # fmt: skip
 
 
