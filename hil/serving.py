@@ -90,7 +90,7 @@ class Buttons:
         return serve.Request.END if self.interrupted or over else serve.Request.CONTINUE
 
     def press(self, signum: int, frame: FrameType | None = None) -> None:
-        """Handle a signal: SIGINT or SIGTERM end, the second one at once; SIGUSR1, 2 are buttons."""
+        """Handle a signal: SIGINT and SIGTERM end, the second at once; SIGUSR1, 2 are buttons."""
         del frame
         if signum in (signal.SIGUSR1, signal.SIGUSR2):
             self._pressed.add(signum)

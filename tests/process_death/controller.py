@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from drivers.packets import packet_number
 from hil.cell import Cell
-from hil.serving import Buttons, serve_session, undisturbed
+from hil.serving import Buttons, realtime_process, serve_session
 from hil.simulation import controller_settings, simulated_controller
 from sim_fixtures import SimulatedController
 from sim_fixtures.program import Phase
@@ -193,7 +193,7 @@ def serve(cell: Cell, played: Round, page: Page) -> None:
             plant.position, plant.velocity,
         ))  # fmt: skip
 
-    with undisturbed(None):
+    with realtime_process(None):
         serve_session(
             lambda: simulated_controller(cell, settings=settings, seed=played.seed),
             end,
