@@ -128,7 +128,7 @@ def origin_of(
     }
 
 
-def dated_anew(metadata: Mapping[str, str]) -> dict[str, str]:
+def with_present_date(metadata: Mapping[str, str]) -> dict[str, str]:
     """The same, for an archive that begins now; what has no date gets none."""
     return {**metadata, **({"recorded_at": _now()} if "recorded_at" in metadata else {})}
 

@@ -284,7 +284,7 @@ class Campaign:
             stop or Stop(),
             reporter or Silent(),
             operator or Unattended(),
-            said=provenance,
+            given_provenance=provenance,
             durable=durable,
             unrehearsed=unrehearsed,
             dry_run_only=dry_run_only,

@@ -1,4 +1,4 @@
-"""The slow dry run: every motion of the plan at a fifth of its speed, and a person's word on it."""
+"""The dry run: every motion of the plan at 20 % of its speed, accepted by the operator."""
 
 from __future__ import annotations
 
@@ -27,12 +27,11 @@ Array = NDArray[np.float64]
 DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 SIMULATED: Final = "simulated"
-"""Metadata: whether nothing but a simulated arm can have moved, "yes" or "no". The link says so,
-whatever the caller of a run says."""
+"""Metadata key: whether only a simulated arm can have moved, "yes" or "no", by the link."""
 OVERRIDE: Final = 0.2
 """Largest share of the planned speed."""
 FORMAT_VERSION: Final = 2
-"""1 did not look at torques."""
+"""1 had no check of torques."""
 _FIELDS: Final = (
     *("cycle", "gap", "position", "target_position", "target_current", "torque"),
     "commanded_position",
@@ -41,44 +40,43 @@ AGAINST: Final = (
     "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
 )
 CLEAR: Final = 0.5
-"""Correlation from which torque and gravity belong together, or against each other."""
+"""Magnitude of a correlation of torque and gravity that is significant."""
 _LEAST_SHARE: Final = 0.05
-"""Gravity as a share of the rms torque below which the joint has none to speak of."""
+"""Gravity as a share of the rms torque below which it is not compared."""
 _LEAST_SAMPLES: Final = 100
 _STEP: Final = 0.01
-"""s between samples whose torque is looked at."""
+"""Period of the samples whose torque is compared, s."""
 
 
-def said_of(only_simulated: bool) -> str:
-    """The kind of arm as archives name it under `SIMULATED`."""
+def yes_or_no(only_simulated: bool) -> str:
+    """Return the metadata value of `SIMULATED`."""
     return "yes" if only_simulated else "no"
 
 
 def made_by(path: Path, only_simulated: bool) -> bool:
-    """Whether an archive says that this kind of arm made it; a damaged one does not."""
+    """Return whether an archive is of this kind of arm; False for a damaged one."""
     try:
-        return open_archive(path, fields=()).header.simulated == said_of(only_simulated)
+        return open_archive(path, fields=()).header.simulated == yes_or_no(only_simulated)
     except ArchiveError:
         return False
 
 
 def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np.bool_]) -> Array:
-    """Correlation of gravity and torque beside friction, -1 to 1, for each joint (n,).
+    """Return the correlation of gravity and torque without friction, -1 to 1, per joint (n,).
 
-    At a fifth of full speed inertia is next to nothing: what a joint's torque is beside friction is
-    gravity. Both are regressed on Coulomb and viscous friction, and what that leaves of them is
-    compared. A torque of the wrong sign, a `joint_sign` or zero position that mirrors the arm, or
-    masses that are not there make the correlation negative. There is no constant beside them: the
-    sign of a weight that hardly changes counts as well.
+    At 20 % of full speed inertial torques are negligible. Coulomb and viscous friction are removed
+    from both by regression, without a constant: the sign of a constant load counts as well. A
+    torque of the wrong sign, or a `joint_sign` or zero position that mirrors the arm, makes the
+    correlation negative.
 
     Args:
         gravity: by the model (m, n) [N·m].
         torque: measured (m, n) [N·m].
         velocity: (m, n) [rad/s].
-        moving: rows of each joint that count (m, n): friction is known in direction there.
+        moving: rows (m, n) in which a joint moves, so that the sign of its friction is known.
 
     Returns:
-        NaN for a joint that hardly moves, or that gravity hardly loads.
+        NaN for a joint that moves too little, or with too little gravity.
     """
     found = np.full(gravity.shape[1], np.nan)
     for joint in range(len(found)):
@@ -98,14 +96,14 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Who accepted a dry run: name of the user on this computer, and time of day, ISO 8601."""
+    """Acceptance of a dry run: name of the user on this computer, and time, ISO 8601."""
 
     by: str
     at: str
 
     @classmethod
     def now(cls) -> Self:
-        """That of whoever runs this program."""
+        """Return the acceptance by the user of this program."""
         try:
             user = getpass.getuser()
         except (OSError, KeyError):  # a user without a name
@@ -115,22 +113,22 @@ class Acceptance:
 
 @dataclass(frozen=True)
 class DryRun:
-    """A whole dry run; `dry_run.json`.
+    """A completed dry run; `dry_run.json`.
 
     Attributes:
-        plan_hash: of exactly the plan that was run.
+        plan_hash: of the plan that was run.
         override: largest share of the planned speed.
         archives: file names, one for each motion of the plan.
         duration: of the motions [s].
-        simulated: whether nothing but a simulated arm can have moved.
+        simulated: whether only a simulated arm can have moved.
         joint_names: of the n joints.
         current_share: (n) largest current as a share of its limit.
         following_error: (n) largest [rad].
         missed: packets that never arrived.
-        late: packets whose answer was late.
-        accepted: by whom; None as long as nobody has.
-        against_gravity: joints whose torque runs against the model's gravity.
-        gravity_not_seen: joints with too little gravity to tell.
+        late: packets whose reply was late.
+        accepted: None until it is.
+        against_gravity: joints whose torque has the opposite sign of the model's gravity.
+        gravity_not_seen: joints with too little gravity to be compared.
     """
 
     plan_hash: str
@@ -153,7 +151,7 @@ class DryRun:
 
     @classmethod
     def load(cls, folder: CampaignFolder, plan_hash: str | None = None) -> Self | None:
-        """That of a plan (of the folder, if left out), as it was written down; None without one.
+        """Return the dry run of a plan (by default the folder's) from its file; None without one.
 
         Raises:
             CampaignFolderError: the file is damaged, or of another version.
@@ -162,7 +160,7 @@ class DryRun:
             cls,
             folder.dry_run,
             "is damaged, or of another version",
-            "remove it; its archives are looked at again, or the dry run is done again",
+            "remove it; its archives are evaluated again, or the dry run is repeated",
             version=FORMAT_VERSION,
         )
         now = folder.plan_hash if plan_hash is None and found is not None else plan_hash
@@ -172,10 +170,9 @@ class DryRun:
     def that_counts(
         cls, folder: CampaignFolder, *, plan_hash: str, motions: int, simulated: bool
     ) -> Self | None:
-        """That of a plan, where everything it says was seen can still be seen.
+        """Return the dry run of a plan on this kind of arm whose archives are all there, or None.
 
-        What a simulated arm did says nothing of the room around a real one, and a file that was
-        copied, or whose archives are gone, says nothing at all.
+        A dry run of a simulated arm does not cover the surroundings of a real one.
 
         Raises:
             CampaignFolderError: the file is damaged, or of another version.
@@ -198,7 +195,7 @@ class DryRun:
         plan_hash: str,
         simulated: bool,
     ) -> Self:
-        """What the archives of a dry run say.
+        """Return the dry run from its archives.
 
         Raises:
             ArchiveError: one of them cannot be read.
@@ -247,11 +244,11 @@ class DryRun:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What speaks against it, in sentences."""
+        """Warnings, in sentences."""
         return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
 
     def save(self, path: Path) -> None:
-        """Write it.
+        """Write the file.
 
         Raises:
             OutputError: the disk refuses.
@@ -259,16 +256,16 @@ class DryRun:
         save_record(path, self, FORMAT_VERSION)
 
     def accepted_now(self) -> DryRun:
-        """This dry run, accepted by whoever runs the program."""
+        """Return this dry run, accepted by the user of this program."""
         return replace(self, accepted=Acceptance.now())
 
 
 class DryRunStage:
-    """Every motion that will be sent at full speed, once and slowly.
+    """Runs every motion that is to be sent at full speed once slowly, and has it accepted.
 
     Attributes:
-        intervals: the motions under the names of their slow runs.
-        state: whether a person has accepted what was done; "left out" where the caller did without.
+        intervals: the slow motions.
+        state: "accepted", "to be accepted", or "left out" where the caller did without.
     """
 
     def __init__(self, run: Run) -> None:
@@ -279,11 +276,11 @@ class DryRunStage:
             if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
         ]  # fmt: skip
         self.intervals = [replace(one, kind="dryrun", index=k) for k, one in enumerate(motions)]
-        # Nobody knows beforehand what will contradict: only what an earlier run saw is accepted.
+        # Only what an earlier run measured can be accepted, not what this one is going to.
         self._known = run.accept_torque if run.accept_torque and self.found() else ()
 
     def found(self) -> DryRun | None:
-        """The dry run of exactly this plan and kind of arm; None where none counts."""
+        """Return the dry run of this plan and kind of arm; None without a valid one."""
         run = self._run
         if run.unrehearsed:
             return None
@@ -295,35 +292,35 @@ class DryRunStage:
         )
 
     def missing(self) -> list[Interval]:
-        """Each motion that was not run slowly yet."""
+        """Return the motions that were not run slowly yet."""
         intervals = [] if self._run.unrehearsed else self.intervals
-        return [one for one in intervals if self._whole(one) is None]
+        return [one for one in intervals if self._complete(one) is None]
 
     def run(self, runner: Runner) -> None:
-        """Run what is missing, slowly, and have it accepted.
+        """Run what is missing slowly, and have it accepted.
 
         Raises:
-            DryRunError, OperatorStopError: see `settle`.
+            DryRunError, OperatorStopError: see `accept`.
         """
         missing = self.missing()
         for slow in missing:
-            name = runner.play(slow, slow.index + 1, len(self.intervals), OVERRIDE)
-            self._run.entering.enter(slow, name)
+            name = runner.run_motion(slow, slow.index + 1, len(self.intervals), OVERRIDE)
+            self._run.review.enter(slow, name)
         if missing:
-            self.settle()
+            self.accept()
 
-    def settle(self) -> None:
-        """Write down what was done, once all of it is, and have it accepted.
+    def accept(self) -> None:
+        """Write `dry_run.json` once all motions are done, and have it accepted.
 
         Raises:
             DryRunError: it must be accepted now and is not.
-            OperatorStopError: a stop was asked for instead of an answer.
+            OperatorStopError: the operator stopped instead of answering.
         """
         run, found = self._run, self.found()
         if run.unrehearsed:
             return
         if found is None:
-            names = [name for slow in self.intervals if (name := self._whole(slow)) is not None]
+            names = [name for slow in self.intervals if (name := self._complete(slow)) is not None]
             if len(names) < len(self.intervals):
                 return
             found = DryRun.of(
@@ -340,27 +337,27 @@ class DryRunStage:
         self.state = "accepted"
 
     def _agreed(self, found: DryRun, unknown: Sequence[str]) -> bool:
-        """Whether the caller accepts, or the operator; unknown joints only the operator."""
+        """Return whether caller or operator accepts it; unknown joints only the operator can."""
         run = self._run
         if run.accept_dry_run and not unknown:
             return True
         agreed = run.operator.can_answer and run.operator.accept_dry_run(found)
         if run.operator.can_answer and not agreed and run.stop.requested:
             raise OperatorStopError(
-                f"{run.folder.root}: stopped instead of an answer; its slow dry run was done, and "
-                "is not accepted."
+                f"{run.folder.root}: stopped by the operator; its dry run was done, and is not "
+                "accepted."
             )
         return agreed
 
-    def _whole(self, slow: Interval) -> str | None:
-        """Name of its whole archive, if this kind of arm made it."""
+    def _complete(self, slow: Interval) -> str | None:
+        """Return the name of its complete archive, if it is of this kind of arm."""
         name = self._run.folder.whole(slow.kind, slow.index)
         made = name is not None and made_by(self._run.folder.archives / name, self._run.simulated)
         return name if made else None
 
 
 def not_accepted(folder: CampaignFolder, against: Sequence[str] = ()) -> DryRunError:
-    """What is raised where a dry run is not accepted, or torques of joints that nobody named."""
+    """Return the error of a dry run that is not accepted, or of joints that were not named."""
     if against:
         return AgainstGravityError(folder.root, against, AGAINST)
     how = f"if the motions looked right, run `hil run {folder.root} --accept-dry-run`"

@@ -12,7 +12,7 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .dry_run import DryRun, DryRunStage, not_accepted, said_of
+from .dry_run import DryRun, DryRunStage, not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .motion_link import Connection, narrower_limits
@@ -88,7 +88,7 @@ def _require_one_world(run: Run) -> None:
     What a simulated arm did slowly says nothing of the room around a real one, and what either
     did must not be pooled. Archives that cannot be read are made anew.
     """
-    ours = said_of(run.simulated)
+    ours = yes_or_no(run.simulated)
     for entry in run.folder.manifest():
         path, made_by = run.folder.archives / entry.name, ours
         with suppress(ArchiveError):

@@ -105,7 +105,9 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
     )
 
 
-def wanted(cell: Cell, plan: CampaignPlan, repetitions: int | None = None) -> list[Interval]:
+def planned_intervals(
+    cell: Cell, plan: CampaignPlan, repetitions: int | None = None
+) -> list[Interval]:
     """All motions of a plan, without the ways between them.
 
     Args:
@@ -143,7 +145,7 @@ class StraightMoves:
         found = next((one for one in self._known if one.leads(start, end)), None)
         if found is None:
             found = replace(way(self._cell, start, end), index=index, from_arm=from_arm)
-            require_sound([found], self._checks)
+            require_allowed([found], self._checks)
             self._known.append(found)
         return replace(found, index=index)
 
@@ -175,7 +177,7 @@ class StraightMoves:
         return joined
 
 
-def require_sound(intervals: Sequence[Interval], checks: MotionChecks) -> None:
+def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None:
     """Refuse motions that must not be sent; each is looked at once.
 
     Raises:
@@ -195,8 +197,8 @@ def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None
         MotionRefusedError: names the motion, what is wrong with it and what to do.
     """
     checks = checks or MotionChecks.of(cell)
-    intervals = wanted(cell, plan)
-    require_sound(intervals, checks)  # before ways are planned to where they lead
+    intervals = planned_intervals(cell, plan)
+    require_allowed(intervals, checks)  # before ways are planned to where they lead
     StraightMoves(cell, checks).joining(intervals, cell.home)
 
 

@@ -1,4 +1,4 @@
-"""The person at a running campaign: what is shown of it and its motions, and what is requested."""
+"""The operator of a running campaign: what is shown to him, and what he requests."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Ctrl-C, whoever ends programs, and the end of the terminal."""
+"""Ctrl-C, the usual request to end, and the end of the terminal."""
 
 
 @dataclass
 class Stop:
-    """Set by Ctrl-C; the link then brings the arm to rest on its path.
+    """Request to stop; the link then brings the arm to rest on its path.
 
     Attributes:
-        requested: once.
-        insisted: again, where that is asked for.
+        requested: whether a stop was requested.
+        insisted: whether it was requested a second time.
     """
 
     requested: bool = False
@@ -42,10 +42,9 @@ class Stop:
 def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
     """Turn SIGINT, SIGTERM and SIGHUP into a request to stop on the path.
 
-    A second one is the ordinary interrupt: it ends the program at once. In virtual time the
-    controller is then on its own; on a real link the exchange process notices, and still brings
-    the arm to rest. With `twice` the second is a request too, `insisted`, and the third ends.
-    A signal that is ignored (SIGHUP under nohup) stays ignored.
+    A second one is the ordinary interrupt and ends the program at once; on a real link the exchange
+    process then still brings the arm to rest. With `twice` the second one sets `insisted`, and the
+    third one ends the program. A SIGHUP that is ignored (nohup) stays ignored.
     """
     stop = Stop()
 
@@ -67,14 +66,14 @@ def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
 
 @dataclass(frozen=True)
 class OperatorRequest:
-    """What the person wants of the motion, until another request.
+    """Override and hold that the operator requests.
 
     Attributes:
         override: fraction (0 to 1) of the planned speed.
         held: whether the arm is to rest on its path.
 
     Raises:
-        ValueError: an override that is none.
+        ValueError: the override is not in 0..1.
     """
 
     override: float = 1.0
@@ -87,10 +86,7 @@ class OperatorRequest:
 
 @dataclass(frozen=True)
 class Latency:
-    """How long the PC took from a packet's arrival to its answer, in this motion [s].
-
-    `p99` is not exceeded by 99 % of the answers.
-    """
+    """Time from a packet's arrival to its reply, in this motion [s]; `p99` is its 99 % quantile."""
 
     median: float
     p99: float
@@ -99,24 +95,23 @@ class Latency:
 
 @dataclass(frozen=True, eq=False)
 class MotionProgress:
-    """A motion at one moment. Joint arrays are (n,); None before the first record.
+    """State of a motion. Joint arrays are (n,); None before the first record.
 
     Attributes:
-        motion_time, duration: s of the planned motion, done and in all, at full speed; None if
-            the source does not tell.
+        motion_time, duration: s of the planned motion, done and in total; None if unknown.
         cycles, missed, late, not_accepted: packets of this motion that were answered, never
             arrived, were answered late or left out, and whose reply was not accepted.
         state: of the session.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
-        following_share: magnitude of that as a share of the threshold in force.
-        current: A at the motors, the controller's target (there is no measured one).
-        current_share: magnitude of that as a share of the limit in force.
-        override: the fraction asked for last.
-        rate: fraction of the planned speed at this moment; None if the source does not tell.
-        held: whether a hold was asked for.
-        latency: None in virtual time, which has none, and before the first answer.
-        events: the last ones of this motion, in words, oldest first.
+        following_share: magnitude of that as a share of the active threshold.
+        current: A at the motors, the controller's target; no current is measured.
+        current_share: magnitude of that as a share of the active limit.
+        override: the fraction requested last.
+        rate: present fraction of the planned speed; None if unknown.
+        held: whether a hold is requested.
+        latency: None in virtual time, and before the first reply.
+        events: the last events of this motion, oldest first.
     """
 
     motion_time: float | None
@@ -139,29 +134,29 @@ class MotionProgress:
 
 
 class MotionWatch(Protocol):
-    """Whoever looks at a motion and may slow, hold and release it.
+    """Observer of a motion that may slow, hold and release it.
 
-    Both are called from the loop that supervises the motion and must return at once: no stop and
-    no hold is passed on meanwhile. On a real link the arm is brought to rest on its path when one
+    Both methods are called by the loop that supervises the motion and must return at once: no stop
+    or hold is passed on meanwhile. On a real link the arm is brought to rest on its path when one
     of them takes longer than a second.
     """
 
     def show(self, progress: MotionProgress) -> None:
-        """Look; called about ten times a second."""
+        """Show the motion; called about ten times a second."""
         ...
 
     def request(self) -> OperatorRequest:
-        """The latest request."""
+        """Return the present request."""
         ...
 
 
 Phase = Literal["dry run", "warm-up", "standstill", "repetition", "validation", "move"]
-"""What a motion is for, in the words of the screen. A "move" is a way between the others."""
+"""Purpose of a motion as shown on the screen. A "move" is a way between the others."""
 
 
 @dataclass(frozen=True, eq=False)
 class DriftCurve:
-    """How friction changes while the joints warm up, from one motion to the next.
+    """Change of friction from motion to motion while the joints warm up.
 
     Attributes:
         joint_names: of the n joints.
@@ -179,17 +174,17 @@ class DriftCurve:
 
 @dataclass(frozen=True, eq=False)
 class RunStatus:
-    """Where a run stands, about ten times a second while something moves.
+    """Progress of a run, about ten times a second while the arm moves.
 
     Attributes:
-        phase: what the motion is for.
+        phase: purpose of the motion.
         number: which of its kind, from 1.
-        total: how many there are of its kind; of a warm-up, how many there may be.
+        total: number of its kind; of a warm-up, the largest number.
         time_left: of motion to the end of the run, the present one at its override [s]; of a
-            warm-up, whose length nobody knows, at least as many motions as it has to have.
+            warm-up with its least number of motions.
         motions_left: after the present one.
-        motion: of the motion that is being run; None between two.
-        drift: of the warm-up so far, None where there is none.
+        motion: the motion that is being run; None between two.
+        drift: of the warm-up so far, None without one.
         notes: on the quality of the last repetitions, newest last.
     """
 
@@ -204,28 +199,28 @@ class RunStatus:
 
 
 class Operator(Protocol):
-    """Who watches a run; as quick as a `MotionWatch`. One that raises costs only what it shows."""
+    """Operator of a run; as quick as a `MotionWatch`. Errors of his screen end no motion."""
 
     @property
     def can_answer(self) -> bool:
-        """Whether there is a person to accept a dry run."""
+        """Whether he can be asked to accept a dry run."""
         ...
 
     def show(self, status: RunStatus) -> None:
-        """Show where the run stands."""
+        """Show the progress of the run."""
         ...
 
     def request(self) -> OperatorRequest:
-        """Return what the person requests now: override and hold."""
+        """Return the present request."""
         ...
 
     def accept_dry_run(self, found: DryRun) -> bool:
-        """Ask whether the slow motion looked right; False where nobody can answer."""
+        """Ask whether the slow motion was right; False where he cannot be asked."""
         ...
 
 
 class Unattended:
-    """Nobody watches a run, or a motion: full speed, no hold, and no dry run is accepted."""
+    """No operator: full speed, no hold, and no dry run is accepted."""
 
     can_answer = False
 
@@ -234,37 +229,35 @@ class Unattended:
         del status
 
     def request(self) -> OperatorRequest:
-        """Full speed."""
+        """Return full speed."""
         return OperatorRequest()
 
     def accept_dry_run(self, found: object) -> bool:
-        """Nobody has seen it."""
+        """Return False."""
         del found
         return False
 
 
 unwatched_motion = Unattended()
-"""For motions that nobody watches."""
+"""For motions without a watch."""
 
 NOTES = 4
-"""Last notes on quality that are shown."""
+"""Notes on quality that are shown."""
 
 
 @dataclass(eq=False)
 class RunWatch:
-    """A `MotionWatch` that tells the operator where the whole run stands.
+    """A `MotionWatch` that shows the progress of the whole run to its operator.
 
-    What an operator's screen gets wrong must not end a motion: it is reported, and the motion goes
-    on at the speed requested last. Each request is asked for anew, whatever the last one met with.
-    A hold is another matter: one that nobody can release any more becomes a stop.
+    Errors of the operator's screen are reported and end no motion: it continues at the speed
+    requested last. A hold that nobody can release any more becomes a stop.
 
     Attributes:
-        operator: who looks.
+        operator: of the run.
         stop: brings the arm to rest on its path.
-        time_left: s of motion after the present one, each at the largest override it may have.
-        began: when the present motion began, or the last one [s since 1970]; later than it was
-            asked for where it was held.
-        status: what was shown last, but for its time left.
+        time_left: s of motion after the present one, each at its largest override.
+        began: when the present or the last motion began [s since 1970], after any hold.
+        status: shown last, except for its time left.
     """
 
     operator: Operator
@@ -275,18 +268,18 @@ class RunWatch:
     _duration: float = 0.0
     _most: float = 1.0
     _request: OperatorRequest = OperatorRequest()
-    _troubles: dict[str, str] = field(default_factory=dict)
+    _problems: dict[str, str] = field(default_factory=dict)
 
     def expect(self, times: list[float]) -> None:
-        """More motions are to come, of so many s each."""
+        """Add motions that are to be run, with the duration of each [s]."""
         self.time_left += sum(times)
         self.status = replace(self.status, motions_left=self.status.motions_left + len(times))
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
-        """The next motion, of `duration` s at full speed, at an override of at most `most`."""
+        """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
         self.time_left = max(0.0, self.time_left - duration / most)
         self._duration, self._most, self.began = duration, most, time.time()
-        self._tell(
+        self._show(
             None,
             phase=cast(Phase, KIND_NAMES.get(kind, kind)),
             number=number,
@@ -294,20 +287,20 @@ class RunWatch:
             motions_left=max(0, self.status.motions_left - 1),
         )
 
-    def note(self, text: str) -> None:
-        """A line on the quality of the motion that has ended."""
+    def add_note(self, text: str) -> None:
+        """Add a line on the quality of the motion that has ended."""
         self._duration = 0.0
-        self._tell(None, notes=(*self.status.notes, text)[-NOTES:])
+        self._show(None, notes=(*self.status.notes, text)[-NOTES:])
 
-    def warms(self, drift: DriftCurve) -> None:
-        """How far the warm-up is."""
+    def set_drift(self, drift: DriftCurve) -> None:
+        """Set the state of the warm-up."""
         self.status = replace(self.status, drift=drift)
 
     def show(self, progress: MotionProgress) -> None:
-        """See `MotionWatch.show`; links do not show a motion before they ask for it."""
+        """See `MotionWatch.show`."""
         if self.status.motion is None:
             self.began = time.time()
-        self._tell(progress)
+        self._show(progress)
 
     def request(self) -> OperatorRequest:
         """See `MotionWatch.request`."""
@@ -317,34 +310,34 @@ class RunWatch:
                 raise TypeError(f"{request!r} is no OperatorRequest")
             self._request = request
         except Exception as error:  # the arm moves: a screen must not decide how it ends
-            became = "the last request stayed in force"
+            became = "the last request remained active"
             if self._request.held and not self.stop.requested:
                 self.stop.requested = True
-                became = "the arm was held, which nobody could end any more: the run was stopped"
-                self._troubles.pop("request", None)
-            self._troubles.setdefault(
+                became = "the arm was held and could not be released any more: the run was stopped"
+                self._problems.pop("request", None)
+            self._problems.setdefault(
                 "request",
-                f"the operator could not be asked for requests ({type(error).__name__}: {error}); "
+                f"the operator's request could not be read ({type(error).__name__}: {error}); "
                 f"{became}",
             )
         return self._request
 
     @property
-    def troubles(self) -> tuple[str, ...]:
-        """What went wrong with the operator's screen, in sentences."""
-        return tuple(self._troubles.values())
+    def problems(self) -> tuple[str, ...]:
+        """Errors of the operator's screen, in sentences."""
+        return tuple(self._problems.values())
 
-    def _tell(self, progress: MotionProgress | None, **changes: Any) -> None:
+    def _show(self, progress: MotionProgress | None, **changes: Any) -> None:
         done = 0.0 if progress is None or progress.motion_time is None else progress.motion_time
         requested = max(self._request.override, 0.01)
         left = max(self._duration - done, 0.0) / min(self._most, requested)
         self.status = replace(
             self.status, motion=progress, time_left=left + self.time_left / requested, **changes
         )
-        if "show" in self._troubles:
+        if "show" in self._problems:
             return
         try:
             self.operator.show(self.status)
-        except Exception as error:  # likewise
-            said = f"{type(error).__name__}: {error}"
-            self._troubles["show"] = f"the operator's screen failed ({said}); nothing was shown"
+        except Exception as error:  # nor what is shown
+            text = f"{type(error).__name__}: {error}"
+            self._problems["show"] = f"the operator's screen failed ({text}); nothing was shown"

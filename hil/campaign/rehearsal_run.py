@@ -48,7 +48,7 @@ from sim_fixtures import ServoSettings, SimulatedDrive, SimulationError, Unmodel
 from .campaign import Campaign
 from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder
-from .intervals import require_runnable, wanted
+from .intervals import planned_intervals, require_runnable
 from .link import Link
 from .operator import Stop
 from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
@@ -443,7 +443,7 @@ def _rehearsed(
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = _campaign(root / where, replace(campaign, cell=cell))
         reporter.say(f"rehearsing on a simulated arm, {name}")
-        motions = wanted(rehearsal.cell, rehearsal.plan)
+        motions = planned_intervals(rehearsal.cell, rehearsal.plan)
         planned = sum(one.trajectory.duration for one in motions)
         link = twin.link(planned, effects=effects, drive=drive)
         failure = _failure(rehearsal, link, twin, reporter, stop)

@@ -17,7 +17,7 @@ from hil.terminal_text import plural
 
 from .dry_run import DryRun
 from .folder import CampaignFolder, Entry
-from .intervals import wanted
+from .intervals import planned_intervals
 from .rehearsal import Rehearsal
 from .warmup import WarmUp, drift_wanted
 
@@ -235,7 +235,7 @@ def _warm_up(found: WarmUp | None) -> Step:
 
 
 def _motions(campaign: Campaign, kind: str, words: str) -> Step:
-    total = sum(one.kind == kind for one in wanted(campaign.cell, campaign.plan))
+    total = sum(one.kind == kind for one in planned_intervals(campaign.cell, campaign.plan))
     whole = len(campaign.folder.completed(kind))
     state: State = "done" if whole >= total else "next"
     return Step(state, f"{whole} of {total} {words} whole", "run {}")

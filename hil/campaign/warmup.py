@@ -1,15 +1,14 @@
-"""Warm-up: the excitation is repeated until friction changes but little from motion to motion.
+"""Warm-up: the excitation is repeated until friction hardly changes from motion to motion.
 
-**Measure.** Over a motion that begins and ends at rest, inertial and gravity torques do no work on
-the whole; what a joint's torque does beyond that of the rigid arm,
+**Measure.** Mean friction torque of a joint along a motion that begins and ends at rest:
 
-    F_j = (∫ tau_j qd_j dt - ∫ tau_rigid,j qd_j dt) / ∫ |qd_j| dt,
+    F_j = (∫ tau_j qd_j dt - ∫ tau_rigid,j qd_j dt) / ∫ |qd_j| dt.
 
-is its friction torque, averaged along the way. The rigid part is that of the nominal model on the
-planned motion: the same in each repetition, so that its error drops out of every change.
+The rigid part is that of the nominal model on the planned motion: it is the same in each
+repetition, so that its error cancels in every change.
 
-**Criterion.** The change per motion is the slope of a straight line through the last motions
-(Theil and Sen: the median of all slopes between two of them), as a share of the friction.
+**Criterion.** The change per motion is the Theil-Sen slope of the last motions (the median of all
+slopes between two of them), as a share of the friction.
 """
 
 from __future__ import annotations
@@ -38,28 +37,28 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 DEFAULT_DRIFT: Final = 0.002
-"""Change per motion that counts as warm on a real arm. Thirty repetitions then change friction by
-a few per cent at most; with half a minute each and a time constant of 20 min, which is usual, the
-slope falls to it from 1 % within about 40 motions."""
+"""Change per motion below which a real arm is warm. Thirty repetitions then change friction by some
+per cent at most; with half a minute each and the usual time constant of 20 min the slope falls to
+it from 1 % within about 40 motions."""
 WINDOW: Final = 4
-"""Motions that a slope is read from."""
+"""Motions of which the slope is computed."""
 COLD_AFTER: Final = 600.0
-"""s without motion after which the joints are assumed to have cooled down."""
+"""s without motion after which the joints are assumed to be cold."""
 FORMAT_VERSION: Final = 2
-"""1 did not say when the joints moved last."""
+"""1 had no time of the last motion."""
 _FIELDS: Final = ("torque", "commanded_position", "position")
 _LEAST_SHARE: Final = 0.02
-"""Of a joint's rms torque: less friction than that is not the nominal model's to tell."""
+"""Share of a joint's rms torque below which its friction cannot be measured."""
 _LEAST_WAY: Final = 1e-2
-"""rad; a joint that goes less far tells nothing."""
+"""rad of travel below which the friction of a joint cannot be measured."""
 
 
 def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
-    """Change per motion below which the arm counts as warm; 0 where no warm-up is wanted.
+    """Return the change per motion below which the arm is warm; 0 for no warm-up.
 
     Args:
-        cell: its own link says whether only a simulated arm can move, where that is left out.
-        only_simulated: of the link that is really used.
+        cell: its `[campaign]`.
+        only_simulated: whether only a simulated arm can move; by default as the cell's own link.
     """
     wanted = cell.campaign.warmup_drift
     if wanted is not None:
@@ -70,10 +69,7 @@ def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
 
 @dataclass(frozen=True)
 class WarmMotion:
-    """One motion of a warm-up: file name of its archive, and friction of each joint (n) [N·m].
-
-    None for a joint that hardly moves.
-    """
+    """Archive of a motion of a warm-up, and friction of each joint (n) [N·m], None if unknown."""
 
     archive: str
     friction: tuple[float | None, ...]
@@ -84,14 +80,13 @@ class WarmUp:
     """Warm-up of a campaign; `warmup.json`.
 
     Attributes:
-        plan_hash: of the plan it belongs to.
+        plan_hash: of its plan.
         joint_names: of the n joints.
-        threshold: change per motion that counts as warm.
+        threshold: change per motion below which the arm is warm.
         motions: of the present warm-up, in order.
-        outcome: "going on", "warm", or "not warm" where the most motions were not enough.
-        earlier: motions of warm-ups whose warmth was lost in a pause, oldest first.
-        moved_at: when a motion that keeps the joints warm ended last [s since 1970]; None if that
-            is not known.
+        outcome: "going on", "warm", or "not warm" after the largest number of motions.
+        earlier: motions of earlier warm-ups, before the arm cooled down in a pause; oldest first.
+        moved_at: end of the last motion that warms the joints [s since 1970]; None if unknown.
     """
 
     plan_hash: str
@@ -108,7 +103,7 @@ class WarmUp:
 
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
-        """Read it; None where there is none for this plan.
+        """Read the file; return None without one for this plan.
 
         Raises:
             CampaignFolderError: the file is damaged.
@@ -117,7 +112,7 @@ class WarmUp:
         return found if found is not None and found.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:
-        """Write it.
+        """Write the file.
 
         Raises:
             OutputError: the disk refuses.
@@ -126,61 +121,61 @@ class WarmUp:
 
     @property
     def next_index(self) -> int:
-        """Of the archive of the next motion; none is given twice."""
+        """Index of the next motion; none is used twice."""
         return len(self.earlier) + len(self.motions)
 
     def cold(self, now: float) -> bool:
-        """Whether the joints have cooled down by `now` [s since 1970].
+        """Return whether the joints have cooled down by `now` [s since 1970].
 
-        Not known, or in the future (a clock was put back): cold. A motion too many harms nothing.
+        They have if the time of the last motion is unknown, or in the future (a clock was reset).
         """
         return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER
 
     @property
     def curve(self) -> DriftCurve:
-        """Friction and its change, motion by motion."""
+        """Friction and its change from motion to motion."""
         friction = np.array([one.friction for one in self.motions], dtype=np.float64)
         friction = friction.reshape(len(self.motions), len(self.joint_names))
         change = [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
         return DriftCurve(self.joint_names, friction, np.array(change), self.threshold)
 
     def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUp:
-        """This warm-up after one more motion, with its friction (n,) [N·m], and what came of it."""
+        """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
         known = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
         done, change = len(longer.motions), longer.curve.change[-1]
         if done >= max(least, WINDOW) and change <= self.threshold:
             return replace(longer, outcome="warm")
-        untold = done >= least and np.isnan(change)  # more motions would not tell either
-        return replace(longer, outcome="not warm") if untold or done >= most else longer
+        unknown = done >= least and np.isnan(change)  # and would be after more motions
+        return replace(longer, outcome="not warm") if unknown or done >= most else longer
 
     def cooled(self) -> WarmUp:
-        """A new warm-up after this one was lost in a pause."""
+        """Return a new warm-up after the arm cooled down."""
         earlier = (*self.earlier, *self.motions)
         return replace(self, motions=(), outcome="going on", earlier=earlier)
 
     @property
     def sentence(self) -> str:
-        """Where it stands; it has had a motion."""
+        """Its state in a sentence; it has had a motion."""
         done, change = len(self.motions), float(self.curve.change[-1])
         text = f"warm-up: friction changes by {change:.2%} a motion after {done} motions"
         if self.outcome == "warm":
-            return f"{text}; below {self.threshold:.2%} counts as warm"
+            return f"{text}; below {self.threshold:.2%} the arm is warm"
         if self.outcome == "not warm":
             return f"{text}; still not below {self.threshold:.2%}, and no more motions were allowed"
         return text
 
     def rested(self, now: float) -> str:
-        """How long the arm has rested, as the beginning of a sentence."""
+        """Return how long the arm has rested, as the beginning of a sentence."""
         if self.moved_at is None:
             return "the arm had rested"
         if now < self.moved_at:
-            return "the arm moved last at a time that is still to come (a clock was put back)"
+            return "the last motion of the arm is dated in the future (a clock was reset)"
         return f"the arm had rested for {(now - self.moved_at) / 60.0:.0f} min"
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:
-    """Largest change per motion of any joint at the end of a row of motions, as a share.
+    """Return the largest change per motion of any joint over the last motions, as a share.
 
     Args:
         friction: (k, n) [N·m].
@@ -192,7 +187,7 @@ def change_per_motion(friction: Sequence[Array] | Array) -> float:
     moves = np.isfinite(last).all(axis=0) if len(last) else np.zeros(0, bool)
     if len(last) < 2 or not moves.any():
         return float("nan")
-    # Theil's slope: the median over all pairs, which one motion that went wrong does not move.
+    # Theil-Sen slope: one disturbed motion does not change it.
     first, second = np.triu_indices(len(last), k=1)
     known = last[:, moves]
     slopes = np.median((known[second] - known[first]) / (second - first)[:, None], axis=0)
@@ -213,7 +208,7 @@ class FrictionMeter:
         self._way = np.abs(qd).sum(axis=0) * cell.period
 
     def measure(self, path: Path) -> Array:
-        """Friction torque of each joint along the way (n,) [N·m]; NaN where it hardly moves.
+        """Return the mean friction torque of each joint (n,) [N·m]; NaN where it is unknown.
 
         Raises:
             ArchiveError: the archive cannot be read.
@@ -221,7 +216,7 @@ class FrictionMeter:
         columns = open_archive(path, fields=_FIELDS).recorded(*_FIELDS)
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         torque = columns["torque"][rows]
-        # Measured, not commanded: while the arm lags behind, inertial torque works on the command.
+        # Measured, not commanded: with a lag, inertial torque does work on the commanded motion.
         work = (torque * np.gradient(columns["position"][rows], axis=0)).sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             friction = (work - self._rigid_work) / self._way
@@ -241,7 +236,7 @@ class WarmUpStage:
 
     @property
     def outcome(self) -> str:
-        """How the warm-up stands: "none", "going on", "warm" or "not warm"."""
+        """State of the warm-up: "none", "going on", "warm" or "not warm"."""
         found = self._found()
         return "none" if found is None else found.outcome
 
@@ -254,59 +249,59 @@ class WarmUpStage:
         cold = f"the arm was not warm when the repetitions began ({found.sentence})"
         return [cold, *self._pauses]
 
-    def next_motion(self) -> Interval | None:
-        """What a warm-up would run next, None where none is wanted."""
-        return self._interval(self._state()) if self._threshold else None
+    def next_motion(self) -> list[Interval]:
+        """Return the next motion of a warm-up; none where no warm-up is wanted."""
+        return [self._interval(self._state())] if self._threshold else []
 
     def expected(self) -> list[float]:
-        """Durations [s] of the motions that it runs at least."""
-        state, motion = self._state(), self.next_motion()
-        if motion is None or state.outcome != "going on":
+        """Return the durations [s] of the motions that it runs at least."""
+        state, motions = self._state(), self.next_motion()
+        if state.outcome != "going on":
             return []
         missing = self._run.cell.campaign.warmup_least - len(state.motions)
-        return [motion.trajectory.duration] * max(missing, 0)
+        return [motion.trajectory.duration for motion in motions] * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
-        """Run as many motions as it takes; none where the arm is warm, or none are wanted.
+        """Run motions until the arm is warm.
 
         Raises:
-            RepetitionsRejectedError: a motion was slowed again and again.
+            RepetitionsRejectedError: each attempt at a motion was slowed.
         """
         if not self._threshold:
             return
         run, state = self._run, self._present()
-        run.watch.warms(state.curve)
+        run.watch.set_drift(state.curve)
         while state.outcome == "going on":
             interval, done = self._interval(state), len(state.motions)
             if done >= run.cell.campaign.warmup_least:
                 run.watch.expect([interval.trajectory.duration])
-            name = runner.play_until_good(interval, done + 1, run.cell.campaign.warmup_most)
+            name = runner.run_until_accepted(interval, done + 1, run.cell.campaign.warmup_most)
             state = self._saved(state, name, time.time())
-            run.watch.warms(state.curve)
-            run.watch.note(state.sentence)
+            run.watch.set_drift(state.curve)
+            run.watch.add_note(state.sentence)
         run.reporter.say(state.sentence)
 
-    def keep(self, runner: Runner) -> None:
-        """Warm up anew where the joints have cooled down since they moved last.
+    def rewarm(self, runner: Runner) -> None:
+        """Warm up again if the joints have cooled down.
 
         Raises:
-            RepetitionsRejectedError: as `run`.
+            RepetitionsRejectedError: see `run`.
         """
         if self._cold(time.time()) is not None:
             self.run(runner)
 
-    def lost(self, began: float) -> Problem | None:
-        """What is wrong with a repetition that began then [s since 1970]; None if it was warm.
+    def cold_start(self, began: float) -> Problem | None:
+        """Return the problem of a repetition that began cold [s since 1970]; None if it was warm.
 
-        A hold before it may last as long as a person likes.
+        The operator may hold the arm for any time before it.
         """
         found = self._cold(began)
         if found is None:
             return None
         return Problem(f"{found.rested(began)} when it began and was assumed to be cold", True)
 
-    def moved(self) -> None:
-        """A motion has ended that keeps the joints warm."""
+    def motion_ended(self) -> None:
+        """Record that a motion that warms the joints has ended."""
         found = self._found()
         if found is not None:
             replace(found, moved_at=time.time()).save(self._run.folder.warmup)
@@ -315,12 +310,12 @@ class WarmUpStage:
         return WarmUp.load(self._run.folder.warmup, self._run.plan_hash)
 
     def _state(self) -> WarmUp:
-        """As it was written down, or a new one."""
+        """Return the warm-up from its file, or a new one."""
         new = WarmUp(self._run.plan_hash, self._run.cell.joint_names, self._threshold)
         return replace(self._found() or new, threshold=self._threshold)
 
     def _cold(self, when: float) -> WarmUp | None:
-        """The warm-up whose warmth is lost by then [s since 1970]; None where none is."""
+        """Return a warm-up after which the arm has cooled down by `when` [s since 1970]."""
         found = self._found() if self._threshold else None
         return found if found is not None and found.motions and found.cold(when) else None
 
@@ -329,7 +324,7 @@ class WarmUpStage:
         return Interval("warmup", state.next_index, plan.excitation.trajectory, plan.moves)
 
     def _saved(self, state: WarmUp, name: str, moved_at: float) -> WarmUp:
-        """The warm-up after the motion of an archive, written down."""
+        """Return the warm-up after the motion of an archive, and save it."""
         run, settings = self._run, self._run.cell.campaign
         self._meter = self._meter or FrictionMeter(run.cell, run.plan.excitation.trajectory)
         friction = self._meter.measure(run.folder.archives / name)
@@ -339,10 +334,10 @@ class WarmUpStage:
         return state
 
     def _present(self) -> WarmUp:
-        """The warm-up to go on with; a new one where the joints have cooled down.
+        """Return the warm-up to continue; a new one if the joints have cooled down.
 
-        A motion that is entered in the manifest and not here was the last one of a run that was
-        killed between the two.
+        A motion in the manifest that is not in `warmup.json` was the last one of a run that was
+        killed between writing the two.
         """
         run, state = self._run, self._state()
         name = run.folder.whole("warmup", state.next_index)
@@ -352,7 +347,7 @@ class WarmUpStage:
             state = self._saved(state, name, max(state.moved_at or 0.0, written))
         if state.motions and state.cold(time.time()):
             rested = state.rested(time.time())
-            run.reporter.say(f"{rested} and is assumed to be cold: warming up anew")
-            self._pauses.append(f"{rested} during the campaign, and was warmed up anew")
+            run.reporter.say(f"{rested} and is assumed to be cold: warming up again")
+            self._pauses.append(f"{rested} during the campaign, and was warmed up again")
             return state.cooled()
         return state

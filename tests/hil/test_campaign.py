@@ -29,7 +29,7 @@ from hil.campaign import (
     Stop,
 )
 from hil.campaign import campaign as campaign_module
-from hil.campaign.intervals import Interval, StraightMoves, hold, require_sound, wanted
+from hil.campaign.intervals import Interval, StraightMoves, hold, planned_intervals, require_allowed
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, InputError
 from hil.motion_checks import MotionChecks
@@ -327,7 +327,7 @@ def test_an_older_folder_that_must_not_be_run_is_refused(
 
 def test_only_a_way_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan) -> None:
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
-    intervals = wanted(cell, plan)
+    intervals = planned_intervals(cell, plan)
     ways = StraightMoves(cell, MotionChecks.of(cell)).joining(intervals, low)
     assert [way.from_arm for way in ways if way.kind == "move"] == [True, True]
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
@@ -335,7 +335,7 @@ def test_only_a_way_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan
         StraightMoves(cell, buried).joining(intervals, low)
     wild = Interval("excitation", 0, hold(cell.home + 10.0, 1.0))
     with pytest.raises(MotionRefusedError, match=r"repetition 1 .*; design another motion\."):
-        require_sound([wild], buried)
+        require_allowed([wild], buried)
 
 
 def test_folders_in_use_and_foreign_ones_are_named(campaign: Campaign, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from hil.identify import identify_campaign
 from hil.motion_checks import MotionChecks
 from hil.move import straight_way
 from hil.progress import Silent
-from hil.recording import dated_anew, origin_of
+from hil.recording import origin_of, with_present_date
 from hil.report.page import when
 from hil.version import software
 from planner import TrajectoryPlayer
@@ -289,8 +289,8 @@ def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     assert said["simulated"] == "yes"
     assert datetime.fromisoformat(said["recorded_at"]).tzinfo is not None
     earlier = {**said, "recorded_at": "2026-03-01T08:00:00+00:00"}
-    assert dated_anew(earlier)["recorded_at"] >= said["recorded_at"]
-    assert "recorded_at" not in dated_anew({"simulated": "yes"})
+    assert with_present_date(earlier)["recorded_at"] >= said["recorded_at"]
+    assert "recorded_at" not in with_present_date({"simulated": "yes"})
     recorded = conduct_of(ran.folder).recorded
     assert when(recorded).startswith("No date")
     dates = ("2026-03-01T10:05:00+00:00", "2026-03-01T08:01:30+00:00")

@@ -50,7 +50,7 @@ from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.motion_link import active_checks
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
-from hil.campaign.quality import FIELDS, Played, RepetitionCheck
+from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
 from hil.campaign.status import conduct_of
@@ -418,8 +418,8 @@ def test_a_repetition_with_lost_answers_is_as_planned(
     np.testing.assert_allclose(*both, atol=1e-5)
 
 
-def played(archive: Path) -> Played:
-    return Played.of(open_archive(archive, fields=FIELDS))
+def played(archive: Path) -> Executed:
+    return Executed.of(open_archive(archive, fields=FIELDS))
 
 
 @pytest.mark.parametrize(
@@ -931,7 +931,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     assert "not named in its campaign's manifest.json" in told.reason
     good = campaign.folder.completed("excitation")
     doubts = gather_sources([*good, slowed], 0.5).warnings
-    assert any(doubt.startswith(f"{slowed.name} is not named") for doubt in doubts)
+    assert any(doubt.startswith(f"{slowed.name} is not in its campaign") for doubt in doubts)
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)
     assert [one.archive for one in again.rejected] == [slowed.name], "judged by the next run"

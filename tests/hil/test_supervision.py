@@ -402,17 +402,17 @@ def watch(operator: Failing) -> RunWatch:
 def test_a_screen_that_fails_is_asked_all_the_same(operator: Failing, watch: RunWatch) -> None:
     operator.fails = True
     for _ in range(3):
-        watch.note("good")
+        watch.add_note("good")
     assert operator.shown == 1
     operator.answer = OperatorRequest(0.4, held=True)
     assert watch.request() == operator.answer
     assert not watch.stop.requested
-    (trouble,) = watch.troubles
-    assert "no picture" in trouble
+    (problem,) = watch.problems
+    assert "no picture" in problem
     for answer, expected in ((0.4, 0.4), (None, 0.4), (0.3, 0.3)):
         operator.answer = None if answer is None else OperatorRequest(answer)
         assert watch.request() == OperatorRequest(expected)
-    assert "None is no OperatorRequest" in watch.troubles[-1]
+    assert "None is no OperatorRequest" in watch.problems[-1]
     assert not watch.stop.requested
 
 
@@ -423,7 +423,7 @@ def test_a_hold_that_nobody_can_release_becomes_a_stop(operator: Failing, watch:
     operator.answer = None
     assert watch.request().held
     assert watch.stop.requested
-    assert "the run was stopped" in watch.troubles[0]
+    assert "the run was stopped" in watch.problems[0]
 
 
 # --- When an arm that the controller moves counts as being at rest

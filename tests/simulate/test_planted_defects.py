@@ -102,7 +102,7 @@ def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
 
 def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
     """A run does not believe what the one before it has entered."""
-    whole, play = CampaignFolder.whole, Runner.play
+    whole, play = CampaignFolder.whole, Runner.run_motion
     begun: list[bool] = []
 
     def believed(self: CampaignFolder, kind: str, index: int) -> str | None:
@@ -120,7 +120,7 @@ def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
 
     patch.setattr(CampaignFolder, "whole", believed)
     patch.setattr(CampaignFolder, "require_unchanged", begins)
-    patch.setattr(Runner, "play", played)
+    patch.setattr(Runner, "run_motion", played)
 
 
 def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
@@ -196,7 +196,7 @@ def test_a_defect_that_needs_no_fault_is_no_reason_to_draw_another_arm(
     def fails(self: Runner, *arguments: Any) -> str:
         raise TypeError("planted")
 
-    monkeypatch.setattr(Runner, "play", fails)
+    monkeypatch.setattr(Runner, "run_motion", fails)
     verdict = stage.verdict(SEED + NEIGHBOURS)
     assert verdict.broken[0][0] == "undisturbed"
     assert "it ended TypeError: planted" in verdict.broken[0][1]

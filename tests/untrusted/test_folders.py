@@ -32,7 +32,7 @@ from hil.archive.container import MAGIC
 from hil.campaign import Campaign, CampaignFolderError
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import LOCK, CampaignFolder
-from hil.campaign.quality import Played
+from hil.campaign.quality import Executed
 from hil.campaign.rehearsal import Criterion, Rehearsal
 from hil.campaign.status import conduct_of
 from hil.campaign.warmup import FrictionMeter, WarmUp
@@ -465,7 +465,7 @@ def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, fold
     names = ["dryrun_000_a1.mcap"]
     for way in (
         lambda: DryRun.of(campaign.folder, cell, names, plan_hash="", simulated=True),
-        lambda: Played.of(open_archive(imported)),
+        lambda: Executed.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
     ):
         with pytest.raises(ArchiveError, match="is not a recording by hil"):
