@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Campaign:
-    """One folder: a cell, a plan, and what of it has been done."""
+    """A campaign folder with its cell and its plan."""
 
     folder: CampaignFolder
     cell: Cell
@@ -54,24 +54,22 @@ class Campaign:
         *,
         exist_ok: bool = False,
     ) -> Campaign:
-        """A new campaign folder with its own copies of cell, URDF and plan.
+        """Create a campaign folder with its own copies of cell, URDF and plan.
 
         Args:
-            folder: the folder to make; it may hold the design that the plan comes from.
+            folder: the folder to create; it may hold the design of the excitation.
             cell: the cell.
-            excitation: an excitation, around which validation motions are drawn as `[campaign]`
-                says; or a whole plan, with validation motions of its own.
-            checks: those of the cell, where they are at hand.
-            exist_ok: open the campaign that the folder holds already, if its cell and its
-                excitation are these.
+            excitation: an excitation, to which random validation motions are added as given in
+                `[campaign]`; or a plan with its own validation motions.
+            checks: of the cell, if available.
+            exist_ok: open the campaign of the folder if it has this cell and excitation.
 
         Raises:
-            CampaignFolderError: the folder holds something already; with `exist_ok`, something
-                else than this campaign.
-            MotionRefusedError: the plan can never run on the cell; no folder was made.
-            NoExcitationError: no validation motion keeps the constraints of the cell.
-            WrongObjectError: it was given something that is no cell or no excitation.
-            OutputError: the disk refuses; the folder is as it was.
+            CampaignFolderError: the folder is not empty; with `exist_ok`, it is another campaign.
+            MotionRefusedError: the plan cannot run on the cell; no folder was created.
+            NoExcitationError: no validation motion satisfies the constraints of the cell.
+            WrongObjectError: `cell` or `excitation` has the wrong type.
+            OutputError: the disk refuses; the folder is unchanged.
         """
         root, plan = _path(folder), excitation
         if not isinstance(cell, Cell):
@@ -84,7 +82,7 @@ class Campaign:
             )
             raise WrongObjectError("excitation", plan, remedy)
         if exist_ok and CampaignFolder(root).plan.exists():
-            return cls.open(root)._if_of(cell, plan)
+            return cls.open(root)._require_same(cell, plan)
         if isinstance(plan, Excitation):
             checks = checks or MotionChecks.of(cell)
             plan = plan_around(cell, plan, checks)
@@ -112,7 +110,7 @@ class Campaign:
 
     @classmethod
     def open(cls, folder: Path | str) -> Campaign:
-        """An existing campaign folder.
+        """Open an existing campaign folder.
 
         Raises:
             CampaignFolderError: it is not one.
@@ -125,11 +123,11 @@ class Campaign:
             )
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
 
-    def _if_of(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Campaign:
-        """This campaign.
+    def _require_same(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Campaign:
+        """Return this campaign if it has this cell and excitation.
 
         Raises:
-            CampaignFolderError: its cell or its excitation is another one.
+            CampaignFolderError: it has another one.
         """
         own = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
         same = (own.text, own.urdf) == (self.cell.text, self.cell.urdf)
@@ -149,7 +147,7 @@ class Campaign:
         return f"Campaign({str(self.folder.root)!r}, cell {self.cell.name!r})"
 
     def status(self) -> CampaignStatus:
-        """What is done, what is next, and what to type for it."""
+        """Return which steps are done, and the command for the next one."""
         return status_of(self)
 
     def rehearse(
@@ -161,23 +159,23 @@ class Campaign:
         again: bool = False,
         drive: SimulatedDrive | None = None,
     ) -> Rehearsal:
-        """Run exactly this plan on a simulated twin of the cell, and judge it.
+        """Run the plan on a simulated copy of the cell, and judge it.
 
-        The result is in `rehearsal.json` and holds as long as cell, URDF and plan stay what they
-        are. A rehearsal that passed is not repeated, one that was stopped goes on.
+        The result is in `rehearsal.json` and is valid while cell, URDF and plan are unchanged. A
+        passed rehearsal is not repeated, a stopped one is resumed.
 
         Args:
             reporter: receives the progress.
-            seed: of what is planted in the twin, its noise and its link's faults.
+            seed: of the simulated parameters, noise and link faults.
             stop: ends it early.
-            again: rehearse once more even if it passed.
-            drive: the simulated arm's gears and motors, where they shall not be those of the cell
-                file; the result is then returned only, and opens no gate.
+            again: repeat a passed rehearsal.
+            drive: gears and motors of the simulated arm in place of the cell's; the result is then
+                only returned, and opens no gate.
 
         Raises:
             MotionRefusedError: a motion breaks a limit of the cell.
-            OperatorStopError: it was stopped; what was recorded remains.
-            CampaignFolderError: the folder was changed, or a run is at work on it.
+            OperatorStopError: it was stopped; its recordings remain.
+            CampaignFolderError: the folder was changed, or is in use by a run.
         """
         from .rehearsal_run import SEED, rehearse  # which runs campaigns
 
@@ -196,7 +194,7 @@ class Campaign:
         """Estimate from the archives, judge, and write results, exports and report to the folder.
 
         Raises:
-            InputError: there is no whole excitation yet, or the archives cannot be used.
+            InputError: there is no complete excitation yet, or the archives cannot be used.
             OutputError: the folder cannot be written to.
         """
         from hil.identify import Options, identify_campaign  # which knows campaign folders
@@ -207,7 +205,7 @@ class Campaign:
         return replace(found, results=write_outcome(self.folder.root, found, reporter))
 
     def report(self, *, reporter: Reporter | None = None) -> Path:
-        """The report, made anew from the results; from the archives where these know more.
+        """Write the report again from the results, or from the archives if there are newer ones.
 
         Raises:
             InputError: nothing can be identified yet.
@@ -239,42 +237,39 @@ class Campaign:
         live: LiveView | None = None,
         repetitions: int | None = None,
     ) -> RunResult:
-        """Run what is still missing, in order, and return to where the arm was.
+        """Run the motions that are missing, in order, and return the arm to its first position.
 
-        A plan is run after it passed its rehearsal on the simulated twin, and at full speed only
-        after a person has accepted its slow dry run. Every motion is checked before the first one
-        is sent. A motion that fails its quality check is archived as rejected, with the reason,
-        and run again.
+        The plan must have passed its rehearsal, and runs at full speed only after its dry run was
+        accepted. Every motion is checked before the first one is sent. A motion that fails its
+        quality check is archived as rejected, with the reason, and run again.
 
         Args:
-            link: to the controller; the cell's own if left out. A cell with the transport
-                "simulated" has a simulated controller in virtual time.
-            stop: set from outside to bring the arm to rest on its path.
+            link: to the controller; by default the cell's own. That of a cell with the transport
+                "simulated" is a simulated controller in virtual time.
+            stop: brings the arm to rest on its path.
             reporter: receives the progress.
-            operator: sees each motion, may slow or hold it, and is asked to accept the dry run;
-                nobody if left out.
-            provenance: goes into the metadata of every archive, e.g. whether it is simulated.
-            durable: wait at each flush until the disk has the data; left out, in real time only.
-            unrehearsed: without rehearsal and dry run; only a simulated arm allows that.
+            operator: is shown each motion, may slow or hold it, and is asked to accept the dry run.
+            provenance: metadata of every archive, e.g. whether it is simulated.
+            durable: wait at each flush until the disk has the data; by default in real time only.
+            unrehearsed: run without rehearsal and dry run; with a simulated arm only.
             dry_run_only: end after the dry run.
-            accept_dry_run: the caller accepts the dry run that was done before; on a simulated
-                link also the one that this run does.
-            accept_torque: joints whose torque ran against the model's gravity in the dry run that
-                was done before (`DryRun.against_gravity`), accepted by name.
-            live: of the cell's own link: lets viewers look at what is recorded.
-            repetitions: of the excitation that are enough for now, without validation motions;
-                the whole plan if left out.
+            accept_dry_run: accept the dry run of an earlier run; on a simulated link also that of
+                this run.
+            accept_torque: joints to accept whose torque had the opposite sign of gravity in the
+                dry run of an earlier run (`DryRun.against_gravity`).
+            live: where viewers may connect, on the cell's own link.
+            repetitions: of the excitation, without validation motions; by default the whole plan.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
-            DryRunError: nobody has accepted the dry run of the plan.
+            DryRunError: the dry run of the plan is not accepted.
             MotionRefusedError: a motion failed its check; nothing was sent.
             MotionFailedError: a motion ended otherwise than planned; it is archived.
-            RepetitionsRejectedError: a motion failed its quality check again and again.
-            ControllerFault: the controller did not come up.
-            OperatorStopError: a stop was asked for instead of an answer to the dry run.
-            CampaignFolderError: the folder was changed, or another run is at work on it.
-            OutputError: what came of it cannot be written down.
+            RepetitionsRejectedError: a motion failed its quality check too often.
+            ControllerFault: the controller was not ready.
+            OperatorStopError: the operator stopped instead of accepting the dry run.
+            CampaignFolderError: the folder was changed, or is in use by another run.
+            OutputError: a result cannot be written.
         """
         from .run import Run  # which `hil status` does not need
 
@@ -296,15 +291,15 @@ class Campaign:
 
 
 def _path(folder: object) -> Path:
-    """A folder as the caller names it."""
+    """Check the type of a folder."""
     if not isinstance(folder, str | PathLike):
         raise WrongObjectError("folder", folder, "give the path of a folder")
     return Path(folder)
 
 
-_OURS = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)
-"""What a campaign has before anything is recorded; the manifest goes first, so that what a crash
-leaves of the others is no campaign."""
+_FILES = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)
+"""Files of a campaign without recordings. The manifest is removed first: after a crash the rest is
+not a campaign."""
 
 
 def require_replaceable(root: Path) -> None:
@@ -320,24 +315,23 @@ def require_replaceable(root: Path) -> None:
 
 
 def campaign_of_design(root: Path, cell: Cell, excitation: Excitation) -> Campaign:
-    """A campaign of a designed motion, made in the folder of the design.
+    """Return the campaign of a designed motion, in the folder of the design.
 
-    One that is there already stays if it is of this motion and cell, and is replaced otherwise.
+    An existing campaign of another motion or cell is replaced.
 
     Raises:
-        CampaignFolderError: something was recorded in the campaign that is there, or the folder
-            holds files that are no campaign's and no design's.
+        CampaignFolderError: the existing campaign has recordings, or the folder has other files.
         CellError: the cell file lacks what a campaign needs.
         MotionRefusedError, NoExcitationError: see `Campaign.create`.
     """
-    _ = cell.controller  # named before anything is drawn
+    _ = cell.controller  # its absence is reported before the search for validation motions
     folder = CampaignFolder(root)
     if folder.sealed:
         with suppress(HilError):
             return Campaign.create(root, cell, excitation, exist_ok=True)
         require_replaceable(root)
         with folder.locked():
-            for name in _OURS:
+            for name in _FILES:
                 (root / name).unlink(missing_ok=True)
             shutil.rmtree(folder.archives, ignore_errors=True)
             shutil.rmtree(folder.rehearsed, ignore_errors=True)

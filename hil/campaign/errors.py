@@ -14,14 +14,14 @@ from hil.terminal_text import plural
 
 
 class CampaignFolderError(InputError):
-    """The campaign folder is not what it should be."""
+    """A campaign folder that cannot be used."""
 
     def __init__(self, folder: Path, problem: str, remedy: str) -> None:
         super().__init__(folder, problem, remedy=remedy)
 
 
 class WrongObjectError(InputError, TypeError):
-    """An argument is of another type than it has to be."""
+    """An argument of the wrong type."""
 
     def __init__(self, argument: str, given: object, remedy: str) -> None:
         what = "None" if given is None else f"an object of type {type(given).__name__}"
@@ -41,12 +41,11 @@ class MotionFailedError(ControllerFault):
     """A motion ended otherwise than planned; what was recorded is archived.
 
     Attributes:
-        motion: which one, as a person counts: "repetition 1".
+        motion: its name, counted from 1: "repetition 1".
         outcome: "stopped", "refused" or "lost".
-        reason: in words.
-        sentence: all of this, and the archive, without what is to be done.
-        flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to the refusal; None
-            where nothing was refused.
+        reason: of the outcome.
+        sentence: motion, archive, outcome and reason.
+        flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to a refusal, or None.
     """
 
     def __init__(
@@ -68,57 +67,57 @@ class MotionFailedError(ControllerFault):
 
 
 class NotRehearsedError(UnsafeError):
-    """A plan that did not pass its rehearsal is not run."""
+    """A plan that did not pass its rehearsal."""
 
     def __init__(self, campaign: Path, problem: str, remedy: str) -> None:
         super().__init__(f"{campaign} {problem}; {remedy}.")
 
 
 class DryRunError(UnsafeError):
-    """A plan is not run at full speed before a person has accepted its slow dry run."""
+    """A plan whose dry run is not accepted."""
 
     def __init__(self, campaign: Path, problem: str, remedy: str) -> None:
-        super().__init__(f"{campaign}: its slow dry run {problem}; {remedy}.")
+        super().__init__(f"{campaign}: its dry run {problem}; {remedy}.")
 
 
 class AgainstGravityError(DryRunError):
-    """A dry run whose torques contradict the model is accepted joint by joint, or not at all.
+    """A dry run with torques that contradict the model; each joint must be accepted by name.
 
     Attributes:
-        joints: whose torque runs against the model's gravity.
+        joints: whose torque has the opposite sign of the model's gravity.
     """
 
-    def __init__(self, campaign: Path, joints: Sequence[str], why: str) -> None:
+    def __init__(self, campaign: Path, joints: Sequence[str], problem: str) -> None:
         self.joints = tuple(joints)
         names = " ".join(f"--accept-torque {joint}" for joint in joints)
         super().__init__(
             campaign,
-            f"was done, but is not accepted ({', '.join(joints)}: {why})",
+            f"was done, but is not accepted ({', '.join(joints)}: {problem})",
             "correct the cell file and rehearse again, or, if you know that the arm is right and "
             f"the model is not, run `hil run {campaign} --accept-dry-run {names}`",
         )
 
 
 class RepetitionsRejectedError(HilError):
-    """A motion failed its quality check as often as it may be repeated, for these reasons."""
+    """A motion that failed its quality check in each attempt, for these reasons."""
 
     exit_code: ClassVar[int] = 5
 
     def __init__(self, motion: str, reasons: Sequence[str]) -> None:
         self.motion, self.reasons = motion, tuple(reasons)
         super().__init__(
-            f"{motion} was of no use {plural(len(self.reasons), 'time')}, at last because "
+            f"{motion} was rejected {plural(len(self.reasons), 'time')}, the last time because "
             f"{self.reasons[-1]}; all attempts are archived with their reasons: find the cause, "
             "then run the campaign again to continue."
         )
 
 
 class ArmChangedError(RepetitionsRejectedError):
-    """Later attempts at a motion agree with each other, and not with the repetitions that count.
+    """Later attempts at a motion agree with each other, and not with the accepted repetitions.
 
     Attributes:
-        reference: file names of the archives that count.
-        later: of those that agree with each other and were rejected.
+        reference: file names of the accepted archives.
+        later: of the rejected ones that agree with each other.
     """
 
     def __init__(
@@ -130,7 +129,7 @@ class ArmChangedError(RepetitionsRejectedError):
             self,
             f"{motion}: the last {len(later)} attempts ({', '.join(later)}) agree with each other, "
             f"and not with the {len(reference)} repetitions that count ({', '.join(reference)}): "
-            f"{differs}. Look at the arm: payload, tool, cables, belts, brakes, what stands near "
-            "it. If it can be put back as it was, do so and run the campaign again; if the later "
-            "ones are right, begin a new campaign.",
+            f"{differs}. Check the arm: payload, tool, cables, belts, brakes, obstacles. If it "
+            "can be restored, do so and run the campaign again; if the later attempts are right, "
+            "begin a new campaign.",
         )

@@ -1,9 +1,8 @@
-"""The campaign folder: what lies where, and which archives are whole.
+"""The campaign folder: its files, and its manifest of complete archives.
 
-`manifest.json` holds the checksums of cell, URDF and plan, and names every closed archive with its
-checksum and outcome. It is replaced atomically after each archive, so a killed run loses at most
-the archive being written, and that file is recognised as torn because the manifest does not name
-it.
+`manifest.json` has the checksums of cell, URDF and plan, and every closed archive with its checksum
+and outcome. It is replaced atomically after each archive, so that a killed run loses at most the
+archive being written, which the manifest does not name.
 """
 
 from __future__ import annotations
@@ -43,25 +42,24 @@ T = TypeVar("T")
 
 LOCK: Final = "campaign.lock"
 LOCK_PATIENCE: Final = 0.5
-"""s to wait for a lock: whoever looks whether somebody is at work holds it for a moment."""
+"""s to wait for a lock: `busy` holds it for a moment."""
 MESH: Final = "mesh "
-"""Begins the entry of a mesh, by its name in the URDF."""
+"""Prefix of the entry of a mesh, by its name in the URDF."""
 MISSING: Final = "missing"
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"
 
 
 def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
-    """An object of a dataclass or model, from the JSON that its fields were written as.
+    """Return an object of a dataclass or model from its JSON.
 
     Args:
         kind: of the object.
         text: the JSON.
-        strict: numbers are no texts. If not, each field is as strict as it says itself: a model
-            writes infinite numbers as words.
+        strict: whether texts are refused as numbers; a model may write infinite numbers as texts.
 
     Raises:
-        ValueError: it is no JSON, or a field is not what it has to be; names the first one.
+        ValueError: it is not JSON, or a field is invalid; names the first one.
     """
     try:
         return TypeAdapter(kind).validate_json(text, strict=strict or None)
@@ -74,13 +72,13 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
 def load_record(
     kind: type[T], path: Path, problem: str, remedy: str, *, version: int = 0, strict: bool = True
 ) -> T | None:
-    """What a step of a campaign left in its folder; None where there is nothing.
+    """Read the file of a campaign's step; return None where there is none.
 
     Args:
         kind: of the object.
         path: of the file.
-        problem: said of a file that cannot be read.
-        remedy: what to do about it.
+        problem: of a file that cannot be read.
+        remedy: for it.
         version: the only `format_version` that is read; 0 for any.
         strict: see `read_back`.
 
@@ -95,12 +93,13 @@ def load_record(
             raise ValueError(f"format version {found}, this is {version}")
         return read_back(kind, text, strict=strict)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        why = getattr(error, "strerror", None) or error
-        raise CampaignFolderError(path.parent, f"{path.name} {problem} ({why})", remedy) from error
+        cause = getattr(error, "strerror", None) or error
+        text = f"{path.name} {problem} ({cause})"
+        raise CampaignFolderError(path.parent, text, remedy) from error
 
 
 def save_record(path: Path, record: Any, version: int) -> None:
-    """Write a dataclass so that `load_record` reads it.
+    """Write a dataclass for `load_record`.
 
     Raises:
         OutputError: the disk refuses.
@@ -110,26 +109,23 @@ def save_record(path: Path, record: Any, version: int) -> None:
 
 
 def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
-    """Checksums of the inputs of a plan, and of the collision meshes that they name.
+    """Return the checksums of the inputs of a plan and of its collision meshes, by file name.
 
     Args:
-        contents: of `cell.toml`, `robot.urdf` and `plan.json`, as far as they are there.
-        root: folder that relative paths in them begin at.
-
-    Returns:
-        By file name; a mesh that cannot be read is "missing" (no motion is checked without).
+        contents: of `cell.toml`, `robot.urdf` and `plan.json`, as far as they exist.
+        root: folder of relative paths in them; a mesh that cannot be read is "missing".
     """
     sums = {name: digest(content) for name, content in contents.items()}
     try:
         urdf = urdf_tree(as_text(contents.get("robot.urdf", b"")))
         found = urdf.iterfind("./link/collision/geometry/mesh")
         meshes = sorted({name for mesh in found if (name := mesh.get("filename"))})
-    except (ModelError, UnicodeDecodeError):  # whoever loads it says so
+    except (ModelError, UnicodeDecodeError):  # reported by whoever loads it
         return sums
     try:
         cell = parse_toml(as_text(contents.get("cell.toml", b"")))
         folders = [root / name for name in cell["cell"]["mesh_folders"]]
-    except (ValueError, KeyError, TypeError):  # likewise
+    except (ValueError, KeyError, TypeError):  # as above
         folders = []
     for mesh in meshes:
         name = mesh.removeprefix("package://").removeprefix("file://")
@@ -139,7 +135,7 @@ def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
 
 
 def as_text(content: bytes) -> str:
-    """A file's content as reading it as text gives it (UTF-8, any line ends)."""
+    """Decode a file's content as a text file (UTF-8, any line ends)."""
     return io.TextIOWrapper(io.BytesIO(content), "utf-8").read()
 
 
@@ -156,12 +152,12 @@ class Entry:
 
     Attributes:
         name: of the file.
-        outcome: how its motion ended; "rejected" for one that ended well and is of no use.
+        outcome: of its motion; "rejected" for a completed one that failed its quality check.
         sha256: checksum of the file.
-        reason: why it is not completed, in words; "" for one that is.
+        reason: of the outcome; "" for "completed".
 
     Raises:
-        ValueError: it names a file elsewhere.
+        ValueError: `name` is a path to another folder.
     """
 
     name: str
@@ -171,7 +167,7 @@ class Entry:
 
     def __post_init__(self) -> None:
         if Path(self.name).name != self.name or not self.name.strip("."):
-            raise ValueError(f"{self.name!r} is no name of a file in archives/")
+            raise ValueError(f"{self.name!r} is not the name of a file in archives/")
 
 
 @dataclass(frozen=True)
@@ -192,19 +188,18 @@ class _Below:
 
 @dataclass(frozen=True)
 class CampaignFolder:
-    """Paths below one campaign folder, and what its manifest says.
+    """Paths below one campaign folder, and its manifest.
 
     Attributes:
         archives: folder of the MCAP files.
         cell, urdf: the campaign's own copies.
-        plan: excitation and validation motions, as planned.
-        results, report: what the identification found, for programs and for people.
-        rehearsal: how the rehearsal of the plan went.
-        rehearsed: folder of the rehearsal's own campaigns: its archives and reports.
-        dry_run: who accepted the slow dry run.
-        warmup: how the friction fell while the arm warmed up.
-        digests: of archives by name, so that one look at the folder reads each of them once; None
-            to read them each time.
+        plan: excitation and validation motions.
+        results, report: of the identification.
+        rehearsal: result of the rehearsal.
+        rehearsed: folder of the rehearsal's own campaigns.
+        dry_run: the dry run and its acceptance.
+        warmup: friction during the warm-up.
+        digests: cached checksums of archives by name; None to compute them each time.
     """
 
     root: Path
@@ -224,12 +219,12 @@ class CampaignFolder:
 
     @property
     def plan_hash(self) -> str:
-        """SHA-256 over cell, URDF, plan and collision meshes as they lie there."""
+        """SHA-256 over the present cell, URDF, plan and collision meshes."""
         return json_digest(self._inputs())
 
     @property
     def motion_hash(self) -> str:
-        """The same but for the number of repetitions: of what moves the arm, however often.
+        """SHA-256 as `plan_hash`, without the number of repetitions.
 
         Raises:
             CampaignFolderError: one of them cannot be read.
@@ -239,17 +234,15 @@ class CampaignFolder:
         try:
             cell = parse_toml(as_text(contents[self.cell.name]))
         except (KeyError, ValueError):
-            return json_digest(sums)  # no cell that anything could be run with
+            return json_digest(sums)  # not a cell that can be run
         cell.get("campaign", {}).pop("repetitions", None)
         return json_digest(sums | {self.cell.name: json_digest(cell)})
 
     def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
-        """The hash of a cell and a plan in memory, which must be those that lie in the folder.
-
-        What is judged, run and stamped is then one and the same, whatever is edited meanwhile.
+        """Return the hash of a cell and a plan in memory, which must be those of the folder.
 
         Raises:
-            CampaignFolderError: one of them was changed since it was read.
+            CampaignFolderError: one of the files was changed since it was read.
         """
         contents = self._contents()
         names = self.cell.name, self.urdf.name, self.plan.name
@@ -260,7 +253,7 @@ class CampaignFolder:
                 raise CampaignFolderError(
                     self.root,
                     f"{name} was changed after it was read",
-                    "open the campaign anew, and begin this step again",
+                    "open the campaign again, and repeat this step",
                 )
         return json_digest(self._checksums(contents))
 
@@ -270,10 +263,10 @@ class CampaignFolder:
         return path_exists(self._path)
 
     def locked(self) -> AbstractContextManager[None]:
-        """Keep every other run out of the folder; a run that dies lets go of it.
+        """Lock the folder against other runs; the lock of a killed run is released.
 
         Raises:
-            CampaignFolderError: another run is at work on it, or the disk refuses.
+            CampaignFolderError: it is locked by another run, or the disk refuses.
         """
 
         def refusal(error: OSError) -> CampaignFolderError:
@@ -288,18 +281,18 @@ class CampaignFolder:
 
     @property
     def busy(self) -> bool:
-        """Whether a run is at work on the folder at this moment."""
+        """Whether a run uses the folder now."""
         return is_locked(self.root / LOCK)
 
     def seal(self) -> None:
-        """Begin the manifest with the checksums of what the campaign is about."""
+        """Create the manifest with the checksums of cell, URDF, plan and meshes."""
         self._save(_Manifest(self._inputs(), []))
 
     def accept_changes(self) -> None:
-        """Take cell, URDF and plan as they are, if nothing has been recorded with them yet.
+        """Accept changes of cell, URDF and plan if there are no recordings yet.
 
         Raises:
-            CampaignFolderError: something was recorded, and one of them changed since.
+            CampaignFolderError: there are recordings, and one of the files was changed since.
         """
         manifest = self._manifest()
         if not manifest.archives:
@@ -309,10 +302,10 @@ class CampaignFolder:
             raise CampaignFolderError(self.root, _ANOTHER.format(changed), _RESTORE)
 
     def require_unchanged(self) -> None:
-        """Refuse to go on if cell, URDF or plan are not those the campaign began with.
+        """Check that cell, URDF and plan are those of the manifest.
 
         Raises:
-            NotRehearsedError: names the file that changed.
+            NotRehearsedError: names the file that was changed.
         """
         if changed := self._changed():
             again = f"restore it, or rehearse again (`hil rehearse {self.root}`)"
@@ -320,7 +313,7 @@ class CampaignFolder:
             raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
 
     def manifest(self) -> list[Entry]:
-        """Closed archives in the order they were made.
+        """Return the closed archives in the order of their recording.
 
         Raises:
             CampaignFolderError: the manifest cannot be read.
@@ -328,7 +321,7 @@ class CampaignFolder:
         return self._manifest().archives
 
     def add(self, name: str, outcome: str, reason: str = "") -> None:
-        """Enter a closed archive into the manifest, or anew what became of one.
+        """Enter a closed archive in the manifest, or change the outcome of one.
 
         Raises:
             CampaignFolderError: the disk refuses.
@@ -340,15 +333,15 @@ class CampaignFolder:
         self._save(replace(manifest, archives=entries))
 
     def whole(self, kind: str, index: int) -> str | None:
-        """Name of the whole archive of this interval, if there is one with outcome `completed`."""
+        """Return the name of the completed archive of this interval, or None."""
         return self._whole(kind, index).get(index)
 
     def completed(self, kind: str) -> list[Path]:
-        """Whole archives of one kind, by index; of several attempts the last completed one."""
+        """Return the completed archives of a kind by index; of several attempts the last one."""
         return [self.archives / name for _, name in sorted(self._whole(kind).items())]
 
     def damaged(self) -> list[str]:
-        """What the manifest names and is missing, or is not what was written, in words."""
+        """Return a sentence for each archive of the manifest that is missing or was changed."""
         return [
             f"{entry.name} is missing or is not what was recorded, and was left out"
             for entry in self.manifest()
@@ -356,7 +349,7 @@ class CampaignFolder:
         ]
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
-        """Name of the next attempt at an interval; never one that lies there or ever did.
+        """Return the name of the next attempt at an interval; no name is used twice.
 
         Raises:
             CampaignFolderError: the manifest cannot be read.
@@ -369,7 +362,7 @@ class CampaignFolder:
         return ArchiveName(kind, index, attempt)
 
     def _whole(self, kind: str, index: int | None = None) -> dict[int, str]:
-        """Names of the whole archives of a kind (of one of them) by index, the last ones."""
+        """Return the names of the completed archives of a kind by index, the last attempts."""
         found: dict[int, str] = {}
         for entry in reversed(self.manifest()):
             name = ArchiveName.parse(entry.name)
@@ -384,11 +377,11 @@ class CampaignFolder:
         return found
 
     def _changed(self) -> str | None:
-        """The first file that is not the one that was sealed."""
+        """Return the first file that differs from the manifest."""
         sealed, now = self._manifest().inputs, self._inputs()
         for name in sorted(sealed.keys() | now.keys()):
             if name.startswith(MESH) and name not in sealed:
-                continue  # sealed by a version that did not look at meshes
+                continue  # created by a version without checksums of meshes
             if sealed.get(name) != now.get(name):
                 return name
         return None
@@ -407,10 +400,10 @@ class CampaignFolder:
             ) from error
 
     def _contents(self) -> dict[str, bytes]:
-        """Cell, plan and URDF by file name, each read once.
+        """Return the contents of cell, plan and URDF by file name.
 
         Raises:
-            CampaignFolderError: one is there and cannot be read.
+            CampaignFolderError: one cannot be read.
         """
         contents = {}
         for file in (self.cell, self.plan, self.urdf):
@@ -425,11 +418,11 @@ class CampaignFolder:
         return contents
 
     def _inputs(self) -> dict[str, str]:
-        """Checksums of cell, plan, URDF and meshes by name."""
+        """Return the checksums of cell, plan, URDF and meshes by name."""
         return self._checksums(self._contents())
 
     def _checksums(self, contents: dict[str, bytes]) -> dict[str, str]:
-        """Checksums of these; a mesh that is not on this computer counts as it was sealed."""
+        """Return checksums; a mesh that is not on this computer has that of the manifest."""
         sums = checksums(contents, self.root)
         if MISSING in sums.values():
             sealed = self._manifest().inputs
@@ -441,7 +434,7 @@ class CampaignFolder:
         return found or _Manifest({}, [])
 
     def _save(self, manifest: _Manifest) -> None:
-        # A line an archive. With `indent` each call leaves a reference cycle, motion by motion.
+        # One line per archive; `indent` would leave a reference cycle in each call.
         archives = ",\n".join(json.dumps(asdict(one)) for one in manifest.archives)
         text = f'{{"inputs": {json.dumps(manifest.inputs)},\n"archives": [\n{archives}\n]}}\n'
         try:

@@ -1,4 +1,4 @@
-"""What must be done before a campaign moves an arm at full speed; each refusal says what to do."""
+"""Conditions for running a campaign at full speed; each refusal names its remedy."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from .run import Run
 
 _ADDRESS: Final = {"transport", "host", "port", "bind", "can", "packets"}
-"""Keys of `[controller]` that say where it is, and not what is exchanged."""
+"""Keys of `[controller]` with its address, which do not affect what is exchanged."""
 
 
 def require_gates(run: Run, dry_run: DryRunStage) -> None:
-    """Refuse what was not rehearsed, or whose dry run nobody can accept; nothing has moved yet.
+    """Require a passed rehearsal, and a dry run that is accepted or can be; nothing has moved yet.
 
     Raises:
-        NotRehearsedError, DryRunError: each says what to do.
+        NotRehearsedError, DryRunError: with the remedy.
         CampaignFolderError: folder, archives or link are not those of this campaign.
     """
-    _require_one_world(run)
+    _require_one_kind_of_arm(run)
     _require_own_link(run)
     root = run.folder.root
     if run.unrehearsed:
@@ -47,7 +47,7 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
     if (warning := require_rehearsed(run.folder, run.plan_hash).warning) is not None:
         run.notes.append(warning)
         run.reporter.say(f"note: {warning}")
-    # Before anything moves, where nobody could accept the dry run that is to come.
+    # Refused before anything moves if the dry run could not be accepted afterwards.
     found, first = dry_run.found(), f"run `hil run {root} --dry-run`"
     if found is None and run.accept_dry_run and not run.simulated:
         remedy = f"{first}, watch the arm, and accept it then"
@@ -56,17 +56,17 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
         return
     if found is None:
         remedy = f"{first} and watch the arm"
-        raise DryRunError(root, "was not done, and nobody is here to accept it", remedy)
+        raise DryRunError(root, "was not done, and nobody can accept it here", remedy)
     if found.accepted is None:
         raise not_accepted(run.folder, found.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
-    """The rehearsal of a plan, or of the folder's; one that was not passed is refused.
+    """Return the passed rehearsal of a plan, by default the folder's.
 
     Raises:
-        NotRehearsedError: there was none of exactly this cell, URDF and plan, or it failed.
-        CampaignFolderError: what it left cannot be read.
+        NotRehearsedError: there was none of this cell, URDF and plan, or it failed.
+        CampaignFolderError: its file cannot be read.
     """
     found = Rehearsal.load(folder)
     rehearse = f"run `hil rehearse {folder.root}`"
@@ -82,21 +82,21 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     return found
 
 
-def _require_one_world(run: Run) -> None:
-    """Refuse to mix a simulated arm and a real one in one campaign.
+def _require_one_kind_of_arm(run: Run) -> None:
+    """Refuse to mix a simulated and a real arm in one campaign.
 
-    What a simulated arm did slowly says nothing of the room around a real one, and what either
-    did must not be pooled. Archives that cannot be read are made anew.
+    A dry run of a simulated arm does not cover the surroundings of a real one, and their archives
+    must not be pooled. Archives that cannot be read are recorded again.
     """
-    ours = yes_or_no(run.simulated)
+    own = yes_or_no(run.simulated)
     for entry in run.folder.manifest():
-        path, made_by = run.folder.archives / entry.name, ours
+        path, made_by = run.folder.archives / entry.name, own
         with suppress(ArchiveError):
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
-        if made_by != ours:
+        if made_by != own:
             whose = {"yes": "a simulated arm", "no": "a real arm"}.get(
-                made_by, "an arm that they do not name (an earlier version wrote them)"
+                made_by, "an unknown kind of arm (written by an earlier version)"
             )
             link = "a simulated one" if run.simulated else "a real one"
             raise CampaignFolderError(
@@ -109,14 +109,13 @@ def _require_one_world(run: Run) -> None:
 def _require_own_link(run: Run) -> None:
     """Refuse a link that was opened for another arm than the campaign's.
 
-    The address may differ, and what is planted in a simulated arm; a link that does not say what
-    it was opened for is used as it is.
+    The address and the simulated arm may differ; a link without a cell is not checked.
     """
     other = getattr(run.link, "cell", None)
     if not isinstance(other, Cell) or other is run.cell:
         return
-    ours, theirs = _as_linked(run.cell), _as_linked(other)
-    if differ := [name for name in ours if ours[name] != theirs[name]]:
+    wanted, found = _sent_by(run.cell), _sent_by(other)
+    if differ := [name for name in wanted if wanted[name] != found[name]]:
         raise CampaignFolderError(
             run.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",
@@ -124,8 +123,8 @@ def _require_own_link(run: Run) -> None:
         )
 
 
-def _as_linked(cell: Cell) -> dict[str, Any]:
-    """What of a cell decides what a link sends, by table of its file."""
+def _sent_by(cell: Cell) -> dict[str, Any]:
+    """Return what affects the packets of a link, by table of the cell file."""
     file = cell.file
     return {
         "URDF": cell.urdf,
@@ -137,11 +136,11 @@ def _as_linked(cell: Cell) -> dict[str, Any]:
 
 
 def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None) -> None:
-    """Refuse a controller whose figures are not those that everything was checked with.
+    """Refuse a controller whose figures are not those of the rehearsal and the checks.
 
     Raises:
-        NotRehearsedError: names the differences, or each joint whose following error trips the
-            controller sooner than the rehearsal allowed, and both thresholds.
+        NotRehearsedError: names the differences, or each joint whose following-error threshold is
+            narrower in the controller, and both thresholds.
     """
     root, cell = run.folder.root, run.cell
     if connection.adopted and connection.differences:
@@ -154,7 +153,7 @@ def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None)
     below = narrower_limits(cell, connection, "following_error")
     if not below:
         return
-    needed = "what the motions need at full speed, no model tells"
+    needed = "what the motions need at full speed is unknown"
     if found is not None:
         turns = np.abs(cell.drive_train.motor_from_joint) @ np.array(found.following_error) / TURN
         both = zip(cell.joint_names, turns, strict=True)
@@ -162,8 +161,8 @@ def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None)
         needed = f"at {found.override:.0%} of the speed the dry run needed {seen}"
     raise NotRehearsedError(
         root,
-        "was planned and rehearsed with wider following-error thresholds than the controller "
-        f"announces ({'; '.join(below)}; {needed})",
+        "was planned and rehearsed with wider following-error thresholds than those of the "
+        f"controller ({'; '.join(below)}; {needed})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "
         "or widen them in the controller",
     )

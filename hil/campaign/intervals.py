@@ -30,26 +30,26 @@ from .plan import CampaignPlan
 Array = NDArray[np.float64]
 
 _ROUNDED: Final = 9e-7
-"""Share of half a joint's range by which the wire rounds an arm at its limit out of it; the guard
-of every cycle and the player allow as much."""
+"""Rounding of a position at its limit in packets, as a share of half a joint's range; guard and
+player allow as much."""
 AT_REST_TOLERANCE: Final = 1e-6
-"""rad; a move shorter than this is not worth an interval."""
+"""rad; a shorter move is left out."""
 START_TOLERANCE: Final = 1e-3
-"""rad by which a motion may begin elsewhere than where the arm is."""
+"""Largest distance of the arm from the start of a motion, rad."""
 REPEATED: Final = ("excitation", "warmup")
-"""Kinds that run the excitation as it was designed."""
+"""Kinds of motion that run the excitation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """One interval of motion: what kind it is, the trajectory to run, and the moves behind it.
+    """One interval of motion.
 
     Attributes:
         kind: "standstill", "excitation", "validation", "move", "dryrun" or "warmup".
         index: which of its kind, from 0.
         trajectory: the motion.
-        moves: those that it was planned from, where there are any.
-        from_arm: whether it is a way from or to where the arm happens to stand.
+        moves: that it was planned from, None without any.
+        from_arm: whether it is a way from or to the first position of the arm.
     """
 
     kind: str
@@ -63,35 +63,34 @@ class Interval:
 
     @property
     def ends(self) -> tuple[Array, Array]:
-        """Where it begins and where it ends, (n,) [rad] each."""
+        """Its first and last position, (n,) [rad] each."""
         start, end = self.trajectory.sample(np.array([0.0, self.trajectory.duration]))[0]
         return start, end
 
     def leads(self, start: Array, end: Array) -> bool:
-        """Whether it leads from `start` to `end` (n,) [rad]."""
+        """Return whether it leads from `start` to `end` (n,) [rad]."""
         first, last = self.ends
         apart = max(np.max(np.abs(first - start)), np.max(np.abs(last - end)))
         return bool(apart <= AT_REST_TOLERANCE)
 
     def places(self, home: Array) -> tuple[Array, Array]:
-        """Where the arm is to be before and after it (n,) [rad]: at home, as a rule.
+        """Return the position of the arm before and after it (n,) [rad], usually at home.
 
-        An excitation, and sines of any kind, may begin and end elsewhere; whatever else does is
-        not met.
+        Excitations and Fourier series may begin and end elsewhere.
         """
         own = self.kind in (*REPEATED, "dryrun") or isinstance(self.trajectory, FourierSeries)
         return self.ends if own else (home, home)
 
 
 def at_limit(posture: Array, limits: JointLimits) -> Array:
-    """A posture (n,) [rad], brought back to a limit that only rounding took it across."""
+    """Return a posture (n,) [rad], moved back to limits that are exceeded by rounding only."""
     within = np.clip(posture, limits.lower, limits.upper)
     rounding = 0.5 * _ROUNDED * (limits.upper - limits.lower)
     return np.where(np.abs(posture - within) <= rounding, within, posture)
 
 
 def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
-    """Which joint of a posture (n,) [rad] is outside its limits, in words and degrees."""
+    """Return which joint of a posture (n,) [rad] is outside its limits, in degrees, or None."""
     limits, frame = cell.joint_limits, AngleFrame.of(cell)
     posture = at_limit(posture, limits)
     outside = np.flatnonzero((posture < limits.lower) | (posture > limits.upper))
@@ -108,12 +107,12 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
 def planned_intervals(
     cell: Cell, plan: CampaignPlan, repetitions: int | None = None
 ) -> list[Interval]:
-    """All motions of a plan, without the ways between them.
+    """Return all motions of a plan, without the ways between them.
 
     Args:
-        cell: says how many repetitions there are.
+        cell: its `[campaign]`.
         plan: the motions.
-        repetitions: of the excitation, and no validation motion; None for all of both.
+        repetitions: of the excitation, without validation motions; None for all of both.
     """
     validation = plan.validation if repetitions is None else ()
     repetitions = cell.campaign.repetitions if repetitions is None else repetitions
@@ -135,10 +134,10 @@ class StraightMoves:
     def between(
         self, start: Array, end: Array, index: int, *, from_arm: bool = False
     ) -> Interval | None:
-        """The way from `start` to `end` (n,) [rad]; None where they are the same.
+        """Return the way from `start` to `end` (n,) [rad]; None where they are the same.
 
         Raises:
-            MotionRefusedError: it is not free.
+            MotionRefusedError: it failed its check.
         """
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
@@ -150,10 +149,10 @@ class StraightMoves:
         return replace(found, index=index)
 
     def joining(self, intervals: Sequence[Interval], where: Array) -> list[Interval]:
-        """These motions with the ways between them, from `where` (n,) [rad] to home, and back.
+        """Return these motions with the ways between them, from `where` (n,) [rad] and back.
 
         Raises:
-            MotionRefusedError: a way is not free, or a motion begins where no way leads.
+            MotionRefusedError: a way failed its check, or a motion begins where no way leads.
         """
         at, home, joined = where, self._cell.home, list[Interval]()
 
@@ -178,10 +177,10 @@ class StraightMoves:
 
 
 def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None:
-    """Refuse motions that must not be sent; each is looked at once.
+    """Check motions, each once.
 
     Raises:
-        MotionRefusedError: names the motion, what is wrong with it and what to do.
+        MotionRefusedError: one must not be sent.
     """
     different: dict[int, Interval] = {}
     for one in intervals:
@@ -191,19 +190,19 @@ def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None
 
 
 def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None) -> None:
-    """Refuse a plan that can never run on a cell, wherever its arm stands.
+    """Check that a plan can run on a cell, from any position of its arm.
 
     Raises:
-        MotionRefusedError: names the motion, what is wrong with it and what to do.
+        MotionRefusedError: it cannot.
     """
     checks = checks or MotionChecks.of(cell)
     intervals = planned_intervals(cell, plan)
-    require_allowed(intervals, checks)  # before ways are planned to where they lead
+    require_allowed(intervals, checks)  # before ways to them are planned
     StraightMoves(cell, checks).joining(intervals, cell.home)
 
 
 def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> TrajectoryPlayer:
-    """Plays a motion within the three sets of bounds of a cell."""
+    """Return a player of a motion within the bounds of a cell."""
     bounds = cell.file.bounds
     return TrajectoryPlayer(
         trajectory,
@@ -218,7 +217,7 @@ def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> Traject
 
 
 def hold(position: Array, duration: float) -> PiecewiseCubic:
-    """Rest at `position` (n,) [rad] for `duration` [s]."""
+    """Return a rest at `position` (n,) [rad] of `duration` s."""
     return PiecewiseCubic(
         knots=tuple(np.array([0.0, duration]) for _ in position),
         coefficients=tuple(np.array([[q, 0.0, 0.0, 0.0]]) for q in position),
@@ -226,13 +225,13 @@ def hold(position: Array, duration: float) -> PiecewiseCubic:
 
 
 def way(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Interval:
-    """The straight way between two postures (n,) [rad]; planned where a crash does not end us.
+    """Return the straight way between two postures (n,) [rad], planned in a child process.
 
     Args:
         cell: its limits.
-        start: where the arm stands.
-        end: where it is to go.
-        speed: fraction of the joints' speeds; the cell's `approach_speed` if left out.
+        start: first posture.
+        end: last posture.
+        speed: fraction of the joints' speeds; by default the cell's `approach_speed`.
 
     Raises:
         MotionRefusedError: one of them is outside the limits.
@@ -260,7 +259,7 @@ def _require(interval: Interval, problem: str | None) -> None:
 
 
 def _jump(before: Interval, after: Interval) -> str | None:
-    """Why `after` cannot follow `before`, or None if it begins where that ends."""
+    """Return why `after` cannot follow `before`, None if it begins where that ends."""
     end, start = before.ends[1], after.ends[0]
     distance = np.abs(start - end)
     if np.max(distance) <= START_TOLERANCE:

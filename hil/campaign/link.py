@@ -140,7 +140,10 @@ class Link(MotionLink):
                 self.ring.drain()
                 self.drain_packets()
                 self._poll()
-            yield
+            try:
+                yield
+            finally:
+                self._archiving = None  # which refers to this link
 
     def complete(self, outcome: str, reason: str) -> Recorder:
         """See `MotionLink.complete`."""

@@ -183,7 +183,7 @@ class Connection:
 
 def not_ready(state: State, waited: float) -> ControllerFault:
     """Return the error of a controller that was not ready for a motion after `waited` s."""
-    after, restart = f"within {waited:.3g} s", "start the program on the controller anew"
+    after, restart = f"within {waited:.3g} s", "restart the program on the controller"
     match state:
         case State.SYNC:
             problem = (

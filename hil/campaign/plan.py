@@ -1,7 +1,4 @@
-"""What a campaign is going to do: its excitation and its validation motions, in one small file.
-
-Around a designed excitation, or one found in a few seconds.
-"""
+"""Plan of a campaign: its excitation and its validation motions."""
 
 from __future__ import annotations
 
@@ -34,31 +31,31 @@ from planner import FourierSeries, PiecewiseCubic, PlanFile
 from .errors import MotionRefusedError
 
 LEAST: Final = 4
-"""Individuals that a genetic search needs."""
+"""Least population of a genetic search."""
 SLOWEST: Final = 0.5
-"""Smallest share of a joint's speed that is tried: slow motions excite little."""
+"""Smallest share of a joint's speed in the search: slow motions excite little."""
 LONGEST: Final = 60.0
-"""s that the excitation may last."""
+"""Longest excitation, s."""
 FORMAT_VERSION = 4
-"""1 kept no moves: of validation motions the trajectories only, and no limits. 2 knew excitations
-through via points only, without their method, 3 validation motions in pieces only, no sines."""
+"""1 has no moves and no limits; 2 excitations through via points only, without their method; 3 no
+Fourier series as validation motions."""
 READ = (1, 2, 3, FORMAT_VERSION)
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A motion, and the moves that it was planned from.
+    """A motion with its moves.
 
     Attributes:
         trajectory: the motion.
-        moves: start, moves and limits, without the motion; None where they were not stored.
+        moves: start, moves and limits, without the motion; None if they were not stored.
     """
 
     trajectory: PiecewiseCubic | FourierSeries
     moves: PlanFile | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return data; `from_dict` restores every bit, through JSON too."""
+        """Return data; `from_dict` restores every bit, also through JSON."""
         return {"trajectory": self.trajectory.to_dict(), **moves_to_dict(self.moves)}
 
     @classmethod
@@ -66,16 +63,13 @@ class PlannedMotion:
         """Restore what `to_dict` returned.
 
         Raises:
-            KeyError, TypeError, ValueError: the data are no planned motion.
+            KeyError, TypeError, ValueError: the data are not a planned motion.
         """
         return cls(trajectory_from_dict(data["trajectory"]), moves_from_dict(data))
 
 
 def moves_to_dict(moves: PlanFile | None) -> dict[str, Any]:
-    """Return the entry `moves` of data, a plan file without its motion; none without moves.
-
-    The motion stands beside it, so that it is not stored twice.
-    """
+    """Return the entry `moves` of data, a plan file without its motion; {} without moves."""
     return {} if moves is None else {"moves": replace(moves, trajectory=None).to_dict()}
 
 
@@ -86,13 +80,12 @@ def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
 
 @dataclass(frozen=True, eq=False)
 class CampaignPlan:
-    """The excitation, and the motions that are kept for validation and never fitted.
+    """The excitation, and motions that are predicted and never fitted.
 
     Attributes:
         excitation: the motion to fit, and how it was found.
         validation: the motions to predict.
-        moves: those of the excitation, with the limits that it was planned for; None for sines,
-            and where they were not stored.
+        moves: of the excitation, with its limits; None for Fourier series, and if not stored.
     """
 
     excitation: Excitation
@@ -104,7 +97,7 @@ class CampaignPlan:
         write_atomically(path, self.to_text())
 
     def to_text(self) -> str:
-        """The plan as JSON."""
+        """Return the plan as JSON."""
         content = {
             "format_version": FORMAT_VERSION,
             "excitation": self.excitation.to_dict(),
@@ -114,7 +107,7 @@ class CampaignPlan:
         return json.dumps(content) + "\n"
 
     def is_of(self, text: str) -> bool:
-        """Whether a text is this plan's, in whatever version and layout."""
+        """Return whether a text is this plan, in any format version and layout."""
         own = self.to_text()
         try:
             return text == own or CampaignPlan.from_text(text).to_text() == own
@@ -137,10 +130,10 @@ class CampaignPlan:
 
     @classmethod
     def from_text(cls, text: str) -> CampaignPlan:
-        """The plan from its JSON.
+        """Return the plan from its JSON.
 
         Raises:
-            ValueError, KeyError, TypeError, AttributeError: it is none.
+            ValueError, KeyError, TypeError, AttributeError: it is not a plan.
         """
         content: dict[str, Any] = parse_json(text)
         version = content["format_version"]
@@ -159,24 +152,21 @@ class CampaignPlan:
 
 
 def design(cell: Cell, reporter: Reporter) -> CampaignPlan:
-    """Search an excitation quickly and draw the validation motions, all within the cell.
+    """Search an excitation quickly, and add random validation motions.
 
-    The paper's method B with as few individuals as `[campaign].candidates` allows; `hil design`
-    searches longer and finds better ones.
+    The paper's method B with `[campaign].candidates` motions; `hil design` searches longer.
 
     Raises:
-        NoExcitationError: says which constraint forbids every motion, where, and by how much;
-            of the validation motions as well.
+        NoExcitationError: a constraint forbids every motion; names it with the position and amount.
     """
     excitation = run_search(cell, quick_settings(cell), reporter).excitation
     return plan_around(cell, excitation)
 
 
 def quick_settings(cell: Cell) -> DesignSettings:
-    """Settings of the quick search: its seed, via points and size are those of `[campaign]`.
+    """Return settings of the quick search with seed, via points and size of `[campaign]`.
 
-    It scores at most `candidates` motions (4 at least), in about as many generations as each has
-    individuals.
+    It evaluates at most `candidates` motions, at least 4, in a population of about their root.
     """
     campaign = cell.campaign
     motions = max(LEAST, campaign.candidates)
@@ -192,23 +182,23 @@ def quick_settings(cell: Cell) -> DesignSettings:
 def plan_around(
     cell: Cell, excitation: Excitation, checks: MotionChecks | None = None
 ) -> CampaignPlan:
-    """Return a plan with this excitation, and validation motions motion for the cell.
+    """Return a plan with this excitation and random validation motions.
 
     Args:
-        cell: whose `[campaign]` says how many validation motions, and from which seed.
+        cell: its `[campaign]` has number and seed of the validation motions.
         excitation: designed for this cell.
-        checks: those of the cell, where they are at hand.
+        checks: of the cell, if available.
 
     Raises:
         MotionRefusedError: the excitation must not be sent to this cell's arm.
-        NoExcitationError: no validation motion keeps the constraints; says which one.
+        NoExcitationError: no validation motion satisfies the constraints.
     """
     checks = checks or MotionChecks.of(cell)
     problem = checks.refusal(excitation.trajectory)
     if problem is not None:
         raise MotionRefusedError("the excitation", problem, "design another motion")
-    # A design may have judged some parameters only, or what it adds to earlier archives; what is
-    # executed is compared with the motion by itself, over all parameters.
+    # A design may be judged by some parameters only, or with earlier archives; the plan has the
+    # criteria of the motion alone, over all parameters.
     criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
     excitation = replace(excitation, criteria=criteria)
     validation = _validation_motions(cell, checks)
@@ -238,7 +228,7 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotio
 
 
 def _moves_of(cell: Cell, motion: Excitation | ViaPointMotion) -> PlanFile | None:
-    """The moves behind a motion through via points; none behind sines."""
+    """Return the moves of a motion through via points; None for Fourier series."""
     moves, via_points = motion.moves, motion.via_points
     if moves is None or via_points is None:
         return None

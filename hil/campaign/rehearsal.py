@@ -1,7 +1,4 @@
-"""How the rehearsal of a plan went: `rehearsal.json`.
-
-This says what was found; `hil.campaign.rehearsal_run` finds it.
-"""
+"""Result of a rehearsal: `rehearsal.json`, written by `hil.campaign.rehearsal_run`."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ from .folder import CampaignFolder, load_record
 FORMAT_VERSION: Final = 1
 AS_MODELLED: Final = "as modelled"
 EFFECTS: Final = "with what the model leaves out"
-"""The two runs of a rehearsal, in words."""
+"""The two runs of a rehearsal."""
 CRITERIA: Final = (
     f"motions ({AS_MODELLED})",
     f"current ({AS_MODELLED})",
@@ -28,15 +25,15 @@ CRITERIA: Final = (
     f"motions ({EFFECTS})",
     f"current ({EFFECTS})",
 )
-"""What a rehearsal that passed was judged by, all of it."""
+"""All criteria of a rehearsal."""
 
 
 class Criterion(Frozen):
-    """One thing that a rehearsal is judged by."""
+    """One criterion of a rehearsal."""
 
     name: str
     value: float | None
-    """What was found; null where it could not be found."""
+    """Null where it could not be determined."""
     bound: float
     """The largest value that passes."""
     passed: StrictBool
@@ -44,30 +41,30 @@ class Criterion(Frozen):
 
 
 class Rehearsal(Frozen):
-    """The rehearsal of exactly one plan."""
+    """The rehearsal of one plan."""
 
     format_version: Literal[1] = FORMAT_VERSION
     plan_hash: str
     """Of cell, URDF and plan as they were rehearsed."""
     seed: int
-    """Of the planted parameters, the noise and the link's faults."""
+    """Of the simulated parameters, the noise and the link faults."""
     passed: StrictBool
     criteria: list[Criterion]
     assumed: list[str]
-    """What the simulated arm has by assumption, in sentences."""
+    """Assumed properties of the simulated arm, in sentences."""
     not_seen: list[str]
-    """What this rehearsal cannot show, in sentences."""
+    """What this rehearsal cannot detect, in sentences."""
     repetitions: int
     motion_seconds: float
     software: dict[str, str]
     failed_seeds: tuple[int, ...] = ()
-    """With which exactly this plan failed before."""
+    """Seeds with which this plan failed before."""
     motion_hash: str = ""
-    """As `plan_hash`, whatever the number of repetitions; empty in files of older versions."""
+    """As `plan_hash`, without the number of repetitions; empty in files of older versions."""
 
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:
-        """Passed is what met every criterion there is, and nothing else."""
+        """Require that it passed if and only if it met every criterion."""
         met = [one.name for one in self.criteria if one.passed]
         if self.passed != (len(met) == len(self.criteria) and set(met) == {*CRITERIA}):
             raise ValueError("passed is not what its criteria say")
@@ -75,7 +72,7 @@ class Rehearsal(Frozen):
 
     @classmethod
     def load(cls, folder: CampaignFolder) -> Rehearsal | None:
-        """The rehearsal of a campaign, whatever plan it was of; None if there was none.
+        """Return the rehearsal of a campaign, of any plan; None without one.
 
         Raises:
             CampaignFolderError: the file cannot be read.
@@ -89,7 +86,7 @@ class Rehearsal(Frozen):
         )
 
     def save(self, path: Path) -> None:
-        """Write the file, whole or not at all.
+        """Write the file.
 
         Raises:
             OutputError: the disk refuses.
@@ -97,7 +94,7 @@ class Rehearsal(Frozen):
         write_output(path, self.model_dump_json(indent=1) + "\n")
 
     def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
-        """Whether it is the rehearsal of a plan, or of the same motions repeated as often or not.
+        """Return whether it is of this plan, up to the number of repetitions.
 
         Raises:
             CampaignFolderError: cell, URDF or plan cannot be read.
@@ -108,11 +105,11 @@ class Rehearsal(Frozen):
 
     @property
     def failures(self) -> tuple[str, ...]:
-        """What did not pass, in sentences."""
+        """Criteria that were not met, in sentences."""
         return tuple(one.sentence for one in self.criteria if not one.passed)
 
     def after(self, before: Rehearsal | None) -> Rehearsal:
-        """This one, with what the same plan failed with before: another seed does not undo it."""
+        """Return this rehearsal with the seeds with which the same plan failed before."""
         same = before is not None and (
             before.plan_hash == self.plan_hash or before.motion_hash == self.motion_hash
         )
@@ -123,7 +120,7 @@ class Rehearsal(Frozen):
 
     @property
     def warning(self) -> str | None:
-        """What a reader of one that passed must know, in a sentence; None for nothing."""
+        """Warning of a passed rehearsal, in a sentence; None for none."""
         if not self.passed or not self.failed_seeds:
             return None
         seeds = ", ".join(map(str, self.failed_seeds))
@@ -131,11 +128,11 @@ class Rehearsal(Frozen):
 
     @property
     def line(self) -> str:
-        """How it went, in one sentence."""
+        """Its result, in one sentence."""
         if self.passed:
             but = "" if self.warning is None else f"; {self.warning}"
             return (
-                f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot see is "
-                f"in rehearsal.json (not_seen){but}"
+                f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot detect "
+                f"is in rehearsal.json (not_seen){but}"
             )
         return f"the rehearsal failed: {'; '.join(self.failures)}"

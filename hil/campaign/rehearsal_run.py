@@ -1,9 +1,8 @@
-"""A rehearsal: exactly the plan of a campaign, on a simulated twin of its cell.
+"""Rehearsal: runs the plan of a campaign on a simulated arm close to the nominal one.
 
-The twin is an arm near the nominal one, behind the cell's own link. It knows of the cell what a
-robot would: its links, its gears, its limits. What nobody knows before the robot has moved is
-varied: masses, inertias, rotors and friction within `SPREAD` of the nominal figures. A cell without
-`[simulation]` gets one from `[nominal]` and the defaults below.
+The simulated arm has the links, gears and limits of the cell. Masses, inertias, rotors and friction
+are varied within `SPREAD` of their nominal values. A cell without `[simulation]` gets one from
+`[nominal]` and the defaults below.
 """
 
 from __future__ import annotations
@@ -56,37 +55,37 @@ from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 Array = NDArray[np.float64]
 
 SPREAD: Final = 0.1
-"""Largest relative distance of what is planted from what is nominal."""
+"""Largest relative deviation of the simulated parameters from the nominal ones."""
 NOISE_SHARE: Final = 0.005
-"""Current that flows about the target current, rms, as a share of the weakest motor's limit."""
+"""Noise of the current, rms, as a share of the weakest motor's limit."""
 RESOLUTION_SHARE: Final = 0.001
-"""Step of the target current, likewise."""
+"""Resolution of the target current, as a share of the same limit."""
 FAULT_EVERY: Final = 3.0
-"""s between two faults of the link, on average."""
+"""Mean time between two faults of the link, s."""
 LOOP_CYCLES: Final = 0.5
-"""A target current acts over the cycle before the packet: half a cycle earlier on average."""
+"""Mean delay of a target current, cycles: it acts over the cycle before the packet."""
 RESONANCE: Final = 500.0
-"""rad/s of a main axis, rotor against link, where the cell says nothing of elasticity."""
+"""Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
 FASTEST: Final = 800.0
-"""rad/s that no resonance exceeds in any posture: the simulated arm is stepped in half cycles."""
+"""Highest resonance in any posture, rad/s: the simulated arm has steps of half a cycle."""
 POSTURES: Final = 60
-"""That are looked at for it."""
+"""Postures in which the resonances are computed."""
 MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
-"""s; a slower current loop would shake the simulated arm."""
+"""Slowest current loop, s; a slower one makes the simulated arm oscillate."""
 _HORIZON: Final = 4.0
-"""Faults are varied for so many times the motion's length: settling and ways take time too."""
+"""Period of link faults as a multiple of the motions' duration: ways take time, too."""
 
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A simulated arm to rehearse on.
+    """A simulated arm for a rehearsal.
 
     Attributes:
-        cell: nominal, but simulated; what was varied is in its `[simulation]`.
-        truth: planted parameters (p,) in the order of the model.
-        assumed: what the arm has by assumption, in sentences.
-        seed: of everything varied.
+        cell: the cell with a simulated controller; its `[simulation]` has the varied parameters.
+        truth: simulated parameters (p,) in the order of the model.
+        assumed: assumed properties, in sentences.
+        seed: of the variation.
     """
 
     cell: Cell
@@ -96,7 +95,7 @@ class Twin:
 
     @classmethod
     def of(cls, cell: Cell, *, seed: int, repetitions: int) -> Twin:
-        """Draw an arm for a cell."""
+        """Return an arm with random parameters for a cell."""
         rng = np.random.default_rng(seed)
         planted = _varied(cell, rng)
         settings, assumed = _simulation(cell, planted, seed)
@@ -110,14 +109,14 @@ class Twin:
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
     def link(self, seconds: float, *, effects: bool, drive: SimulatedDrive | None = None) -> Link:
-        """A link in virtual time to the arm, with faults now and then."""
+        """Return a link in virtual time to the arm, with random faults."""
         table = self.cell.controller
-        # A current loop as late as the cell says that its currents are.
+        # The current loop has the delay of `[controller] current_delay_cycles`.
         lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
         settings = replace(
             controller_settings(self.cell, effects=effects),
             servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP))),
-            # Packets in a row that the cell says a motion survives.
+            # `[controller] max_gap` missed packets in a row end no motion.
             missed_replies=table.max_gap + 1,
             while_silent="continue",
         )
@@ -135,7 +134,7 @@ class Twin:
 
     @property
     def provenance(self) -> dict[str, str]:
-        """Metadata that mark an archive as a rehearsal's, and say what was planted."""
+        """Metadata of a rehearsal's archive, with the simulated parameters."""
         planted = dict(zip(self.cell.model.parameter_names, self.truth.tolist(), strict=True))
         return {
             **simulated_provenance(self.cell, effects=False),
@@ -145,19 +144,19 @@ class Twin:
 
 
 def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
-    """Faults of an ordinary network: single packets that are lost, doubled or late.
+    """Return faults of an ordinary network: single packets that are lost, doubled or late.
 
     Args:
-        cell: its `max_gap` says whether a lost packet is survived at all.
-        seconds: of the controller's time that they are varied for.
-        seed: of the draw.
+        cell: packets are lost only with a `max_gap` above 0.
+        seconds: period of the controller's time with faults.
+        seed: of the random numbers.
     """
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
     count = max(1, round(seconds / FAULT_EVERY))
     kinds = ["delay", "duplicate", *(["lose"] if cell.controller.max_gap else [])]
     faults: list[Fault] = []
-    # Not in the packets of the start: what is rehearsed is motion.
+    # Not in the packets of the start.
     for cycle in sorted(rng.integers(1000, max(1001, cycles), count).tolist()):
         match kinds[rng.integers(len(kinds))]:
             case "delay":
@@ -170,7 +169,7 @@ def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
 
 
 def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
-    """Inertias of links, rotors and friction within the spread of the URDF and of `[nominal]`."""
+    """Return inertias, rotors and friction varied about those of the URDF and `[nominal]`."""
     nominal = cell.nominal
     n = len(cell.joint_names)
 
@@ -190,7 +189,7 @@ def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
 def _simulation(
     cell: Cell, planted: dict[str, list[float]], seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    """`[simulation]` of the twin, and what in it is assumed."""
+    """Return `[simulation]` of the simulated arm, and what in it is assumed."""
     table: dict[str, Any] = {**planted, "seed": seed}
     assumed = []
     given = cell.file.simulation
@@ -200,7 +199,7 @@ def _simulation(
         table["current_noise"] = NOISE_SHARE * weakest
         table["current_resolution"] = RESOLUTION_SHARE * weakest
         assumed.append(
-            f"the current trembles by {table['current_noise']:.3g} A rms and comes in steps of "
+            f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
             f"{table['current_resolution']:.3g} A ({NOISE_SHARE:.1%} and {RESOLUTION_SHARE:.1%} of "
             "the weakest motor's limit)"
         )
@@ -210,23 +209,22 @@ def _simulation(
         effects = _ordinary_effects(cell, np.array(planted["rotor_inertia"]))
         table |= asdict(effects) | {"elasticity": list(effects.elasticity)}
         assumed.append(
-            f"what the model leaves out is of ordinary size: torque ripple of "
+            f"effects that the model leaves out have default sizes: torque ripple of "
             f"{effects.torque_ripple:.0%} of the Coulomb torque, friction that falls by "
             f"{effects.friction_drift:.0%}, springs in the main axes, {1e3 * effects.delay:g} ms "
             "of delay"
         )
     unknown = [key for key in ("rotor_inertia", "coulomb", "viscous") if not any(planted[key])]
     if unknown:
-        assumed.append(f"[nominal] has nothing but zeros for {', '.join(unknown)}: so has the arm")
+        assumed.append(f"[nominal] has only zeros for {', '.join(unknown)}: so has the arm")
     return table, assumed
 
 
 def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
-    """Effects at their default sizes, with springs that suit the size of the arm.
+    """Return effects of default sizes, with springs that suit the arm.
 
-    None is stiffer than resonates at `FASTEST` in any of some postures within the limits. Where
-    axes are almost parallel, as the first and the third of an arm with seven, the link beyond a
-    spring is much lighter than its own inertia says: the next axis gives way.
+    No resonance exceeds `FASTEST` in any of `POSTURES` random postures within the limits. Where
+    axes are almost parallel, the effective inertia beyond a spring is much below that of its link.
     """
     n, limits = len(rotors), cell.joint_limits
     model = pinocchio.buildModelFromXML(cell.urdf)
@@ -254,23 +252,23 @@ def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
 
 
 MOST_SIGMA: Final = 4.0
-"""Standard deviations that an estimate may lie from what was planted."""
+"""Largest deviation of an estimate from the simulated value, in standard deviations."""
 MOST_ERROR: Final = 1.2
-"""Error on unseen motion, as a multiple of what the planted parameters themselves leave."""
+"""Largest error on unseen motion, as a multiple of that of the simulated parameters."""
 SATURATED: Final = 0.99
-"""Share of it from which a motor counts as saturated."""
+"""Share of the current limit from which a motor is saturated."""
 _NAMED: Final = 3
 
 
-def judged(name: str, value: float | None, bound: float, good: str, bad: str = "") -> Criterion:
-    """A criterion that is met by a finite value up to `bound`.
+def criterion(name: str, value: float | None, bound: float, good: str, bad: str = "") -> Criterion:
+    """Return a criterion that is met by a finite value up to `bound`.
 
     Args:
         name: of the criterion.
-        value: what was found; None where it cannot be determined.
+        value: None where it cannot be determined.
         bound: the largest value that passes.
-        good: what was found, in words.
-        bad: the same of what does not pass, where that is more.
+        good: sentence of the result.
+        bad: sentence of a result that does not pass, if another.
     """
     known = value is not None and np.isfinite(value)
     passed = value is not None and known and value <= bound
@@ -284,7 +282,7 @@ def judged(name: str, value: float | None, bound: float, good: str, bad: str = "
 
 
 def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
-    """The largest current of any motor, as a share of its limit."""
+    """Judge the largest current of any motor, as a share of its limit."""
     worst, motor, where = 0.0, 0, ""
     limit = cell.drive_train.current_limit
     for entry in folder.manifest():
@@ -292,17 +290,17 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
         share = np.nan_to_num(current).max(axis=0, initial=0.0) / limit
         if share.max() > worst:
             worst, motor, where = float(share.max()), int(share.argmax()), entry.name
-    return judged(
+    return criterion(
         f"current ({name})",
         worst,
         bound,
         f"{name}: the largest current is {worst:.0%} of its limit (motor of "
-        f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is wanted",
+        f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is allowed",
     )
 
 
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
-    """What identification makes of the archives: determined, found again, predicting."""
+    """Judge an identification from the archives: determined, correct, predictive."""
     bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]
@@ -310,8 +308,10 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
         prepared = prepare_sources(gather_sources(paths, FIXED.split), FIXED, reporter)
         estimation = estimate_with(prepared, FIXED, reporter)
     except (InputError, IdentificationError, RecordingError) as error:
-        why = f"cannot be determined, for nothing can be identified ({error})"
-        return [judged(name, None, bound, f"{name}: {why}") for name, bound in bounds.items()]
+        problem = f"cannot be determined: the identification failed ({error})"
+        return [
+            criterion(name, None, bound, f"{name}: {problem}") for name, bound in bounds.items()
+        ]
     model, found = twin.cell.model, estimation.result.pooled
     undetermined = found.undetermined
     deviation = found.interval_factor / normal_limit(0.025) * found.std
@@ -328,35 +328,35 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
     joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
     error_is = (
         f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
-        f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is wanted"
+        f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is allowed"
     )
     return [
-        judged(
+        criterion(
             "excitation",
             float(len(undetermined)),
             bounds["excitation"],
             "the excitation determines every parameter",
-            f"the excitation says nothing about {len(undetermined)} parameters "
+            f"the excitation does not determine {len(undetermined)} parameters "
             f"({_some(undetermined)}): design a motion that moves every joint",
         ),
-        judged(
+        criterion(
             "parameters",
             sigma,
             MOST_SIGMA,
             f"all {known} parameters were found within {sigma or 0.0:.1f} standard deviations of "
-            f"what was planted, {MOST_SIGMA:g} are allowed",
+            f"the simulated values, {MOST_SIGMA:g} are allowed",
             f"{len(far)} of {known} parameters ({_some(far)}) are more than {asked}, up to "
-            f"{sigma:.3g}, from what was planted: the drive train or the model of the cell file is "
-            "not that of the arm"
+            f"{sigma:.3g}, from the simulated values: the drive train or the model of the cell "
+            "file is not that of the arm"
             if sigma is not None
             else "parameters: no parameter has a standard deviation",
         ),
-        judged(
+        criterion(
             "unseen motion",
             float(ratio[joint]),
             MOST_ERROR,
             error_is,
-            f"{error_is}: the excitation teaches too little; search a better one (`hil design`)",
+            f"{error_is}: the excitation is too poor; design a better one (`hil design`)",
         ),
     ]
 
@@ -367,10 +367,10 @@ def _some(names: Sequence[str]) -> str:
 
 
 REPETITIONS: Final = 3
-"""Of the excitation: enough for its spread, few enough for a minute."""
+"""Repetitions of the excitation: enough for their scatter, few enough for a minute."""
 SEED: Final = 1
 OTHER_DRIVE: Final = "other_drive"
-"""Folder of a rehearsal on other gears and motors than the cell file's; it opens no gate."""
+"""Folder of a rehearsal with other gears and motors than the cell's; it opens no gate."""
 
 
 def rehearse(
@@ -382,17 +382,16 @@ def rehearse(
     again: bool = False,
     drive: SimulatedDrive | None = None,
 ) -> Rehearsal:
-    """Run the plan on the twin, twice, and judge it; the result is in `rehearsal.json`.
+    """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
 
-    See `Campaign.rehearse`. Until something has been recorded in the campaign, changes of its cell
-    file are taken in when it is opened; later they are refused. Whatever is edited meanwhile, the
-    result is of the cell and plan that were rehearsed, or there is none.
+    Changes of the cell file are accepted until the campaign has recordings, but not during the
+    rehearsal.
 
     Raises:
         MotionRefusedError: a motion breaks a limit of the cell; nothing was rehearsed.
-        OperatorStopError: it was stopped; what was recorded remains.
-        CampaignFolderError: the folder was changed after the first archive, or meanwhile, or is
-            in use.
+        OperatorStopError: it was stopped; its recordings remain.
+        CampaignFolderError: the folder was changed after the first archive or during the
+            rehearsal, or is in use.
         OutputError: the result cannot be written.
     """
     folder, stop = campaign.folder, stop or Stop()
@@ -405,18 +404,18 @@ def rehearse(
             shutil.rmtree(where, ignore_errors=True)
             return _rehearsed(campaign, where, plan_hash, reporter, seed, stop, drive)
         before = None
-        with suppress(HilError):  # what cannot be read is made anew
+        with suppress(HilError):  # a file that cannot be read is replaced
             before = Rehearsal.load(folder)
         same = before is not None and before.covers(folder, plan_hash) and before.seed == seed
         if before is not None and same and before.passed and not again:
-            reporter.say("exactly this plan was rehearsed already and passed")
+            reporter.say("this plan has passed its rehearsal already")
             return before
         if again or (same and before is not None):
             shutil.rmtree(folder.rehearsed, ignore_errors=True)
         found = _rehearsed(campaign, folder.rehearsed, plan_hash, reporter, seed, stop, None)
         if folder.hash_of(campaign.cell, campaign.plan) != plan_hash:
             raise CampaignFolderError(
-                folder.root, "a mesh was changed while it was rehearsed", "rehearse again"
+                folder.root, "a mesh was changed during the rehearsal", "rehearse again"
             )
         found = found.after(before)
         found.save(folder.rehearsal)
@@ -439,7 +438,7 @@ def _rehearsed(
     criteria: list[Criterion] = []
     seconds = 0.0
     for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
-        # What the model leaves out is no matter of repetition.
+        # One repetition shows the effects that the model leaves out.
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
         rehearsal = _campaign(root / where, replace(campaign, cell=cell))
         reporter.say(f"rehearsing on a simulated arm, {name}")
@@ -449,7 +448,7 @@ def _rehearsed(
         failure = _failure(rehearsal, link, twin, reporter, stop)
         seconds += link.cycles * cell.period
         criteria.append(
-            judged(
+            criterion(
                 f"motions ({name})",
                 float(bool(failure)),
                 0.0,
@@ -461,7 +460,7 @@ def _rehearsed(
             bound = SATURATED if effects else PLANNED_CURRENT
             criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))
         if failure:
-            break  # the rest would say the same in other words
+            break  # the other criteria would fail for the same reason
         if not effects:
             criteria += of_estimate(twin, rehearsal.folder, reporter)
     names = {one.name for one in criteria}
@@ -480,12 +479,12 @@ def _rehearsed(
 
 
 def _campaign(root: Path, like: Campaign) -> Campaign:
-    """The twin's own campaign folder: that of a rehearsal that was stopped, or a new one."""
+    """Return the campaign of the simulated arm: that of a stopped rehearsal, or a new one."""
     with suppress(HilError):
         there = Campaign.open(root)
         expected = like.cell.with_urdf(there.folder.cell, there.folder.urdf.name)
         same = there.cell.text == expected.text and there.cell.urdf == expected.urdf
-        whole = there.folder.sealed  # else whoever made it was killed, or its disk was full
+        whole = there.folder.sealed  # else its creation was interrupted
         if same and whole and there.plan.to_text() == like.plan.to_text():
             return there
     shutil.rmtree(root, ignore_errors=True)
@@ -494,7 +493,7 @@ def _campaign(root: Path, like: Campaign) -> Campaign:
 
 
 def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, stop: Stop) -> str:
-    """Run what is missing; what went wrong, in words."""
+    """Run what is missing; return the failure in a sentence, "" for none."""
     try:
         rehearsal.run(
             link, stop, reporter, provenance=twin.provenance, durable=False, unrehearsed=True
@@ -502,7 +501,7 @@ def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, st
     except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
             raise OperatorStopError(
-                "the rehearsal was stopped; the recordings remain, rehearse again to go on"
+                "the rehearsal was stopped; the recordings remain, rehearse again to resume it"
             ) from error
         if isinstance(error, MotionFailedError):
             return error.sentence
@@ -511,7 +510,7 @@ def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, st
 
 
 def _not_seen(cell: Cell) -> list[str]:
-    """What no simulation of this cell file can show."""
+    """Return what no simulation of this cell file can detect."""
     known = cell.file.simulation
     given = set() if known is None else known.drive_train.model_fields_set
     unknown = [
@@ -524,7 +523,7 @@ def _not_seen(cell: Cell) -> list[str]:
     if unknown:
         sentences.append(
             f"{', '.join(unknown)} of [drive_train]: the simulated arm takes them from there, so "
-            "that a mistake in them cannot show; the controller's init packet (gears, coupling) "
-            "and the slow dry run (signs) will tell, or a table [simulation.drive_train] now"
+            "that errors in them are not detected; the controller's init packet (gears, coupling) "
+            "and the dry run (signs) detect them, or a table [simulation.drive_train] now"
         )
     return sentences

@@ -1,4 +1,4 @@
-"""Where a campaign stands and what to type next; how it was run, for a reader who was not there."""
+"""Progress of a campaign with the next command, and the conduct of its run for the report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 State = Literal["done", "next", "blocked"]
 
 _WANTED: Final = ("standstill", "excitation", "validation", "dryrun")
-"""Kinds of motion that a campaign cannot do without."""
+"""Kinds of motion that a campaign requires."""
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,9 @@ class Step:
     """One step of a campaign.
 
     Attributes:
-        state: whether it is done, is to be done next, or waits for one before it.
-        sentence: what is known of it.
-        command: what to type for it; "" for what is done, and where no command helps (the
-            sentence then says what does).
+        state: done, next, or blocked by an earlier step.
+        sentence: its result, or what is missing.
+        command: to do it; "" for a step that is done, or for which there is no command.
         details: more sentences, for the report.
         name: "design", "rehearse", "dry run", "warm-up", "repetitions", "validation", "identify"
             or "report".
@@ -52,19 +51,19 @@ class Step:
 
     @property
     def done(self) -> bool:
-        """Whether it is."""
+        """Whether it is done."""
         return self.state == "done"
 
 
 @dataclass(frozen=True)
 class CampaignStatus:
-    """Where a campaign stands.
+    """Progress of a campaign.
 
     Attributes:
         root: its folder.
-        plan_hash: of cell, URDF and plan as they lie there.
-        steps: in the order in which they are done.
-        notes: archives that are torn, damaged or rejected, and why, in sentences.
+        plan_hash: of its present cell, URDF and plan.
+        steps: in their order.
+        notes: truncated, damaged or rejected archives with the reason, in sentences.
     """
 
     root: str
@@ -79,16 +78,16 @@ class CampaignStatus:
 
     @property
     def next_command(self) -> str:
-        """What to type next; "" where nothing is left to do, or where no command helps."""
+        """Command of the next step; "" where there is none."""
         return next((step.command for step in self.steps if step.state == "next"), "")
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return the status for JSON."""
         return asdict(self) | {"complete": self.complete, "next_command": self.next_command}
 
 
 def status_of(campaign: Campaign) -> CampaignStatus:
-    """Look at what lies in a campaign's folder; nothing is changed.
+    """Return the progress of a campaign from the files in its folder; nothing is changed.
 
     Raises:
         CampaignFolderError: its manifest cannot be read.
@@ -96,9 +95,9 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
     at = shlex.quote(str(folder.root))
-    # With what makes the file of a step anew, should it be damaged: nothing makes up for the cell
-    # or the plan of recordings, nor for what a person saw.
-    looks: list[tuple[str, Callable[[], Step], str]] = [
+    # With the command that recreates the file of a step, should it be damaged: none does for the
+    # cell or the plan of recordings, nor for an acceptance.
+    evaluations: list[tuple[str, Callable[[], Step], str]] = [
         ("design", lambda: _design(campaign), ""),
         ("rehearse", lambda: _gate(campaign, _rehearsal(folder), folder.rehearsal), again),
         ("dry run", lambda: _gate(campaign, _dry_run(campaign), folder.dry_run), ""),
@@ -110,8 +109,8 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     ]
     steps: list[Step] = []
     first = ""
-    for name, look, mend in looks:
-        step = replace(_looked(look, mend), name=name)
+    for name, evaluate, repair in evaluations:
+        step = replace(_step(evaluate, repair), name=name)
         if step.done:
             step = replace(step, command="")
         elif first:
@@ -122,16 +121,16 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps), _notes(folder))
 
 
-def _looked(look: Callable[[], Step], mend: str = "") -> Step:
+def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:
     try:
-        return look()
-    except HilError as error:  # a file of one step says nothing of the others
-        return Step("next", str(error).rstrip("."), mend)
+        return evaluate()
+    except HilError as error:  # a damaged file of one step does not affect the others
+        return Step("next", str(error).rstrip("."), repair)
 
 
 def _design(campaign: Campaign) -> Step:
     excitation, folder = campaign.plan.excitation, campaign.folder
-    if folder.manifest():  # until something is recorded, a rehearsal takes changes in
+    if folder.manifest():  # before the first recording a rehearsal accepts changes
         folder.require_unchanged()
     motions = plural(len(campaign.plan.validation), "validation motion")
     return Step("done", f"an excitation of {excitation.trajectory.duration:.1f} s and {motions}")
@@ -151,7 +150,7 @@ def _rehearsal(folder: CampaignFolder) -> Step:
         "rehearse {}",
         (
             *(one.sentence for one in found.criteria),
-            *(f"not seen by it: {sentence}" for sentence in found.not_seen),
+            *(f"not detectable by it: {sentence}" for sentence in found.not_seen),
         ),
     )
 
@@ -165,14 +164,14 @@ def _dry_run(campaign: Campaign) -> Step:
         simulated=campaign.cell.only_simulated,
     )
     if found is None and folder.dry_run.exists():
-        was = "of another plan, of another kind of arm, or its archives are gone"
-        return Step("next", f"the one on record does not count: it is {was}", "run {} --dry-run")
+        problem = "of another plan or kind of arm, or its archives are missing"
+        return Step("next", f"the recorded one is not valid: {problem}", "run {} --dry-run")
     return _accepted(found)
 
 
 def _accepted(found: DryRun | None) -> Step:
     if found is None:
-        return Step("next", "not done: every motion at a fifth of its speed", "run {} --dry-run")
+        return Step("next", "not done: every motion at 20 % of its speed", "run {} --dry-run")
     if found.accepted is None:
         names = "".join(f" --accept-torque {joint}" for joint in found.against_gravity)
         but = "".join(f"; {warning}" for warning in found.warnings)
@@ -186,14 +185,14 @@ def _accepted(found: DryRun | None) -> Step:
         details=(
             f"largest current, of its limit: {currents}",
             f"{plural(len(found.archives), 'motion')} at {found.override:.0%} of their speed",
-            f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late",
+            f"{plural(found.missed, 'packet')} missed, {found.late} replies late",
             *(f"{warning}; it was accepted by name" for warning in found.warnings),
         ),
     )
 
 
 def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
-    """A step that a simulated arm may leave out, and has, once all is done at full speed."""
+    """Return a step, done if a simulated arm has left it out and run everything at full speed."""
     if found.done or record.exists() or not campaign.cell.only_simulated:
         return found
     if all(_motions(campaign, kind, kind).done for kind in ("excitation", "validation")):
@@ -212,23 +211,22 @@ def _warmed(campaign: Campaign) -> Step:
 
 
 def _warm_up(found: WarmUp | None) -> Step:
-    """As the report has it: done is an arm that was warm."""
+    """Return the step for the report: done if the arm was warm."""
     if found is None:
         return Step("next", "not done", "run {}")
     details = []
     if lost := len(found.earlier):
-        were = "was" if lost == 1 else "were"
-        details.append(f"{plural(lost, 'motion')} before {were} lost in a pause")
+        details.append(f"the arm cooled down in a pause after {plural(lost, 'motion')}")
     if found.outcome == "not warm":
         change = float(found.curve.change[-1]) if found.motions else math.nan
         left = (
             f"friction still changed by {change:.2%} a motion"
             if math.isfinite(change)
-            else "no joint moved enough to tell its friction"
+            else "no joint moved enough to measure its friction"
         )
         details.append(
-            f"{left}; below {found.threshold:.2%} was wanted, so the repetitions were begun while "
-            "it may have drifted, and what is estimated is its mean over them"
+            f"{left}; below {found.threshold:.2%} was required: friction may have drifted during "
+            "the repetitions, and its mean over them is estimated"
         )
     words = f"{found.outcome} after {plural(len(found.motions), 'motion')}"
     return Step("done" if found.outcome == "warm" else "next", words, "run {}", tuple(details))
@@ -238,7 +236,7 @@ def _motions(campaign: Campaign, kind: str, words: str) -> Step:
     total = sum(one.kind == kind for one in planned_intervals(campaign.cell, campaign.plan))
     whole = len(campaign.folder.completed(kind))
     state: State = "done" if whole >= total else "next"
-    return Step(state, f"{whole} of {total} {words} whole", "run {}")
+    return Step(state, f"{whole} of {total} {words} complete", "run {}")
 
 
 def _identified(folder: CampaignFolder) -> Step:
@@ -264,7 +262,7 @@ def _reported(folder: CampaignFolder) -> Step:
 
 
 def _notes(folder: CampaignFolder) -> tuple[str, ...]:
-    """Archives that are of no use, and why."""
+    """Return archives that are not used, with the reason."""
     entries = folder.manifest()
     there = {path.name for path in folder.archives.glob("*.mcap")}
     left = [_left_behind(folder, name) for name in sorted(there - {one.name for one in entries})]
@@ -273,12 +271,12 @@ def _notes(folder: CampaignFolder) -> tuple[str, ...]:
         for one in entries
         if one.outcome != "completed"
     ]
-    busy = ["a run or a rehearsal is at work on it now"] if folder.busy else []
+    busy = ["it is in use by a run or a rehearsal"] if folder.busy else []
     return (*busy, *folder.damaged(), *left, *bad)
 
 
 def _left_behind(folder: CampaignFolder, name: str) -> str:
-    """What becomes of an archive that its run had no time to enter."""
+    """Describe an archive that is not in the manifest."""
     parsed = ArchiveName.parse(name)
     needed = (
         parsed is not None
@@ -286,17 +284,17 @@ def _left_behind(folder: CampaignFolder, name: str) -> str:
         and folder.whole(parsed.kind, parsed.index) is None
     )
     becomes = (
-        ": used if it is whole, its motion run again if not"
+        "it is used if it is complete, its motion run again if not"
         if needed
-        else "; nothing is missing without it"
+        else "it is not needed"
     )
-    return f"{name} was left by a run that was killed{becomes}"
+    return f"{name} was left by a run that was killed; {becomes}"
 
 
 def conduct_of(folder: CampaignFolder) -> ConductResult:
-    """What rehearsal, dry run, warm-up and archives of a folder say; nothing is changed.
+    """Return the conduct of a campaign from the files in its folder; nothing is changed.
 
-    A file that cannot be read is reported in its step's words.
+    A file that cannot be read is reported in its step.
 
     Raises:
         CampaignFolderError: the manifest cannot be read.
@@ -310,9 +308,9 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
         return _warm_up(warm)
 
     steps = {
-        "rehearsal": _looked(lambda: _rehearsal(folder)),
-        "dry run": _looked(lambda: _accepted(DryRun.load(folder))),
-        "warm-up": _looked(warm_up),
+        "rehearsal": _step(lambda: _rehearsal(folder)),
+        "dry run": _step(lambda: _accepted(DryRun.load(folder))),
+        "warm-up": _step(warm_up),
         "repetitions": _whole(recorded, "excitation"),
         "validation": _whole(recorded, "validation"),
     }
@@ -336,14 +334,14 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
 def _whole(recorded: list[RecordedResult], kind: str) -> Step:
     own = [one for one in recorded if one.kind == kind]
     good = [one for one in own if one.outcome == "completed"]
-    words = f"{len(good)} whole, {sum(one.seconds for one in good):.0f} s of motion"
+    words = f"{len(good)} complete, {sum(one.seconds for one in good):.0f} s of motion"
     if bad := len(own) - len(good):
         words += f"; {bad} rejected or ended early"
     return Step("done" if good else "next", words)
 
 
 def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:
-    """What an archive says of its motion; None of one that is gone or cannot be read."""
+    """Return the conduct of a motion from its archive; None if it cannot be read."""
     name = ArchiveName.parse(entry.name)
     try:
         archive = open_archive(folder.archives / entry.name, fields=())

@@ -1,4 +1,4 @@
-"""Designed motions as files for controllers that `hil` does not drive itself.
+"""Designed motions as files for controllers that `hil` does not drive.
 
 Each motion as a table (CSV), as ROS 2's `trajectory_msgs/JointTrajectory` and, for arms of six
 turning joints, as URScript; and a player of the tables for a Universal Robots arm by ur_rtde.
@@ -26,11 +26,11 @@ Array = NDArray[np.float64]
 
 PLAYER: Final = "play_ur.py"
 RATE: Final = 500.0
-"""Hz of the tables: an e-Series controller's cycles."""
+"""Rate of the tables, Hz: the cycle of an e-Series controller."""
 ROS_RATE: Final = 100.0
-"""Hz of the points that a trajectory controller interpolates."""
+"""Rate of the points that a trajectory controller interpolates, Hz."""
 SCRIPT_RATE: Final = 125.0
-"""Hz of the set-points in a program that the controller has to hold as a whole."""
+"""Rate of the set-points of a URScript program, Hz."""
 UR_JOINTS: Final = 6
 
 _PLAYER: Final = '''\
@@ -56,11 +56,11 @@ receive.stopFileRecording()
 
 
 def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[str, ...]:
-    """Write a designed motion and validation motions of the cell into a folder; their names.
+    """Write a designed motion and validation motions into a folder; return the file names.
 
     Raises:
         MotionRefusedError: the motion breaks a constraint of the cell.
-        NoExcitationError: no validation motion keeps the constraints.
+        NoExcitationError: no validation motion satisfies the constraints.
         OutputError: the folder cannot be written to; nothing in it was changed.
     """
     plan = plan_around(cell, excitation, MotionChecks.of(cell))
@@ -70,7 +70,7 @@ def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[
 
 
 def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
-    """The texts of all motions of a plan by file name, and that of the player."""
+    """Return the texts of all motions of a plan and of the player by file name."""
     motions = {"excitation": plan.excitation.trajectory}
     for number, motion in enumerate(plan.validation):
         motions[f"validation_{number:03d}"] = motion.trajectory
@@ -87,10 +87,10 @@ def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
 
 
 def joint_trajectory(trajectory: Trajectory, joint_names: tuple[str, ...]) -> str:
-    """A motion as YAML of a `trajectory_msgs/msg/JointTrajectory`; the arm stands at its start."""
+    """Return a motion as YAML of a `trajectory_msgs/msg/JointTrajectory`."""
 
     def points() -> Iterator[str]:
-        time = _instants(trajectory, ROS_RATE)
+        time = _times(trajectory, ROS_RATE)
         for t, *motion in zip(time, *trajectory.sample(time), strict=True):
             nanoseconds = round(t * 1e9)
             for mark, key, values in zip(
@@ -106,9 +106,9 @@ def joint_trajectory(trajectory: Trajectory, joint_names: tuple[str, ...]) -> st
 
 
 def urscript(trajectory: Trajectory, name: str, repetitions: int) -> str:
-    """A motion of six joints as a URScript program that makes it so often, at rest in between."""
+    """Return a URScript program that repeats a motion of six joints, at rest in between."""
     cycle = 1.0 / SCRIPT_RATE
-    positions = trajectory.sample(_instants(trajectory, SCRIPT_RATE))[0]
+    positions = trajectory.sample(_times(trajectory, SCRIPT_RATE))[0]
     lines = [
         f"def {name}():",
         f"  movej({_list(positions[0])}, a=0.5, v=0.2)",
@@ -125,8 +125,8 @@ def urscript(trajectory: Trajectory, name: str, repetitions: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _instants(trajectory: Trajectory, rate: float) -> Array:
-    """Instants (m,) [s] from beginning to end; the last step may be shorter."""
+def _times(trajectory: Trajectory, rate: float) -> Array:
+    """Return times (m,) [s] from start to end; the last step may be shorter."""
     steps = np.arange(0.0, trajectory.duration, 1.0 / rate)
     return np.append(steps[: -1 if trajectory.duration - steps[-1] < 0.5 / rate else None],
                      trajectory.duration)  # fmt: skip

@@ -129,9 +129,9 @@ def test_status_names_what_is_torn_rejected_and_next(
     with folder.locked():
         notes = campaign.status().notes
     assert notes == (
-        "a run or a rehearsal is at work on it now",
-        "excitation_001_a1.mcap was left by a run that was killed: used if it is whole, its "
-        "motion run again if not",
+        "it is in use by a run or a rehearsal",
+        "excitation_001_a1.mcap was left by a run that was killed; it is used if it is complete, "
+        "its motion run again if not",
         "excitation_000_a1.mcap is rejected: a jam",
     )
 
@@ -233,7 +233,7 @@ def test_every_archive_and_what_was_left_out_is_in_the_conduct(ran: Campaign) ->
     steps = {one.step: one for one in conduct_of(ran.folder).steps}
     assert not steps["rehearsal"].done and steps["rehearsal"].words.startswith("not rehearsed")
     assert not steps["dry run"].done
-    assert steps["repetitions"].words.startswith("2 whole")
+    assert steps["repetitions"].words.startswith("2 complete")
     found = identify_campaign(ran.folder.root, Silent())
     assert found.results.conduct == conduct_of(ran.folder)
 
@@ -257,7 +257,7 @@ def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolde
     assert "shoulder 30%, elbow 12%" in steps["dry run"].details[0]
     assert not steps["warm-up"].done and steps["warm-up"].words == "not warm after 3 motions"
     (drifting,) = steps["warm-up"].details
-    assert "still changed by 11.11% a motion; below 0.20% was wanted" in drifting
+    assert "still changed by 11.11% a motion; below 0.20% was required" in drifting
     assert "1 rejected" in steps["repetitions"].words
     assert found.warm_up.friction == [[10.0, None], [9.0, None], [8.0, None]]
     assert found.warm_up.change[0] is None
@@ -503,6 +503,6 @@ def test_a_torn_archive_that_was_replaced_is_nothing_to_run_again(
     (folder.archives / "excitation_000_a2.mcap").write_bytes(whole.read_bytes())
     folder.add("excitation_000_a2.mcap", "completed")
     assert campaign.status().notes == (
-        "excitation_000_a1.mcap was left by a run that was killed; nothing is missing without it",
-        "move_000_a1.mcap was left by a run that was killed; nothing is missing without it",
+        "excitation_000_a1.mcap was left by a run that was killed; it is not needed",
+        "move_000_a1.mcap was left by a run that was killed; it is not needed",
     )

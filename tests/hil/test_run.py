@@ -368,7 +368,7 @@ def test_a_motion_that_is_never_of_use_ends_the_run(
     slow = Person(
         requests=lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
     )
-    with pytest.raises(RepetitionsRejectedError, match="of no use 3 times") as ended:
+    with pytest.raises(RepetitionsRejectedError, match="was rejected 3 times") as ended:
         campaign.run(operator=slow, unrehearsed=True)
     assert ended.value.exit_code == 5
     assert [e.outcome for e in campaign.folder.manifest() if "excitation" in e.name] == [
@@ -686,7 +686,7 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(
             mine.run(Real(simulated_link(mine.cell, instead_of_hardware=True)))
         step = mine.status().steps[2]
         assert (step.name, step.state) == ("dry run", "next")
-        assert "does not count" in step.sentence
+        assert "is not valid" in step.sentence
         assert not list(mine.folder.archives.iterdir())
 
 
@@ -1010,7 +1010,7 @@ def test_a_repetition_slowed_for_a_moment_is_no_attempt(make: Make) -> None:
     assert result.complete
     assert len(result.rejected) == 1
     kept = make("kept", bad_repetitions=0)
-    with pytest.raises(RepetitionsRejectedError, match="of no use 1 time,"):
+    with pytest.raises(RepetitionsRejectedError, match="was rejected 1 time,"):
         kept.run(operator=Person(lambda status: OperatorRequest(0.5)), unrehearsed=True)
 
 
@@ -1027,7 +1027,7 @@ def test_a_script_that_slows_each_attempt_is_ended(
         begins = status.phase == "repetition" and done is not None and done < 0.5
         return OperatorRequest(0.5 if begins else 1.0)
 
-    with pytest.raises(RepetitionsRejectedError, match=r"of no use 2 times.* held or slowed"):
+    with pytest.raises(RepetitionsRejectedError, match=r"was rejected 2 times.* held or slowed"):
         campaign.run(operator=Person(at_its_begin), stop=stop, unrehearsed=True)
 
 

@@ -51,7 +51,7 @@ class TestAControllerThatDoesNotBeginASession:
         first.connect(Stop())
         controller.emergency_stop()
         second = Link.over(SimulatedTransport(controller), cell)
-        with pytest.raises(ControllerFault, match=r"did not begin a session.*anew") as told:
+        with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as told:
             second.connect(Stop(), timeout=0.5)
         assert "switch the drive on" not in str(told.value)
 
