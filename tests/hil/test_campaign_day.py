@@ -297,7 +297,7 @@ def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     dated = [
         one.model_copy(update={"when": date}) for one, date in zip(recorded[:2], dates, strict=True)
     ]
-    assert when(dated).startswith("2026-03-01 08:01 to 10:05, ")
+    assert when(dated).startswith("2026-03-01 08:01 to 10:05 ")
 
 
 def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
