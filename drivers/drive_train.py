@@ -11,7 +11,7 @@ or, with K = diag(kr), C the unit triangular coupling and S = diag(joint_sign),
 
     2 pi (p - cal) = K C (S q + joint_offset),      M = K C S  (`motor_from_joint`).
 
-Power is the same on both sides, so torques take the transposed way: tau = M^T (Kt i).
+Power is the same on both sides, so torques transform with the transpose: tau = M^T (Kt i).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ WRIST_AXES: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class DriveTrain:
-    """What stands between joints and motors of one arm with n rotary joints.
+    """Transmission between joints and motors of one arm with n rotary joints.
 
     Attributes:
         gear_ratio: (n,) signed motor revolutions per joint revolution.
@@ -43,7 +43,7 @@ class DriveTrain:
         joint_offset: (n,) rad, controller's angle where the joint angle is zero.
         torque_constant: (n,) N·m/A on the motor side.
         current_limit: (n,) A.
-        k54: influence of axis 4 on axis 5; likewise `k64` and `k65`. Zero without a coupled wrist.
+        k54, k64, k65: influence of axis 4 on axis 5, 4 on 6, 5 on 6; zero without a coupled wrist.
         motor_from_joint: (n, n) motor rad per joint rad, gears, coupling and signs included.
         joint_from_motor: (n, n) its inverse.
         motor_offset: (n,) motor revolutions where the joint angles are zero.
@@ -99,29 +99,29 @@ class DriveTrain:
         return len(self.gear_ratio)
 
     def motor_revolutions(self, q: ArrayLike) -> Array:
-        """Joint positions (..., n) rad to motor revolutions as on the wire."""
+        """Convert joint positions (..., n) rad to motor revolutions on the wire."""
         return np.asarray(q) @ self.motor_from_joint.T / TURN + self.motor_offset
 
     def joint_position(self, motor_revolutions: ArrayLike) -> Array:
-        """Motor revolutions (..., n) as on the wire to joint positions, rad."""
+        """Convert motor revolutions (..., n) on the wire to joint positions, rad."""
         shifted = np.asarray(motor_revolutions, dtype=np.float64) - self.motor_offset
         return TURN * shifted @ self.joint_from_motor.T
 
     def motor_revolutions_per_cycle(self, qd: ArrayLike, period: float) -> Array:
-        """Joint velocities (..., n) rad/s to motor revolutions per cycle of `period` s."""
+        """Convert joint velocities (..., n) rad/s to motor revolutions per cycle of `period` s."""
         return np.asarray(qd) @ self.motor_from_joint.T * (period / TURN)
 
     def joint_velocity(self, motor_revolutions_per_cycle: ArrayLike, period: float) -> Array:
-        """Motor revolutions per cycle (..., n) to joint velocities, rad/s."""
+        """Convert motor revolutions per cycle (..., n) to joint velocities, rad/s."""
         per_cycle = np.asarray(motor_revolutions_per_cycle, dtype=np.float64)
         return (TURN / period) * per_cycle @ self.joint_from_motor.T
 
     def joint_torque(self, current: ArrayLike) -> Array:
-        """Motor currents (..., n) A to joint torques, N·m."""
+        """Convert motor currents (..., n) A to joint torques, N·m."""
         return (np.asarray(current) * self.torque_constant) @ self.motor_from_joint
 
     def motor_current(self, torque: ArrayLike) -> Array:
-        """Joint torques (..., n) N·m to the motor currents that make them, A."""
+        """Convert joint torques (..., n) N·m to motor currents, A."""
         return np.asarray(torque) @ self.joint_from_motor / self.torque_constant
 
 
@@ -159,7 +159,7 @@ Ages = NDArray[np.uint16]
 
 
 class ArmWire:
-    """Joint side and wire side of the joints of one arm.
+    """Conversion between joints of one arm and slots of a packet.
 
     Attributes:
         joint_slots: (n,) slot of each joint.
@@ -169,7 +169,7 @@ class ArmWire:
         n_axes: slots in a packet.
 
     Raises:
-        PacketError: the init packet's axis map is impossible or lacks one of the joints.
+        PacketError: the init packet's axis map is invalid or lacks one of the joints.
     """
 
     def __init__(
@@ -209,9 +209,9 @@ class ArmWire:
         self.age: Ages | None = None
 
     def read(self, received: Floats, measured: Array, ages: Ages | None = None) -> None:
-        """Take a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI.
+        """Read a packet's axis blocks (n_axes, 9) into `raw`, and (8, n) into `measured` in SI.
 
-        `ages` (n_axes, 8) go with the blocks; None if nothing is older than the packet.
+        `ages` (n_axes, 8) are those of the values; None if all were sent with the packet.
         """
         raw = self.raw
         self.age = None if ages is None else ages[self._pick].T
@@ -223,31 +223,31 @@ class ArmWire:
         measured[4:] = raw[4:]
 
     def motor(self, q: Array) -> Array:
-        """Joint positions (n,) to motor revolutions (n,)."""
+        """Convert joint positions (n,) to motor revolutions (n,)."""
         motor: Array = np.dot(q, self._to_motor)
         motor += self._motor_offset
         return motor
 
     def motor_difference(self, dq: Array) -> Array:
-        """Differences of joint positions (n,) rad to motor revolutions (n,)."""
+        """Convert differences of joint positions (n,) rad to motor revolutions (n,)."""
         difference: Array = np.dot(dq, self._to_motor)
         return difference
 
     def joint_difference(self, motor: Array) -> Array:
-        """Differences of motor revolutions (n,) to those of joint positions (n,) rad."""
+        """Convert differences of motor revolutions (n,) to those of joint positions (n,) rad."""
         difference: Array = np.dot(motor, self._to_joint)
         return difference
 
     def joint_rounding(self, motor: Array) -> Array:
-        """What float32 may make, in rad, of a step between two targets (n,) like these."""
+        """Return the float32 rounding of a step between targets (n,) of this size, rad."""
         rounding: Array = np.spacing(np.abs(motor).astype(np.float32)) @ np.abs(self._to_joint)
         return rounding
 
     def put(self, frame: Floats, column: int, values: Array) -> None:
-        """Put values (n,) into one column of a frame."""
+        """Write values (n,) into one column of a frame."""
         frame[self._slots, column] = values[self._written]
 
     def write(self, frame: Floats, position: Array, step: Array) -> None:
-        """Put set-points (n,) in motor revolutions, per cycle, into a frame's D1 and D2."""
+        """Write set-points (n,), motor revolutions and per cycle, into D1 and D2 of a frame."""
         self.put(frame, D1, position)
         self.put(frame, D1 + 1, step)

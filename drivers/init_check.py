@@ -1,4 +1,4 @@
-"""Whether the controller and the cell speak of the same arm, and whose word counts."""
+"""Comparison of the controller's init packet with the cell."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ from drivers.packets import InitPacket
 Array = NDArray[np.float64]
 
 _RELATIVE: Final = 1e-6
-"""The wire rounds to float32, by 6e-8 at most; a cell file has six digits or more."""
+"""Relative tolerance: float32 rounds by 6e-8 at most; a cell file has six digits or more."""
 _WRITTEN: Final = 1e-5
-"""Of a limit: six digits written by a person may be rounded by half of this."""
+"""Relative tolerance of a limit: twice the rounding of six digits."""
 _FACTOR: Final = 2.0
-"""Gear ratios further apart are not of the same kind of arm."""
+"""Largest factor between gear ratios of the same type of arm."""
 _COUPLING: Final = 1.0
-"""Magnitude of a wrist coupling beyond which it is none."""
+"""Largest magnitude of a wrist coupling."""
 _FLOOR: Final = float(np.spacing(np.float32(1.0)))
-"""Motor revolutions: what float32 resolves within one, far below an encoder's increment."""
+"""Resolution of float32 within one motor revolution, far below an encoder's increment."""
 
 
 @dataclass(frozen=True, eq=False)
 class InitCheck:
-    """An init packet held against the cell.
+    """Comparison of an init packet with the cell.
 
     Attributes:
-        drive_train: in force: the cell's, or that with the controller's values adopted.
+        drive_train: the one to use: the cell's, or that with adopted values of the controller.
         differences: each names the axis and both values.
         unusable: why the arm cannot be moved, or None.
-        adopted: the controller's values are in force.
+        adopted: the controller's values are used.
     """
 
     drive_train: DriveTrain
@@ -58,7 +58,7 @@ class ControllerLimits:
 
     @classmethod
     def of(cls, init: InitPacket, arm: int, n_joints: int) -> ControllerLimits:
-        """Those of the first axes of an arm, which counts from 1."""
+        """Return the limits of the first axes of an arm, from 1."""
         row, axes = arm - 1, slice(0, n_joints)
         return cls(
             init.current_limit[row, axes].astype(np.float64),
@@ -67,12 +67,12 @@ class ControllerLimits:
 
 
 def is_narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
-    """Where a limit (n,) of the controller is below the cell's by more than six digits round."""
+    """Return where a limit (n,) of the controller is below the cell's by more than rounding."""
     return np.asarray(theirs < ours * (1.0 - _WRITTEN))
 
 
 def float32_text(value: float) -> str:
-    """A figure of the wire in the fewest digits that are that float32 again."""
+    """Return the shortest text of a float32 value."""
     return str(np.float32(value)).removesuffix(".0")
 
 
@@ -84,20 +84,20 @@ def compare(
     accept: bool,
     other_axes: frozenset[tuple[int, int]] = frozenset(),
 ) -> InitCheck:
-    """Hold an init packet against what the cell says of the arm.
+    """Compare an init packet with the cell.
 
-    Motor positions made with a wrong ratio, calibration or coupling send the arm elsewhere, so
-    any difference refuses the session, unless the controller's values are accepted on purpose.
-    So does an axis that is open, of whichever arm, and no joint of the cell: it would be held at
-    targets that nobody watches. What the controller leaves undefined (NaN, or 0 for a ratio) or
-    what is far off, another cycle and a joint that is not open cannot be accepted.
+    With a wrong gear ratio, calibration or coupling the arm moves elsewhere, so any difference
+    makes the session unusable unless the controller's values are accepted. So does an open axis of
+    any arm that is not a joint of the cell, because its targets are not checked. Undefined values
+    (NaN, or 0 for a ratio), values far off, another cycle and a joint that is not open cannot be
+    accepted.
 
     Args:
         drive_train: the cell's.
         period: s, the cell's cycle.
         init: the controller's init packet.
         arm: the arm that is moved, from 1.
-        accept: take the controller's word where it may be taken.
+        accept: accept the controller's values where that is allowed.
         other_axes: (arm, axis), both from 1, that may be open as well.
     """
     fixed = _timing(period, init) + _axis_map(drive_train.n_joints, init, arm)
@@ -154,10 +154,7 @@ def _unknown_axes(
 
 
 def _too_far_off(ours: DriveTrain, theirs: DriveTrain) -> tuple[str, ...]:
-    """What nobody means to accept: the guard's bounds are on the joint side of these values.
-
-    A calibration more than one turn of the joint away is that of another arm, or none.
-    """
+    """Return values that cannot be accepted, because the guard's bounds depend on them."""
     share = theirs.gear_ratio / ours.gear_ratio
     found = [
         f"gear ratio of axis {axis + 1} is {share[axis]:.4g} times the cell's, and a factor of "
@@ -203,10 +200,10 @@ def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, .
 
 
 def _adopted(drive_train: DriveTrain, init: InitPacket, arm: int) -> DriveTrain:
-    """The cell's drive train with the controller's gear ratios, calibration and coupling.
+    """Return the drive train with the controller's gear ratios, calibration and coupling.
 
     Raises:
-        DriveTrainError: one of them is no number, or a ratio is zero.
+        DriveTrainError: one of them is not finite, or a ratio is zero.
     """
     n, row = drive_train.n_joints, arm - 1
     k54, k64, k65 = init.wrist_coupling(arm)

@@ -1,7 +1,7 @@
 """C4G Open packets: bytes to numbers and back, bit for bit.
 
-All fields are little-endian int32 or IEEE float32 without padding. The same cyclic layout goes
-both ways; the controller sends first and every answer carries the received number plus one.
+All fields are little-endian int32 or IEEE float32 without padding. The cyclic layout is the same
+in both directions; the controller sends first and every reply has the received number plus one.
 Quantities are those of the wire (motor revolutions, revolutions per cycle, A).
 Layout and codes: facts on the C4G Open wire, sections 2 to 4.
 """
@@ -40,7 +40,7 @@ _NUMBER: Final = struct.Struct("<i")
 
 
 class Mode(IntEnum):
-    """Mode of one axis, as it stands on the wire. 3 and 6 exist but their meaning is unknown."""
+    """Mode of one axis on the wire. 3 and 6 exist but their meaning is unknown."""
 
     CLOSED = 0
     POSITION_FEED_FORWARD = 1
@@ -79,7 +79,7 @@ MODE_FIELDS: Final[Mapping[int, tuple[int, ...]]] = {
     Mode.POSITION_RELATIVE_PRIMED: (1, 2),
     Mode.DELTA_POSITION_PRIMED: (1,),
 }
-"""Which of D1..D5 an answer fills in each open mode; all others have to be zero."""
+"""Fields of D1..D5 that a reply contains in each open mode; all others are zero."""
 
 AXIS_DTYPE: Final = np.dtype([("mode", "<i4"), ("d", "<f4", (5,)), ("extra", "<f4", (3,))])
 """One axis block: mode, D1..D5, extra1..extra3."""
@@ -108,17 +108,17 @@ INIT_DTYPE: Final = np.dtype(
 
 
 def next_number(number: int) -> int:
-    """Number of the answer to packet `number`; 0x7FFF is followed by 1."""
+    """Return the number of the reply to packet `number`; 0x7FFF is followed by 1."""
     return 1 if number >= LAST_NUMBER else number + 1
 
 
 def cyclic_length(n_axes: int) -> int:
-    """Bytes of a cyclic packet with `n_axes` open axes."""
+    """Return the length of a cyclic packet with `n_axes` open axes, bytes."""
     return HEADER_LENGTH + AXIS_LENGTH * n_axes
 
 
 def packet_number(packet: bytes) -> int:
-    """Sequence number of any packet.
+    """Return the sequence number of any packet.
 
     Raises:
         PacketError: shorter than a header, or a number outside 1..0x7FFF.
@@ -134,19 +134,19 @@ def packet_number(packet: bytes) -> int:
 def is_init(packet: bytes) -> bool:
     """Whether this is the init packet: number 10 *and* 1200 bytes.
 
-    A cyclic packet carries number 10 too, each time the numbers wrap around.
+    Cyclic packets have the number 10 too, after the numbers wrap around.
     """
     return len(packet) == INIT_LENGTH and _NUMBER.unpack_from(packet)[0] == INIT_NUMBER
 
 
 def echo(packet: bytes) -> bytes:
-    """The packet itself with the number of its answer: what sync and init packets get."""
+    """Return the packet with the number of its reply: the reply to sync and init packets."""
     return _NUMBER.pack(next_number(packet_number(packet))) + packet[4:]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CyclicPacket:
-    """One packet of the running exchange, either way.
+    """One packet of the cyclic exchange, in either direction.
 
     Attributes:
         number: sequence number, 1..0x7FFF.
@@ -162,7 +162,7 @@ class CyclicPacket:
 
     @classmethod
     def decode(cls, packet: bytes, n_axes: int) -> CyclicPacket:
-        """Read a packet with `n_axes` slots; what follows them is ignored.
+        """Decode a packet with `n_axes` slots; bytes behind them are ignored.
 
         Raises:
             PacketError: shorter than 12 + 36 n bytes, longer than 732, or number not 1..0x7FFF.
@@ -182,16 +182,16 @@ class CyclicPacket:
 
     @classmethod
     def zeros(cls, number: int, n_axes: int) -> CyclicPacket:
-        """A packet with every field zero, whose `axes` may be filled in place."""
+        """Return a packet with every field zero, whose `axes` may be filled in place."""
         return cls(number, bytes(N_ARMS), bytes(N_ARMS), np.zeros(n_axes, AXIS_DTYPE))
 
     def encode(self) -> bytes:
-        """The 12 + 36 n bytes."""
+        """Return the 12 + 36 n bytes."""
         return _HEADER.pack(self.number, self.status, self.functionality) + self.axes.tobytes()
 
 
 class OpenAxis(NamedTuple):
-    """Where an open axis stands: arm from 1, logical axis and slot from 0."""
+    """Position of an open axis: arm from 1, logical axis and slot from 0."""
 
     arm: int
     axis: int
@@ -200,7 +200,7 @@ class OpenAxis(NamedTuple):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class InitPacket:
-    """What the controller says about itself before the exchange starts.
+    """The controller's description of its arms, before the cyclic exchange.
 
     Attributes:
         record: (1,) of `INIT_DTYPE`, every field as received. Entries of axes that are not open
@@ -211,7 +211,7 @@ class InitPacket:
 
     @classmethod
     def decode(cls, packet: bytes) -> InitPacket:
-        """Read 1200 bytes.
+        """Decode 1200 bytes.
 
         Raises:
             PacketError: wrong length or number, or a number of axes outside 1..20.
@@ -229,14 +229,14 @@ class InitPacket:
     def build(
         cls, n_axes: int, sample_time: int, arm_1: Mapping[str, ArrayLike], **fields: ArrayLike
     ) -> InitPacket:
-        """An init packet with arm 1's first `n_axes` axes open in slots 0..n_axes-1.
+        """Return an init packet with arm 1's first `n_axes` axes open in slots 0..n_axes-1.
 
         Args:
             n_axes: open axes, 1..10.
             sample_time: ms.
             arm_1: per-axis fields of arm 1 (`calibration`, `gear_ratio`, ...), (k,) with k <= 10;
                 the remaining axes stay zero.
-            fields: any whole field of `INIT_DTYPE`, to override.
+            fields: other fields of `INIT_DTYPE`, in full.
         """
         record = np.zeros(1, INIT_DTYPE)
         record["number"] = INIT_NUMBER
@@ -256,7 +256,7 @@ class InitPacket:
         return cls(record)
 
     def encode(self) -> bytes:
-        """The 1200 bytes."""
+        """Return the 1200 bytes."""
         return self.record.tobytes()
 
     def _field(self, name: str) -> Any:
@@ -264,7 +264,7 @@ class InitPacket:
 
     @property
     def number(self) -> int:
-        """Always 10 from a controller, 11 in the answer."""
+        """10 from a controller, 11 in the reply."""
         return int(self._field("number"))
 
     @property
@@ -324,12 +324,12 @@ class InitPacket:
         return np.asarray(self._field("following_error"))
 
     def wrist_coupling(self, arm: int = 1) -> tuple[float, float, float]:
-        """(k54, k64, k65) of one arm."""
+        """Return (k54, k64, k65) of one arm."""
         k54, k64, k65 = (float(k) for k in self.kinematic_influence[arm - 1, 3:6])
         return k54, k64, k65
 
     def open_axes(self) -> Sequence[OpenAxis]:
-        """The open axes of all arms in slot order.
+        """Return the open axes of all arms in slot order.
 
         Raises:
             PacketError: the map does not give each of the n_axes slots to exactly one axis.

@@ -1,10 +1,9 @@
-"""One cycle as the PC saw it, raw packets, and the rings that keep the last of either.
+"""Ring buffers of cycle records and raw packets.
 
-A ring lies in memory of its own or in that of a descriptor, which other processes can read. The
-writer fills a row and then raises the count of rows written; it never waits and never looks back. A
-reader copies rows and then reads the count again, to find out which of them were overwritten
-meanwhile. That is sound where stores of one processor are seen by others in their order and loads
-are not moved ahead of earlier ones, as on x86.
+A ring uses its own memory or that of a descriptor, which other processes can read. The writer fills
+a row and then increments the count of rows written; it never waits. A reader copies rows and then
+reads the count again, to find those overwritten meanwhile. This requires that stores of one
+processor become visible to others in order and that loads are not reordered, as on x86.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ MEASURED = (
     "diagonal_inertia",
     "extra3",
 )
-"""What the controller says of each joint, in the order of the wire (D1..D5, extra1..3)."""
+"""Values received of each joint, in the order of the wire (D1..D5, extra1..3)."""
 COMMANDED = ("commanded_position", "commanded_velocity")
-"""What it was answered."""
+"""Values sent in the reply."""
 
 
 def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
-    """Layout of one CycleRecord of an arm with `n_joints` joints; fixed size.
+    """Return the layout of one cycle record of an arm with `n_joints` joints.
 
     ``cycle`` controller's cycles since its init packet, missed ones counted in; ``number`` wire
     sequence number; ``arrival`` s, for diagnosis only; ``gap`` packets missed before this one;
@@ -45,8 +44,8 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     packet; ``status`` status byte of the arm; ``mode`` of each joint; ``age`` cycles since the
     oldest joint value of each of `MEASURED` was sent (0: in this packet). Joint arrays are joint
     side in SI (rad, rad/s), currents motor side in A, ``diagonal_inertia`` kg·m²; ``commanded_*``
-    is what this packet was answered, NaN where no set-point was sent. Where the controller makes
-    the targets, ``commanded_position`` is its target with the offset added (mode 7, else NaN) and
+    are those of the reply, NaN where no set-point was sent. Where the controller generates the
+    targets, ``commanded_position`` is its target with the offset added (mode 7, else NaN) and
     ``commanded_velocity`` the velocity fed forward (modes 2 and 8, else NaN).
     """
     joint = (n_joints,)
@@ -66,9 +65,9 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
 
 
 LONGEST_PACKET: Final = INIT_LENGTH
-"""Bytes stored of a packet; none of a controller is longer."""
+"""Bytes stored of a packet; those of a controller are not longer."""
 CAPACITY: Final = 16_384
-"""Packets stored: 8 s of both directions at 1 kHz, more than a disk may keep an archive waiting."""
+"""Packets stored: 8 s of both directions at 1 kHz, longer than an archive may wait for a disk."""
 _MOST_LENGTH: Final = 0xFFFF
 _ROW: Final = struct.Struct(f"<qdHBx{LONGEST_PACKET}s4x")
 PACKET_DTYPE: Final = np.dtype(
@@ -85,19 +84,19 @@ received it; ``data`` its bytes, then zeros (the first ones of a longer packet).
 
 
 def create_memory(name: str, size: int) -> int:
-    """Descriptor of `size` zero bytes to be shared; the name only shows in the system's lists."""
+    """Return a descriptor of `size` zero bytes to be shared; the name is for diagnosis only."""
     fd = os.memfd_create(name, os.MFD_CLOEXEC)
     os.ftruncate(fd, size)
     return fd
 
 
 def attach_memory(fd: int) -> mmap.mmap:
-    """Map all of it, to read and to write, shared with whoever else does."""
+    """Map all of the memory of a descriptor, shared, for reading and writing."""
     return mmap.mmap(fd, os.fstat(fd).st_size)
 
 
 class _Kind(NamedTuple):
-    """Tag in the header of a ring, its name there, what its rows are, what their width counts."""
+    """Kind of a ring: tag in its header, name of its memory, its rows, unit of their width."""
 
     tag: int
     name: str
@@ -113,19 +112,19 @@ _TAG, _WIDTH, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
 
 
 class _Ring:
-    """Rows behind a header, with a reader's place in them.
+    """Rows behind a header, with the position of a reader.
 
     Args:
         kind: of rows.
         width: of a row, in the unit of its kind.
         dtype: of a row.
-        capacity: rows of memory of its own; only where there is no `fd`.
-        fd: descriptor of memory that was made by `_create`.
-        acknowledge: whether the writer learns how far this reader got, so that it counts what it
-            overwrites; one reader at a time may.
+        capacity: rows of its own memory; only without `fd`.
+        fd: descriptor of memory created by `_create`.
+        acknowledge: write the position of this reader to the memory, so that the writer counts rows
+            overwritten before they were read; for one reader at a time.
 
     Raises:
-        ValueError: that memory is none of such a ring.
+        ValueError: the memory is not such a ring.
     """
 
     def __init__(
@@ -158,7 +157,7 @@ class _Ring:
 
     @staticmethod
     def _create(kind: _Kind, width: int, dtype: np.dtype[np.void], capacity: int) -> int:
-        """Descriptor of memory for `capacity` rows."""
+        """Return a descriptor of memory for `capacity` rows."""
         if capacity < 2:
             raise ValueError(f"a shared ring of {capacity} {kind.rows}; at least 2 are needed")
         fd = create_memory(kind.name, _HEADER_BYTES + capacity * dtype.itemsize)
@@ -170,46 +169,46 @@ class _Ring:
         return max(0, self._words[_WRITTEN] - self._readable)
 
     def drain(self) -> NDArray[np.void]:
-        """A copy of the rows not read yet, (k,), oldest first."""
+        """Return a copy of the rows not read yet, (k,), oldest first."""
         end = self._words[_WRITTEN]
         begin = max(self._read, self._oldest())
         rows = self.rows.take(np.arange(begin, end), mode="wrap")
-        torn = min(max(0, self._oldest() - begin), len(rows))
-        self._missed += begin - self._read + torn
+        overwritten = min(max(0, self._oldest() - begin), len(rows))
+        self._missed += begin - self._read + overwritten
         self._read = end
         if self._acknowledge:
             self._words[_READ] = end
-        return rows[torn:]
+        return rows[overwritten:]
 
 
 class _Reader(_Ring):
-    """Reads rows that another process writes, from the oldest one still there."""
+    """Reader of rows that another process writes, from the oldest one available."""
 
     @property
     def overflow(self) -> int:
-        """Rows that were overwritten before this reader had them."""
+        """Rows overwritten before this reader read them."""
         return self._missed
 
 
 class RingReader(_Reader):
-    """Reads a ring of cycle records of `n_joints` joints; see `_Ring` for `acknowledge`."""
+    """Reader of a ring of cycle records of `n_joints` joints; see `_Ring` for `acknowledge`."""
 
     def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
         super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), fd=fd, acknowledge=acknowledge)
 
 
 class PacketReader(_Reader):
-    """Reads a ring of raw packets, rows of `PACKET_DTYPE`."""
+    """Reader of a ring of raw packets, rows of `PACKET_DTYPE`."""
 
     def __init__(self, fd: int) -> None:
         super().__init__(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, fd=fd, acknowledge=False)
 
 
 class _Writer(_Ring):
-    """The writer's end; where rows are drained too rarely, the oldest are overwritten.
+    """Writer of a ring; if rows are not drained in time, the oldest are overwritten.
 
     Attributes:
-        fd: descriptor of the memory, -1 for memory of its own.
+        fd: descriptor of the memory, -1 for its own memory.
     """
 
     fd: int
@@ -218,16 +217,16 @@ class _Writer(_Ring):
 
     @property
     def written(self) -> int:
-        """Rows written so far."""
+        """Rows written."""
         return self._written
 
     @property
     def overflow(self) -> int:
-        """Rows overwritten before they were drained, so far."""
+        """Rows overwritten before they were drained."""
         return self._lost
 
     def commit(self) -> None:
-        """Make the next row part of the ring."""
+        """Add the row filled last to the ring."""
         words, written = self._words, self._written
         if words[_READ] <= written - self.capacity:
             self._lost += 1
@@ -239,8 +238,8 @@ class CycleRing(_Writer):
 
     Args:
         n_joints: n.
-        capacity: rows, unless they lie in the memory of a descriptor.
-        fd: such a descriptor, see `shared`.
+        capacity: rows, without `fd`.
+        fd: descriptor of shared memory, see `shared`.
     """
 
     def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
@@ -263,12 +262,12 @@ class CycleRing(_Writer):
 
     @classmethod
     def shared(cls, n_joints: int, capacity: int) -> Self:
-        """Ask for memory for `capacity` records that other processes can read."""
+        """Allocate shared memory for `capacity` records."""
         dtype = cycle_dtype(n_joints)
         return cls(n_joints, fd=cls._create(_CYCLES, n_joints, dtype, capacity))
 
     def _block(self, names: tuple[str, ...]) -> Array:
-        """Consecutive joint fields of all rows as one array (capacity, count, n)."""
+        """Return consecutive joint fields of all rows as one array (capacity, count, n)."""
         fields = self.rows.dtype.fields
         assert fields is not None
         return np.ndarray(
@@ -285,7 +284,7 @@ class CycleRing(_Writer):
         return self._written % self.capacity
 
     def last(self, count: int) -> NDArray[np.void]:
-        """A copy of the newest `count` records (fewer if there are fewer), oldest first."""
+        """Return a copy of the newest `count` records (or all of them), oldest first."""
         count = min(count, self._written, self.capacity)
         return self.rows.take(np.arange(self._written - count, self._written), mode="wrap")
 
@@ -301,11 +300,11 @@ class PacketRing(_Writer):
 
     @classmethod
     def shared(cls, capacity: int = CAPACITY) -> Self:
-        """Ask for memory for `capacity` packets that other processes can read."""
+        """Allocate shared memory for `capacity` packets."""
         return cls(fd=cls._create(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, capacity))
 
     def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
-        """Store one packet, over the oldest where there is no room; see `PACKET_DTYPE`."""
+        """Store one packet; see `PACKET_DTYPE`."""
         place = self._written % self.capacity * _ROW.size
         length = min(len(packet), _MOST_LENGTH)
         _ROW.pack_into(self._memory, place, cycle, time, length, sent, packet)
