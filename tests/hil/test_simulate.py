@@ -347,7 +347,7 @@ def test_open_mode_lost_again_and_again_ends_the_session_with_a_reason_and_a_sta
     assert cabinet.status == 4
     assert "the session has ended (504): open mode was lost 5 times in a row" in said
     assert said.count("axes opening") == 2  # the first two; the others are summed up
-    assert "lost again, 4 times in a row by now" in said
+    assert "open mode lost 4 times in a row" in said
 
 
 def test_own_postures_are_within_limits_and_clear_on_the_way():

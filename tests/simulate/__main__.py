@@ -1,4 +1,4 @@
-"""Play campaigns on a simulated cell with everything that goes wrong, and judge them by laws."""
+"""Simulate campaigns with random faults of link, controller, PC and disk, and check their laws."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
 from tests.simulate.world import UndisturbedError
 
 EPILOG = f"""\
-One seed is one arm, plan, person and script of faults, and always the same run:
-  python -m tests.simulate --seed 17                    play it and tell all of it
+A seed determines arm, plan, operator and script of faults; runs are reproducible.
+  python -m tests.simulate --seed 17                    run it and print the details
   python -m tests.simulate --seed 17 --script FILE      the same arm and plan, another script
   python -m tests.simulate --seeds 10000 --jobs 2 --journal seeds.jsonl
-The last may be killed and typed again: what the journal knows is not played again. A journal
-belongs to one state of the code; after a change of it name another.
-The exit code is 1 if a law was broken. A script has lines of `hil simulate`'s faults, and of
+The last can be interrupted and repeated: seeds in the journal are not run again. Use another
+journal for each version of the code.
+The exit code is 1 if a law was broken. A script has lines of the faults of `hil simulate`, and of
 
 {GRAMMAR}
 """
@@ -34,19 +34,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = parser_of("tests.simulate", __doc__, EPILOG)
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument(
-        "--seed", type=whole_number, metavar="S", help="play this one and tell all of it"
+        "--seed", type=whole_number, metavar="S", help="run one seed and print the details"
     )
-    what.add_argument("--seeds", type=whole_number, metavar="N", help="play N of them")
+    what.add_argument("--seeds", type=whole_number, metavar="N", help="run N seeds")
     option = parser.add_argument
-    option("--start", type=whole_number, default=0, help="the first of N (0)")
-    option("--script", type=Path, metavar="FILE", help="of --seed: instead of its own")
+    option("--start", type=whole_number, default=0, help="first of the N seeds (0)")
+    option("--script", type=Path, metavar="FILE", help="script for --seed, in place of its own")
     option("--jobs", type=at_least_one, default=1, help="child processes (1)")
-    option("--journal", type=Path, metavar="FILE", help="JSON lines, one a seed")
-    option("--no-shrink", action="store_true", help="leave scripts of failures as is")
-    option("--json", action="store_true", help="end with one JSON object")
+    option("--journal", type=Path, metavar="FILE", help="JSON lines, one per seed")
+    option("--no-shrink", action="store_true", help="do not reduce scripts of failures")
+    option("--json", action="store_true", help="print one JSON object at the end")
     options = parser.parse_args(arguments)
     if options.seed is None and options.script is not None:
-        parser.error("--script is played with one --seed, not with --seeds")
+        parser.error("--script needs --seed, not --seeds")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of the children
     try:
         return _one(options) if options.seed is not None else _many(options)
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"{error}\n")
         return 2
     except KeyboardInterrupt:
-        sys.stderr.write("stopped; what a journal has is kept\n")
+        sys.stderr.write("stopped; the journal is complete so far\n")
         return 130
 
 
@@ -87,7 +87,7 @@ def _one(options: argparse.Namespace) -> int:
         sys.stdout.write(json.dumps(found) + "\n")
         return int(bool(broken))
     lines += [
-        f"  {line}{'' if line in seen.struck else '   (never struck)'}" for line in seen.schedule
+        f"  {line}{'' if line in seen.struck else '   (did not occur)'}" for line in seen.schedule
     ]
     for number, (life, how) in enumerate(zip(seen.runs, runs, strict=True), start=1):
         why = "" if life.error is None else f": {life.error}"
@@ -96,7 +96,7 @@ def _one(options: argparse.Namespace) -> int:
         lines.append(f"run {number}, cycles {cycles}: {how}{why} [{archives}]")
     if seen.unidentified:
         lines.append(f"not identified: {seen.unidentified}")
-    lines += [f"BROKEN {law}: {text}" for law, text in broken] or ["all laws hold"]
+    lines += [f"BROKEN {law}: {text}" for law, text in broken] or ["no law is broken"]
     sys.stdout.writelines(f"{line}\n" for line in lines)
     return int(bool(broken))
 
@@ -108,7 +108,7 @@ def _many(options: argparse.Namespace) -> int:
     failed = 0
     with redirect_stdout(sys.stderr if options.json else sys.stdout):
         progress = reporter()
-        with progress.task("playing seeds", len(seeds)) as task:
+        with progress.task("simulating seeds", len(seeds)) as task:
             for verdict in played(seeds, known, options.jobs, shrink=not options.no_shrink):
                 verdicts.append(verdict)
                 failed += bool(verdict.broken)
@@ -126,7 +126,7 @@ def _many(options: argparse.Namespace) -> int:
 def _failure(verdict: Verdict) -> str:
     lines = [f"FAILED seed {verdict.seed} ({verdict.scene})"]
     lines += [f"  {law}: {text}" for law, text in verdict.broken[:6]]
-    lines += ["  script, made small:", *(f"    {line}" for line in verdict.shrunk)]
+    lines += ["  reduced script:", *(f"    {line}" for line in verdict.shrunk)]
     return "\n".join(lines)
 
 

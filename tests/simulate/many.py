@@ -1,4 +1,4 @@
-"""Many seeds, in child processes, kept in a journal so that none is played twice."""
+"""Many seeds in child processes, with a journal of the results."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from tests.journal import Journal, entries
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, Verdict
 
-SEEDS_PER_CHILD: Final = 400  # After which it gives its memory back
-LONGEST: Final = 1200.0  # s that a seed may take, made small included, on a busy machine
+SEEDS_PER_CHILD: Final = 400  # after which a child is restarted, to release its memory
+LONGEST: Final = 1200.0  # s for a seed with the reduction of its script, on a busy machine
 DIED: Final = "the process lives"
-"""Name of the law that a seed breaks which takes its process with it, or never ends."""
+"""Law that a seed breaks if its process crashes or does not end."""
 _PREFIX: Final = "hil_simulate_"
 
 
 class Known:
-    """Verdicts by seed that a journal has, and those that are added to it; without a path none."""
+    """Verdicts by seed, read from and added to a journal; without a path in memory only."""
 
     def __init__(self, path: Path | None) -> None:
         found = () if path is None else entries(path, Verdict.from_dict, "verdict on a seed")
         self.verdicts = {verdict.seed: verdict for verdict in found}
-        self._journal = Journal(path, sync_every=60.0)  # s of which a loss of power costs
+        self._journal = Journal(path, sync_every=60.0)
 
     def add(self, verdict: Verdict) -> None:
         self.verdicts[verdict.seed] = verdict
@@ -44,7 +44,7 @@ class Known:
 
 @contextmanager
 def stage_folder() -> Iterator[Path]:
-    """A folder in memory where there is one, removed afterwards, or by the next if it is killed."""
+    """Create a folder, in memory if possible; remove it afterwards, and leftover ones."""
     shared = Path("/dev/shm")
     where = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())
     for left in where.glob(f"{_PREFIX}*"):
@@ -61,29 +61,29 @@ def stage_folder() -> Iterator[Path]:
 def played(
     seeds: Sequence[int], known: Known, jobs: int, *, shrink: bool = True
 ) -> Iterator[Verdict]:
-    """Verdicts as they come, those first that are known. Children end with this process."""
+    """Yield the verdicts on seeds in the order of completion, known ones first."""
     yield from (known.verdicts[seed] for seed in seeds if seed in known.verdicts)
     missing = [seed for seed in seeds if seed not in known.verdicts]
     groups = deque(deque(group) for _, group in groupby(missing, lambda seed: seed // NEIGHBOURS))
     with stage_folder() as root, ExitStack() as children:
-        desks = [_Desk(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
-        for desk in desks:
-            children.callback(desk.child.close)
-        busy = [desk for desk in desks if desk.begin()]
+        workers = [_Worker(groups, str(root), shrink) for _ in range(min(jobs, len(groups)))]
+        for worker in workers:
+            children.callback(worker.child.close)
+        busy = [worker for worker in workers if worker.begin()]
         while busy:
-            left = min(desk.child.deadline for desk in busy) - monotonic()
-            ready = wait([desk.child.connection for desk in busy], max(0.0, left))
-            for desk in list(busy):
-                if desk.child.connection in ready or desk.child.deadline <= monotonic():
-                    if (verdict := desk.fetch()) is not None:
+            left = min(worker.child.deadline for worker in busy) - monotonic()
+            ready = wait([worker.child.connection for worker in busy], max(0.0, left))
+            for worker in list(busy):
+                if worker.child.connection in ready or worker.child.deadline <= monotonic():
+                    if (verdict := worker.fetch()) is not None:
                         known.add(verdict)
                         yield verdict
-                    if not desk.begin():
-                        busy.remove(desk)
+                    if not worker.begin():
+                        busy.remove(worker)
 
 
-class _Desk:
-    """One child process, and the seeds of one group that wait for it."""
+class _Worker:
+    """One child process and its queue of seeds of one group."""
 
     def __init__(self, groups: deque[deque[int]], root: str, shrink: bool) -> None:
         self._groups, self._root, self._shrink = groups, root, shrink
@@ -94,7 +94,7 @@ class _Desk:
         self._played = 0
 
     def begin(self) -> bool:
-        """Give the child the next seed; whether there was one."""
+        """Start the next seed in the child; return False without one."""
         if not self._seeds:
             if not self._groups:
                 return False
@@ -107,7 +107,7 @@ class _Desk:
         return True
 
     def fetch(self) -> Verdict | None:
-        """The verdict; None where the child died, and the seed is tried once more."""
+        """Return the verdict; None if the child died and the seed is tried once more."""
         try:
             found: Verdict = self.child.receive()
         except (PlannerCrashed, PlannerNotStarted, PlanningTimedOut) as error:
@@ -127,5 +127,5 @@ def _stage(root: str) -> Stage:
 
 
 def play_one(seed: int, root: str, shrink: bool) -> Verdict:
-    """The verdict on a seed, in a child process."""
+    """Return the verdict on a seed, in a child process."""
     return _stage(root).verdict(seed, shrink=shrink)

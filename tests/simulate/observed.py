@@ -1,4 +1,4 @@
-"""What is seen of one simulated campaign from outside: all that a law may judge by."""
+"""Observation of one simulated campaign from outside: the input of the laws."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ Digests = Mapping[str, str]
 
 
 class Exchanged(NamedTuple):
-    """A packet that the PC's end of the link received, and what it sent before the next one."""
+    """A packet that the PC received, and its replies before the next one."""
 
-    now: float  # time on the PC's own clock as the session sees it [s]; clock faults are in it
-    cycle: int  # the controller's cycle in which it was received, counted over all lives
-    packet: bytes  # as it arrived
-    replies: tuple[bytes, ...]  # in order; () for none, as for packets left out of a pile
-    record: int  # row in `Life.records` that it made; -1 for none
-    given: bool  # whether it was handed to the session, whatever came of it
+    now: float  # time of the PC's clock [s], with clock faults
+    cycle: int  # cycle of the controller, counted over all lives
+    packet: bytes  # as received
+    replies: tuple[bytes, ...]  # in order; () for packets superseded by a newer one
+    record: int  # its row in `Life.records`; -1 for none
+    given: bool  # whether it was passed to the session
 
 
 class Act(NamedTuple):
-    """A call of the session from the PC's own side that was not refused."""
+    """An accepted call of a method of the session by the PC."""
 
-    before: int  # index of the exchanged packet before which it came
+    before: int  # index of the next exchanged packet
     name: str  # "request", "stop", "override", "hold", "resume", "discarded" or "tick"
     detail: tuple[Any, ...]  # its arguments
 
 
 @dataclass(frozen=True, eq=False)
 class Life:
-    """One process life of the PC: one `Campaign.open(...).run(...)` over a link of its own.
+    """One process of the PC: one `Campaign.open(...).run(...)` over its own link.
 
-    A life in which nothing was missing any more never connects: then all is empty.
+    A life of a complete campaign never connects: then everything is empty.
 
     Attributes:
         records: (m,) of `drivers.cycle_dtype`, all that the session committed, in order.
-        events: each with the index of the exchanged packet that it came with or after.
-        error: what it raised, whatever it is; a `Killed` or `KeyboardInterrupt` among them.
-        died: the process was killed in mid-cycle: the last packet may be unanswered, and what was
-            in memory is lost.
-        before, after: digests of the files in the folder when the life began and when it had ended
-            (and been torn).
+        events: each with the index of the exchanged packet with or after which it came.
+        error: exception of the run, also `Killed` or `KeyboardInterrupt`.
+        died: the process was killed within a cycle: the last packet may be unanswered, and records
+            in memory are lost.
+        before, after: digests of the files in the folder at the beginning and at the end (after
+            truncations).
     """
 
     exchanged: tuple[Exchanged, ...]  # in the order of their arrival
@@ -65,25 +65,22 @@ class Life:
     events: tuple[tuple[int, Event], ...]
     counters: Counters  # of the session when the life ended
     settings: Mapping[str, Any]  # keyword arguments of the session
-    first_cycle: int  # the controller's cycle in which this life began (counted over all lives)
-    last_cycle: int  # that in which it ended
-    result: RunResult | None  # what the run returned; None if it raised or died
+    first_cycle: int  # cycle of the controller at the beginning, counted over all lives
+    last_cycle: int  # and at the end
+    result: RunResult | None  # None if the run raised or died
     error: BaseException | None
     died: bool
-    archives: tuple[str, ...]  # names of the archives that this life began, in order
-    torn: Mapping[str, int]  # archive name to bytes that its death took from the end of the file
-    refused: frozenset[str]  # archives that the disk took no more of before that
-    disk: tuple[str, ...]  # names of the disk's failures that struck in this life
+    archives: tuple[str, ...]  # names of the archives created in this life, in order
+    torn: Mapping[str, int]  # archive name to bytes that the kill removed from the end of the file
+    refused: frozenset[str]  # archives with a failed write
+    disk: tuple[str, ...]  # kinds of disk faults in this life
     before: Digests
     after: Digests
 
 
 @dataclass(frozen=True, eq=False)
 class ArmHistory:
-    """The controller's side, one row for each of its cycles, over all lives and between them.
-
-    The last second and more of it is after the last life has ended.
-    """
+    """State of the controller in each cycle, over all lives, between them and after the last."""
 
     sent: tuple[bytes, ...]  # (k,) packets as the controller sent them, b"" for none
     position: Array  # (k, n) joint angles [rad] at the beginning of the cycle
@@ -93,12 +90,12 @@ class ArmHistory:
 
 
 class Estimated(NamedTuple):
-    """What was identified, by weighted least squares as a campaign does it."""
+    """Estimate of the campaign by weighted least squares."""
 
     result: RepeatedEstimate  # pooled and per repetition
-    pooled: tuple[str, ...]  # names of the archives that were fitted, predicted or rested at
+    pooled: tuple[str, ...]  # names of the archives used
     model: RobotModel  # of the arm
-    fitted: tuple[Samples, ...]  # what was fitted, one a repetition
+    fitted: tuple[Samples, ...]  # fitted samples of each repetition
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,32 +103,32 @@ class Observed:
     """One simulated campaign with its faults.
 
     Attributes:
-        found: the estimate from `folder` by the product's own way; None where the campaign was not
-            completed, or where `unidentified` says why.
-        twin_found: that of the same plan on the same cell without any fault; None of that itself.
+        found: the estimate from `folder` by the product; None if the campaign is not complete, or
+            for the reason `unidentified`.
+        twin_found: the estimate of the same campaign without faults; None for the latter.
     """
 
-    seed: int  # that all was drawn from
-    cell: Cell  # with its limits, drive train and truth
-    plan: CampaignPlan  # what was to be run
-    controller: ControllerSettings  # how the controller behaves
-    schedule: tuple[str, ...]  # the faults and acts, one line each, as `--script` takes them
-    struck: tuple[str, ...]  # lines of these that came to pass
-    runs: tuple[Life, ...]  # the process lives, in order
-    arm: ArmHistory  # the controller's side
-    folder: Path  # the campaign's, after the last life
+    seed: int
+    cell: Cell
+    plan: CampaignPlan
+    controller: ControllerSettings
+    schedule: tuple[str, ...]  # lines of the script
+    struck: tuple[str, ...]  # lines that occurred
+    runs: tuple[Life, ...]  # in order
+    arm: ArmHistory
+    folder: Path  # of the campaign, after the last life
     found: Estimated | None
     twin_found: Estimated | None
-    unidentified: str  # why there is none although the campaign was completed; "" otherwise
+    unidentified: str  # why a complete campaign has no estimate; "" otherwise
 
     @property
     def pooled(self) -> tuple[str, ...]:
-        """Names of the archives that the estimate is made of."""
+        """Names of the archives of the estimate."""
         return () if self.found is None else self.found.pooled
 
     @property
     def complete(self) -> bool:
-        """Whether the last life said that nothing is missing any more."""
+        """Whether the last run reported that the campaign is complete."""
         last = self.runs[-1].result
         return last is not None and last.complete
 
@@ -144,10 +141,10 @@ class Observed:
 
 
 class Broken(NamedTuple):
-    """A law that does not hold."""
+    """A violation of a law."""
 
-    law: str  # its name; what shrinking keeps
-    text: str  # what is wrong, with the figures
+    law: str  # its name
+    text: str  # with the values
 
 
 Law = Callable[[Observed], Iterable[Broken]]

@@ -1,4 +1,4 @@
-"""An arm that can do what is planned for it: cell, plan and controller, drawn until they fit."""
+"""Random cell, plan and controller of a simulated campaign."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ _MASS: Final = (14.0, 11.0, 6.0, 2.5, 2.0, 1.2, 0.8)  # kg
 
 @dataclass(frozen=True)
 class Arm:
-    """The texts that a cell is loaded from."""
+    """URDF and cell file of an arm."""
 
     urdf: str
-    cell: str  # texts; the cell names the URDF `arm.urdf`
+    cell: str  # with the URDF `arm.urdf`
     n_joints: int  # 1 to 7
-    foreign_axes: int  # axes of another arm that its controller moves as well
-    words: str  # what was drawn, for a person
+    foreign_axes: int  # axes of another arm at the same controller
+    words: str  # description
 
 
 def draw_arm(chance: random.Random) -> Arm:
-    """An arm with its drives, limits, controller and truth; what it can do is not checked yet."""
+    """Return a random arm with drives, limits, controller and truth."""
     n = chance.choices(range(1, 8), (4, 9, 5, 2, 1, 2, 1))[0]
     shape = chance.choice(SHAPES)
     mass = [m * chance.uniform(0.6, 1.4) for m in _MASS[:n]]
@@ -95,12 +95,12 @@ def _cell_text(
 ) -> Iterable[str]:
     gear = [chance.choice((-1, 1)) * round(chance.uniform(60.0, 140.0), 2) for _ in range(n)]
     constant = [round(chance.uniform(0.2, 0.6), 3) for _ in range(n)]
-    # Inertia of the stretched arm, about: a gear's rotor shows as much, or the loop were weak.
+    # Approximate inertia of the stretched arm; rotors are of similar size.
     arm = [sum(mass[i:]) * sum(reach[i:]) ** 2 / 3.0 for i in range(n)]
     rotor = [chance.uniform(0.5, 1.0) * inertia + 0.1 for inertia in arm]
     coulomb = [1.0 + chance.uniform(0.3, 0.8) * mass[i] for i in range(n)]
     viscous = [chance.uniform(0.1, 0.4) * mass[i] for i in range(n)]
-    # Static torque of the stretched arm, three times, and what acceleration takes of it.
+    # Three times the static torque of the stretched arm, and a torque for acceleration.
     weight = [9.81 * sum(mass[i:]) * sum(reach[i:]) for i in range(n)]
     torque = [3.0 * w + 120.0 * (r + i) for w, r, i in zip(weight, rotor, arm, strict=True)]
     current = [
@@ -149,32 +149,32 @@ def _controller_text(chance: random.Random, cycle: int, arm: int, foreign: int) 
 
 Array = NDArray[np.float64]
 
-NEIGHBOURS: Final = 8  # Seeds in a row that share arm, plan and the run without faults
+NEIGHBOURS: Final = 8  # consecutive seeds with the same arm, plan and run without faults
 _ARMS: Final = 20
 _MOTIONS: Final = 12
 _QUICK_SERVO: Final = ServoSettings(position_gain=30.0, model_error=(0.01, 0.03))
-"""Comes to rest within the short time that a motion's end is held here."""
+"""Stops within the short settling time of these cells."""
 _SHORTEST: Final = 0.35
 _LONGEST: Final = 0.55  # s of one motion
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What neighbouring seeds share."""
+    """Arm, plan and controller of a group of seeds."""
 
     group: int  # seed // NEIGHBOURS
     arm: Arm
     cell: Cell
-    plan: CampaignPlan  # drawn, and sound together
-    controller: ControllerSettings  # how the controller behaves where nothing goes wrong
-    words: str  # what was drawn
+    plan: CampaignPlan
+    controller: ControllerSettings  # without faults
+    words: str  # description
 
 
 def scene_of(group: int, variant: int = 0) -> Scene:
-    """The scene of a group of seeds; another one where an earlier variant was of no use.
+    """Return the scene of a group of seeds; `variant` counts the rejected ones before it.
 
     Raises:
-        RuntimeError: none was found; the way arms are drawn is at fault.
+        RuntimeError: none was found.
     """
     for attempt in range(_ARMS):
         chance = random.Random(f"scene {group} {variant} {attempt}")
@@ -184,7 +184,7 @@ def scene_of(group: int, variant: int = 0) -> Scene:
         if plan is not None:
             words = f"{arm.words}; {_words_of(plan)}; {cell.campaign.repetitions} repetitions"
             return Scene(group, arm, cell, plan, _controller(chance, arm, cell), words)
-    raise RuntimeError(f"no sound scene for group {group} in {_ARMS} arms")
+    raise RuntimeError(f"no usable scene for group {group} in {_ARMS} arms")
 
 
 def _words_of(plan: CampaignPlan) -> str:
@@ -193,7 +193,7 @@ def _words_of(plan: CampaignPlan) -> str:
 
 
 def _draw_plan(chance: random.Random, cell: Cell) -> CampaignPlan | None:
-    """An excitation and a validation motion within all limits; None if none was found."""
+    """Return an excitation and a validation motion within all limits, or None."""
     checks = MotionChecks.of(cell)
     sines = chance.random() < 0.25
     found: list[Excitation] = []
@@ -227,7 +227,7 @@ def _excitation(
 
 
 def _vias(chance: random.Random, cell: Cell, size: float) -> Excitation | None:
-    """Random via points about home; rounded by as much as the size of the motion."""
+    """Return a motion through random via points about home, or None."""
     n, limits = len(cell.joint_names), cell.joint_limits
     home = cell.home
     reach = np.minimum(np.radians(28.0), 0.9 * (limits.upper - home)) * size

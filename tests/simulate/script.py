@@ -1,7 +1,7 @@
-"""One line of text for one thing that happens in a simulated campaign.
+"""Scripts of simulated campaigns: one line per fault or act.
 
-Faults of link, controller and arm are written as everywhere (`sim_fixtures.faults`); the
-lines here are those of the PC, its disk and the person before it.
+Faults of link, controller and arm have the format of `sim_fixtures.faults`; the other lines are
+faults of the PC and its disk, and acts of the operator.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from sim_fixtures.faults import Fault, FaultScriptError, parse_fault
 
 GRAMMAR: Final = """\
 KIND@AT[xCOUNT][:OPTION]         AT counts the controller's cycles from 0, through all runs of the
-                                 campaign; or, where said, what is done with the disk
+                                 campaign, or operations of the disk
 
-stall@1200:12ms                  the PC answers nothing for so long; :answering with an answer ready
-clock@1200:+2s                   its clock jumps by so much, also backwards
+stall@1200:12ms                  the PC stalls; :answering when an answer is ready
+clock@1200:+2s                   its clock jumps, also backwards
 kill@1200                        its process is killed
-interrupt@1200                   Ctrl-C twice: the run unwinds in mid-motion
-power-cut@1200:keep=0.3          the archive being written keeps that share; x2 the one before too
-kill-at-write@7:keep=0.3         killed in the 7th write to archives, of which that share is there
+interrupt@1200                   Ctrl-C twice: the run is aborted during a motion
+power-cut@1200:keep=0.3          a share of the present archive remains; x2 also of the previous one
+kill-at-write@7:keep=0.3         killed in the 7th write to archives, of which a share is written
 kill-at-save@2:left              killed in the 2nd save of the manifest; or :before, :after
-disk-full@7x2:keep=0.3           the 7th and 8th write to archives fail, with a share written
-disk-error@7                     likewise, as a broken disk does
-short-write@7:keep=0.3           the 7th write takes only a share of what it is given
+disk-full@7x2:keep=0.3           the 7th and 8th write to archives fail after a share (ENOSPC)
+disk-error@7                     the 7th write fails (EIO)
+short-write@7:keep=0.3           the 7th write writes a share only
 save-full@2                      the 2nd save of the manifest fails
-create-full@3                    the 3rd archive cannot be made
-lurch@1200x3:0.01                a defect of ours: 3 set-points are off by 0.01 rad; or :nan
-stop@1200                        Ctrl-C once: the arm is to stop on its path
-override@1200:60                 the person asks for 60 % of the speed
-hold@1200x3                      the person holds the arm, and releases it when asked 3 times
+create-full@3                    the 3rd archive cannot be created
+lurch@1200x3:0.01                a simulated defect: 3 set-points are off by 0.01 rad; or :nan
+stop@1200                        Ctrl-C once: stop on the path
+override@1200:60                 the operator sets the speed to 60 %
+hold@1200x3                      the operator holds the arm until asked 3 times
 with-dry-run@0                   the campaign is rehearsed and does its dry run
-declines@0x1                     the person does not accept the dry run the first time
-hurry@0                          runs are begun again at once, the controller left as it is"""
+declines@0x1                     the operator does not accept the first dry run
+hurry@0                          runs are repeated at once, without a restart of the controller"""
 
 _COUNTED: Final = {
     "cycle": "stall clock kill interrupt power-cut lurch stop override hold",
@@ -47,7 +47,7 @@ _COUNTED: Final = {
     "always": "with-dry-run declines hurry",
 }
 KINDS: Final = {kind: what for what, kinds in _COUNTED.items() for kind in kinds.split()}
-"""What `AT` of each kind counts."""
+"""Quantity counted by `AT` of each kind."""
 _LINE: Final = re.compile(
     r"(?P<kind>[a-z-]+)@(?P<at>\d{1,9})(?:x(?P<count>\d{1,6}))?(?P<options>(?::[^:\s]+)*)"
 )
@@ -56,52 +56,52 @@ _WORDS: Final = frozenset({"answering", "left", "before", "after", "nan"})
 
 
 @dataclass(frozen=True)
-class Mishap:
-    """What happens to the PC, its disk, or by the person before it."""
+class ScriptedEvent:
+    """A fault of the PC or its disk, or an act of the operator."""
 
-    line: str  # as it was written
+    line: str  # its text
     kind: str  # one of `KINDS`
-    at: int  # when; what it counts is in `KINDS`
-    count: int = 1  # how often, or how many
-    value: float = 0.0  # the number among the options: seconds, a share, percent; 0 for none
-    word: str = ""  # the word among the options, "" for none
+    at: int  # in the unit of `KINDS`
+    count: int = 1
+    value: float = 0.0  # number among the options: seconds, a share, percent; 0 for none
+    word: str = ""  # word among the options; "" for none
 
 
 @dataclass(frozen=True)
 class Script:
-    lines: tuple[str, ...]  # as written, in order
+    lines: tuple[str, ...]
     faults: tuple[tuple[str, Fault], ...]  # of link, controller and arm, each with its line
-    mishaps: tuple[Mishap, ...]  # of the PC, its disk and the person
+    events: tuple[ScriptedEvent, ...]  # of PC, disk and operator
 
-    def of(self, counts: str) -> tuple[Mishap, ...]:
-        """The mishaps whose `AT` counts that, in order."""
-        return tuple(one for one in self.mishaps if KINDS[one.kind] == counts)
+    def of(self, counts: str) -> tuple[ScriptedEvent, ...]:
+        """Return the events whose `AT` counts this quantity, in order."""
+        return tuple(one for one in self.events if KINDS[one.kind] == counts)
 
     def has(self, kind: str) -> bool:
-        return any(one.kind == kind for one in self.mishaps)
+        return any(one.kind == kind for one in self.events)
 
 
 DISTURBS_THE_ARM: Final = frozenset({"push", "saturate", "following-error"})
-"""Kinds of lines after which it may be elsewhere than where it was sent."""
+"""Kinds of faults that move the arm away from its set-points."""
 
 
 def kind_of(line: str) -> str:
-    """The kind of a line, for tallies."""
+    """Return the kind of a line."""
     return line.partition("@")[0]
 
 
 def parse_script(lines: Iterable[str]) -> Script:
-    """Read a script; empty lines and # say nothing. ValueError if a line is none."""
-    kept = [line.strip() for line in lines]
-    kept = [line for line in kept if line and not line.startswith("#")]
+    """Parse a script, without empty lines and comments (#); ValueError for an invalid line."""
+    stripped = [line.strip() for line in lines]
+    used = [line for line in stripped if line and not line.startswith("#")]
     faults: list[tuple[str, Fault]] = []
-    mishaps: list[Mishap] = []
-    for line in kept:
+    events: list[ScriptedEvent] = []
+    for line in used:
         if kind_of(line) in KINDS:
-            mishaps.append(_mishap(line))
+            events.append(_event(line))
         else:
             faults.append((line, _fault(line)))
-    return Script(tuple(kept), tuple(faults), tuple(mishaps))
+    return Script(tuple(used), tuple(faults), tuple(events))
 
 
 def _fault(line: str) -> Fault:
@@ -113,7 +113,7 @@ def _fault(line: str) -> Fault:
         ) from error
 
 
-def _mishap(line: str) -> Mishap:
+def _event(line: str) -> ScriptedEvent:
     match = _LINE.fullmatch(line)
     if match is None:
         raise ValueError(f"{line!r} cannot be read; lines are\n{GRAMMAR}\n{FAULTS}")
@@ -127,11 +127,11 @@ def _mishap(line: str) -> Mishap:
         else:
             raise ValueError(f"{line!r} has no option {option!r}; lines are\n{GRAMMAR}")
     count = int(match["count"]) if match["count"] else 1
-    return Mishap(line, match["kind"], int(match["at"]), count, value, word)
+    return ScriptedEvent(line, match["kind"], int(match["at"]), count, value, word)
 
 
 def simpler(line: str) -> Sequence[str]:
-    """The same line with smaller counts and plainer numbers, the boldest first."""
+    """Return variants of a line with smaller counts and rounder numbers."""
     found: list[str] = []
     for pattern, lead, trail in ((r"x(\d+)", "x", ""), (r":(\d+)ms", ":", "ms")):
         match = re.search(pattern, line)
@@ -147,22 +147,22 @@ def simpler(line: str) -> Sequence[str]:
 
 
 class Story(NamedTuple):
-    """What a line may refer to."""
+    """Numbers of the run without faults, from which the parameters of lines are drawn."""
 
-    cycles: int  # that the run without faults takes
-    moving: tuple[int, ...]  # cycles of it in which set-points move
-    n_joints: int  # axes are drawn from these
+    cycles: int
+    moving: tuple[int, ...]  # cycles in which the arm moves
+    n_joints: int
     bytes: int  # length of a cyclic packet
     writes: int
     saves: int
-    creates: int  # that the run without faults makes
+    creates: int
 
 
 Draw = Callable[[random.Random, Story], str]
 
 
 def _cycle(chance: random.Random, story: Story) -> int:
-    """A cycle; mostly one in which the arm moves."""
+    """Return a random cycle, mostly one in which the arm moves."""
     if story.moving and chance.random() < 0.75:
         return chance.choice(story.moving)
     return chance.randrange(story.cycles)
@@ -221,7 +221,7 @@ def _stall(chance: random.Random, story: Story) -> str:
 
 
 def _stalls(chance: random.Random, story: Story) -> str:
-    """A virtual machine whose processor is taken away again and again."""
+    """Return repeated stalls, as of a virtual machine."""
     at = _cycle(chance, story)
     lines = []
     for _ in range(chance.randint(2, 6)):
@@ -303,12 +303,13 @@ DRAWS: Final[Mapping[str, tuple[float, Draw]]] = {
     "override": (1.0, _override),
     "hold": (1.0, lambda chance, story: f"hold@{_cycle(chance, story)}x{chance.randint(1, 5)}"),
     "hurry": (0.8, lambda chance, story: "hurry@0"),
-}  # How often each kind is drawn, against the others, and how
+}
+"""Relative frequency of each kind, and the function that draws a line."""
 WITH_DRY_RUN: Final = 0.02
 
 
 def draw_script(chance: random.Random, story: Story) -> tuple[str, ...]:
-    """Two or three lines as a rule; now and then nothing, or everything at once."""
+    """Return a random script, mostly of one to three lines."""
     kinds = list(DRAWS)
     weights = [DRAWS[kind][0] for kind in kinds]
     count = chance.choices((0, 1, 2, 3, 4, 6, 15), (0.3, 3.0, 3.0, 2.0, 1.0, 0.7, 0.4))[0]

@@ -295,28 +295,29 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("replies", lambda o: with_answer(o, REST(o), 4 + arm_of(o) % 4, 4), ("status bytes",)),
     ("replies", lambda o: with_answer(o, REST(o), 3 + arm_of(o)), ("asked for outside of it",)),
     ("replies", lambda o: with_answer(o, REST(o), 17), ("not the safe answer",)),
-    ("replies", lambda o: with_answer(o, *in_motion(o)), ("has no use for",)),
-    ("replies", lambda o: with_answer(o, *in_motion(o, 24)), ("has no use for",)),
+    ("replies", lambda o: with_answer(o, *in_motion(o)), ("does not use",)),
+    ("replies", lambda o: with_answer(o, *in_motion(o, 24)), ("does not use",)),
     ("replies", lambda o: with_answer(o, of_kind(o, "init"), 700), ("not echoed byte for byte",)),
-    ("replies", lambda o: with_answer(o, of_kind(o, "again"), 20), ("answered otherwise",)),
-    ("replies", lambda o: with_exchanged(o, REST(o), replies=()), ("got no answer that was due",)),
+    ("replies", lambda o: with_answer(o, of_kind(o, "again"), 20), ("second answer differs",)),
+    ("replies", lambda o: with_exchanged(o, REST(o), replies=()),
+     ("got no answer although required",)),
     ("replies", lambda o: with_exchanged(o, REST(o), replies=(), given=False),
-     ("late is 0, and 1 were seen",)),
+     ("late is 0, and 1 were observed",)),
     ("replies", lambda o: with_exchanged(o, of_kind(o, "again"), replies=()),
-     ("got no answer that was due (again)",)),
+     ("got no answer although required (again)",)),
     ("replies", lambda o: with_exchanged(o, REST(o), replies=2 * reply_at(o)), ("2 answers",)),
     ("replies", lambda o: with_exchanged(o, of_kind(o, "nothing"), replies=(bytes(48),)),
-     ("had to get no answer",)),
+     ("must not be",)),
     ("replies", lambda o: with_exchanged(o, REST(o), replies=(reply_at(o)[0][:-4],)),
      ("was answered by",)),
-    ("replies", lambda o: with_exchanged(o, REST(o), record=-1), ("left no record",)),
+    ("replies", lambda o: with_exchanged(o, REST(o), record=-1), ("has no record",)),
     ("replies", lambda o: with_life(o, 0, counters=replace(o.runs[0].counters, duplicates=0)),
      ("duplicates is 0",)),
     ("replies", lambda o: refused_instead(o, REST(o), 505), ("a refusal where nothing is open",)),
     ("replies", lambda o: refused_instead(o, in_motion(o)[0], 505, 0),
      ("neither 505 in all axes nor one 508",)),
     ("replies", lambda o: refused_instead(o, in_motion(o)[0], 505),
-     ("not seen closed since the last fault",)),
+     ("not closed since the last fault",)),
     ("replies", lambda o: with_received(o, in_motion(o), bytes(4)),
      ("not open: not the safe answer",)),
     ("guard", leapt, ("acceleration", "jerk", "recorded set-points", "float32 set-points")),
@@ -346,7 +347,7 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("completion", lambda o: stuck(o, "the drive is off"), ("the drive is off",)),
     ("completion", lambda o: replace(o, found=None), ("not identified",)),
     ("gaps", too_many_missed, ("are allowed, and the motion completed",)),
-    ("piles", piled_up, ("of one pile were both answered",)),
+    ("piles", piled_up, ("both were answered",)),
 ]  # fmt: skip
 
 
@@ -394,9 +395,9 @@ def moved_from_there(observed: Observed, way: float, speed: float) -> Observed:
 @pytest.mark.parametrize(
     ("alter", "text"),
     [
-        (lambda o: received_there(o, 0, 1.0, 50.0), "from a target that is not on its way"),
-        (lambda o: received_there(o, 1, 1.6), "had not carried it on"),
-        (lambda o: received_there(o, 1, 0.0), "had not carried it on"),
+        (lambda o: received_there(o, 0, 1.0, 50.0), "from a target that is off its path"),
+        (lambda o: received_there(o, 1, 1.6), "had not extrapolated it"),
+        (lambda o: received_there(o, 1, 0.0), "had not extrapolated it"),
         (lambda o: received_there(o, 2, 1.0, 50.0), "does not follow"),
         (lambda o: moved_from_there(o, 0.01, 0.0), "acceleration"),
         (lambda o: moved_from_there(o, 0.0, 0.02), "acceleration"),
@@ -487,10 +488,10 @@ def cell_edited(path: Path) -> None:
 
 SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
     "a byte": (flipped,
-     {"archives": "{name}: is not whole", "folder": "{name} is not what was entered",
+     {"archives": "{name}: is incomplete", "folder": "{name} is not what was entered",
       "estimate": "{name} was pooled"}),
     "the tail": (lambda path: path.write_bytes(path.read_bytes()[:-300]),
-     {"archives": "though nobody tore it"}),
+     {"archives": "without a fault that truncated it"}),
     "an archive": (Path.unlink,
      {"archives": "cycles are in 0 archives",
       "folder": "{name} is in the manifest and not in the folder"}),
@@ -524,8 +525,8 @@ def test_a_record_that_is_not_what_crossed_the_wire_is_found(
     monkeypatch.setattr(archived, "cycles", cycles)
     said = found(replace(observed), "archives")
     assert {
-        "position": "position is not what the packets say",
-        "target_current": "target_current is not what the packets say",
+        "position": "position is not that of the packets",
+        "target_current": "target_current is not that of the packets",
         "commanded_position": "not the one that was sent",
         "mode": "mode is not that of the cycle exchanged",
     }[name] in said
@@ -545,7 +546,7 @@ def test_a_hole_in_an_archive_is_found_unless_it_is_stated(
     said = found(replace(observed), "archives")
     assert f"{count} cycles in between were exchanged and not archived, 0 are stated" in said
     assert f"samples is stated as {len(kept)}, and is {len(kept) - count}" in said
-    assert "not numbered without a hole" in said
+    assert "not numbered consecutively" in said
     outcome = {**(archived.outcome or {}), "records_lost": str(count)}
     monkeypatch.setattr(archived, "outcome", outcome)
     assert "not archived" not in found(replace(observed), "archives")

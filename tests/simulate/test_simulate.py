@@ -36,7 +36,7 @@ class TestScript:
 
     def test_what_a_line_says_is_kept(self) -> None:
         script = parse_script(["# a note", "", "stall@1200:12ms:answering", "lose@3x2"])
-        (stall,) = script.mishaps
+        (stall,) = script.events
         assert (stall.at, stall.word) == (1200, "answering")
         assert stall.value == pytest.approx(0.012)
         assert [line for line, _ in script.faults] == ["lose@3x2"]
@@ -197,6 +197,6 @@ def test_a_campaign_that_never_ends_is_a_finding(
 def test_a_scene_whose_arm_trembles_where_it_stands_is_drawn_anew(tmp_path: Path) -> None:
     """Seed 744: whether a motion could begin was a matter of chance, five runs in a row."""
     group = 744 // NEIGHBOURS
-    with pytest.raises(SceneError, match="standing, it moves at"):
+    with pytest.raises(SceneError, match="at rest it moves at"):
         _twin(scene_of(group), tmp_path / "trembling")
     assert twin_of(group, tmp_path).scene.words != scene_of(group).words

@@ -1,4 +1,4 @@
-"""Laws of a whole campaign, and what came of a seed and of many, as a journal has it."""
+"""Laws of whole campaigns, the verdict on a seed, the reduction of scripts, the summary of many."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.script import DISTURBS_THE_ARM, DRAWS, kind_of, parse_script, simpler
 from tests.simulate.world import Twin, UndisturbedError, play, twin_of
 
-_NUMBERS: Final = 0x7FFF  # Packet numbers are 1 to this
+_NUMBERS: Final = 0x7FFF  # largest packet number
 _HEADER, _AXIS, _INIT = 12, 36, 1200  # bytes
 _DRIVE_ON: Final = 5
 
 
 def gaps(seen: Observed) -> Iterator[Broken]:
-    """More packets missed in a row than the cell allows: the motion comes to no good end.
+    """A motion with more consecutive missed packets than allowed does not complete.
 
-    `docs/safety.md`: it is brought to rest on its path, or refused, or lost, but not completed.
+    `docs/safety.md`: it is stopped on its path, refused or lost.
     """
     most = seen.cell.controller.max_gap
     for number, life in enumerate(seen.runs, start=1):
@@ -42,24 +42,23 @@ def gaps(seen: Observed) -> Iterator[Broken]:
 
 
 def _outcome_of_motion(life: Life, first: Exchanged, second: Exchanged) -> str | None:
-    """How a motion ended whose set-points moved before a gap and after it."""
+    """Return the outcome of a motion whose set-points moved before and after a gap."""
     before, after = life.records[first.record], life.records[second.record]
     sped = np.nan_to_num(before["commanded_velocity"]).any()
     if not sped or not np.isfinite(after["commanded_velocity"]).all():
         return None
     later = life.records[second.record : second.record + 3]["commanded_velocity"]
     if not np.nan_to_num(later).any(axis=1).all():
-        return None  # it was at its end
+        return None  # at its end
     ends = (event for _, event in life.events if isinstance(event, MotionEnded))
     same = (end for end in ends if end.interval == int(after["interval"]))
     return next((end.outcome for end in same if end.cycle >= int(after["cycle"])), None)
 
 
 def piles(seen: Observed) -> Iterator[Broken]:
-    """Of packets of one kind that waited together in open mode only one gets an answer.
+    """Of packets of one kind that waited together in open mode, one is answered.
 
-    ARCHITECTURE.md, "Late answers are dropped": answers to the others would run the motion ahead
-    of the arm.
+    Answers to the others would run the motion ahead of the arm (ARCHITECTURE.md).
     """
     mode = seen.cell.controller.mode
     end = _HEADER + _AXIS * (len(seen.cell.joint_names) + seen.controller.foreign_axes)
@@ -70,7 +69,7 @@ def piles(seen: Observed) -> Iterator[Broken]:
             opens = len(second.packet) < _INIT and _opens(second.packet[:end], mode)
             if together and opens and _kind(first, end) == _kind(second, end):
                 text = f"run {number}: packets {_number(first)} and {_number(second)}"
-                yield Broken("piles", f"{text} of one pile were both answered in open mode")
+                yield Broken("piles", f"{text} waited together; both were answered in open mode")
 
 
 def _number(one: Exchanged) -> int:
@@ -78,7 +77,7 @@ def _number(one: Exchanged) -> int:
 
 
 def _kind(one: Exchanged, end: int) -> tuple[int, bytes, bytes]:
-    """What follows the axes, from `end` on, may be garbage."""
+    """Return length, status and modes, without the bytes after the axes, from `end` on."""
     return len(one.packet), one.packet[4:8], one.packet[_HEADER:end:_AXIS]
 
 
@@ -92,22 +91,20 @@ def _opens(packet: bytes, mode: int) -> bool:
     )
 
 
-_FOR_A_PERSON: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
+_NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
 
 
 def completion(seen: Observed) -> Iterator[Broken]:
-    """Once nothing goes wrong any more, the campaign completes and can be identified.
+    """Without further faults the campaign completes and is identified.
 
-    But where something disturbed the arm, its repetitions may be unlike each other for good: the
-    run then says that a person has to look.
+    If the arm was disturbed, its repetitions may differ, and the run may request an inspection.
     """
     if seen.complete:
         if seen.found is None:
             yield Broken("completion", f"complete, and not identified: {seen.unidentified}")
         return
     disturbed = any(kind_of(line) in {*DISTURBS_THE_ARM, "corrupt"} for line in seen.struck)
-    looked_for = disturbed and type(seen.runs[-1].error).__name__ in _FOR_A_PERSON
-    if not looked_for:
+    if not (disturbed and type(seen.runs[-1].error).__name__ in _NEEDS_OPERATOR):
         yield Broken("completion", f"after {len(seen.runs)} runs it ended {seen.ended}")
 
 
@@ -115,23 +112,23 @@ LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": 
 
 
 def judged(seen: Observed) -> list[Broken]:
-    """What is broken; a law that fails itself is a failure of its own name."""
+    """Return the violations of all laws; an exception of a law is a violation of its name."""
     found: list[Broken] = []
     for name, law in LAWS.items():
         try:
             found += law(seen)
-        except Exception as error:  # an observation that a law cannot read must be looked at
-            found.append(Broken(f"{name} (cannot judge)", f"{type(error).__name__}: {error}"))
+        except Exception as error:
+            found.append(Broken(f"{name} (exception)", f"{type(error).__name__}: {error}"))
     return found
 
 
-MOST_TRIES: Final = 40  # Campaigns that are played for it, at most
+MOST_TRIES: Final = 40  # largest number of campaigns simulated for the reduction
 
 Fails = Callable[[tuple[str, ...]], bool]
 
 
 def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple[str, ...]:
-    """A script that fails of which no line can be left out or simplified, as far as was tried."""
+    """Return a failing script with as few and as simple lines as found in some tries."""
     left, current = [tries], tuple(lines)
 
     def still(candidate: tuple[str, ...]) -> bool:
@@ -193,45 +190,40 @@ MET: Final[dict[str, Callable[[Life, Observed], Any]]] = {
     "several runs completed it": lambda _, seen: seen.complete and len(seen.runs) > 1,
     "no run completed it": lambda _, seen: not seen.complete,
 }
-"""Situations, and whether a life of a campaign came into each: the ground of a law, or of a part
-of one, for a law about what never came about says nothing."""
+"""Situations to which laws apply, each with its condition on a life of a campaign."""
 
 
 def situations(seen: Observed) -> tuple[str, ...]:
-    """Those of `MET` that came about."""
+    """Return the situations of `MET` that occurred."""
     return tuple(name for name, met in MET.items() if any(met(life, seen) for life in seen.runs))
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One seed.
+    """Result of one seed."""
 
-    Attributes:
-        shrunk: the smallest script that breaks the first of these laws; () if none was broken.
-    """
-
-    seed: int  # its number
-    scene: str  # arm and plan, in words
-    script: tuple[str, ...]  # what was drawn
-    struck: tuple[str, ...]  # kinds of the lines that came to pass, each as often as it did
-    met: tuple[str, ...]  # situations that came about, see `situations`
-    runs: tuple[str, ...]  # how each run ended: "complete", "incomplete" or the name of an error
-    cycles: int  # that the controller took, in all
-    broken: tuple[tuple[str, str], ...] = ()  # laws and what is wrong, as (law, text)
-    shrunk: tuple[str, ...] = ()
-    redrawn: int = 0  # scenes that were of no use before that of this seed's group
+    seed: int
+    scene: str  # description of arm and plan
+    script: tuple[str, ...]
+    struck: tuple[str, ...]  # kinds of the lines that occurred
+    met: tuple[str, ...]  # situations that occurred
+    runs: tuple[str, ...]  # "complete", "incomplete" or the name of an error
+    cycles: int  # of the controller
+    broken: tuple[tuple[str, str], ...] = ()  # (law, text)
+    shrunk: tuple[str, ...] = ()  # reduced script that breaks the first of these laws
+    redrawn: int = 0  # rejected scenes of the group
     seconds: float = 0.0  # processor time
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """From its fields, through JSON; KeyError, TypeError or ValueError if it is none."""
+        """Restore a verdict from JSON; KeyError, TypeError or ValueError if it is invalid."""
         lists = ("script", "struck", "met", "runs", "shrunk")
         broken = tuple((str(law), str(text)) for law, text in data["broken"])
         return cls(**data | {name: tuple(data[name]) for name in lists} | {"broken": broken})
 
 
 class Stage:
-    """Where seeds of one process are played; the run without faults is shared by neighbours."""
+    """Runs seeds in a folder; the run without faults is shared by a group of seeds."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
@@ -246,15 +238,15 @@ class Stage:
         return twin
 
     def twin(self, seed: int) -> Twin:
-        """The run without faults of a seed's group, which keeps every law.
+        """Return the run without faults of a seed's group.
 
         Raises:
-            UndisturbedError: it does not, or ends otherwise than any may.
+            UndisturbedError: it failed or broke a law.
         """
         return self._twin(seed // NEIGHBOURS)
 
     def observed(self, seed: int, lines: Iterable[str] | None = None) -> Observed:
-        """A seed, played; its folder stays until `clear`."""
+        """Run a seed; its folder remains until `clear`."""
         script = None if lines is None else parse_script(lines)
         twin = self.twin(seed)
         self.clear()
@@ -265,7 +257,7 @@ class Stage:
             shutil.rmtree(old)
 
     def verdict(self, seed: int, *, shrink: bool = True) -> Verdict:
-        """Play a seed, judge it, and make its script small where it fails."""
+        """Run a seed, check the laws, and reduce its script if one is broken."""
         begun = time.process_time()
         try:
             seen = self.observed(seed)
@@ -305,7 +297,7 @@ def runs_of(seen: Observed) -> tuple[str, ...]:
 
 
 def summary(verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """Many verdicts as JSON holds them; what never came about is named: nothing was tried of it."""
+    """Return the JSON summary of verdicts, with the kinds and situations that did not occur."""
 
     def counts(values: Iterable[str]) -> dict[str, int]:
         return dict(sorted(Counter(values).items()))

@@ -1,4 +1,4 @@
-"""Controller and link of a simulated campaign, with everything that passes written down."""
+"""Controller, link and session of a simulated campaign, with recorders."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from tests.simulate.observed import Act, ArmHistory, Exchanged
 from tests.simulate.script import Script
 
 Array = NDArray[np.float64]
-LONGEST_STALL = 1.0  # s; a longer one is a loss
+LONGEST_STALL = 1.0  # s
 
 
 class WatchedController:
-    """A peer that outlives the PC's processes, inflicts its faults, and has its history."""
+    """A controller with its scripted faults and its history over all processes of the PC."""
 
     def __init__(self, controller: SimulatedController, script: Script) -> None:
         self.controller = controller
@@ -68,14 +68,14 @@ class WatchedController:
         self.controller.accept(reply)
 
     def alone(self, cycles: int) -> None:
-        """Let time pass with nobody at the other end."""
+        """Simulate some cycles without a PC."""
         for _ in range(cycles):
             if self.next_packet() is None:
                 return
             self.accept(None)
 
     def press(self, *, restart: bool, warm: bool) -> None:
-        """Somebody restarts the controller, or not, and switches the drive on."""
+        """Switch the drive on, after a restart of the controller if requested."""
         if restart:
             self.controller.restart(warm=warm)
         self.controller.drive_on()
@@ -92,7 +92,7 @@ class WatchedController:
 
 
 class Clock:
-    """The PC's clock, which jumps by what the script says; it goes on through all lives."""
+    """The PC's clock with scripted jumps, over all lives."""
 
     def __init__(self, script: Script) -> None:
         jumps = sorted(
@@ -104,7 +104,7 @@ class Clock:
         self.struck: list[str] = []
 
     def offset(self, cycle: int) -> float:
-        """What has been added to it by this cycle [s]."""
+        """Return the sum of the jumps up to a cycle [s]."""
         if not self._at:
             return 0.0
         passed = bisect_right(self._at, cycle)
@@ -114,26 +114,25 @@ class Clock:
 
 
 class WatchedTransport(SimulatedTransport):
-    """The PC's end of the link, with its stalls, its clock, and all packets written down.
+    """A simulated transport with stalls and clock faults that records all packets.
 
-    Packets go through another transport in virtual time, which it holds. Before each packet is
-    waited for, `look` gets the present cycle; it may raise.
+    `on_cycle` is called with the present cycle before each packet is received; it may raise.
     """
 
     def __init__(
-        self, peer: WatchedController, script: Script, clock: Clock, look: Callable[[int], None]
+        self, peer: WatchedController, script: Script, clock: Clock, on_cycle: Callable[[int], None]
     ) -> None:
         faults = [fault for _, fault in script.faults if isinstance(fault, LinkFault)]
         self._inner = SimulatedTransport(peer, faults)
         self._inner.cycle = peer.cycle
-        self._clock, self._look = clock, look
+        self._clock, self._on_cycle = clock, on_cycle
         self._period = peer.period
         stalls = (one for one in script.of("cycle") if one.kind == "stall" and one.at >= peer.cycle)
         self._stalls = deque(sorted(stalls, key=lambda one: one.at))
         self._held: deque[tuple[float, bytes]] = deque()
         self._arrival = -math.inf
         self.struck: list[str] = []
-        self.answering = -1  # which of the packets seen the session has in hand
+        self.answering = -1  # index in `seen` of the packet that the session processes
         self.seen: list[tuple[float, int, bytes, list[bytes]]] = []  # time, cycle, packet, replies
 
     @property
@@ -145,7 +144,7 @@ class WatchedTransport(SimulatedTransport):
         return self._inner.cycle
 
     def receive(self, timeout: float) -> bytes | None:
-        self._look(self._inner.cycle)
+        self._on_cycle(self._inner.cycle)
         self._stall("")
         if self._held:
             self._arrival, packet = self._held.popleft()
@@ -166,7 +165,7 @@ class WatchedTransport(SimulatedTransport):
         self._inner.close()
 
     def _stall(self, where: str) -> None:
-        """Let time pass with nothing done, if it is time for that; packets pile up."""
+        """Execute the next stall if it is due; packets accumulate meanwhile."""
         if not self._stalls or self._stalls[0].at > self._inner.cycle:
             return
         if self._stalls[0].word != where:
@@ -181,7 +180,7 @@ class WatchedTransport(SimulatedTransport):
 
 
 class StampedWatchedTransport(WatchedTransport):
-    """The same of a link that knows when a packet arrived, as UDP does."""
+    """A `WatchedTransport` with times of arrival, as UDP has them."""
 
     @property
     def arrived(self) -> float:
@@ -189,7 +188,7 @@ class StampedWatchedTransport(WatchedTransport):
 
 
 class SessionLog:
-    """What a new link's session was told to do, and every record that it made."""
+    """Recorder of the calls, events and records of a session."""
 
     def __init__(self, link: Link, transport: WatchedTransport) -> None:
         self._transport, self._seen = transport, transport.seen
@@ -227,7 +226,7 @@ class SessionLog:
             self.acts.append(Act(self._transport.answering + 1, "tick", (now,)))
 
     def _reply(self, session: Session, reply: Any, packet: bytes, *arguments: Any) -> bytes | None:
-        """Of a pile the session gets some: find out which of those received it has in hand."""
+        """Find the packet among those received: the session skips superseded ones."""
         row = self._transport.answering + 1
         while row < len(self._seen) and self._seen[row][2] is not packet:
             row += 1

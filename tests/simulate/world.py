@@ -1,4 +1,4 @@
-"""A simulated cell and the person at it, over all process lives of one campaign."""
+"""Simulated cell, disk and operator, over all process lives of one campaign."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from sim_fixtures.settings import WHILE_SILENT
 from tests.hil.fast_cell import pass_rehearsal
 from tests.simulate.observed import ArmHistory, Digests, Estimated, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS, Scene, scene_of
-from tests.simulate.script import Mishap, Script, Story, draw_script, parse_script
+from tests.simulate.script import Script, ScriptedEvent, Story, draw_script, parse_script
 from tests.simulate.watched import (
     Clock,
     SessionLog,
@@ -56,34 +56,34 @@ from tests.simulate.watched import (
 
 
 class Killed(BaseException):
-    """The process is no more; what unwinds after this does nothing to the disk."""
+    """The process was killed; writes after this are ignored."""
 
 
 class Disk:
-    """Stands between what writes archives and manifests, and the files."""
+    """Replaces `os` in the archive writer and `write_atomically` of manifests, with disk faults."""
 
     def __init__(self, script: Script) -> None:
-        self._mishaps = {
+        self._events_at = {
             what: {at: one for one in script.of(what) for at in range(one.at, one.at + one.count)}
             for what in ("write", "save", "create")
         }
-        self._count = dict.fromkeys(self._mishaps, 0)
+        self._count = dict.fromkeys(self._events_at, 0)
         self._paths: dict[int, Path] = {}
         self._last: list[Path] = []
         self.struck: list[str] = []
-        self.failures: list[str] = []  # kinds of those since the last `begin`
-        self.torn: dict[str, int] = {}  # bytes that an archive lacks since its process died
-        self.refused: set[str] = set()  # archives that a write to failed
+        self.failures: list[str] = []  # kinds since the last `begin`
+        self.torn: dict[str, int] = {}  # bytes removed from archives
+        self.refused: set[str] = set()  # archives with a failed write
         self.dead = False  # whether the process was killed
 
     @property
     def most(self) -> int:
-        """How often it can strike at all."""
-        return sum(len(mishaps) for mishaps in self._mishaps.values())
+        """Number of scripted disk faults."""
+        return sum(len(events) for events in self._events_at.values())
 
     @property
     def done(self) -> dict[str, int]:
-        """How often there was something to strike, by what it is: writes, saves, creates."""
+        """Number of writes, saves and creates."""
         return {f"{what}s": count for what, count in self._count.items()}
 
     def begin(self) -> None:
@@ -93,22 +93,20 @@ class Disk:
         self._last.clear()
 
     def cut_power(self, keep: float, files: int) -> None:
-        """Kill the process, and have a share left of the newest archives it wrote."""
+        """Kill the process and truncate the newest archives."""
         self.dead = True
         for path in self._last[-files:]:
             size = path.stat().st_size
             os.truncate(path, left := round(keep * size))
             self.torn[path.name] = size - left
 
-    def _due(self, what: str) -> Mishap | None:
+    def _due(self, what: str) -> ScriptedEvent | None:
         self._count[what] += 1
-        found = self._mishaps[what].get(self._count[what])
+        found = self._events_at[what].get(self._count[what])
         if found is not None:
             self.struck.append(found.line)
             self.failures.append(found.kind)
         return found
-
-    # What stands in for `os` below archives.
 
     def open(self, path: Any, flags: int, mode: int = 0o777) -> int:
         if flags & os.O_CREAT and self._due("create") is not None:
@@ -120,51 +118,50 @@ class Disk:
         return descriptor
 
     def write(self, descriptor: int, data: Any) -> int:
-        """Write as much as the disk takes."""
+        """Replace `os.write`."""
         if self.dead:
             return len(data)
-        mishap = self._due("write")
-        if mishap is None:
+        event = self._due("write")
+        if event is None:
             return os.write(descriptor, data)
-        if mishap.kind == "short-write":
-            return os.write(descriptor, data[: max(1, round(mishap.value * len(data)))])
-        part = data[: min(len(data) - 1, round(mishap.value * len(data)))]
+        if event.kind == "short-write":
+            return os.write(descriptor, data[: max(1, round(event.value * len(data)))])
+        part = data[: min(len(data) - 1, round(event.value * len(data)))]
         kept = os.write(descriptor, part) if len(part) else 0
-        if mishap.kind == "kill-at-write":
+        if event.kind == "kill-at-write":
             self.dead = True
             self.torn[self._paths[descriptor].name] = len(data) - kept
-            raise Killed(mishap.line)
+            raise Killed(event.line)
         self.refused.add(self._paths[descriptor].name)
-        number = errno.EIO if mishap.kind == "disk-error" else errno.ENOSPC
+        number = errno.EIO if event.kind == "disk-error" else errno.ENOSPC
         raise OSError(number, os.strerror(number))
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os, name)
 
-    # What stands in for `write_atomically` below manifests.
-
     def save(self, path: Path, content: str | bytes) -> None:
+        """Replace `write_atomically`."""
         if self.dead:
             return
-        mishap = self._due("save")
-        if mishap is None:
+        event = self._due("save")
+        if event is None:
             write_atomically(path, content)
             return
-        if mishap.kind == "save-full":
+        if event.kind == "save-full":
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        if mishap.word == "after":
+        if event.word == "after":
             write_atomically(path, content)
-        elif mishap.word == "left":
+        elif event.word == "left":
             half = content[: len(content) // 2]
             left = path.with_suffix(path.suffix + ".tmp")
             left.write_bytes(half.encode() if isinstance(half, str) else half)
         self.dead = True
-        raise Killed(mishap.line)
+        raise Killed(event.line)
 
 
 @contextmanager
-def planted(disk: Disk) -> Iterator[None]:
-    """Everything that this thread archives goes through `disk`."""
+def installed(disk: Disk) -> Iterator[None]:
+    """Write archives and manifests through `disk`."""
     with (
         patch.object(writer, "os", disk),
         patch.object(campaign_folder, "write_atomically", disk.save),
@@ -172,8 +169,8 @@ def planted(disk: Disk) -> Iterator[None]:
         yield
 
 
-class Person:
-    """An `Operator` with requests by the controller's cycle."""
+class ScriptedOperator:
+    """An `Operator` with scripted requests by cycle of the controller."""
 
     can_answer = True
 
@@ -192,7 +189,7 @@ class Person:
         del status
 
     def request(self) -> OperatorRequest:
-        """See `Operator`; a hold ends when it was asked after often enough."""
+        """See `Operator`; a hold ends after `count` calls."""
         cycle = self._cycle()
         while self._overrides and self._overrides[0].at <= cycle:
             act = self._overrides.pop(0)
@@ -218,7 +215,7 @@ class Person:
 
 @contextmanager
 def lurching(script: Script, cycle: Callable[[], int], struck: list[str]) -> Iterator[None]:
-    """Motions lurch where the script says so; `struck` takes the lines that came to pass."""
+    """Shift set-points as scripted; add the lines that occurred to `struck`."""
     due = [one for one in script.of("cycle") if one.kind == "lurch" and one.line not in struck]
     if not due:
         yield
@@ -248,25 +245,25 @@ def lurching(script: Script, cycle: Callable[[], int], struck: list[str]) -> Ite
 
 MOST_LIVES: Final = 32
 MOST_CYCLES: Final = 500_000
-"""Of one life; all lives together take 66 415 in the longest of some 7000 seeds."""
-_SECOND_CHANCES: Final = 5
-"""Runs that may still fail once the script speaks of no later cycle, beside the disk's failures."""
-_JUST_BEFORE: Final = 10  # Cycles before a motion was refused in which the arm is looked at
-_AFTERWARDS: Final = 400  # Cycles that the controller goes on alone after a run, at most
+"""Limit for one life; in 7000 seeds all lives of a campaign together take 66 415 at most."""
+_RETRIES: Final = 5
+"""Runs that may fail after the last scripted cycle, in addition to the number of disk faults."""
+_JUST_BEFORE: Final = 10  # cycles before a refused motion in which the speed is checked
+_AFTERWARDS: Final = 400  # cycles of the controller without a PC after a run, at most
 _HURRIES: Final = 500
-"""Cycles after the last one of the script in which runs are still begun again at once."""
-_GIVES_UP: Final = 3000  # Cycles without an init packet after which the person ends a run
-_JOG: Final = "jog the arm"  # What a run says that cannot find a free way from where the arm stands
+"""Cycles after the last scripted one in which runs are repeated at once."""
+_GIVES_UP: Final = 3000  # cycles without an init packet after which the operator ends a run
+_JOG: Final = "jog the arm"  # remedy in the error of a run without a free path
 
 
 class EndlessError(Exception):
-    """A run goes on and on in virtual time."""
+    """A run does not end in virtual time."""
 
 
-def unrest(scene: Scene, history: ArmHistory) -> float:
-    """The largest speed with closed or opening axes, in units of what the guard calls standstill.
+def standstill_ratio(scene: Scene, history: ArmHistory) -> float:
+    """Return the largest speed with closed or opening axes relative to the guard's standstill.
 
-    Beyond one it is a matter of chance whether a motion may begin, with faults or without.
+    Above one, whether a motion may start depends on chance.
     """
     still = np.isin(history.phase, ("CLOSED", "OPENING"))
     revolutions = np.abs(scene.cell.drive_train.gear_ratio) * scene.cell.period / (2.0 * np.pi)
@@ -275,7 +272,7 @@ def unrest(scene: Scene, history: ArmHistory) -> float:
 
 
 class World:
-    """Controller, disk, clock and person of one campaign, over all its lives."""
+    """Controller, disk, clock and operator of one campaign, over all its lives."""
 
     def __init__(
         self,
@@ -294,7 +291,7 @@ class World:
         )
         self.disk = Disk(script)
         self._clock = Clock(script)
-        self._person = Person(script, lambda: self.controller.cycle)
+        self._operator = ScriptedOperator(script, lambda: self.controller.cycle)
         self._due = sorted(
             (one for one in script.of("cycle") if one.kind in _BY_CYCLE), key=lambda one: one.at
         )
@@ -308,22 +305,22 @@ class World:
         self._digests = _digests(folder)
 
     def all_lives(self) -> list[Life]:
-        """Runs until the campaign is complete, or nothing more is to be hoped for."""
+        """Run until the campaign is complete or the number of retries is exhausted."""
         lives: list[Life] = []
-        patience = _SECOND_CHANCES + self.disk.most
+        retries = _RETRIES + self.disk.most
         while True:
             lives.append(self.live())
             result = lives[-1].result
             if result is not None and result.complete:
                 break
-            patience -= self.controller.cycle > self._last and not self._trembled(lives[-1])
-            if len(lives) == MOST_LIVES or patience <= 0:
+            retries -= self.controller.cycle > self._last and not self._trembled(lives[-1])
+            if len(lives) == MOST_LIVES or retries <= 0:
                 break
             self._between(jog=_JOG in str(lives[-1].error))
         return lives
 
     def _trembled(self, life: Life) -> bool:
-        """Whether a motion could not begin because the arm did move where it has to stand."""
+        """Whether a motion was refused because the arm moved at standstill."""
         if NotAtStandstill.check not in str(life.error):
             return False
         index = next(k for k, event in reversed(life.events) if isinstance(event, MotionEnded))
@@ -331,14 +328,14 @@ class World:
         history = self.controller.history()
         last = slice(at - _JUST_BEFORE, at + 1)
         moved = replace(history, phase=history.phase[last], velocity=history.velocity[last])
-        return unrest(self._scene, moved) > 1.0
+        return standstill_ratio(self._scene, moved) > 1.0
 
     def live(self) -> Life:
-        """One process: opens the campaign and runs it."""
+        """Run one process, which opens the campaign and runs it."""
         self._stop = Stop()
         self.disk.begin()
         first, before, names = self.controller.cycle, self._digests, _names(self.folder)
-        transport = self._kind(self.controller, self.script, self._clock, self._look)
+        transport = self._kind(self.controller, self.script, self._clock, self._on_cycle)
         connection = Link.over(
             transport, self._scene.cell, finish=self.controller.controller.finish
         )
@@ -369,12 +366,12 @@ class World:
 
     def _run(self, connection: Link) -> tuple[RunResult | None, BaseException | None]:
         lurches = lurching(self.script, lambda: self.controller.cycle, self._struck)
-        with planted(self.disk), _no_waiting(), lurches:
+        with installed(self.disk), _no_waiting(), lurches:
             try:
                 result = Campaign.open(self.folder).run(
                     connection,
                     self._stop,
-                    operator=self._person,
+                    operator=self._operator,
                     durable=False,
                     unrehearsed=self._unrehearsed,
                 )
@@ -382,27 +379,27 @@ class World:
                 return None, error
         return result, None
 
-    def _look(self, cycle: int) -> None:
-        """What is due in this cycle happens to the process."""
+    def _on_cycle(self, cycle: int) -> None:
+        """Execute the events of the process that are due in this cycle."""
         if cycle - self._begun > MOST_CYCLES:
             raise EndlessError
         if cycle - self._begun > _GIVES_UP and self._session.state is State.SYNC:
-            self._stop.requested = True  # nobody waits a minute for a controller in mid-session
+            self._stop.requested = True  # the controller is within a session
         while self._due and self._due[0].at <= cycle:
-            mishap = self._due.pop(0)
-            self._struck.append(mishap.line)
-            if mishap.kind == "stop":
+            event = self._due.pop(0)
+            self._struck.append(event.line)
+            if event.kind == "stop":
                 self._stop.requested = True
-            elif mishap.kind == "interrupt":
+            elif event.kind == "interrupt":
                 raise KeyboardInterrupt
             else:
-                if mishap.kind == "power-cut":
-                    self.disk.cut_power(mishap.value, mishap.count)
+                if event.kind == "power-cut":
+                    self.disk.cut_power(event.value, event.count)
                 self.disk.dead = True
-                raise Killed(mishap.line)
+                raise Killed(event.line)
 
     def _between(self, *, jog: bool) -> None:
-        """The controller goes on alone, and somebody sees to it, or jogs the arm home if asked."""
+        """Run the controller without a PC, restart it, and jog the arm home if requested."""
         hurry = self.script.has("hurry") and self.controller.cycle <= self._last + _HURRIES
         hurried = hurry and not jog and not self.controller.ended
         if not hurried:
@@ -415,15 +412,15 @@ class World:
         self.controller.press(restart=not hurried, warm=self._chance.random() < 0.5)
 
     def history(self) -> ArmHistory:
-        """The controller's side, when it has ended or gone on for a while."""
+        """Return the history of the controller, some cycles after the last run."""
         if not self.controller.ended:
             self.controller.alone(_AFTERWARDS)
         return self.controller.history()
 
     def struck(self) -> tuple[str, ...]:
-        """Lines that came to pass, those on the link by the cycles that passed."""
+        """Return the lines that occurred; those of the link by their cycles."""
         found = [*self._struck, *self.controller.struck, *self.disk.struck]
-        found += [*self._clock.struck, *self._person.struck]
+        found += [*self._clock.struck, *self._operator.struck]
         found += [one.line for one in self.script.of("always") if one.kind == "with-dry-run"]
         on_link = [line for line, fault in self.script.faults if line not in found]
         for line, fault in self.script.faults:
@@ -440,7 +437,7 @@ def _of_link(fault: object) -> bool:
 
 
 def _when(script: Script) -> int:
-    """The last cycle that a script speaks of."""
+    """Return the last cycle in a script."""
     cycles = [fault.cycle + getattr(fault, "count", 1) for _, fault in script.faults]
     cycles += [one.at for one in script.of("cycle")]
     return max(cycles, default=0)
@@ -448,7 +445,7 @@ def _when(script: Script) -> int:
 
 @contextmanager
 def _no_waiting() -> Iterator[None]:
-    """A person who holds the arm is asked again at once."""
+    """Do not sleep while the operator holds the arm."""
     fake = SimpleNamespace(sleep=lambda seconds: None, monotonic=time.monotonic)
     with patch.object(link, "time", fake), patch.object(steering, "time", fake):
         yield
@@ -473,28 +470,28 @@ _EMPTY: Final = parse_script(())
 class Twin:
     """The run without faults of a group of seeds."""
 
-    scene: Scene  # cell, plan and controller
-    folder: Path  # of its campaign
-    found: Estimated  # its estimate
-    story: Story  # what a script may refer to
-    seen: Observed  # all that was seen of it
-    redrawn: int = 0  # scenes before this one that were of no use
+    scene: Scene
+    folder: Path
+    found: Estimated
+    story: Story
+    seen: Observed
+    redrawn: int = 0  # rejected scenes before this one
 
 
 class SceneError(Exception):
-    """A scene of no use, for a reason that scenes may have: another one is drawn."""
+    """The random arm or motion of a scene is unusable; another one is drawn."""
 
 
 class UndisturbedError(Exception):
-    """What no scene is a reason for: an undisturbed campaign that fails is a finding."""
+    """A campaign without faults failed for a reason that is not the scene: a finding."""
 
 
 def twin_of(group: int, root: Path) -> Twin:
-    """The undisturbed campaign of a group, in a folder below `root`.
+    """Return the campaign without faults of a group, in a folder below `root`.
 
     Raises:
-        UndisturbedError: it ends otherwise than any may.
-        RuntimeError: no scene of the group is of use.
+        UndisturbedError: it failed.
+        RuntimeError: no scene of the group is usable.
     """
     why = ""
     for attempt in range(8):
@@ -504,11 +501,11 @@ def twin_of(group: int, root: Path) -> Twin:
             return replace(_twin(scene, folder), redrawn=attempt)
         except SceneError as error:
             why = str(error)
-    raise RuntimeError(f"no scene of group {group} is of use, the last: {why}")
+    raise RuntimeError(f"no scene of group {group} is usable, the last: {why}")
 
 
-def _require_use(scene: Scene, life: Life) -> None:
-    """What may be wrong with arms and motions that are drawn."""
+def _check_usable(scene: Scene, life: Life) -> None:
+    """Raise SceneError for an unusable arm or motion, UndisturbedError for another failure."""
     error, result = life.error, life.result
     if isinstance(error, RepetitionsRejectedError):
         raise SceneError(f"{scene.words}: {error}")
@@ -524,15 +521,15 @@ def _require_use(scene: Scene, life: Life) -> None:
 def _twin(scene: Scene, folder: Path) -> Twin:
     world = World(scene, scene.controller, _EMPTY, random.Random(0), folder)
     life = world.live()
-    _require_use(scene, life)
+    _check_usable(scene, life)
     found, why = estimated(folder)
     if found is None:
         raise UndisturbedError(f"{scene.words}: complete, and not identified: {why}")
     if found.result.pooled.undetermined:
         raise SceneError(f"{scene.words}: its motion does not determine all parameters")
     history = world.history()
-    if (share := unrest(scene, history)) > 1.0:
-        raise SceneError(f"{scene.words}: standing, it moves at {share:.2g} of what is at rest")
+    if (ratio := standstill_ratio(scene, history)) > 1.0:
+        raise SceneError(f"{scene.words}: at rest it moves at {ratio:.2g} times the standstill")
     moving = np.abs(history.velocity).max(axis=1) > _MOVING
     story = Story(
         cycles=world.controller.cycle,
@@ -546,7 +543,7 @@ def _twin(scene: Scene, folder: Path) -> Twin:
 
 
 def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Observed:
-    """Play a seed in a folder below `root`, or another script in the place of the drawn one."""
+    """Simulate a seed in a folder below `root`, with its own script or another one."""
     chance = random.Random(f"seed {seed}")
     settings = replace(
         twin.scene.controller,
@@ -584,7 +581,7 @@ def _observed(
 
 
 def estimated(root: Path) -> tuple[Estimated | None, str]:
-    """The estimate from a folder as `hil identify` makes it with fixed settings, or why not."""
+    """Return the estimate of `hil identify` with fixed settings, or None and the reason."""
     folder = CampaignFolder(root)
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]

@@ -1,7 +1,7 @@
-"""What holds in every simulated campaign, whatever befell it; one family of laws per module.
+"""Laws of all simulated campaigns, one family per module.
 
-A law sees an `Observed` and nothing else of the product: the wire, the archives and the manifest
-are decoded here a second time, from the documents.
+The input of a law is an `Observed`: wire, archives and manifest are decoded here independently of
+the product, from the documentation.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Every archive tells what crossed the wire, all of it up to what it states as lost.
+"""Archives contain what crossed the wire, except what they state as lost.
 
-`docs/archive-format.md`: one interval of motion in one file, records as they were exchanged, cycles
-that grow, what is missing counted; a file that was not closed is readable to its last whole chunk.
-Each record is held against the packet and the answer that it was made of, decoded here.
+`docs/archive-format.md`: one interval of motion per file, records as exchanged, increasing cycles,
+missing packets counted; a file that was not closed is readable to its last complete chunk. Records
+are compared with the packets and answers, decoded here.
 """
 
 from __future__ import annotations
@@ -31,27 +31,25 @@ from .wire import Array, Gears
 
 LAW: Final = "archives"
 _EPS: Final = float(np.finfo(np.float64).eps)
-_FLUSHED: Final = 0.1
-"""s of the controller's time in a chunk."""
-_DRAINED: Final = 100
-"""Cycles after which records in memory are handed to the archive (`hil.campaign.link`)."""
+_FLUSHED: Final = 0.1  # duration of a chunk [s]
+_DRAINED: Final = 100  # cycles after which records are passed to the archive
 _SAME: Final = ("arrival", "number", "gap", "interval", "state", "status", "mode", "age")
 _SI: Final = (
     *("target_position", "target_velocity", "position", "velocity"),
     *("target_current", "model_current", "diagonal_inertia", "extra3"),
 )
-"""The wire's D1..D5, extra1..3 as they are called in a record."""
+"""Names of D1..D5, extra1..3 in a record."""
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """An archive, and the session that its records are of.
+    """An archive with its session.
 
     Attributes:
-        archived: as read.
-        life: that wrote it.
-        talk: the session; None where no record is in the file, or none fits.
-        rows: (k,) rows of the session that its records were made of.
+        archived: content of the file.
+        life: life that wrote it.
+        talk: the session; None without records, or if none matches.
+        rows: (k,) rows of the session for its records.
     """
 
     archived: Archived
@@ -62,7 +60,7 @@ class Placed:
 
 @lru_cache(maxsize=2)
 def placed(observed: Observed) -> tuple[Placed, ...]:
-    """The archives of all lives that are in the folder."""
+    """Return the archives of all lives that are in the folder."""
     found = []
     for life, one in zip(observed.runs, heard(observed), strict=True):
         for name in life.archives:
@@ -90,7 +88,7 @@ def _place(archived: Archived, talks: tuple[Talk, ...]) -> tuple[Talk | None, ND
 
 
 def archives(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     gears = Gears.of(observed.cell.drive_table)
     constants = np.array(observed.cell.drive_table.torque_constant, float)
     one_asked = observed.seed
@@ -114,23 +112,23 @@ def archives(observed: Observed) -> Iterator[Broken]:
 
 
 def _newest(all_placed: tuple[Placed, ...], life: Life) -> list[Placed]:
-    """The archive of a life with its last cycles, and those that had none yet."""
+    """Return the archive with the last cycles of a life, and those without cycles."""
     mine = [p for p in all_placed if p.life is life]
     last = max((_last_of(p) for p in mine), default=-1)
     return [p for p in mine if _last_of(p) in (-1, last)]
 
 
 def _last_of(one: Placed) -> int:
-    """Index among the exchanged packets of the last cycle in an archive, -1 for none."""
+    """Return the index of the packet of the last cycle in an archive; -1 for none."""
     return int(one.talk.index[one.rows[-1]]) if one.talk is not None and len(one.rows) else -1
 
 
 def _readable(one: Placed, *, by_library: bool, newest: bool) -> Iterator[str]:
     archived, life = one.archived, one.life
     name = archived.path.name
-    at_work = newest and (life.died or bool(life.disk))  # on it, when that befell it
-    if not archived.whole and not at_work and name not in life.torn:
-        yield f"is not whole ({archived.problem}), though nobody tore it"
+    being_written = newest and (life.died or bool(life.disk))  # at the fault
+    if not archived.whole and not being_written and name not in life.torn:
+        yield f"is incomplete ({archived.problem}) without a fault that truncated it"
     if not archived.whole or by_library:
         yield from _as_the_product_reads(archived)
     if by_library:
@@ -138,31 +136,31 @@ def _readable(one: Placed, *, by_library: bool, newest: bool) -> Iterator[str]:
 
 
 def _as_the_product_reads(archived: Archived) -> Iterator[str]:
-    """The same rows; and what is torn is told to be."""
+    """The product reads the same rows and reports truncation."""
     try:
         archive = open_archive(archived.path, fields=("cycle", "position"))
     except ArchiveError as error:
         if len(archived.cycles):
-            yield f"{len(archived.cycles)} records are whole, and it is refused ({error})"
+            yield f"it is refused ({error}) with {len(archived.cycles)} complete records"
         return
     if archive.complete is not archived.whole:
-        yield f"complete is {archive.complete}, but whole is {archived.whole}"
+        yield f"complete is {archive.complete}, expected {archived.whole}"
     columns = archive.columns
     if len(archived.cycles):
         same = np.array_equal(columns["cycle"], archived.cycles["cycle"])
         if not same or not np.array_equal(columns["position"], archived.cycles["position"]):
-            yield f"{len(columns['cycle'])} records are read, {len(archived.cycles)} are whole"
+            yield f"{len(columns['cycle'])} records are read of {len(archived.cycles)}"
 
 
 def _as_the_library_reads(archived: Archived) -> Iterator[str]:
-    """As many messages, with the same times, from the `mcap` library's own reader."""
+    """The reader of the `mcap` library finds the same messages and times."""
     stamps = []
     try:
         reader = NonSeekingReader(io.BytesIO(archived.path.read_bytes()), validate_crcs=True)
         for _, channel, message in reader.iter_messages(log_time_order=False):
             if channel.topic == "/hil/cycle":
                 stamps.append(message.log_time)
-    except (McapError, ValueError, struct.error) as error:  # the last: torn within an index
+    except (McapError, ValueError, struct.error) as error:  # the last: truncated within an index
         if archived.whole:
             yield f"the mcap library cannot read it: {type(error).__name__}: {error}"
             return
@@ -171,19 +169,19 @@ def _as_the_library_reads(archived: Archived) -> Iterator[str]:
 
 
 def _columns(archived: Archived, period: float) -> Iterator[str]:
-    """What the channels say of one another."""
+    """Channels are consistent with each other."""
     rows = archived.cycles
     if not len(rows):
         return
     cycle = rows["cycle"]
     if not (np.diff(cycle) > 0).all():
-        yield "cycles do not grow"
+        yield "cycles do not increase"
     stamps = np.rint(cycle * (period * 1e9)).astype(np.int64)
-    told = rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"]
-    if not (np.array_equal(stamps, archived.stamps) and np.array_equal(stamps, told)):
+    headers = rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"]
+    if not (np.array_equal(stamps, archived.stamps) and np.array_equal(stamps, headers)):
         yield "times are not cycle times period"
     if not np.array_equal(archived.sequences, np.arange(len(rows))):
-        yield "messages are not numbered without a hole"
+        yield "messages are not numbered consecutively"
     state = np.concatenate([rows[name] for name in ("position", "velocity", "torque")], axis=1)
     sent, inside = (
         np.concatenate([rows[f"{whose}_{name}"] for name in ("position", "velocity")], axis=1)
@@ -192,14 +190,14 @@ def _columns(archived: Archived, period: float) -> Iterator[str]:
     sent = np.where(np.isnan(sent), inside, sent)
     same = np.array_equal(state, archived.states, equal_nan=True)
     if not (same and np.array_equal(sent, archived.commanded, equal_nan=True)):
-        yield "the JointState channels do not repeat the records"
-    # An unknown number of packets is missing after a silence, and the cycles do not count them.
+        yield "the JointState channels do not agree with the records"
+    # After a silence the number of missing packets is unknown, and not counted in the cycles.
     if np.any(np.diff(cycle) < 1 + rows["gap"][1:]):
-        yield "more packets are missing before a cycle than there is room for"
+        yield "more packets are missing than cycles between two records"
 
 
 def _stated(one: Placed) -> Iterator[str]:
-    """The outcome's own figures."""
+    """The numbers of the outcome agree with the records."""
     archived, outcome = one.archived, one.archived.outcome
     if outcome is None or not archived.whole:
         return
@@ -217,13 +215,13 @@ def _stated(one: Placed) -> Iterator[str]:
 
 
 def _made_of(one: Placed, gears: Gears, constants: Array) -> Iterator[str]:
-    """Each record is of one packet and its answer."""
+    """Each record agrees with its packet and answer."""
     archived, talk, rows = one.archived, one.talk, one.rows
     cycles = archived.cycles
     if not len(cycles):
         return
     if talk is None:
-        yield "its records never crossed the wire of the run that wrote it"
+        yield "its records agree with no session of the run that wrote it"
         return
     init = talk.life.exchanged[talk.at].packet
     if archived.attachments.get("init_packet.bin") != init:
@@ -233,7 +231,7 @@ def _made_of(one: Placed, gears: Gears, constants: Array) -> Iterator[str]:
     if archived.whole and lost != stated:
         yield f"{lost} cycles in between were exchanged and not archived, {stated} are stated lost"
     if not archived.whole and lost:
-        yield f"what survives has a hole of {lost} cycles"
+        yield f"{lost} cycles are missing within the truncated file"
     records = talk.records[rows]
     for name in _SAME:
         if not np.array_equal(records[name], cycles[name]):
@@ -248,7 +246,7 @@ def _decoded(
     slots = list(talk.init.slots or ())
     d = talk.received.d[rows][:, slots].astype(np.float64)
     period = talk.init.period
-    finite = np.isfinite(d).all(axis=(1, 2))  # a garbled packet may hold any number
+    finite = np.isfinite(d).all(axis=(1, 2))  # a corrupted packet may have any number
     size = np.abs(np.linalg.inv(gears.matrix)).sum(axis=1).max() * (
         1.0
         + np.abs(gears.offset).max()
@@ -256,16 +254,16 @@ def _decoded(
     )
     bound = 16.0 * len(slots) * _EPS * size
     for column, name in enumerate(_SI):
-        told = cycles[name][finite]
+        recorded = cycles[name][finite]
         if column in (0, 2):
-            good = np.abs(told - gears.joint(d[finite, :, column])) <= bound
+            good = np.abs(recorded - gears.joint(d[finite, :, column])) <= bound
         elif column in (1, 3):
             expected = gears.joint_step(d[finite, :, column]) / period
-            good = np.abs(told - expected) <= bound / period
+            good = np.abs(recorded - expected) <= bound / period
         else:
-            good = told == d[finite, :, column]
+            good = recorded == d[finite, :, column]
         if not good.all():
-            yield f"{name} is not what the packets say"
+            yield f"{name} is not that of the packets"
     torque = (cycles["target_current"][finite] * constants) @ (2.0 * np.pi * gears.matrix)
     scale = np.abs(cycles["target_current"][finite] * constants) @ np.abs(
         2.0 * np.pi * gears.matrix
@@ -276,11 +274,11 @@ def _decoded(
     sent = cycles["commanded_position"]
     led = (modes.all_ready & ~modes.refused)[rows]
     if talk.usable and not np.array_equal(np.isfinite(sent).all(axis=1) & led, led):
-        yield "a set-point was sent that its record does not have"
+        yield "a set-point was sent that is not in its record"
     given = np.isfinite(sent) & led[:, np.newaxis]
     motor = gears.motor(np.where(given, sent, 0.0))
     on_wire = talk.answer.d[rows][:, slots, 0]
-    # Recorded in joint angles, sent as float32: half a step of those, and the conversion.
+    # Tolerance: half a step of float32 on the wire, and the conversion from joint angles.
     allowed = np.spacing(np.abs(on_wire)).astype(np.float64) + 32.0 * len(slots) * _EPS * (
         1.0 + np.abs(motor)
     )
@@ -288,42 +286,41 @@ def _decoded(
         yield "a recorded set-point is not the one that was sent"
     held = np.isfinite(sent) & ~talk.safe.on[rows][:, slots] if talk.safe is not None else given
     if held.any() or np.isfinite(sent[modes.refused[rows]]).any():
-        yield "a set-point is recorded where none may have been sent"
+        yield "a set-point is recorded where none was allowed"
 
 
 def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterator[str]:
-    """Each motion is in one archive of its life, whole, and with its true outcome."""
+    """Each motion is completely in one archive of its life, with its outcome."""
     for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
         mine = [p for p in all_placed if p.life is life and p.talk is not None]
         begun = [(talk, interval) for talk in one.talks for interval in _motions(talk)]
-        spared = begun[len(begun) - _at_risk(life, mine) :]
+        at_risk = begun[len(begun) - _at_risk(life, mine) :]
         for talk, interval in begun:
             rows = np.flatnonzero(talk.records["interval"] == interval)
             if len(rows):
-                excused = any(talk is other and interval == same for other, same in spared)
+                excused = any(talk is other and interval == same for other, same in at_risk)
                 period = observed.cell.period
                 for text in _interval(life, talk, interval, rows, mine, period, excused=excused):
                     yield f"life {number}, interval {interval}: {text}"
-        taken: set[tuple[int, int]] = set()
+        archived: set[tuple[int, int]] = set()
         for p in mine:
-            cells = {(id(p.talk), int(row)) for row in p.rows}
-            if taken & cells:
-                yield f"life {number}: {len(taken & cells)} records are in two archives"
-            taken |= cells
+            records = {(id(p.talk), int(row)) for row in p.rows}
+            if archived & records:
+                yield f"life {number}: {len(archived & records)} records are in two archives"
+            archived |= records
 
 
 def _at_risk(life: Life, mine: list[Placed]) -> int:
-    """How many of a life's last motions may have no archive.
+    """Return the number of last motions of a life that may have no archive.
 
-    Who dies, or has no room, does so at the last one that was begun; what is torn to its beginning
-    tells nothing, and those are the newest files.
+    A kill or a disk fault concerns the last one; truncation may leave the newest files empty.
     """
-    telling = {p.archived.path.name for p in mine if len(p.rows)}
-    return max(len({*life.torn} - telling), int(life.died or bool(life.disk)))
+    with_rows = {p.archived.path.name for p in mine if len(p.rows)}
+    return max(len({*life.torn} - with_rows), int(life.died or bool(life.disk)))
 
 
 def _motions(talk: Talk) -> list[int]:
-    """Intervals of a session in which a motion began."""
+    """Return the intervals of a session in which a motion began."""
     return [event.interval for event in talk.events if isinstance(event, MotionStarted)]
 
 
@@ -339,7 +336,7 @@ def _interval(
 ) -> Iterator[str]:
     cycles = talk.records["cycle"]
     ends = [e for e in talk.events if isinstance(e, MotionEnded) and e.interval == interval]
-    if ends:  # axes whose drive went off may be open for some cycles more
+    if ends:  # axes may stay open for some cycles after the drive was lost
         rows = rows[cycles[rows] <= ends[-1].cycle]
     holding = [p for p in mine if p.talk is talk and np.isin(rows, p.rows).any()]
     if len(holding) != 1:
@@ -349,21 +346,21 @@ def _interval(
     archived = holding[0].archived
     if ends and archived.whole:
         ended = ends[-1]
-        told = {ended.outcome, *(("rejected",) if ended.outcome == "completed" else ())}
-        if archived.ended not in told and archived.ended != "interrupted":
-            yield f"it ended {ended.outcome}, and {archived.path.name} says {archived.ended!r}"
+        valid = {ended.outcome, *(("rejected",) if ended.outcome == "completed" else ())}
+        if archived.ended not in valid and archived.ended != "interrupted":
+            yield f"it ended {ended.outcome}, and {archived.path.name} states {archived.ended!r}"
     missing = rows[~np.isin(rows, holding[0].rows)]
     stated = int((archived.outcome or {}).get("records_lost", 0))
     if archived.whole and archived.ended != "interrupted" and len(missing) > stated:
         yield f"{len(missing)} of its cycles are not in {archived.path.name}, which states {stated}"
     torn = archived.path.name in life.torn or archived.path.name in life.refused
     if not archived.whole and life.died and not torn and len(rows):
-        # A chunk that was not full, and what had not been handed over yet.
+        # An incomplete chunk, and records still in memory.
         most = round(_FLUSHED / period) + _DRAINED
         if cycles[missing[-1]] - cycles[missing[0]] >= most if len(missing) else False:
-            yield f"its death cost {len(missing)} cycles, at most {most} are to be lost"
+            yield f"{len(missing)} cycles were lost by the kill, at most {most} are allowed"
 
 
 def _cut_short(life: Life) -> bool:
-    """Whether the run unwound on something that is no error of ours: Ctrl-C twice."""
+    """Whether the run was aborted by Ctrl-C."""
     return isinstance(life.error, KeyboardInterrupt)

@@ -1,4 +1,4 @@
-"""What was said on the link, sorted: which packet got which kind of answer, session by session."""
+"""Packets and answers of a process life, classified and divided into sessions."""
 
 from __future__ import annotations
 
@@ -19,10 +19,8 @@ from tests.simulate.observed import Exchanged, Life, Observed
 from .wire import CLOSED, PAUSES, Flags, Init, Packets, SafeAnswers, safe_answers
 
 INIT_TIMEOUT = 300.0
-SILENCE_TIMEOUT = 1.0
-"""s; defaults of a session, until its settings say otherwise."""
-_RECENT = 200
-"""Packets among which one that came twice is looked for."""
+SILENCE_TIMEOUT = 1.0  # s; defaults of a session
+_RECENT = 200  # packets among which duplicates are searched
 _END = (504).to_bytes(4, "little")
 _PAUSED = tuple(mode.to_bytes(4, "little") for mode in PAUSES)
 _KNOWN = {*oracle.OPEN, *CLOSED, *PAUSES}
@@ -33,15 +31,15 @@ class Talk:
     """The cyclic packets of one session with the controller, up to the next init packet.
 
     Attributes:
-        life: the process life it belongs to.
-        init: the init packet, decoded.
-        usable: whether the arm may be moved at all.
-        events: of this session, in order, from the one that it began on.
+        life: its process life.
+        init: the decoded init packet.
+        usable: whether the arm may be moved.
+        events: of this session, in order.
         at: index of the init packet in `life.exchanged`.
         index: (m,) index of each packet there.
-        silent: (m,) whether nothing had been heard for too long before it.
-        received, answer: the packets and what they were answered.
-        safe: the safe answers; None where the axis map is impossible.
+        silent: (m,) whether a silence preceded the packet.
+        received, answer: packets and answers.
+        safe: the safe answers; None if the axis map is invalid.
     """
 
     life: Life
@@ -62,27 +60,27 @@ class Talk:
 
     @cached_property
     def records(self) -> NDArray[np.void]:
-        """(m,) the record that each packet made."""
+        """(m,) record of each packet."""
         return self.life.records[self.record]
 
     def at_cycle(self, cycle: int) -> int:
-        """Index among the exchanged of the packet of a cycle of this session, or the next one."""
+        """Return the index of the exchanged packet of a cycle, or of the next one."""
         row = int(np.searchsorted(self.records["cycle"], cycle))
         return int(self.index[row]) if row < len(self.index) else len(self.life.exchanged)
 
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """One process life, sorted.
+    """Classification of one process life.
 
     Attributes:
         talks: its sessions.
-        kinds: of the answer that each packet had to get.
-        wrong: index of a packet and what is wrong with its answer.
-        left_out: indices of packets that were not handed to the session, for a newer one.
-        fates: how many packets of each kind there were.
-        repeated: packets among these that had come before, byte for byte.
-        missed: packets that the numbers show never to have arrived, or to have had no answer.
+        kinds: kind of the required answer of each packet.
+        wrong: index of a packet and the error of its answer.
+        left_out: indices of packets superseded by a newer one.
+        fates: number of packets of each kind.
+        repeated: superseded packets that are duplicates.
+        missed: packets that did not arrive or were not answered, by their numbers.
     """
 
     talks: tuple[Talk, ...]
@@ -96,13 +94,13 @@ class Heard:
 
 @lru_cache(maxsize=2)
 def heard(observed: Observed) -> tuple[Heard, ...]:
-    """Every process life of a campaign."""
+    """Return the classification of each process life of a campaign."""
     n_joints = len(observed.cell.joint_names)
-    return tuple(_Sorting(life, n_joints).done() for life in observed.runs)
+    return tuple(_Classifier(life, n_joints).done() for life in observed.runs)
 
 
 def talks_of(observed: Observed) -> Iterator[Talk]:
-    """All sessions of all lives."""
+    """Yield all sessions of all lives."""
     for one in heard(observed):
         yield from one.talks
 
@@ -115,8 +113,8 @@ class _Part:
     silent: list[bool] = field(default_factory=list)
 
 
-class _Sorting:
-    """Goes through a life packet by packet, as `Reception` has it."""
+class _Classifier:
+    """Classifies a life packet by packet with `Reception`."""
 
     def __init__(self, life: Life, n_joints: int) -> None:
         self._life, self._n_joints = life, n_joints
@@ -135,10 +133,10 @@ class _Sorting:
 
     def done(self) -> Heard:
         for index, exchanged in enumerate(self._life.exchanged):
-            self._hear(index, exchanged)
-        told = _by_session(self._life)
+            self._classify(index, exchanged)
+        events = _by_session(self._life)
         talks = tuple(
-            self._talk(part, told[number] if number < len(told) else ())
+            self._talk(part, events[number] if number < len(events) else ())
             for number, part in enumerate(self._parts)
         )
         fates = Counter(self._kinds)
@@ -152,7 +150,7 @@ class _Sorting:
             self._missed,
         )
 
-    def _hear(self, index: int, one: Exchanged) -> None:
+    def _classify(self, index: int, one: Exchanged) -> None:
         reception = self._reception
         if self._fell_silent(index, one.now) and not reception.ended:
             reception.silent = reception.n_axes is not None
@@ -163,14 +161,14 @@ class _Sorting:
             self._left_out.append(index)
             return
         if one.now >= self._deadline and not reception.ended:
-            self._wrong.append((index, "came after a silence that nobody noticed"))
+            self._wrong.append((index, "came after a silence that was not detected"))
         last, silent = reception.last, reception.silent
         kind = reception.expect(one.packet)
         self._kinds.append(kind if one.replies else "nothing")
         if not one.replies:
-            # Whoever dies, or whose link is closed, may not come to answer the last one.
+            # The last packet of a life may have no answer.
             if kind != "nothing" and index < len(self._life.exchanged) - 1:
-                self._wrong.append((index, f"got no answer that was due ({kind})"))
+                self._wrong.append((index, f"got no answer although required ({kind})"))
             return
         if len(one.replies) > 1:
             self._wrong.append((index, f"{len(one.replies)} answers"))
@@ -189,10 +187,7 @@ class _Sorting:
             self._deadline = one.now + self._patience(one.packet, kind)
 
     def _fell_silent(self, index: int, now: float) -> bool:
-        """Whether the session took the link for lost before this packet.
-
-        Told while nothing came, or found out when this one came after too long.
-        """
+        """Whether the session detected a silence before this packet or with it."""
         fell = False
         while self._ticks and self._ticks[0] <= index + (now >= self._deadline):
             self._ticks.pop(0)
@@ -200,12 +195,12 @@ class _Sorting:
         return fell
 
     def _judge(self, index: int, one: Exchanged, kind: Kind) -> None:
-        """Against the answer that needs no knowledge of what went before but the last one."""
+        """Check an answer as far as it depends on the packet and the previous answer."""
         reply = one.replies[0]
         if kind == "nothing":
-            self._wrong.append((index, "was answered, and had to get no answer"))
+            self._wrong.append((index, "was answered although it must not be"))
         elif kind == "again" and reply != self._reply:
-            self._wrong.append((index, "came twice, and was answered otherwise the second time"))
+            self._wrong.append((index, "came twice, and the second answer differs"))
         elif kind in ("echo", "init") and reply != oracle.echo(one.packet):
             self._wrong.append((index, "was not echoed byte for byte with its number plus one"))
         elif kind == "cyclic":
@@ -216,9 +211,9 @@ class _Sorting:
             if _END in one.packet and {*_modes(one.packet, range(n_axes))} == {504}:
                 self._reception.ended = True
         if kind != "cyclic" and one.record >= 0:
-            self._wrong.append((index, f"left a record though it is no cyclic packet ({kind})"))
+            self._wrong.append((index, f"has a record though it is not a cyclic packet ({kind})"))
         if kind == "cyclic" and one.record < 0:
-            self._wrong.append((index, "is a fresh cyclic packet and left no record"))
+            self._wrong.append((index, "is a new cyclic packet and has no record"))
 
     def _begin(self, index: int, one: Exchanged) -> None:
         init = Init.of(one.packet, self._arm, self._n_joints)
@@ -226,7 +221,7 @@ class _Sorting:
         self._slots = init.slots or ()
 
     def _patience(self, packet: bytes, kind: Kind) -> float:
-        """s of silence from this packet on that are none."""
+        """Return the timeout of silence after this packet [s]."""
         if self._reception.ended:
             return np.inf
         if self._reception.n_axes is None:
@@ -241,10 +236,10 @@ class _Sorting:
     def _talk(self, part: _Part, events: tuple[Event, ...]) -> Talk:
         life = self._life
         init = Init.of(part.init, self._arm, self._n_joints)
-        told = events[0] if events else None
-        usable = isinstance(told, InitReceived) and told.unusable is None
+        first = events[0] if events else None
+        usable = isinstance(first, InitReceived) and first.unusable is None
         rows = [life.exchanged[i] for i in part.index]
-        # An answer too short was reported above, and would stop the decoding here.
+        # Answers that are too short were reported above and cannot be decoded.
         fit = [k for k, one in enumerate(rows) if len(one.replies[0]) >= oracle.length(init.n_axes)]
         received = Packets.of([rows[k].packet for k in fit], init.n_axes)
         answer = Packets.of([rows[k].replies[0] for k in fit], init.n_axes)
@@ -263,10 +258,7 @@ class _Sorting:
 
 
 def _by_session(life: Life) -> list[tuple[Event, ...]]:
-    """The events of each session; those before the first init packet are of none.
-
-    The session tells them when it is asked, which may be many packets later: their order counts.
-    """
+    """Return the events of each session, by their order, from its init packet on."""
     events = [event for _, event in life.events]
     begins = [at for at, event in enumerate(events) if isinstance(event, InitReceived)]
     return [tuple(events[a:b]) for a, b in pairwise([*begins, len(events)])]

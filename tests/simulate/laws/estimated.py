@@ -42,7 +42,7 @@ ALLOWED: Final = 5.0
 
 
 def estimate(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     found, twin = observed.found, observed.twin_found
     if found is not None:
         for text in _pooled(observed):

@@ -64,7 +64,7 @@ def manifest_of(observed: Observed) -> tuple[dict[str, Any], list[Entry]]:
 
 
 def folder(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     for text in _texts(observed):
         yield Broken(LAW, text)
 

@@ -1,12 +1,11 @@
-"""No set-point ever passed the guard's bounds, and none left where none may.
+"""Set-points satisfy the bounds of the guard, and are sent only where allowed.
 
-By differences of what was really sent, twice: of the float64 set-points in the records, and of the
-float32 numbers on the wire with the bound of their rounding. Bounds are the cell's; wider ones of
-a change of override or a stop count only once something asked for that.
+Checked are differences of the float64 set-points in the records, and of the float32 numbers on the
+wire with their rounding. The wider bounds of an override or a stop apply only after a request.
 
-A set-point that the controller has not taken is sent again, the same position and velocity, until
-it is: the motion waits, so that no set-point is more than a step from the target that the
-controller holds. Rates are those of the motion, without such repetitions.
+A set-point that the controller has not accepted is sent again with the same position and velocity,
+so that no set-point is more than a step from the controller's target. Rates are those of the motion
+without repetitions.
 """
 
 from __future__ import annotations
@@ -28,27 +27,26 @@ from .wire import Array, Flags, Gears
 
 LAW: Final = "guard"
 _TOLERANCE: Final = 1e-6
-"""Relative: how well planners keep their limits (`docs/interpolator.md`, `drivers.guard`)."""
+"""Relative tolerance of limits (`docs/interpolator.md`, `drivers.guard`)."""
 _EPS: Final = float(np.finfo(np.float64).eps)
 _STANDSTILL: Final = 5e-4
 """Motor revolutions per cycle: two increments of a 12-bit encoder (`drivers.guard`)."""
 _FLOAT32: Final = float(np.finfo(np.float32).eps)
-"""Motor revolutions per cycle: more than float32 leaves open of a step, which is far below 1."""
+"""Motor revolutions per cycle: rounding of a step in float32."""
 _SLOW: Final = 4.0 * _STANDSTILL
-"""Steps of which several may be made up in one cycle (`drivers.open_mode`)."""
+"""Largest step of which several are allowed in one cycle (`drivers.open_mode`)."""
 _FIRST: Final = 0.1
-"""Share of the following-error threshold that target and arm may differ by at first."""
+"""Largest initial difference of target and arm, as a share of the following-error threshold."""
 _LEAP: Final = 0.25
-"""Share that the controller's target may ever be off the set-point sent last."""
+"""Largest difference of the controller's target from the last set-point, as such a share."""
 _SPREAD: Final = 2
-"""Cycles per packet missed in which a motion comes back to its path (`drivers.open_mode`)."""
-_RETURN: Final = 0.03
-"""s that this takes at most."""
+"""Cycles per missed packet in which a motion returns to its path (`drivers.open_mode`)."""
+_RETURN: Final = 0.03  # longest return [s]
 _ORDERS: Final = ("velocity", "acceleration", "jerk")
 
 
 def guard(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     gears = Gears.of(observed.cell.drive_table)
     limits = _Limits.of(observed.cell)
     for talk in talks_of(observed):
@@ -60,20 +58,19 @@ def guard(observed: Observed) -> Iterator[Broken]:
 
 
 def _parts(stretch: Stretch) -> Iterator[Stretch]:
-    """Apart where a controller led the motion by itself during a long gap.
+    """Split at long gaps during which the controller extrapolated the motion.
 
-    What follows goes on from the target received and its velocity, as if these had been sent.
+    The next part continues from the received target and its velocity, as if these had been sent.
     """
     most = int(stretch.talk.life.settings.get("max_gap", 2))
     moved = np.append(False, (stretch.step[:-1] != 0.0).any(axis=1))
     gaps = stretch.talk.records["gap"][stretch.rows].astype(np.intp)
-    # Those that were heard and are in the gap, as of a pile, count once; twice if the session saw
-    # them with a corrupted number, which only a set-point that goes on from the target, or rests
-    # there, shows; one that is sent again begins there, too.
+    # Superseded packets in the gap count once; twice if the session received them with a corrupted
+    # number, which is visible only if a set-point continues from the target or rests there.
     twice = _unanswered_before(stretch)
     once = np.maximum(gaps, twice - gaps)
     before = np.concatenate((stretch.sent[:1], stretch.sent[:-1]))
-    begun = stretch.sent - stretch.step  # where each step begins, by its own account
+    begun = stretch.sent - stretch.step  # start of each step
     off_target = np.abs(begun - stretch.received[0]).max(axis=1)
     off_before = np.abs(begun - before).max(axis=1)
     rounding = np.spacing(np.abs(begun).max(axis=1).astype(np.float32))
@@ -98,7 +95,7 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
 
 @dataclass(frozen=True, eq=False)
 class _Limits:
-    """Of the cell file: (n,) each, and (acceleration, jerk) factors by what was asked for."""
+    """Limits of the cell file, (n,) each, and their (acceleration, jerk) factors."""
 
     lower: Array
     upper: Array
@@ -146,13 +143,13 @@ def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) 
         yield f"a set-point outside the joints' range: {q.min(axis=0)} to {q.max(axis=0)}"
     fresh = ~stretch.again[led]
     q, factors = q[fresh], np.concatenate((factors[led][fresh], factors[stretch.leading :]))
-    # What is held afterwards ends the motion: nobody may be brought to rest by a jump.
+    # The first held rows end the motion and must not be a jump.
     after = min(3, len(stretch.sent) - stretch.leading)
     held = np.concatenate((q, q[-1:].repeat(after, axis=0)))
     record_rounding = np.full_like(held, 8.0 * _EPS) * np.abs(held).max(axis=0)
     before = np.zeros((3, 1)) + held[:1]
     if stretch.carried:
-        # Steps without acceleration: the motion comes back to its own within a few cycles.
+        # Steps without acceleration; the motion returns to its path within a few cycles.
         factors[: min(_SPREAD * stretch.carried, round(_RETURN / period)) + 2, 2] = np.inf
         before = np.arange(2.0, -1.0, -1.0)[:, np.newaxis] * -stretch.received[1, 0]
         before = gears.joint(stretch.received[0, 0] + before)
@@ -178,7 +175,7 @@ def _rates(
     period: float,
     what: str,
 ) -> Iterator[str]:
-    """Differences of set-points (k, n), known to `rounding` (k, n) [rad], after three others."""
+    """Rates of set-points (k, n) with `rounding` (k, n) [rad], after three previous rows."""
     rows = np.concatenate((before, q))
     worst = rounding.max(axis=0)
     for order, (name, bound) in enumerate(zip(_ORDERS, rates, strict=True), 1):
@@ -197,9 +194,9 @@ def _rates(
 
 
 def _asked_for(stretch: Stretch) -> tuple[Flags, Flags]:
-    """Rows from which on a stop or a hold, or a change of override, was asked for, (k,) each.
+    """Rows after a request of a stop or hold, and of an override, (k,) each.
 
-    A stop is asked for by a person, or by the session itself after a long gap or lost answers.
+    The session also stops after a long gap or lost answers.
     """
     life, talk, at = stretch.talk.life, stretch.talk, stretch.at
     requests = [a.before for a in life.acts if a.name == "request" and a.before <= at[-1]]
@@ -222,18 +219,18 @@ def _asked_for(stretch: Stretch) -> tuple[Flags, Flags]:
 
 
 def _unanswered_before(stretch: Stretch) -> NDArray[np.intp]:
-    """(k,) packets before each that never came or got no answer."""
+    """(k,) packets before each that did not arrive or were not answered."""
     talk = stretch.talk
     gaps = talk.records["gap"][stretch.rows].astype(np.intp)
     start = stretch.rows.start
     before = talk.index[start - 1] if start else talk.at
-    # Whatever came in between and left no record was not answered afresh.
+    # Packets in between without a record were not answered.
     silent = np.diff(stretch.at, prepend=before) - 1
     return np.asarray(gaps + silent)
 
 
 def _first(stretch: Stretch, threshold: Array) -> Iterator[str]:
-    """The first set-point is the target received, at rest, where the arm is."""
+    """The first set-point is the received target, at rest, at the arm."""
     target, velocity, actual, actual_velocity = stretch.received[:4, 0]
     if np.any(stretch.sent[0] != target) or np.any(stretch.step[0] != 0.0):
         yield "the first set-point is not the target received at zero velocity"
@@ -244,28 +241,28 @@ def _first(stretch: Stretch, threshold: Array) -> Iterator[str]:
 
 
 def _led_on(stretch: Stretch, threshold: Array) -> Iterator[str]:
-    """After a long gap a motion goes on only where the controller led it, further or to rest."""
+    """After a long gap a motion resumes only from where the controller extrapolated it."""
     target, velocity, actual, measured = stretch.received[:4, 0]
     step, slack = stretch.step_before, _FLOAT32 + _STANDSTILL
     ahead = stretch.before + np.arange(stretch.carried + 1)[:, np.newaxis] * step
     wide = threshold * (1.0 + 2.0 * _TOLERANCE)
     if not (np.abs(target - ahead) <= _FIRST * wide).all(axis=1).any():
-        yield "a motion went on after a long gap from a target that is not on its way"
+        yield "a motion was resumed after a long gap from a target that is off its path"
     if np.any(np.abs(actual - target) > wide):
-        yield "a motion went on after a long gap with an arm that does not follow"
-    # Slower than standstill, only the target says whether it was held.
+        yield "a motion was resumed after a long gap with an arm that does not follow"
+    # At speeds below standstill, only the target shows whether it was held.
     led = np.abs(target - stretch.before) > np.spacing(np.abs(target).astype(np.float32))
     rests = np.all(np.abs(velocity) <= slack) and ((np.abs(step) > slack).any() or not led.any())
     if rests and np.any(np.abs(stretch.sent[0] - target) > slack):
-        yield "a motion went on after a long gap though the controller had brought it to rest"
+        yield "a motion was resumed after a long gap though the controller had brought it to rest"
     off = np.abs(velocity - step) > np.maximum(0.5 * np.abs(step), slack)
     off |= (np.abs(measured) <= _STANDSTILL) & (np.abs(step) > 2.0 * slack)
     if off.any() and not rests:
-        yield "a motion went on after a long gap though the controller had not carried it on"
+        yield "a motion was resumed after a long gap though the controller had not extrapolated it"
 
 
 def _feedback(stretch: Stretch, threshold: Array, current: Array) -> Iterator[str]:
-    """Set-points go on only to an arm that follows, and a controller that takes them."""
+    """Set-points are sent only while the arm follows and the controller accepts them."""
     led = slice(1, stretch.leading)
     target, _, actual, _, amperes = stretch.received[:, led]
     last = stretch.sent[: stretch.leading - 1]
@@ -283,7 +280,7 @@ def _feedback(stretch: Stretch, threshold: Array, current: Array) -> Iterator[st
 
 
 def _after_long_gaps(stretch: Stretch) -> Iterator[str]:
-    """After more than `max_gap` packets missed, set-points only if the controller carried on."""
+    """After more than `max_gap` missed packets, set-points only if the controller extrapolated."""
     talk, k = stretch.talk, stretch.leading
     most = int(talk.life.settings.get("max_gap", 2))
     records = talk.records[stretch.rows][:k]
@@ -297,11 +294,11 @@ def _after_long_gaps(stretch: Stretch) -> Iterator[str]:
     held = np.abs(velocity - step) > allowed
     held |= stands & (np.abs(measured - step) > allowed)
     if held.any():
-        yield "a motion went on after a long gap though the controller had not carried it on"
+        yield "a motion was resumed after a long gap though the controller had not extrapolated it"
 
 
 def _distance_to_last(stretch: Stretch) -> Array:
-    """(k-1, n) from each target received to the nearest set-point it may be."""
+    """(k-1, n) distance of each received target from the nearest possible set-point."""
     depth = int(stretch.talk.life.settings.get("max_gap", 2)) + 1
     k = stretch.leading
     fresh = ~stretch.again[:k]
@@ -321,10 +318,10 @@ def _distance_to_last(stretch: Stretch) -> Array:
 
 
 def _no_leap(stretch: Stretch) -> Iterator[str]:
-    """A set-point is its own step from the one that the target is, or is nearest to.
+    """A set-point is at most its step from the one nearest to the target.
 
-    Slow ones may make up several steps; where packets were missed, the controller may have gone
-    on; on the way to rest a link that was found to be late is no reason to wait.
+    Not checked after missed packets, in which the controller may extrapolate, and during stops;
+    several slow steps are allowed.
     """
     k, depth = stretch.leading, int(stretch.talk.life.settings.get("max_gap", 2)) + 1
     fresh = ~stretch.again[:k]
@@ -343,28 +340,28 @@ def _no_leap(stretch: Stretch) -> Iterator[str]:
 
 
 def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]:
-    """D1 is the recorded set-point, D2 the step from the one before, to rounding."""
+    """D1 is the recorded set-point, D2 the step from the previous one, within rounding."""
     motor = gears.motor(q)
-    # The conversion is a sum of n products, made twice, here and there.
+    # Rounding of two conversions, each a sum of n products.
     rounding = 8.0 * _EPS * np.maximum(1.0, np.abs(motor))
     low, high = np.float32(motor - rounding), np.float32(motor + rounding)
     sent = stretch.sent[: len(q)]
     if np.any(sent < low) or np.any(sent > high):
         yield "the set-point on the wire is not the recorded one"
-    # A set-point sent again has the step that it had.
+    # A repeated set-point has its previous step.
     fresh = ~stretch.again[: len(q)]
     motor, rounding, told = motor[fresh], rounding[fresh], stretch.step[: len(q)][fresh]
     first = stretch.received[0, :1] if stretch.carried else motor[:1]
     step = np.diff(motor, axis=0, prepend=first)
     slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
-    if stretch.carried:  # a motion that rests already goes on from its own set-point
+    if stretch.carried:  # a motion at rest resumes from its own set-point
         slack[0] += np.spacing(np.abs(first[0]).astype(np.float32))
     if np.any(np.abs(told - step) > slack):
         yield "D2 is not the step from one set-point to the next"
 
 
 def _only_when_requested(stretch: Stretch, q: Array) -> Iterator[str]:
-    """Nothing moves but what was requested and has not ended."""
+    """Set-points move only during a requested motion."""
     moves = np.flatnonzero((np.diff(q, axis=0, prepend=q[:1]) != 0.0).any(axis=1))
     if not moves.size:
         return
@@ -384,7 +381,7 @@ def _only_when_requested(stretch: Stretch, q: Array) -> Iterator[str]:
 
 
 def _held_at_the_end(stretch: Stretch) -> Iterator[str]:
-    """On the way out an axis that stayed open keeps the last set-point, at zero velocity."""
+    """While open mode is left, axes still open have the last set-point at zero velocity."""
     talk, led = stretch.talk, stretch.leading
     if led == len(stretch.sent):
         return

@@ -24,7 +24,7 @@ EVERY: Final = 64
 
 
 def judge(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     if observed.seed % EVERY == 0:
         yield from judge_whole(observed)
 

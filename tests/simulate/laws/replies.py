@@ -1,9 +1,8 @@
-"""Every packet got the answer that the documents give it, and none that they do not.
+"""Answers to all packets are those of the protocol and of `docs/safety.md`.
 
-`docs/safety.md` and what the protocol demands: one answer to each fresh well-formed
-packet, with the next number; the same bytes to a duplicate; none to what is stale, foreign or
-malformed; the safest known answer wherever an axis is not open; set-points only between the first
-one, where the controller has the arm, and whatever ends open mode.
+One answer to each new well-formed packet, with the next number; the same bytes to a duplicate; none
+to stale, foreign or malformed packets; the safe answer for axes that are not open; set-points only
+from the first one, at the controller's target, to the end of open mode.
 """
 
 from __future__ import annotations
@@ -23,40 +22,39 @@ from .wire import D1, D2, MODE, Flags, next_number
 
 LAW: Final = "replies"
 Mistake = tuple[Flags | np.bool_, str]
-"""Rows that make it, (m,), and what it is."""
-_MOST_TOLD: Final = 3
-"""Packets named of one kind of mistake; the others are counted."""
+"""Rows with a mistake, (m,), and its text."""
+_MOST_NAMED: Final = 3
+"""Packets named for one kind of mistake; the others are counted."""
 
 
 def replies(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
         for text in _of_life(life, one):
             yield Broken(LAW, f"life {number}: {text}")
 
 
 def _of_life(life: Life, one: Heard) -> Iterator[str]:
-    for index, what in one.wrong[:_MOST_TOLD]:
+    for index, what in one.wrong[:_MOST_NAMED]:
         yield f"packet {index} {what}"
-    if len(one.wrong) > _MOST_TOLD:
-        yield f"and {len(one.wrong) - _MOST_TOLD} more of these"
-    yield from _counted(life, one)
+    if len(one.wrong) > _MOST_NAMED:
+        yield f"and {len(one.wrong) - _MOST_NAMED} more of these"
+    yield from _counters(life, one)
     for talk in one.talks:
         for flags, what in _in_session(talk):
             if flags.any():
-                at = talk.index[np.flatnonzero(flags)[:_MOST_TOLD]].tolist()
+                at = talk.index[np.flatnonzero(flags)[:_MOST_NAMED]].tolist()
                 yield f"{what}: {int(flags.sum())} times, packets {at}"
 
 
-def _counted(life: Life, one: Heard) -> Iterator[str]:
-    """The session's own counters against what was seen."""
+def _counters(life: Life, one: Heard) -> Iterator[str]:
+    """The counters of the session agree with the packets."""
     found, fates = life.counters, one.fates
     answered = fates["echo"] + fates["init"] + fates["cyclic"]
-    # Whoever is killed in mid-cycle has counted, or has not, what was on its way; and the last
-    # answer is counted and does not leave where the link is closed meanwhile.
+    # The last packet may be counted without an answer, if the process is killed or the link closed.
     last = life.exchanged[-1:]
     slack = int(any(one.given and not one.replies for one in last))
-    # A pile that was still being looked through when the end came was not counted.
+    # Waiting packets that were being read at the end are not counted.
     given = [index for index, other in enumerate(life.exchanged) if other.given]
     pile = [index for index in one.left_out if given and index < given[-1]]
     late, left_out = found.discarded.get("late", 0), len(one.left_out)
@@ -65,22 +63,19 @@ def _counted(life: Life, one: Heard) -> Iterator[str]:
         ("answered", found.answered, answered, answered + slack),
         ("duplicates", found.duplicates, fates["again"], fates["again"] + slack),
         ("missed", found.missed, one.missed, one.missed + slack * LAST),
-        # What stands in a pile a second time is left out and not counted.
+        # Duplicates among waiting packets are not counted.
         ("late", late, len(pile) - one.repeated, left_out),
         ("refused", refused, fates["nothing"] - left_out - slack, fates["nothing"] - left_out),
     ):
         if not least <= counted <= most:
-            yield f"{name} is {counted}, and {least} were seen"
+            yield f"{name} is {counted}, and {least} were observed"
     for index in pile:
         if not _newer_answered(life, one, index):
-            yield f"packet {index} was left out, and none newer of its pile was answered"
+            yield f"packet {index} was superseded, and no newer one was answered"
 
 
 def _newer_answered(life: Life, one: Heard, index: int) -> bool:
-    """Whether the next packet that was answered, or the one before, is newer than this one.
-
-    A packet is answered before the next one is waited for, unless it waits in a pile.
-    """
+    """Whether the next answered packet, or the previous one, is newer than this one."""
     number = number_of(life.exchanged[index].packet)
     for step in (1, -1):
         at = index + step
@@ -95,14 +90,14 @@ def _newer_answered(life: Life, one: Heard, index: int) -> bool:
 
 
 def _in_session(talk: Talk) -> Iterator[Mistake]:
-    """Mistakes in answers to cyclic packets, each with the rows that make it."""
+    """Yield the mistakes in answers to cyclic packets."""
     received, answer, safe = talk.received, talk.answer, talk.safe
     if not len(talk.index):
         return
     yield answer.number != next_number(received.number), "an answer of another number"
     yield answer.function != 0, "function bytes in an answer"
     if safe is None or not talk.init.slots:
-        return  # nobody knows whose axes these are; what follows needs that
+        return  # the axis map is invalid
     modes = modes_of(talk)
     arm = int(talk.life.settings.get("arm", 1)) - 1
     own = np.arange(4) == arm
@@ -139,7 +134,7 @@ def _refusals(talk: Talk, modes: Modes) -> Iterator[Mistake]:
     following = reported & own & (answer.mode == oracle.FOLLOWING_ERROR)
     one_508 = (reported.sum(axis=1) == 1) & following.any(axis=1)
     yield refused & ~all_off & ~one_508, "a refusal that is neither 505 in all axes nor one 508"
-    yield modes.no_target & ~all_off, "held at a target that is no number"
+    yield modes.no_target & ~all_off, "held at a target that is not finite"
     numbers = np.ascontiguousarray(safe.words[:, :, D1:])
     finite = np.isfinite(numbers.view(np.float32))
     given = (answer.words[:, :, D1:] == np.where(finite, numbers, 0)).all(axis=(1, 2))
@@ -147,7 +142,7 @@ def _refusals(talk: Talk, modes: Modes) -> Iterator[Mistake]:
 
 
 def _set_points(talk: Talk, modes: Modes, same: Flags) -> Iterator[Mistake]:
-    """Where answers may differ from the safe one: `same` (m, n) says where they do not."""
+    """Yield mistakes in set-points; `same` (m, n): whether answers are the safe ones."""
     sent = ~modes.refused & ~modes.paused
     not_open = sent[:, np.newaxis] & ~modes.ready
     yield (not_open & ~same).any(axis=1), "an axis that is not open: not the safe answer"
@@ -158,19 +153,19 @@ def _set_points(talk: Talk, modes: Modes, same: Flags) -> Iterator[Mistake]:
     )
     yield (
         modes.is_open & sent & ~_closed_before(talk, modes),
-        "axes are open that were not seen closed since the last fault, and are not refused",
+        "axes are open that were not closed since the last fault, and are not refused",
     )
     words = talk.answer.words[:, list(talk.init.slots or ())]
     open_axes = sent[:, np.newaxis] & modes.all_ready[:, np.newaxis]
     mode = int(talk.life.settings.get("mode", 4))
     wrong = (words[:, :, MODE] != mode) | (words[:, :, D2 + 1 :] != 0).any(axis=2)
-    yield (open_axes & wrong).any(axis=1), "a field or mode that open mode 4 has no use for"
+    yield (open_axes & wrong).any(axis=1), "a field or mode that open mode 4 does not use"
     numbers = np.ascontiguousarray(words[:, :, D1 : D2 + 1]).view(np.float32)
-    yield (open_axes & ~np.isfinite(numbers).all(axis=2)).any(axis=1), "a set-point is no number"
+    yield (open_axes & ~np.isfinite(numbers).all(axis=2)).any(axis=1), "a set-point is not finite"
 
 
 def _begun(modes: Modes) -> Flags:
-    """Rows in whose stretch of open axes all were open before (or are now)."""
+    """Rows since which all axes were open, without interruption of open mode, (m,)."""
     rows = np.arange(len(modes.is_open))
     broken = ~modes.is_open | modes.refused | modes.paused
     last_break = np.maximum.accumulate(np.where(broken, rows, -1))
@@ -179,7 +174,7 @@ def _begun(modes: Modes) -> Flags:
 
 
 def _closed_before(talk: Talk, modes: Modes) -> Flags:
-    """Whether all axes were reported closed since whatever asks for that came last."""
+    """Whether all axes were reported closed since the last event that requires it, (m,)."""
     m = len(modes.is_open)
     before, after = 2 * np.arange(m), 2 * np.arange(m) + 1
     closed = modes.closed & ~modes.refused

@@ -1,10 +1,8 @@
-"""Whatever happened, the arm ends at rest with its axes closed.
+"""The arm ends at rest with closed axes.
 
-Seen at the arm itself, after the last process of the PC is gone and the controller alone has acted;
-and at the end of each run that ends by itself, but for what it lost or was refused. There the
-set-points rest, for as long as the cell says (`[campaign] settle_s`), and the arm stands as the
-cell means it (`[robot.friction] standstill`): against dry friction its servo may still creep to
-where it was sent.
+Checked on the true state of the arm after the last run, and at the end of each run that ends
+without a lost or refused motion: set-points rest for `[campaign] settle_s`, and the speed is below
+`[robot.friction] standstill`.
 """
 
 from __future__ import annotations
@@ -24,14 +22,13 @@ from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 from .wire import Array, Gears
 
 LAW: Final = "rest"
-_STANDSTILL: Final = 5e-4
-"""Motor revolutions per cycle below which an axis stands (`drivers.guard`)."""
+_STANDSTILL: Final = 5e-4  # motor revolutions per cycle (`drivers.guard`)
 _SWING: Final = 3.0
-"""Times the cell's standstill that an arm may swing that the controller stopped at once."""
+"""Largest speed relative to standstill after the controller stopped the arm abruptly."""
 
 
 def rest(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     arm, period = observed.arm, observed.cell.period
     gears = Gears.of(observed.cell.drive_table)
     if arm.open_axes[-1:].any():
@@ -39,7 +36,7 @@ def rest(observed: Observed) -> Iterator[Broken]:
     fastest = _speed(arm.velocity[-1:], gears, period)
     if fastest > _STANDSTILL:
         yield Broken(LAW, f"the arm moves at the end, by {fastest:.2g} motor revolutions a cycle")
-    # An arm that was held up still catches up when its set-points rest.
+    # A disturbed arm may still approach its set-points.
     disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
     for number, life in enumerate(observed.runs, 1):
         if _ends_at_rest(life) and life.exchanged:
@@ -56,18 +53,18 @@ def rest(observed: Observed) -> Iterator[Broken]:
 
 
 def _speed(velocity: Array, gears: Gears, period: float) -> float:
-    """The fastest motor, revolutions per cycle, of joint velocities (k, n) [rad/s]."""
+    """Return the largest motor speed [rev per cycle] of joint velocities (k, n) [rad/s]."""
     return float(np.abs(velocity @ gears.matrix.T).max(initial=0.0) * period)
 
 
 def _held_up(life: Life) -> bool:
-    """Whether the controller may have stopped the last motion at once, so that the servo swings."""
+    """Whether the controller may have stopped the last motion abruptly."""
     ends = [event.reason for _, event in life.events if isinstance(event, MotionEnded)]
     return any("missed in a row" in reason for reason in ends[-1:])
 
 
 def _held_too_short(life: Life) -> Iterator[tuple[int, int, int]]:
-    """Intervals in which the set-points rested for fewer cycles than the cell says."""
+    """Yield intervals with too short a settling time: number, cycles, required cycles."""
     wanted = int(life.settings.get("settle_cycles", 200))
     for _, event in life.events:
         if not isinstance(event, MotionEnded) or event.outcome not in ("completed", "stopped"):
@@ -81,14 +78,13 @@ def _held_too_short(life: Life) -> Iterator[tuple[int, int, int]]:
 
 
 def _ends_at_rest(life: Life) -> bool:
-    """Whether the arm has to stand, outside open mode, when the run has ended.
+    """Whether the arm must be at rest outside open mode at the end of a run.
 
-    Who dies leaves that to the controller, which also acts alone where a motion was refused or
-    lost, or where there was never a session to speak of.
+    Not after a kill, a refused or lost motion, or without a session: there the controller acts.
     """
     error = life.error
     if any(isinstance(one, KeyboardInterrupt) for one in _behind(error)):
-        return False  # the disk failed while it unwound
+        return False  # the disk failed during the abort
     if isinstance(error, MotionFailedError):
         return error.outcome == "stopped"
     ends = [event.outcome for _, event in life.events if isinstance(event, MotionEnded)]
@@ -97,7 +93,7 @@ def _ends_at_rest(life: Life) -> bool:
 
 
 def _behind(error: BaseException | None) -> Iterator[BaseException]:
-    """An error, and what was being handled when it was raised."""
+    """Yield an error and the chain of its contexts."""
     while error is not None:
         yield error
         error = error.__context__

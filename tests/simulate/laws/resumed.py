@@ -1,7 +1,6 @@
-"""The campaign comes to its end, or says why a person is needed.
+"""A run ends with a complete campaign, or with an error of `docs/campaign.md` and its remedy.
 
-`docs/campaign.md`, "When it says no": each of these sentences tells what to do. Anything else that
-ends a run is a defect, whatever befell it.
+Any other end of a run is a defect.
 """
 
 from __future__ import annotations
@@ -20,29 +19,29 @@ from .folders import WANTED, manifest_of
 from .wire import Array
 
 LAW: Final = "resume"
-PERSON_NEEDED: Final = frozenset(
+ALLOWED_ERRORS: Final = frozenset(
     (
-        "ControllerFault",  # the drive is off, or what the controller announces is not the cell's
+        "ControllerFault",  # the drive is off, or the init packet does not match the cell
         "MotionFailedError",  # the guard, the link or a stop ended a motion
-        "MotionRefusedError",  # the way from where the arm stands is not free: jog it
-        "RepetitionsRejectedError",  # something touches the arm, slips, or was changed
-        "ArmChangedError",  # the same, for certain
-        "DryRunError",  # somebody has to look at the dry run and accept it
-        "AgainstGravityError",  # somebody has to accept a torque by the joint's name
-        "OperatorStopError",  # a person stopped it
-        "ArchiveWriteError",  # the disk is full or broken: make room
-        "CampaignFolderError",  # the folder cannot be written: make room
-        "OutputError",  # what was found cannot be written: make room
+        "MotionRefusedError",  # the path from the present position is not free: jog the arm
+        "RepetitionsRejectedError",  # contact, slip, or a changed arm
+        "ArmChangedError",  # a changed arm
+        "DryRunError",  # the dry run is not accepted
+        "AgainstGravityError",  # a torque is not accepted
+        "OperatorStopError",  # stopped by the operator
+        "ArchiveWriteError",  # the disk is full or broken
+        "CampaignFolderError",  # the folder cannot be written
+        "OutputError",  # results cannot be written
     )
 )
 """Errors that may end a run."""
 _DEATHS: Final = ("Killed", "KeyboardInterrupt")
 _OFF_PATH: Final = 1e-4
-"""rad between set-point and plan that is rounding of the wire (`hil.campaign.quality`)."""
+"""Largest difference between set-point and plan [rad] (`hil.campaign.quality`)."""
 
 
 def resume(observed: Observed) -> Iterator[Broken]:
-    """See above."""
+    """Check the law of this module."""
     for text in _texts(observed):
         yield Broken(LAW, text)
 
@@ -54,7 +53,7 @@ def _texts(observed: Observed) -> Iterator[str]:
     wanted = _wanted(observed)
     missing = [f"{kind} {index}" for kind, index in wanted if (kind, index) not in whole]
     if observed.complete and missing:
-        yield f"the last run says that it is complete, and {', '.join(missing)} are missing"
+        yield f"the last run reports a complete campaign, and {', '.join(missing)} are missing"
     if not observed.complete and not missing:
         yield f"nothing is missing, and the last run ended {observed.ended}"
     for (kind, index), archived in whole.items():
@@ -74,7 +73,7 @@ def _ended(number: int, life: Life) -> Iterator[str]:
     name = type(error).__name__
     if name in _DEATHS:
         return
-    if not isinstance(error, HilError) or name not in PERSON_NEEDED:
+    if not isinstance(error, HilError) or name not in ALLOWED_ERRORS:
         yield f"life {number} ended with {name}: {error}"
 
 
@@ -86,7 +85,7 @@ def _wanted(observed: Observed) -> list[tuple[str, int]]:
 
 
 def _whole(observed: Observed) -> dict[tuple[str, int], Archived]:
-    """What counts, by kind and index."""
+    """Return the completed archives by kind and index."""
     found = {}
     for entry in manifest_of(observed)[1]:
         if entry.outcome == "completed" and entry.unchanged and entry.motion[0] in WANTED:
@@ -103,11 +102,11 @@ def _motion(observed: Observed, kind: str, index: int) -> PiecewiseCubic | Fouri
 def _played(
     archived: Archived, motion: PiecewiseCubic | FourierSeries, period: float
 ) -> str | None:
-    """Why the recording is not that of the whole motion at full speed; None if it is."""
+    """Return why a recording is not that of the complete motion at full speed, or None."""
     if archived.ended != "completed":
         return f"it ended {archived.ended!r}"
     q: Array = archived.cycles["commanded_position"]
-    # One that the controller did not take was sent again, with its velocity: the motion waited.
+    # Set-points that were not accepted were sent again with their velocity.
     waits = (np.diff(q, axis=0, prepend=np.nan) == 0.0).all(axis=1)
     waits &= (archived.cycles["commanded_velocity"] != 0.0).any(axis=1)
     q = q[np.isfinite(q).all(axis=1) & ~waits]
@@ -117,7 +116,7 @@ def _played(
     moves = np.flatnonzero((np.diff(q, axis=0) != 0.0).any(axis=1))
     if not moves.size:
         return "nothing moves in it"
-    # The first steps of a motion may be smaller than what can be distinguished from rest.
+    # The first steps of a motion may be below the resolution.
     for first in range(max(0, int(moves[0]) - 5), int(moves[0]) + 1):
         part = q[first : first + len(planned)]
         off = np.abs(part - planned[: len(part)]).max()
