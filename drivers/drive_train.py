@@ -166,7 +166,6 @@ class ArmWire:
         opened: (n,) joints that are to be open; only these are written into a frame.
         raw: (8, n) D1..D5, extra1..3 of the packet read last, in wire units.
         age: (8, n) cycles since each of them was sent; None where all came with this packet.
-        n_axes: slots in a packet.
 
     Raises:
         PacketError: the init packet's axis map is invalid or lacks one of the joints.
@@ -182,7 +181,6 @@ class ArmWire:
             raise PacketError(
                 "open_axes_map", init.open_axes_map[arm - 1].tolist(), f"axes {missing} open"
             )
-        self.n_axes = init.n_axes
         self.joint_slots = np.array([slot_of[joint] for joint in range(n)], np.intp)
         first = int(self.joint_slots[0])
         contiguous = np.array_equal(self.joint_slots, np.arange(first, first + n))

@@ -22,12 +22,11 @@ from drivers import (
     GuardLimits,
     InitPacket,
     MotionEnded,
-    NotAtStandstill,
     Refused,
     Session,
     State,
-    VelocityLimit,
 )
+from drivers.errors import NotAtStandstill, VelocityLimit
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
 from tests.drivers.rig import Table

@@ -6,17 +6,19 @@ import numpy as np
 import pytest
 
 from drivers import (
-    AxisNotInMode,
     GapSeen,
     Guard,
     InitReceived,
     Mode,
     MotionEnded,
     MotionStarted,
-    NotFinite,
     RefusalError,
-    SetPointNotAccepted,
     State,
+)
+from drivers.errors import (
+    AxisNotInMode,
+    NotFinite,
+    SetPointNotAccepted,
     VelocityAfterGap,
     VelocityAfterPause,
 )

@@ -5,26 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers import (
-    AccelerationLimit,
-    CurrentLimit,
-    FirstSetPoint,
-    FollowingError,
-    HoldChanged,
-    NotAtStandstill,
-    NotFinite,
-    OverrideChanged,
-    PositionLimit,
-    RequestError,
-    SourceFailed,
-    State,
-    VelocityLimit,
-)
+from drivers import HoldChanged, OverrideChanged, RequestError, SourceFailed, State
 from drivers.errors import (
+    AccelerationLimit,
     CommandedCurrentLimit,
     CommandedCurrentStep,
     CorrectionNotEnded,
     CorrectionUnconfirmed,
+    CurrentLimit,
+    FirstSetPoint,
+    FollowingError,
+    NotAtStandstill,
+    NotFinite,
+    PositionLimit,
+    VelocityLimit,
 )
 from drivers.packets import DRIVE_ON, MODE_FIELDS
 from drivers.states import CORRECTION_MODES, HOLDABLE, INCREMENTAL, POSITION_MODES

@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from drivers import (
-    AxisNotInMode,
-    Mode,
-    MotionEnded,
-    MotionStarted,
-    State,
-    VelocityAfterGap,
-)
-from drivers.errors import AgeAfterGap, FirstSetPointUnknown
+from drivers import Mode, MotionEnded, MotionStarted, State
+from drivers.errors import AgeAfterGap, AxisNotInMode, FirstSetPointUnknown, VelocityAfterGap
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
     MOVE,

@@ -6,29 +6,29 @@ import numpy as np
 import pytest
 
 from drivers import (
-    AccelerationLimit,
-    CurrentLimit,
     CyclicPacket,
-    FirstSetPoint,
-    FollowingError,
     LinkLost,
     Mode,
-    ModeRefused,
     MotionStarted,
-    NotAtStandstill,
-    NotFinite,
     RefusalError,
     Refused,
     RequestError,
-    SetPointNotAccepted,
     SourceFailed,
     State,
     reply_policy,
 )
 from drivers.errors import (
+    AccelerationLimit,
     AgeAfterGap,
+    CurrentLimit,
     ExitTimeout,
+    FirstSetPoint,
     FirstSetPointUnknown,
+    FollowingError,
+    ModeRefused,
+    NotAtStandstill,
+    NotFinite,
+    SetPointNotAccepted,
     TargetNotFinite,
 )
 from drivers.events import AnswersLost

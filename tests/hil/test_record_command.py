@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers import ModeRefused
+from drivers.errors import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
 from drivers.transports.faults import Corrupt, Lose
