@@ -83,78 +83,80 @@ def run(faults=(), *, stays=None, source=None):
     return rig, controller, transport
 
 
-def test_a_session_from_cold_start_to_its_end():
-    rig, controller, _ = run()
-    assert rig.path == [
-        State.INIT,
-        State.DRIVE_OFF,
-        State.DRIVING_ON,
-        State.CLOSED,
-        State.OPENING,
-        State.OPEN,
-        State.EXITING,
-        State.CLOSED,
-        State.ENDED,
-    ]
-    assert rig.ended.outcome == "completed"
-    assert None not in controller.replies
-    np.testing.assert_allclose(
-        rig.train.joint_position(rig.axes["d"][:, 0].astype(float)), START + MOVE, atol=1e-6
+class TestExchange:
+    def test_session_from_cold_start_to_its_end(self):
+        rig, controller, _ = run()
+        assert rig.path == [
+            State.INIT,
+            State.DRIVE_OFF,
+            State.DRIVING_ON,
+            State.CLOSED,
+            State.OPENING,
+            State.OPEN,
+            State.EXITING,
+            State.CLOSED,
+            State.ENDED,
+        ]
+        assert rig.ended.outcome == "completed"
+        assert None not in controller.replies
+        np.testing.assert_allclose(
+            rig.train.joint_position(rig.axes["d"][:, 0].astype(float)), START + MOVE, atol=1e-6
+        )
+
+    @pytest.mark.parametrize(
+        "faults",
+        [
+            [Lose(cycle) for cycle in range(50, 300, 7)],
+            [Lose(cycle, "to_controller") for cycle in range(50, 300, 50)],
+            [Lose(cycle, count=2) for cycle in range(50, 300, 11)],
+            [Duplicate(cycle) for cycle in range(13, 300)],
+            [Corrupt(cycle, offset=3, mask=0xFF) for cycle in range(50, 300, 7)],
+            [Corrupt(cycle, offset=2, mask=0x01) for cycle in range(50, 300, 7)],
+        ],
+        ids=[
+            "lost",
+            "answers lost",
+            "lost in pairs",
+            "doubled",
+            "number negative",
+            "number far off",
+        ],
     )
+    def test_motion_completes_on_a_poor_link(self, faults):
+        rig, _, transport = run(faults)
+        assert rig.ended.outcome == "completed"
+        for surplus in transport.surplus_replies:
+            assert surplus in [reply for _, reply in rig.transcript] or len(surplus) == 228
 
+    def test_duplicated_packets_do_not_change_the_replies(self):
+        clean = run()[1].replies
+        doubled = run([Duplicate(cycle) for cycle in range(400)])[1].replies
+        assert doubled == clean
 
-@pytest.mark.parametrize(
-    "faults",
-    [
-        [Lose(cycle) for cycle in range(50, 300, 7)],
-        [Lose(cycle, "to_controller") for cycle in range(50, 300, 50)],
-        [Lose(cycle, count=2) for cycle in range(50, 300, 11)],
-        [Duplicate(cycle) for cycle in range(13, 300)],
-        [Corrupt(cycle, offset=3, mask=0xFF) for cycle in range(50, 300, 7)],
-        [Corrupt(cycle, offset=2, mask=0x01) for cycle in range(50, 300, 7)],
-    ],
-    ids=["lost", "answers lost", "lost in pairs", "doubled", "number negative", "number far off"],
-)
-def test_a_motion_completes_on_a_poor_link(faults):
-    rig, _, transport = run(faults)
-    assert rig.ended.outcome == "completed"
-    for surplus in transport.surplus_replies:
-        assert surplus in [reply for _, reply in rig.transcript] or len(surplus) == 228
+    def test_three_consecutive_losses_stop_the_motion(self):
+        rig, _, _ = run([Lose(300, count=3)], source=Cruise())
+        assert rig.ended.outcome == "stopped"
+        assert rig.path[-2:] == [State.CLOSED, State.ENDED]
 
+    def test_silent_controller_ends_the_motion(self):
+        rig, _, _ = run([Lose(150, count=10_000)], stays=1000)
+        assert rig.ended.outcome == "lost"
+        lost = rig.seen(LinkLost)
+        assert [event.state for event in lost] == [State.OPEN]
+        assert lost[0].silence == pytest.approx(1.0, abs=PERIOD)
 
-def test_doubled_packets_change_nothing_the_controller_sees():
-    clean = run()[1].replies
-    doubled = run([Duplicate(cycle) for cycle in range(400)])[1].replies
-    assert doubled == clean
+    def test_closed_link_ends_the_motion(self):
+        rig, _, _ = run(stays=150)
+        assert rig.ended.outcome == "lost"
+        assert rig.state is State.FAULTED
 
-
-def test_three_packets_lost_in_a_row_stop_the_motion():
-    rig, _, _ = run([Lose(300, count=3)], source=Cruise())
-    assert rig.ended.outcome == "stopped"
-    assert rig.path[-2:] == [State.CLOSED, State.ENDED]
-
-
-def test_a_controller_that_falls_silent_ends_the_motion():
-    rig, _, _ = run([Lose(150, count=10_000)], stays=1000)
-    assert rig.ended.outcome == "lost"
-    lost = rig.seen(LinkLost)
-    assert [event.state for event in lost] == [State.OPEN]
-    assert lost[0].silence == pytest.approx(1.0, abs=PERIOD)
-
-
-def test_a_link_that_closes_is_silence_for_good():
-    rig, _, _ = run(stays=150)
-    assert rig.ended.outcome == "lost"
-    assert rig.state is State.FAULTED
-
-
-def test_the_exchange_ends_when_it_is_told_to():
-    rig = Rig()
-    controller = Controller(rig)
-    transport = SimulatedTransport(controller)
-    exchange(transport, rig.session, until=lambda: rig.session.state is State.CLOSED)
-    assert controller.cycle == 21
-    assert len(controller.replies) == 21, "the last packet was answered too"
+    def test_exchange_ends_by_its_condition(self):
+        rig = Rig()
+        controller = Controller(rig)
+        transport = SimulatedTransport(controller)
+        exchange(transport, rig.session, until=lambda: rig.session.state is State.CLOSED)
+        assert controller.cycle == 21
+        assert len(controller.replies) == 21, "the last packet was answered too"
 
 
 class Link:
@@ -172,7 +174,7 @@ class Link:
         pass
 
 
-class Piled(Link):
+class Backlogged(Link):
     """A link whose packets pile up now and then: each is there when the test says so."""
 
     def __init__(self, batches):
@@ -193,7 +195,7 @@ class Piled(Link):
         self.sent.append(packet)
 
 
-class TestHeldUp:
+class TestBacklog:
     """What the exchange does with packets that piled up while it was not running."""
 
     def on_time(self, rig):
@@ -204,12 +206,12 @@ class TestHeldUp:
 
     def serve(self, rig, on_time, late):
         """One packet when it is due, so that the exchange knows what that is; then a pile."""
-        link = Piled([[on_time], late])
+        link = Backlogged([[on_time], late])
         link.now = rig.now
         exchange(link, rig.session, until=lambda: False)
         return link.sent
 
-    def test_what_was_left_unanswered_is_counted_and_seen_as_a_gap(self):
+    def test_dropped_packets_are_counted_and_are_a_gap(self):
         rig, source = moving()
         on_time = self.on_time(rig)
         late = [rig.packet() for _ in range(3)]
@@ -221,7 +223,7 @@ class TestHeldUp:
         assert rig.session.counters.missed == 2
         assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
 
-    def test_more_than_the_session_bears_stop_the_motion(self):
+    def test_more_dropped_than_max_gap_stop_the_motion(self):
         rig, source = moving()
         on_time = rig.packet()
         self.serve(rig, on_time, [rig.packet() for _ in range(6)])
@@ -230,7 +232,7 @@ class TestHeldUp:
 
     @pytest.mark.parametrize("waiting", [2, 30, 65, 200, 1000])
     @pytest.mark.parametrize("length", [228, 732])
-    def test_of_a_pile_of_any_height_only_the_newest_is_answered(self, waiting, length):
+    def test_only_the_newest_of_a_backlog_is_answered(self, waiting, length):
         """Some controllers send 732 bytes whatever the number of axes; the rest is garbage."""
         chance = np.random.default_rng(5178)
         rig, source = moving()
@@ -242,13 +244,13 @@ class TestHeldUp:
         assert source.advances <= advances + 2
         assert rig.session.counters.discarded == {"late": waiting - 1}
 
-    def test_with_closed_axes_too(self):
+    def test_only_the_newest_is_answered_with_closed_axes(self):
         rig = closed()
         on_time = rig.packet()
         assert len(self.serve(rig, on_time, [rig.packet() for _ in range(4)])) == 2
         assert rig.session.counters.discarded == {"late": 3}
 
-    def test_packets_that_come_bunched_do_not_make_the_motion_run_ahead(self):
+    def test_bunched_packets_do_not_advance_the_motion(self):
         rig, source = moving()
         packets = [rig.packet() for _ in range(9)]
         # One on time, eight together that were held up on their way.
@@ -259,7 +261,7 @@ class TestHeldUp:
         assert source.advances <= advances + 3
         assert link.sent[-1][:4] == (rig.number + 1).to_bytes(4, "little")
 
-    def test_axes_that_open_within_the_pile_do_not_run_ahead(self):
+    def test_axes_that_open_within_a_backlog_do_not_run_ahead(self):
         rig = Rig()
         source = Cruise()
         rig.session.request(source)
@@ -271,7 +273,7 @@ class TestHeldUp:
         assert len(self.serve(rig, on_time, late)) == 3
         assert source.advances <= 1
 
-    def test_axes_that_closed_and_opened_within_the_pile_are_seen_to_have_closed(self):
+    def test_axes_that_closed_within_a_backlog_are_detected(self):
         rig, source = moving()
         on_time = rig.packet()
         late = []
@@ -286,7 +288,7 @@ class TestHeldUp:
 
     @pytest.mark.parametrize("place", range(4))
     @pytest.mark.parametrize("garbled", [0x10, 0x20, 0x40])
-    def test_a_garbled_number_does_not_take_the_place_of_the_newest(self, place, garbled):
+    def test_corrupt_number_does_not_replace_the_newest(self, place, garbled):
         """Seed 1667: it passed for the newest, and the session would have none of it."""
         rig, source = moving()
         on_time = self.on_time(rig)
@@ -302,20 +304,20 @@ class TestHeldUp:
         assert rig.session.counters.stale == 1
 
     @given(st.lists(st.integers(0, 255), max_size=400))
-    def test_whatever_waits_few_are_answered(self, statuses):
+    def test_number_of_answered_packets_is_bounded(self, statuses):
         packets = [
             number.to_bytes(4, "little") + bytes([status, 0, 0, 0]) + bytes(220)
             for number, status in enumerate(statuses)
         ]
-        session = Mute()
-        link = Piled([packets])
+        session = EchoSession()
+        link = Backlogged([packets])
         exchange(link, session, until=lambda: False)
         assert len(link.sent) <= MAX_KINDS
         if packets:
             assert link.sent[-1] == packets[-1]
         assert len(link.sent) + session.counted.get("late", 0) == len(packets)
 
-    def test_an_init_packet_among_them_is_never_left_out(self):
+    def test_init_packet_in_a_backlog_is_answered(self):
         rig, _ = moving()
         on_time, late = rig.packet(), rig.packet()
         assert len(self.serve(rig, on_time, [late, rig.init.encode()])) == 3
@@ -323,10 +325,10 @@ class TestHeldUp:
             event.after for event in rig.session.events() if isinstance(event, StateChanged)
         ]
 
-    def test_each_packet_keeps_the_ages_it_came_with(self):
+    def test_each_packet_of_a_backlog_has_its_own_ages(self):
         rig, _ = moving()
         on_time, late = rig.packet(), rig.packet()
-        link = Piled([[on_time], [late, rig.init.encode(), b"short"]])
+        link = Backlogged([[on_time], [late, rig.init.encode(), b"short"]])
         link.now = rig.now
         ages = []
         link.ages = np.zeros((N, 8), dtype=np.uint16)
@@ -341,14 +343,14 @@ class TestHeldUp:
         exchange(link, rig.session, until=lambda: False)
         assert ages == [1, 2, 3, 4]
 
-    def test_a_packet_and_its_duplicate_get_one_answer(self):
+    def test_packet_and_duplicate_get_one_reply(self):
         rig, _ = moving()
         on_time, late = rig.packet(), rig.packet()
         assert len(self.serve(rig, on_time, [late, late])) == 2
         assert rig.session.counters.discarded == {}
 
 
-class Bunched(Piled):
+class Bunched(Backlogged):
     """A link that knows when its packets arrived; time is that of the last, or a little more."""
 
     def __init__(self, script):
@@ -368,7 +370,7 @@ class Bunched(Piled):
         return packet
 
 
-class Mute:
+class EchoSession:
     """A session that answers everything with itself, a cycle of 2 ms."""
 
     state = State.OPEN
@@ -449,8 +451,8 @@ class Rejecting(Paced):
 
 
 @pytest.mark.parametrize("end", ["asked for", "closed link"])
-def test_what_the_link_rejected_last_is_counted_however_the_exchange_ends(end):
-    link, session = Rejecting([0.1] * 7), Mute()
+def test_last_rejections_of_the_link_are_counted(end):
+    link, session = Rejecting([0.1] * 7), EchoSession()
     session.reply = link.reply
     exchange(link, session, until=lambda: end == "asked for" and not link.costs)
     assert len(link.answered) == 7
@@ -460,21 +462,21 @@ def test_what_the_link_rejected_last_is_counted_however_the_exchange_ends(end):
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
 class TestLateness:
     def run(self, costs, *, state=State.OPEN, stamped=True, patient=False, max_late=2):
-        link, session = Paced(costs, patient=patient, stamped=stamped), Mute()
+        link, session = Paced(costs, patient=patient, stamped=stamped), EchoSession()
         session.state = state
         session.reply = link.reply
         exchange(link, session, until=lambda: False, max_late=max_late)
         return link, session
 
     @pytest.mark.parametrize("cost", [0.1, 0.9, 0.99])
-    def test_answers_within_their_cycle_are_not_late(self, cost, stamped):
+    def test_replies_within_their_cycle_are_not_late(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
         assert session.counted.get("answered late", 0) == 0
         assert link.answered == list(range(1, 51))
         assert session.stops == []
 
     @pytest.mark.parametrize("cost", [1.05, 1.1, 1.3, 1.49, 1.6, 3.5])
-    def test_an_overload_however_slight_is_seen_and_stops_the_motion(self, cost, stamped):
+    def test_slight_overload_stops_the_motion(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
         assert session.counted["answered late"] >= 49
         if stamped:
@@ -485,17 +487,17 @@ class TestLateness:
         assert link.answered[-1] >= 49 * cost - 1
 
     @pytest.mark.parametrize("state", [State.CLOSED, State.DRIVING_ON, State.EXITING])
-    def test_it_is_counted_in_every_state(self, state, stamped):
+    def test_late_replies_are_counted_in_every_state(self, state, stamped):
         _, session = self.run([1.2] * 50, state=state, stamped=stamped)
         assert session.counted["answered late"] >= 49
         assert session.stops == []
 
-    def test_as_many_as_are_borne_stop_nothing(self, stamped):
+    def test_two_consecutive_late_replies_do_not_stop(self, stamped):
         _, session = self.run([1.2, 1.2, 0.1, 0.1] * 10, stamped=stamped)
         assert session.counted["answered late"] >= 20
         assert session.stops == []
 
-    def test_a_controller_that_waits_for_its_answers_is_not_stopped(self, stamped):
+    def test_controller_that_waits_for_replies_is_not_stopped(self, stamped):
         _, session = self.run([1.5] * 50, patient=True, stamped=stamped)
         assert session.stops == []
 
@@ -516,8 +518,8 @@ class Drifting(Paced):
 
 
 @pytest.mark.parametrize("slower", [1.0, 1.0001, 1.005])
-def test_a_guessed_arrival_calls_no_answer_late_that_left_in_its_cycle(slower):
-    link, session = Drifting([0.95] * 20_000, slower), Mute()
+def test_estimated_arrivals_count_no_reply_as_late(slower):
+    link, session = Drifting([0.95] * 20_000, slower), EchoSession()
     arrivals = []
     session.reply = lambda packet, now, ages: arrivals.append(now) or link.reply(packet, now, ages)
     exchange(link, session, until=lambda: False)
@@ -544,7 +546,7 @@ class TestFullQueue:
         return link
 
     @pytest.mark.parametrize("since", [4.0, 100.0, 434.0])
-    def test_the_newest_of_an_old_pile_gets_no_answer_and_is_late(self, since):
+    def test_newest_of_an_old_backlog_gets_no_reply(self, since):
         rig, source = moving()
         advances, cycle = source.advances, rig.session._machine.cycle
         link = self.serve(rig, [rig.packet() for _ in range(20)], since)
@@ -553,21 +555,21 @@ class TestFullQueue:
         assert rig.session._machine.cycle == cycle
         assert rig.session.counters.discarded == {"late": 20}
 
-    def test_it_does_where_nothing_is_missing_behind_it(self):
+    def test_newest_of_a_recent_backlog_gets_a_reply(self):
         rig, _ = moving()
         link = self.serve(rig, [rig.packet() for _ in range(20)], 1.0)
         assert len(link.sent) == 1
         assert rig.session.counters.discarded["late"] == 19
 
-    def test_a_controller_that_waits_for_its_answer_gets_it_however_late(self):
+    def test_single_old_packet_gets_a_reply(self):
         rig, _ = moving()
         assert len(self.serve(rig, [rig.packet()], 100.0).sent) == 1
 
-    def test_with_closed_axes_an_old_packet_is_echoed_all_the_same(self):
+    def test_old_packet_gets_a_reply_with_closed_axes(self):
         rig = closed()
         assert len(self.serve(rig, [rig.packet() for _ in range(20)], 100.0).sent) == 1
 
-    def test_what_an_old_pile_tells_of_axes_and_sessions_is_not_left_out(self):
+    def test_init_packet_of_an_old_backlog_is_answered(self):
         rig, _ = moving()
         packets = [rig.packet() for _ in range(5)]
         self.serve(rig, [*packets, rig.init.encode()], 100.0)
@@ -576,7 +578,7 @@ class TestFullQueue:
 
 
 class TestDeadline:
-    def test_silence_is_counted_from_the_answer_and_not_from_an_old_arrival(self):
+    def test_silence_is_counted_from_the_reply(self):
         rig = closed(silence_timeout=1.0)
         link = Bunched([(rig.now + PERIOD, rig.packet())])
         link.now = rig.now + PERIOD + 0.9
@@ -585,7 +587,7 @@ class TestDeadline:
         assert rig.session.deadline == pytest.approx(link.now + 1.0)
         assert rig.session._ring.last(1)["arrival"][0] == pytest.approx(rig.now + PERIOD)
 
-    def test_a_duplicate_does_not_put_it_off(self):
+    def test_duplicate_does_not_extend_the_deadline(self):
         rig = closed()
         packet = rig.packet()
         link = Bunched([(rig.now + PERIOD, packet), (rig.now + 0.5, packet)])
@@ -594,7 +596,7 @@ class TestDeadline:
         assert rig.session.deadline == pytest.approx(rig.now + PERIOD + 1.0)
 
 
-class Anywhere(Piled):
+class CountingForgets(Backlogged):
     """A link that says how often it was told to listen to all ports."""
 
     def __init__(self, batches):
@@ -605,7 +607,7 @@ class Anywhere(Piled):
         self.forgotten.append(len(self.sent))
 
 
-class Quiet(Anywhere):
+class Quiet(CountingForgets):
     """After its packets it is silent for so long."""
 
     def __init__(self, batches, silence):
@@ -622,32 +624,32 @@ class Quiet(Anywhere):
         return None
 
 
-class TestWhoIsListenedTo:
+class TestPeerSelection:
     SYNC = (1).to_bytes(4, "little") + bytes(728)
 
-    def test_before_the_init_packet_whoever_gets_answers(self):
+    def test_sender_of_valid_start_packets_is_the_peer(self):
         rig = Rig()
         rig.number = 12
-        link = Anywhere([[b"\xff" * 60], [self.SYNC], [rig.init.encode()], [rig.packet()]])
+        link = CountingForgets([[b"\xff" * 60], [self.SYNC], [rig.init.encode()], [rig.packet()]])
         exchange(link, rig.session, until=lambda: False)
         assert link.forgotten == [0], "not the one whose sync packet was answered"
         assert len(link.sent) == 3
 
-    def test_until_it_sends_what_gets_no_answer(self):
-        link = Anywhere([[self.SYNC], [b"\xff" * 60], [self.SYNC]])
+    def test_peer_is_forgotten_after_a_packet_without_reply(self):
+        link = CountingForgets([[self.SYNC], [b"\xff" * 60], [self.SYNC]])
         exchange(link, Rig().session, until=lambda: False)
         assert link.forgotten == [1]
 
     @pytest.mark.parametrize(("silence", "forgotten"), [(0.8, []), (1.1, [1])])
-    def test_until_it_falls_silent(self, silence, forgotten):
+    def test_peer_is_forgotten_after_a_silence(self, silence, forgotten):
         link = Quiet([[self.SYNC]], silence)
         exchange(link, Rig().session, until=lambda: False)
         assert link.forgotten[:1] == forgotten
 
-    def test_a_lost_session_goes_on_with_whoever_gets_an_answer(self):
+    def test_lost_session_accepts_the_peer_that_gets_a_reply(self):
         rig = closed()
         rig.session.tick(rig.now + 2.0)
-        link = Anywhere([[b"\xff" * 60], [rig.packet()], [rig.packet()]])
+        link = CountingForgets([[b"\xff" * 60], [rig.packet()], [rig.packet()]])
         link.now = rig.now + 2.0
         exchange(link, rig.session, until=lambda: False)
         assert link.forgotten == [0]

@@ -96,7 +96,7 @@ class UdpController:
                 break
             except (TimeoutError, ConnectionError):
                 assert time.monotonic() < end, "the exchange does not answer"
-        while not self.quiet(0.0):
+        while not self.silent(0.0):
             self.socket.recv(2048)  # to an init packet that was sent again
         self.cycle()
 
@@ -126,18 +126,18 @@ class UdpController:
         while self.unanswered and CyclicPacket.decode(reply, N).number < expected:
             reply = self.socket.recv(2048)  # that one came after it had been given up
         assert CyclicPacket.decode(reply, N).number == expected
-        self._obey(reply)
+        self._follow(reply)
 
-    def take_what_came(self) -> None:
+    def follow_received(self) -> None:
         """Follow the answers that are there, to whichever cycle they are."""
-        while not self.quiet(0.0):
-            self._obey(self.socket.recv(2048))
+        while not self.silent(0.0):
+            self._follow(self.socket.recv(2048))
 
-    def quiet(self, seconds: float) -> bool:
+    def silent(self, seconds: float) -> bool:
         """Whether no answer comes within that time."""
         return not select.select([self.socket], [], [], seconds)[0]
 
-    def _obey(self, reply: bytes) -> None:
+    def _follow(self, reply: bytes) -> None:
         answer = CyclicPacket.decode(reply, N)
         if (answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).any():
             self.drive_offs += 1
@@ -227,13 +227,13 @@ def the(kind, events):
     return found[0]
 
 
-def set_going(exchange: ExchangeProcess, controller: UdpController) -> None:
+def start_cruise(exchange: ExchangeProcess, controller: UdpController) -> None:
     exchange.submit(Cruise())
     controller.open = True
     controller.until(lambda: controller.moved > 0.2)
 
 
-def test_a_whole_motion_is_run_recorded_and_told():
+def test_motion_is_run_and_recorded():
     with running() as (exchange, controller):
         reader = RingReader(exchange.ring_fd, N)
         exchange.submit(smooth_move(MOVE, 300))
@@ -266,7 +266,7 @@ def test_a_whole_motion_is_run_recorded_and_told():
         assert exchange.log == ""
 
 
-def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_the_arm():
+def test_packets_are_answered_while_the_controller_moves_the_arm():
     with running() as (exchange, controller):
         exchange._channel.shutdown(socket.SHUT_RDWR)  # as by its death: noticed at once
         controller.beat = lambda: None
@@ -280,7 +280,7 @@ def test_without_supervisor_it_answers_as_long_as_the_controllers_program_moves_
         assert exchange.wait(30.0) == 0
 
 
-def test_a_program_of_many_megabytes_is_handed_over_between_packets():
+def test_motion_of_many_megabytes_is_handed_over():
     with running() as (exchange, controller):
         controller.cycle(5)
         exchange.submit(still(100_000))
@@ -293,8 +293,8 @@ def test_a_program_of_many_megabytes_is_handed_over_between_packets():
         assert controller.unanswered == 0
 
 
-class TestRefusedPrograms:
-    def test_what_the_session_refuses_is_refused_to_the_supervisor(self):
+class TestRefusedMotions:
+    def test_refusal_of_the_session_is_raised(self):
         with running() as (exchange, controller):
             exchange.submit(still(10))
             with pytest.raises(RequestError, match="another motion was requested") as caught:
@@ -305,14 +305,14 @@ class TestRefusedPrograms:
             controller.cycle(5)
             assert exchange.alive
 
-    def test_a_program_that_cannot_be_read_there(self):
+    def test_motion_that_cannot_be_unpickled_is_refused(self):
         with (
             running() as (exchange, _),
             pytest.raises(RequestError, match="cannot be read"),
         ):
             exchange.submit(Trap())
 
-    def test_none_without_an_archive(self):
+    def test_motion_without_archive_is_refused(self):
         with running(needs_archive=True) as (exchange, _):
             with pytest.raises(RequestError, match="archive cannot be written"):
                 exchange.submit(still(10))
@@ -327,7 +327,7 @@ class TestRefusedPrograms:
 
             exchange.submit(still(10), wanted)
 
-    def test_none_once_the_end_was_asked_for(self):
+    def test_motion_after_the_requested_end_is_refused(self):
         with running() as (exchange, controller):
             exchange.finish()
             controller.cycle(5)
@@ -335,7 +335,7 @@ class TestRefusedPrograms:
                 exchange.submit(still(10))
 
 
-def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
+def test_motion_not_accepted_in_time_does_not_begin_later(monkeypatch):
     with running() as (exchange, controller):
         os.kill(exchange.pid, signal.SIGSTOP)
         with monkeypatch.context() as impatient:
@@ -352,7 +352,7 @@ def test_a_program_that_was_given_up_does_not_begin_after_all(monkeypatch):
         assert exchange.submit(still(10)) == 2
 
 
-def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until_then():
+def test_motion_can_be_withdrawn_after_it_was_read():
     with running(preload=(__name__,)) as (exchange, controller):
         begin = time.monotonic()
         controller.open = True
@@ -368,7 +368,7 @@ def test_a_program_is_asked_for_only_once_it_was_read_and_may_be_withdrawn_until
             assert (controller.moved > 0.0) is said
 
 
-class TestBetweenReadingAndBeginning:
+class TestBetweenReadingAndBegin:
     """Whatever comes in between, a motion begins only as it was meant to."""
 
     @staticmethod
@@ -390,7 +390,7 @@ class TestBetweenReadingAndBeginning:
                 exchange.submit(Cruise(), lambda: controller.start() is None)
             self.assert_nothing_moves(controller)
 
-    def test_another_wish_while_the_exchange_stands_still(self):
+    def test_withdrawal_while_the_exchange_is_stopped(self):
         with running() as (exchange, controller):
             signals = iter([signal.SIGSTOP, signal.SIGCONT])
 
@@ -404,9 +404,7 @@ class TestBetweenReadingAndBeginning:
             assert list(signals) == []
             self.assert_nothing_moves(controller)
 
-    def test_an_exception_leaves_no_motion_behind_that_another_could_be_taken_for(
-        self, monkeypatch
-    ):
+    def test_interrupted_submission_leaves_no_motion(self, monkeypatch):
         hand_over = process.hand_over
 
         def interrupted(*arguments):
@@ -442,10 +440,10 @@ def _spring():
     raise OSError("sprung")
 
 
-class TestHeldUp:
-    def test_of_what_piled_up_while_it_stood_still_nothing_old_is_answered(self):
+class TestStall:
+    def test_backlog_after_a_stall_is_dropped(self):
         with running(session={"max_gap": 100}) as (exchange, controller):
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             os.kill(exchange.pid, signal.SIGSTOP)
             while _process_state(exchange.pid) != "T":
                 time.sleep(0.001)
@@ -453,7 +451,7 @@ class TestHeldUp:
                 controller.post()
             time.sleep(10 * PERIOD)
             os.kill(exchange.pid, signal.SIGCONT)
-            assert controller.quiet(0.1)
+            assert controller.silent(0.1)
             before = controller.moved
             controller.cycle(1)
             assert controller.moved - before == pytest.approx(PERIOD * Cruise.SPEED, rel=0.01)
@@ -462,7 +460,7 @@ class TestHeldUp:
             assert status.late - status.answered_late == 90
             assert status.missed == 90
 
-    def test_answers_that_keep_leaving_too_late_stop_the_motion(self):
+    def test_consecutive_late_replies_stop_the_motion(self):
         allowances = {"session": {"max_gap": 100}, "max_late": 2, "preload": (__name__,)}
         with running(realtime=RealTimeSettings(), **allowances) as (exchange, controller):
             exchange.submit(Slow())
@@ -477,7 +475,7 @@ class TestHeldUp:
                     due = time.monotonic()
                 controller.post()
                 time.sleep(max(0.0, due - time.monotonic()))
-                controller.take_what_came()
+                controller.follow_received()
                 events = exchange.events()
                 ended = [event for event in events if isinstance(event, MotionEnded)]
             assert ended[0].outcome == "stopped"
@@ -526,14 +524,14 @@ class TestStops:
             (ExchangeProcess.finish, "the supervisor requested the end", True),
         ],
     )
-    def test_asked_for(self, ask, reason, ends):
+    def test_requested(self, ask, reason, ends):
         with running() as (exchange, controller):
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             ask(exchange)
             self.stopped(exchange, controller, by=reason, ends=ends)
 
     @pytest.mark.parametrize("end", ["silent", "failed"])
-    def test_by_the_end_of_the_archive(self, end):
+    def test_end_of_the_archive(self, end):
         with running(needs_archive=True) as (exchange, controller):
             control = ControlBlock(exchange.control_fd)
 
@@ -544,7 +542,7 @@ class TestStops:
             controller.beat = beat
             beat()
             control.archive_state = ArchiveState.READY
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             controller.cycle_time = PERIOD
             if end == "silent":
                 controller.beat = exchange.send_heartbeat
@@ -554,9 +552,9 @@ class TestStops:
                 reason = "the archive cannot be written"
             self.stopped(exchange, controller, by=reason, ends=False)
 
-    def test_by_a_supervisor_that_is_silent(self):
+    def test_silent_supervisor(self):
         with running() as (exchange, controller):
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             controller.cycle_time = PERIOD  # half a second must not be half the joint's range
             controller.beat = lambda: None
             silent_from = time.monotonic()
@@ -565,9 +563,9 @@ class TestStops:
             self.stopped(exchange, controller, by="no heartbeat", ends=True)
 
     @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-    def test_not_by_an_interrupt_or_a_hang_up(self, number):
+    def test_interrupt_and_hang_up_do_not_stop(self, number):
         with running() as (exchange, controller):
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             os.kill(exchange.pid, number)
             moved = controller.moved
             controller.cycle(200)
@@ -599,10 +597,10 @@ class FaultyTransport(UdpTransport):
         super().send(packet if self.packets < 5 else None)
 
 
-class TestItsOwnEnd:
-    def test_killed_the_supervisor_sees_it_and_the_controller_hears_nothing(self):
+class TestProcessEnd:
+    def test_killed_process_is_detected(self):
         with running() as (exchange, controller):
-            set_going(exchange, controller)
+            start_cruise(exchange, controller)
             os.kill(exchange.pid, signal.SIGKILL)
             assert exchange.wait(30.0) == -signal.SIGKILL
             assert not exchange.alive
@@ -612,7 +610,7 @@ class TestItsOwnEnd:
             with pytest.raises(ExchangeError, match="gone"):
                 exchange.submit(still(10))
 
-    def test_a_fault_of_its_own_is_in_the_log_and_in_the_status(self):
+    def test_internal_error_is_logged(self):
         with running(link=FaultySpec) as (exchange, controller):
             controller.cycle(4)
             assert exchange.wait(30.0) == 70
@@ -622,15 +620,15 @@ class TestItsOwnEnd:
 
 
 class TestStart:
-    def test_a_port_in_use_is_told_to_whoever_starts_it(self):
+    def test_port_in_use_is_raised(self):
         with running() as (_, controller), pytest.raises(TransportError, match="another program"):
             ExchangeProcess.start(settings(controller.socket.getpeername()[1]))
 
-    def test_what_cannot_be_imported_is_told_too(self):
+    def test_failed_import_is_raised(self):
         with pytest.raises(ModuleNotFoundError, match="no_such_module"):
             ExchangeProcess.start(settings(free_port(), preload=("no_such_module",)))
 
-    def test_the_system_is_asked_and_its_refusals_have_remedies(self):
+    def test_refused_permissions_have_remedies(self):
         impossible = RealTimeSettings(priority=50, cpu=4096)
         with running(realtime=impossible) as (exchange, _):
             report = exchange.realtime
@@ -641,9 +639,9 @@ class TestStart:
             ) + (not report.cpu_awake)
 
 
-def test_a_live_change_of_speed_that_a_motion_cannot_make_is_refused():
+def test_override_that_a_motion_cannot_make_is_refused():
     with running() as (exchange, controller):
-        set_going(exchange, controller)
+        start_cruise(exchange, controller)
         exchange.override(0.5)
         controller.cycle(5)
         assert the(OverrideRefused, exchange.events()).fraction == 0.5
@@ -653,7 +651,7 @@ def test_a_live_change_of_speed_that_a_motion_cannot_make_is_refused():
         assert controller.open
 
 
-def test_a_process_that_cannot_be_started_is_an_error_of_ours_and_leaves_nothing_open(monkeypatch):
+def test_process_that_cannot_be_started_leaves_nothing_open(monkeypatch):
     def refuse(*_, **__):
         raise BlockingIOError(11, "no more processes")
 
@@ -688,77 +686,73 @@ def enter(arguments: str = "", *, unprivileged=False, memlock=8 << 20):
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to drop rights")
 
 
-def test_the_collector_is_off_and_nothing_else_changed_where_nothing_is_asked_for():
-    report, collecting, _ = enter("priority=0, lock_memory=False, hold_cpu_awake=False")
-    assert report == RealTimeReport("ordinary", False, False, [])
-    assert not collecting
+class TestRealTimeSettings:
+    def test_without_settings_only_the_collector_is_off(self):
+        report, collecting, _ = enter("priority=0, lock_memory=False, hold_cpu_awake=False")
+        assert report == RealTimeReport("ordinary", False, False, [])
+        assert not collecting
 
+    def test_each_setting_is_granted_or_refused(self):
+        report, _, _ = enter("priority=37")
+        granted = (
+            report.scheduling == "SCHED_FIFO 37",
+            report.memory_locked,
+            report.cpu_awake,
+        )
+        assert sum(granted) + len(report.refused) == 3
 
-def test_what_was_asked_for_is_granted_or_refused_in_one_sentence_each():
-    report, _, _ = enter("priority=37")
-    granted = (
-        report.scheduling == "SCHED_FIFO 37",
-        report.memory_locked,
-        report.cpu_awake,
+    @needs_root
+    def test_refusals_of_an_unprivileged_user_have_remedies(self):
+        report, collecting, _ = enter("", unprivileged=True, memlock=4 << 20)
+        assert report.scheduling == "ordinary"
+        assert not report.memory_locked
+        assert not collecting
+        text = "\n".join(report.refused)
+        assert "rtprio 98" in text
+        assert "memlock unlimited" in text
+        assert "udev" in text or report.cpu_awake
+
+    @pytest.mark.parametrize(
+        ("user", "limit", "flags", "locked"),
+        [(1000, 8 << 30, 1, False), (1000, resource.RLIM_INFINITY, 3, True), (0, 8 << 20, 3, True)],
+        ids=["a finite limit", "no limit", "root"],
     )
-    assert sum(granted) + len(report.refused) == 3
+    def test_future_memory_is_locked_only_without_a_limit(
+        self, monkeypatch, user, limit, flags, locked
+    ):
+        class C:
+            """Grants everything."""
 
+            asked = None
 
-@needs_root
-def test_a_user_without_rights_is_told_each_remedy_and_goes_on():
-    report, collecting, _ = enter("", unprivileged=True, memlock=4 << 20)
-    assert report.scheduling == "ordinary"
-    assert not report.memory_locked
-    assert not collecting
-    text = "\n".join(report.refused)
-    assert "rtprio 98" in text
-    assert "memlock unlimited" in text
-    assert "udev" in text or report.cpu_awake
+            def mallopt(self, *_):
+                return 1
 
+            def mlockall(self, wanted):
+                self.asked = wanted
+                return 0
 
-@pytest.mark.parametrize(
-    ("user", "limit", "flags", "locked"),
-    [(1000, 8 << 30, 1, False), (1000, resource.RLIM_INFINITY, 3, True), (0, 8 << 20, 3, True)],
-    ids=["a finite limit", "no limit", "root"],
-)
-def test_future_memory_is_locked_only_where_no_later_allocation_can_fail(
-    monkeypatch, user, limit, flags, locked
-):
-    class C:
-        """Grants everything."""
+        c = C()
+        monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: c)
+        monkeypatch.setattr(realtime.os, "geteuid", lambda: user)
+        monkeypatch.setattr(realtime.resource, "getrlimit", lambda _: (limit, limit))
+        refused = []
+        assert realtime._lock_memory(refused) is locked
+        assert c.asked == flags
+        assert len(refused) == (not locked)
 
-        asked = None
+    def test_processor_can_be_selected(self):
+        cpu = max(os.sched_getaffinity(0))
+        report, _, cpus = enter(f"priority=0, lock_memory=False, hold_cpu_awake=False, cpu={cpu}")
+        assert cpus == [cpu]
+        assert not report.refused
 
-        def mallopt(self, *_):
-            return 1
-
-        def mlockall(self, wanted):
-            self.asked = wanted
-            return 0
-
-    c = C()
-    monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: c)
-    monkeypatch.setattr(realtime.os, "geteuid", lambda: user)
-    monkeypatch.setattr(realtime.resource, "getrlimit", lambda _: (limit, limit))
-    refused = []
-    assert realtime._lock_memory(refused) is locked
-    assert c.asked == flags
-    assert len(refused) == (not locked)
-
-
-def test_a_processor_can_be_chosen():
-    cpu = max(os.sched_getaffinity(0))
-    report, _, cpus = enter(f"priority=0, lock_memory=False, hold_cpu_awake=False, cpu={cpu}")
-    assert cpus == [cpu]
-    assert not report.refused
-
-
-@pytest.mark.parametrize(
-    ("impossible", "remedy"),
-    [("priority=0, cpu=4096", "choose one of"), ("priority=100", ""), ("priority=1000", "")],
-)
-def test_a_processor_or_priority_that_does_not_exist_is_refused(impossible, remedy):
-    report, _, _ = enter(f"{impossible}, lock_memory=False, hold_cpu_awake=False")
-    assert report.scheduling == "ordinary"
-    assert len(report.refused) == 1
-    assert remedy in report.refused[0]
+    @pytest.mark.parametrize(
+        ("impossible", "remedy"),
+        [("priority=0, cpu=4096", "choose one of"), ("priority=100", ""), ("priority=1000", "")],
+    )
+    def test_unknown_processor_or_priority_is_refused(self, impossible, remedy):
+        report, _, _ = enter(f"{impossible}, lock_memory=False, hold_cpu_awake=False")
+        assert report.scheduling == "ordinary"
+        assert len(report.refused) == 1
+        assert remedy in report.refused[0]

@@ -11,6 +11,7 @@ import pickle
 import socket
 import struct
 import time
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from hypothesis import strategies as st
 
 from drivers import CyclicPacket, GapSeen, Mode, MotionEnded, State, StateChanged
 from drivers.errors import RequestError
-from drivers.events import AnswersLost, Counters, PacketRejected
+from drivers.events import AnswersLost, Counters, Outcome, PacketRejected
 from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.__main__ import warm_up
 from drivers.exchange.control import (
@@ -60,7 +61,7 @@ def write(ring: CycleRing, numbers) -> None:
 
 
 class TestRing:
-    def test_what_is_written_is_read_elsewhere_once(self):
+    def test_records_are_read_once(self):
         ring = CycleRing.shared(N, 100)
         reader = RingReader(ring.fd, N)
         write(ring, range(5))
@@ -71,14 +72,14 @@ class TestRing:
         np.testing.assert_array_equal(records["commanded_velocity"][3], np.full(N, -3.0))
         assert len(reader.drain()) == 0
 
-    def test_a_reader_that_comes_later_begins_with_what_is_still_there(self):
+    def test_later_reader_begins_with_the_oldest_available(self):
         ring = CycleRing.shared(N, 10)
         write(ring, range(25))
         reader = RingReader(ring.fd, N)
         assert reader.drain()["number"].tolist() == list(range(16, 25))
         assert reader.overflow == 0
 
-    def test_the_writer_counts_what_it_overwrites_unread(self):
+    def test_writer_counts_records_overwritten_unread(self):
         ring = CycleRing.shared(N, 10)
         reader = RingReader(ring.fd, N)
         spectator = RingReader(ring.fd, N, acknowledge=False)
@@ -94,7 +95,7 @@ class TestRing:
         assert ring.overflow == 4
 
     @given(st.lists(st.integers(0, 25), max_size=30))
-    def test_every_record_is_read_in_order_or_counted_as_lost(self, steps):
+    def test_each_record_is_read_in_order_or_counted(self, steps):
         ring = CycleRing.shared(1, 10)
         reader = RingReader(ring.fd, 1)
         seen, written = [], 0
@@ -106,7 +107,7 @@ class TestRing:
         assert len(seen) + reader.overflow == written
         os.close(ring.fd)
 
-    def test_records_overwritten_while_they_are_copied_are_not_given_out(self):
+    def test_records_overwritten_during_the_copy_are_dropped(self):
         ring = CycleRing.shared(N, 10)
         reader = RingReader(ring.fd, N)
         write(ring, range(9))
@@ -121,7 +122,7 @@ class TestRing:
         assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
         assert reader.overflow == 4
 
-    def test_memory_of_something_else_is_refused(self):
+    def test_other_memory_is_refused(self):
         ring = CycleRing.shared(N, 10)
         with pytest.raises(ValueError, match="for 6 joints, not 7"):
             RingReader(ring.fd, 7)
@@ -136,7 +137,7 @@ def gaps(numbers):
 
 
 class TestEventLog:
-    def test_several_readers_each_get_all_in_order_once(self):
+    def test_each_reader_gets_all_events_in_order(self):
         fd = event_log.create(4096)
         writer, readers = EventWriter(fd), [EventReader(fd), EventReader(fd)]
         events = [GapSeen(2, 7), StateChanged(State.OPEN, State.EXITING, 9)]
@@ -146,7 +147,7 @@ class TestEventLog:
             assert (reader.drain(), reader.drain(), reader.lost) == (events, [], 0)
 
     @given(st.lists(st.integers(0, 12), max_size=40), st.integers(300, 1100))
-    def test_every_event_is_read_in_order_or_counted_as_lost(self, steps, capacity):
+    def test_each_event_is_read_in_order_or_counted(self, steps, capacity):
         fd = event_log.create(capacity)
         writer, reader = EventWriter(fd), EventReader(fd)
         written, seen, reported = 0, [], 0
@@ -162,7 +163,7 @@ class TestEventLog:
         assert reported == reader.lost
         os.close(fd)
 
-    def test_a_torn_frame_is_lost_and_not_believed(self):
+    def test_corrupt_frame_counts_as_lost(self):
         fd = event_log.create(4096)
         writer, reader = EventWriter(fd), EventReader(fd)
         for event in gaps([1, 2, 3]):
@@ -172,7 +173,7 @@ class TestEventLog:
         assert reader.drain() == [EventsLost(1), *gaps([2, 3])]
         assert reader.lost == 1
 
-    def test_frames_given_up_while_they_are_copied_are_not_given_out(self):
+    def test_frames_overwritten_during_the_copy_are_dropped(self):
         fd = event_log.create(400)
         writer, reader = EventWriter(fd), EventReader(fd)
         for event in gaps([1, 2, 3]):
@@ -192,15 +193,15 @@ class TestEventLog:
         assert 0 < len(seen) < 5
         assert len(seen) + reader.lost == 5
 
-    def test_an_event_longer_than_the_log_is_an_error(self):
+    def test_event_longer_than_the_log_is_refused(self):
         writer = EventWriter(event_log.create(100))
         with pytest.raises(ValueError, match="an event of"):
             writer.write(PacketRejected("x" * 200, 1))
 
 
-class TestDigest:
+class TestEventLimiter:
     @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=200))
-    def test_nothing_is_lost_and_little_is_told(self, steps):
+    def test_sums_are_exact_and_events_few(self, steps):
         limiter, reported, now, rejected, missed = EventLimiter(), [], 0.0, 0, 0
         for count, kind in steps:
             events = [PacketRejected(f"kind {kind}", count), GapSeen(count, round(now * 1000))]
@@ -213,7 +214,7 @@ class TestDigest:
         assert sum(e.missed for _, e in reported if isinstance(e, GapSeen)) == missed
         assert len(reported) <= 5 * (now / 0.1 + 2)
 
-    def test_the_first_of_a_sort_is_told_at_once_and_the_rest_when_the_time_is_over(self):
+    def test_first_passes_at_once_and_the_sum_after_the_period(self):
         limiter = EventLimiter()
         assert limiter.filter([GapSeen(1, 7)], 0.0) == [GapSeen(1, 7)]
         assert limiter.filter([GapSeen(2, 9), AnswersLost(1, 9)], 0.01) == [AnswersLost(1, 9)]
@@ -223,19 +224,19 @@ class TestDigest:
         assert limiter.filter([], 0.11) == [AnswersLost(2, 12)]
         assert limiter.filter([], 1.0) == limiter.flush() == []
 
-    def test_the_end_of_a_motion_comes_after_what_led_to_it(self):
+    def test_sums_precede_the_end_of_a_motion(self):
         limiter = EventLimiter()
         limiter.filter([GapSeen(1, 7)], 0.0)
         ended = MotionEnded("stopped", "5 packets were missed in a row", 0, 9)
         assert limiter.filter([GapSeen(5, 9), ended], 0.01) == [GapSeen(5, 9), ended]
 
-    def test_everything_else_passes_in_order(self):
+    def test_other_events_pass_in_order(self):
         changed = [StateChanged(State.OPEN, State.EXITING, k) for k in range(50)]
         assert EventLimiter().filter(changed, 0.0) == changed
 
 
 class TestControlBlock:
-    def test_each_field_keeps_its_own_value(self):
+    def test_fields_do_not_overlap(self):
         fd = control.create()
         here, there = ControlBlock(fd), ControlBlock(fd)
         numbers = ctypes.c_int64, ctypes.c_double
@@ -247,13 +248,16 @@ class TestControlBlock:
             name: index - 7 for index, name in enumerate(fields)
         }
 
-    def test_memory_of_something_else_is_refused(self):
+    def test_other_memory_is_refused(self):
         with pytest.raises(ValueError, match="not a control block"):
             ControlBlock(CycleRing.shared(N, 10).fd)
 
+    def test_each_outcome_has_a_number(self):
+        assert sorted(OUTCOMES) == sorted(get_args(Outcome))
 
-class TestProgram:
-    def test_it_plays_as_the_original_does(self):
+
+class TestMotionTransfer:
+    def test_copy_equals_the_original(self):
         there = motion_transfer.unpack(motion_transfer.pack(still(5000)))
         here = still(5000)
         there.begin(there.start)
@@ -261,7 +265,7 @@ class TestProgram:
         for _ in range(3):
             np.testing.assert_array_equal(there.advance(), here.advance())
 
-    def test_large_arrays_are_mapped_and_read_only_small_ones_are_not(self):
+    def test_only_large_arrays_are_mapped_read_only(self):
         source = still(5000)
         there = motion_transfer.unpack(motion_transfer.pack(source))
         assert not there.positions.flags.writeable
@@ -269,7 +273,7 @@ class TestProgram:
         small = motion_transfer.unpack(motion_transfer.pack(Cruise()))
         small.start += 1.0
 
-    def test_its_memory_cannot_change_any_more(self):
+    def test_memory_is_sealed(self):
         fd = motion_transfer.pack(still(10))
         with pytest.raises(OSError, match="not permitted"):
             os.pwrite(fd, b"x", 0)
@@ -277,11 +281,11 @@ class TestProgram:
             mmap.mmap(fd, 10)
         assert fcntl.fcntl(fd, fcntl.F_GET_SEALS) & fcntl.F_SEAL_WRITE
 
-    def test_memory_that_could_still_change_is_refused(self):
+    def test_memory_without_seals_is_refused(self):
         with pytest.raises((ValueError, OSError)):
             motion_transfer.unpack(control.create())
 
-    def test_what_does_not_pickle_is_not_handed_over(self):
+    def test_source_that_cannot_be_pickled_is_refused(self):
         source = still(10)
         source.callback = lambda: None
         with pytest.raises((pickle.PicklingError, AttributeError)):
@@ -309,35 +313,33 @@ def counted(seconds) -> list[int]:
     return counts
 
 
-@given(latencies)
-def test_each_latency_is_at_most_the_edge_of_its_bin_and_above_that_of_the_one_before(seconds):
-    edge = upper_edge(bin_of(seconds))
-    assert seconds <= edge * (1.0 + 1e-12)
-    assert edge <= max(seconds, SHORTEST) * WIDTH * (1.0 + 1e-12)
+class TestLatencyBins:
+    @given(latencies)
+    def test_latency_lies_within_its_bin(self, seconds):
+        edge = upper_edge(bin_of(seconds))
+        assert seconds <= edge * (1.0 + 1e-12)
+        assert edge <= max(seconds, SHORTEST) * WIDTH * (1.0 + 1e-12)
 
+    @pytest.mark.parametrize(
+        ("latencies", "place"),
+        [((0.0, -1e-3, math.nan, SHORTEST), 0), ((1.0, 1e300, math.inf), BINS - 1)],
+    )
+    def test_first_and_last_bin_are_unbounded(self, latencies, place):
+        assert {bin_of(seconds) for seconds in latencies} == {place}
+        assert upper_edge(BINS - 1) == math.inf
+        assert 5e-3 < LONGEST < 6e-3
 
-@pytest.mark.parametrize(
-    ("latencies", "place"),
-    [((0.0, -1e-3, math.nan, SHORTEST), 0), ((1.0, 1e300, math.inf), BINS - 1)],
-)
-def test_what_is_outside_of_all_is_in_the_first_or_last_which_has_no_end(latencies, place):
-    assert {bin_of(seconds) for seconds in latencies} == {place}
-    assert upper_edge(BINS - 1) == math.inf
-    assert 5e-3 < LONGEST < 6e-3
+    def test_quantile_without_replies_and_of_share_zero(self):
+        assert quantile([0] * BINS, 0.5) is None
+        assert quantile(counted([1e-3]), 0.0) == upper_edge(bin_of(1e-3))
 
-
-def test_of_no_answers_there_is_no_quantile_and_of_no_share_the_shortest():
-    assert quantile([0] * BINS, 0.5) is None
-    assert quantile(counted([1e-3]), 0.0) == upper_edge(bin_of(1e-3))
-
-
-@given(st.lists(latencies, min_size=1), st.floats(0.0, 1.0, exclude_min=True))
-def test_a_quantile_is_not_exceeded_by_its_share_and_by_no_more_than_a_bin_too_long(found, share):
-    estimated = quantile(counted(found), share)
-    assert estimated is not None
-    needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
-    assert needed <= estimated * (1.0 + 1e-12)
-    assert estimated <= needed * WIDTH * (1.0 + 1e-12)
+    @given(st.lists(latencies, min_size=1), st.floats(0.0, 1.0, exclude_min=True))
+    def test_quantile_is_at_most_one_bin_too_long(self, found, share):
+        estimated = quantile(counted(found), share)
+        assert estimated is not None
+        needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
+        assert needed <= estimated * (1.0 + 1e-12)
+        assert estimated <= needed * WIDTH * (1.0 + 1e-12)
 
 
 class Machine:
@@ -362,31 +364,30 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     return machine
 
 
-def test_silence_is_counted_and_ends_with_the_next_beat(machine: Machine) -> None:
-    pulse = HeartbeatMonitor(lambda: machine.beat)
-    assert machine.watch(pulse, 10.0, beating=True) == 0.0
-    assert machine.watch(pulse, 6.0) == pytest.approx(6.0)
-    assert machine.watch(pulse, 0.1, beating=True) == 0.0
+class TestHeartbeatMonitor:
+    def test_silence_ends_with_the_next_heartbeat(self, machine: Machine) -> None:
+        pulse = HeartbeatMonitor(lambda: machine.beat)
+        assert machine.watch(pulse, 10.0, beating=True) == 0.0
+        assert machine.watch(pulse, 6.0) == pytest.approx(6.0)
+        assert machine.watch(pulse, 0.1, beating=True) == 0.0
 
+    @pytest.mark.parametrize("longest", [MAX_INTERVAL, 0.1])
+    def test_suspension_of_the_computer_is_not_silence(
+        self, machine: Machine, longest: float
+    ) -> None:
+        pulse = HeartbeatMonitor(lambda: machine.beat, max_interval=longest)
+        machine.now += 3600.0
+        assert pulse.silence() == longest
 
-@pytest.mark.parametrize("longest", [MAX_INTERVAL, 0.1])
-def test_a_machine_that_was_suspended_takes_nobody_for_dead(
-    machine: Machine, longest: float
-) -> None:
-    pulse = HeartbeatMonitor(lambda: machine.beat, max_interval=longest)
-    machine.now += 3600.0
-    assert pulse.silence() == longest
-
-
-def test_a_process_that_has_not_begun_is_not_quiet_yet(machine: Machine) -> None:
-    machine.beat = 0.0
-    assert machine.watch(HeartbeatMonitor(lambda: machine.beat), 10.0) == 0.0
+    def test_no_silence_before_the_first_heartbeat(self, machine: Machine) -> None:
+        machine.beat = 0.0
+        assert machine.watch(HeartbeatMonitor(lambda: machine.beat), 10.0) == 0.0
 
 
 STEP = 0.01
 
 
-class Told:
+class FakeSession:
     """A session that is in a given state, and hears a packet per step."""
 
     requested = False
@@ -425,7 +426,7 @@ class Bench:
 
     def __init__(self, clock):
         self.clock = clock
-        self.session = Told()
+        self.session = FakeSession()
         self.ring = CycleRing.shared(N, 16)
         event_fd = event_log.create()
         self.reader = EventReader(event_fd)
@@ -498,24 +499,22 @@ class TestLeaving:
             ([(State.OPEN, 0.5), (State.FREEZING, 5.0), (State.CLOSED, 5.0)], 5.5),
         ],
     )
-    def test_packets_are_answered_for_two_seconds_after_the_axes_closed(
-        self, bench, spans, seconds
-    ):
+    def test_packets_are_answered_two_seconds_after_closing(self, bench, spans, seconds):
         bench.terminated.append(True)
         taken = bench.time_to_the_end(states(*spans))
         assert taken == pytest.approx(seconds + DETACHED_LINGER, abs=2.1 * STEP)
 
-    def test_a_controller_that_opens_again_and_again_cannot_put_off_the_end(self, bench):
+    def test_axes_that_open_repeatedly_do_not_delay_the_end(self, bench):
         bench.terminated.append(True)
         path = states(*[(State.CLOSED, 0.1), (State.OPEN, 0.1)] * 1000)
         assert bench.time_to_the_end(path) == pytest.approx(MAX_LINGER, abs=0.11)
 
-    def test_it_does_not_end_while_the_axes_are_open(self, bench):
+    def test_no_end_while_axes_are_open(self, bench):
         bench.terminated.append(True)
         with pytest.raises(AssertionError, match="does not end"):
             bench.time_to_the_end(states((State.CLOSED, 0.1), (State.FAULTED, 30.0)))
 
-    def test_a_silent_controller_is_not_waited_for(self, bench):
+    def test_no_wait_for_a_silent_controller(self, bench):
         bench.terminated.append(True)
         bench.session.state = State.FREEZING
         bench.step()
@@ -523,29 +522,29 @@ class TestLeaving:
         taken = bench.time_to_the_end(states((State.FREEZING, 10.0)))
         assert taken == pytest.approx(1.0 + DETACHED_LINGER, abs=2.1 * STEP)
 
-    def test_it_is_told_once(self, bench):
+    def test_leaving_is_logged_once(self, bench):
         bench.terminated.append(True)
         for _ in range(5):
             bench.step()
         assert len([e for e in bench.reader.drain() if isinstance(e, Leaving)]) == 1
 
 
-class TestASilentSupervisor:
+class TestSupervisorHeartbeat:
     @pytest.mark.parametrize(
-        ("requested", "borne"), [(True, HEARTBEAT_TIMEOUT), (False, IDLE_HEARTBEAT_TIMEOUT)]
+        ("requested", "timeout"), [(True, HEARTBEAT_TIMEOUT), (False, IDLE_HEARTBEAT_TIMEOUT)]
     )
-    def test_is_borne_for_longer_where_no_motion_was_requested(self, bench, requested, borne):
+    def test_timeout_is_longer_without_a_motion(self, bench, requested, timeout):
         bench.step()
         bench.session.requested = requested
         silent_from = bench.control.supervisor_heartbeat
         while not bench.serving.reason:
             bench.clock.time += STEP
             bench.serving()
-        assert bench.clock.time - silent_from == pytest.approx(borne, abs=1.1 * STEP)
+        assert bench.clock.time - silent_from == pytest.approx(timeout, abs=1.1 * STEP)
         assert bench.serving.reason == NO_SUPERVISOR
         assert "stop" in bench.session.asked
 
-    def test_ends_a_motion_that_it_requests_after_its_silence(self, bench):
+    def test_motion_requested_after_a_silence_is_stopped(self, bench):
         bench.step()
         for _ in range(round(2.0 / STEP)):
             bench.clock.time += STEP
@@ -554,7 +553,7 @@ class TestASilentSupervisor:
         bench.serving()
         assert bench.session.asked == ["stop"]
 
-    def test_ends_with_the_beat_that_comes_with_its_consent(self, bench, monkeypatch):
+    def test_heartbeat_with_the_permission_ends_the_silence(self, bench, monkeypatch):
         """Which may come between any two looks of one call."""
         offered, consent = object(), bench.serving._archive.silence
         bench.step()
@@ -576,7 +575,7 @@ class TestASilentSupervisor:
         assert bench.session.asked == [offered]
         assert not bench.serving.reason
 
-    def test_is_not_concluded_from_time_in_which_this_process_stood_still_itself(self, bench):
+    def test_time_in_which_this_process_stood_still_is_no_silence(self, bench):
         bench.session.requested = True
         bench.step()
         for _ in range(round(0.9 * HEARTBEAT_TIMEOUT / POLL)):  # each as long as the machine liked
@@ -591,7 +590,7 @@ class TestASilentSupervisor:
 
 
 class TestHold:
-    def test_each_change_is_passed_on_once(self, bench):
+    def test_each_change_is_applied_once(self, bench):
         bench.session.requested = True
         for held in (1, 0, 1):
             bench.control.held = held
@@ -600,7 +599,7 @@ class TestHold:
             bench.step()
         assert bench.session.asked == ["hold", "resume", "hold"]
 
-    def test_where_there_is_no_motion_a_hold_is_refused_and_told(self, bench):
+    def test_hold_without_motion_is_refused(self, bench):
         bench.control.held = 1
         bench.control.hold_count += 1
         bench.step()
@@ -609,7 +608,7 @@ class TestHold:
         assert isinstance(notice, HoldRefused)
         assert "no motion was requested" in notice.reason
 
-    def test_of_two_that_come_together_the_last_counts(self, bench):
+    def test_last_of_two_changes_is_applied(self, bench):
         for held in (1, 0):
             bench.control.held = held
             bench.control.hold_count += 1
@@ -617,8 +616,8 @@ class TestHold:
         assert bench.session.asked == ["resume"]
 
 
-class TestWhatIsTold:
-    def test_a_flood_of_rejections_fills_neither_log_nor_reader(self, bench):
+class TestPublished:
+    def test_flood_of_rejections_gives_few_events(self, bench):
         for _ in range(1000):
             bench.session.pending += [PacketRejected("malformed", 20), GapSeen(1, 5)]
             bench.step()
@@ -629,7 +628,7 @@ class TestWhatIsTold:
         assert sum(e.missed for e in events if isinstance(e, GapSeen)) == 1000
         assert bench.reader.lost == 0
 
-    def test_the_end_of_a_motion_has_a_second_witness(self, bench):
+    def test_end_of_a_motion_is_in_the_control_block(self, bench):
         bench.session.pending.append(MotionEnded("refused", "too fast", 3, 77))
         bench.step()
         block = bench.control
@@ -639,21 +638,21 @@ class TestWhatIsTold:
             3,
         )
 
-    def test_late_answers_are_counted_whether_they_left_or_not(self, bench):
+    def test_late_replies_are_counted_sent_or_not(self, bench):
         bench.session.counters.discarded = {"late": 4, "answered late": 3}
         bench.serving.conclude()
         assert (bench.control.late, bench.control.answered_late) == (7, 3)
 
 
-@pytest.mark.parametrize("period", [0.001, 0.002])
-def test_it_goes_as_far_as_a_motion_in_open_mode(period):
-    assert warm_up(drive_train(), limits(), period)[0] is State.OPEN
+class TestWarmUp:
+    @pytest.mark.parametrize("period", [0.001, 0.002])
+    def test_warm_up_reaches_open_mode(self, period):
+        assert warm_up(drive_train(), limits(), period)[0] is State.OPEN
 
-
-def test_it_tells_the_arm_to_stay_in_the_middle_of_its_range():
-    lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
-    _, reply = warm_up(drive_train(), limits(lower=lower, upper=upper), PERIOD, cycles=5)
-    answer = CyclicPacket.decode(reply, N)
-    assert (answer.axes["mode"] == Mode.POSITION).all()
-    reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
-    np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)
+    def test_warm_up_commands_the_middle_of_the_range(self):
+        lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
+        _, reply = warm_up(drive_train(), limits(lower=lower, upper=upper), PERIOD, cycles=5)
+        answer = CyclicPacket.decode(reply, N)
+        assert (answer.axes["mode"] == Mode.POSITION).all()
+        reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
+        np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)

@@ -27,7 +27,7 @@ from tests.drivers.rig import N, Rig, drive_train, init_packet, limits
 from tests.drivers.transport_contract import TransportContract
 
 HOST = "127.0.0.1"
-STRANGER = "127.0.0.2"
+OTHER_HOST = "127.0.0.2"
 PATIENCE = 5.0
 
 
@@ -85,7 +85,7 @@ def another(near):
 
 @pytest.fixture
 def other_host(near):
-    far = Controller(near.address[1], STRANGER)
+    far = Controller(near.address[1], OTHER_HOST)
     yield far
     far.close()
 
@@ -100,7 +100,7 @@ class TestContract(TransportContract):
 
 
 class TestPeer:
-    def test_another_host_gets_no_answer_and_is_counted(self, near, other_host):
+    def test_other_host_gets_no_reply_and_is_counted(self, near, other_host):
         other_host.send(bytes(48))
         assert near.receive(0.05) is None
         near.send(bytes(48))
@@ -108,7 +108,7 @@ class TestPeer:
         assert near.rejected() == {"foreign": 1, "unsent": 1}
         assert near.rejected() == {}
 
-    def test_the_first_sender_is_the_peer_until_it_is_forgotten(self, near, controller, another):
+    def test_first_sender_is_the_peer_until_forgotten(self, near, controller, another):
         controller.send(b"a" * 48)
         assert near.receive(PATIENCE) == b"a" * 48
         another.send(b"b" * 48)
@@ -125,16 +125,14 @@ class TestPeer:
         assert controller.heard_nothing()
 
     @pytest.mark.parametrize("length", [0, 11, 1501, 9000])
-    def test_an_implausible_datagram_does_not_become_the_peer(
-        self, near, controller, another, length
-    ):
+    def test_sender_of_implausible_lengths_is_not_the_peer(self, near, controller, another, length):
         another.send(bytes(length))
         controller.send(b"x" * 48)
         assert near.receive(PATIENCE) == b"x" * 48
         assert near.rejected() == {"malformed": 1}
 
     @pytest.mark.parametrize("length", [12, 47])
-    def test_a_header_alone_is_answered(self, near, controller, length):
+    def test_header_alone_is_answered(self, near, controller, length):
         """Of sync packets nothing is known but that they are shorter than the init packet."""
         rig = Rig()
         controller.send(struct.pack("<i", 3) + bytes(length - 4))
@@ -142,14 +140,14 @@ class TestPeer:
         controller.wait()
         assert controller.replies == [struct.pack("<i", 4) + bytes(length - 4)]
 
-    def test_longer_than_any_packet_is_malformed_and_not_answered(self, near, controller):
+    def test_too_long_datagram_is_malformed(self, near, controller):
         controller.send(bytes(1500))
         assert near.receive(PATIENCE) == bytes(1500)
         controller.send(bytes(1501))
         assert near.receive(0.05) is None
         assert near.rejected() == {"malformed": 1}
 
-    def test_other_hosts_neither_lengthen_the_wait_nor_hide_a_packet(
+    def test_other_hosts_neither_extend_the_wait_nor_hide_packets(
         self, near, controller, other_host
     ):
         for _ in range(200):
@@ -163,7 +161,7 @@ class TestPeer:
         assert near.receive(PATIENCE) == b"x" * 48
         assert near.rejected() == {"foreign": 220}
 
-    def test_without_patience_too(self, near, controller, other_host):
+    def test_packet_behind_other_hosts_without_wait(self, near, controller, other_host):
         controller.send(b"a" * 48)
         assert near.receive(PATIENCE) == b"a" * 48
         for number in range(10):
@@ -177,7 +175,7 @@ class TestPeer:
         assert received == [bytes([number]) * 48 for number in range(10)]
         assert near.rejected() == {"foreign": 30}
 
-    def test_without_patience_a_flood_does_not_keep_it(self, near, other_host):
+    def test_flood_of_other_hosts_ends_without_wait(self, near, other_host):
         kernel = near._receive
 
         def endless(*arguments):
@@ -190,13 +188,13 @@ class TestPeer:
 
 
 class TestWaiting:
-    def test_it_waits_no_shorter_than_asked(self, near):
+    def test_wait_is_not_shorter_than_requested(self, near):
         for timeout in (1e-9, 0.0005, 0.003, 0.0101, 0.03, 0.0, 0.02, 0.02):
             before = time.monotonic()
             assert near.receive(timeout) is None
             assert timeout <= time.monotonic() - before < timeout + 5.0
 
-    def test_what_the_kernel_drops_is_an_overrun(self, near, controller):
+    def test_datagrams_dropped_by_the_kernel_are_overruns(self, near, controller):
         controller.send(bytes(48))
         near.receive(PATIENCE)
         for _ in range(3000):
@@ -210,7 +208,7 @@ class TestWaiting:
 
 
 class TestArrival:
-    def test_it_is_when_the_kernel_had_the_datagram(self, near, controller):
+    def test_arrival_is_the_time_in_the_kernel(self, near, controller):
         before = time.monotonic()
         controller.send(bytes(48))
         sent = time.monotonic()
@@ -218,7 +216,7 @@ class TestArrival:
         assert near.receive(PATIENCE) is not None
         assert before - 1e-5 <= near.arrived <= sent + 1e-5
 
-    def test_arrivals_go_forward(self, near, controller):
+    def test_arrivals_increase(self, near, controller):
         arrivals = []
         for _ in range(50):
             controller.send(bytes(48))
@@ -228,7 +226,7 @@ class TestArrival:
         assert arrivals == sorted(arrivals)
 
     @pytest.mark.parametrize("step", [-3600.0, -1.0, -0.01, 0.01, 0.5, 0.999, 5.0, 3600.0])
-    def test_a_wall_clock_set_meanwhile_makes_no_packet_old(self, near, controller, step):
+    def test_clock_set_meanwhile_makes_no_packet_old(self, near, controller, step):
         wall = time.time
         controller.send(bytes(48))
         near.receive(PATIENCE)
@@ -244,9 +242,7 @@ class TestArrival:
         assert before <= near.arrived <= near.now, "and the clock may be set back"
 
     @pytest.mark.parametrize("step", [-0.5, 0.5])
-    def test_what_waited_while_the_clock_was_set_is_no_older_than_what_was_received(
-        self, near, controller, step
-    ):
+    def test_queued_packets_after_a_clock_change_are_not_old(self, near, controller, step):
         wall = time.time
         for _ in range(5):
             controller.send(bytes(48))
@@ -256,7 +252,7 @@ class TestArrival:
                 near.receive(PATIENCE)
                 assert before <= near.arrived <= near.now
 
-    def test_arrivals_are_known_again_after_the_clock_was_set(self, near, controller):
+    def test_arrivals_are_valid_again_after_a_clock_change(self, near, controller):
         # The kernel's clock cannot be set here: to the link it was, and was set back.
         wall = time.time
         controller.send(bytes(48))
@@ -270,7 +266,7 @@ class TestArrival:
         near.receive(PATIENCE)
         assert near.arrived <= sent + 1e-5
 
-    def test_a_wait_of_any_length_is_told(self, near, controller):
+    def test_long_queueing_time_is_reported(self, near, controller):
         controller.send(bytes(48))
         sent = near.now
         clock, wall = time.monotonic, time.time
@@ -281,7 +277,7 @@ class TestArrival:
             near.receive(PATIENCE)
             assert near.arrived == pytest.approx(sent, abs=0.02)
 
-    def test_without_times_from_the_kernel_it_is_unknown(self):
+    def test_arrival_without_time_stamps_is_unknown(self):
         option = socket.socket.setsockopt
 
         def refuse(self, level, name, value):
@@ -301,14 +297,14 @@ class TestArrival:
 
 
 class TestOpening:
-    def test_a_port_in_use_is_named_with_the_remedy(self, near):
+    def test_port_in_use_has_a_remedy(self, near):
         port = near.address[1]
         with pytest.raises(TransportError, match="another program uses it") as caught:
             UdpTransport(HOST, port, HOST)
         assert str(port) in str(caught.value)
         assert f"ss -ulnp sport = :{port}" in caught.value.remedy
 
-    def test_a_privileged_port_names_the_setting(self):
+    def test_privileged_port_has_a_remedy(self):
         with (
             patch("socket.socket.bind", side_effect=PermissionError(13, "Permission denied")),
             pytest.raises(TransportError, match="privileged") as caught,
@@ -325,23 +321,23 @@ class TestOpening:
             ((HOST, 65536), "no such port"),
         ],
     )
-    def test_an_address_that_is_none(self, address, words):
+    def test_invalid_address_is_refused(self, address, words):
         with pytest.raises(TransportError, match=words):
             UdpTransport(*address)
 
-    def test_a_closed_link_frees_its_port(self, near):
+    def test_closed_link_frees_its_port(self, near):
         port = near.address[1]
         near.close()
         UdpTransport(HOST, port, HOST).close()
 
-    def test_refused_options_are_noted_and_not_fatal(self):
+    def test_refused_options_are_notes(self):
         with patch("socket.socket.setsockopt", side_effect=PermissionError(1, "not permitted")):
             transport = UdpTransport(HOST, 0)
         transport.close()
         assert len(transport.notes) == 4
         assert any("SO_PRIORITY" in note for note in transport.notes)
 
-    def test_the_description_and_its_error_pickle(self):
+    def test_settings_and_error_pickle(self):
         spec = UdpSpec("10.2.12.150", 1000, "10.2.12.149")
         assert pickle.loads(pickle.dumps(spec)) == spec
         error = TransportError("UDP port 1000", "taken", "free it")
@@ -399,7 +395,7 @@ class TestSession:
         assert session.counters.missed == 1
         assert session.state is State.CLOSED
 
-    def test_a_foreign_packet_is_an_event(self, near, controller, other_host, session):
+    def test_foreign_packet_is_an_event(self, near, controller, other_host, session):
         other_host.send(self.packet(11))
         controller.send(init_packet().encode())
         self.serve(near, session, 1)
@@ -408,9 +404,7 @@ class TestSession:
         assert PacketRejected("foreign", 1) in session.events()
         assert other_host.heard_nothing()
 
-    def test_another_host_does_not_take_over_a_start_that_goes_on(
-        self, near, controller, another, session
-    ):
+    def test_other_port_does_not_take_over_a_start(self, near, controller, another, session):
         controller.send(self.SYNC)
         loops = 0
 
@@ -430,7 +424,7 @@ class TestSession:
         assert another.heard_nothing()
         assert session.state is State.INIT
 
-    def test_a_stray_datagram_does_not_lock_the_controller_out(
+    def test_stray_datagram_does_not_exclude_the_controller(
         self, near, controller, another, session
     ):
         another.send(b"\xff" * 60)
@@ -442,7 +436,7 @@ class TestSession:
         another.send(init_packet().encode())
         assert near.receive(0.02) is None, "now the session has its port"
 
-    def test_a_flood_before_the_init_packet_does_not_keep_it_out(
+    def test_flood_before_the_init_packet_does_not_exclude_it(
         self, near, controller, another, session
     ):
         end = time.monotonic() + 5.0
@@ -463,7 +457,7 @@ class TestSession:
         controller.wait()
         assert session.state is State.INIT
 
-    def test_one_that_began_a_start_and_did_not_go_on_does_not_keep_it_out(
+    def test_abandoned_start_does_not_exclude_the_controller(
         self, near, controller, another, session, monkeypatch
     ):
         monkeypatch.setattr(loop, "PEER_TIMEOUT", 0.2)
@@ -478,7 +472,7 @@ class TestSession:
         controller.wait()
         assert session.state is State.INIT
 
-    def test_a_lost_session_may_go_on_from_another_port(self, near, controller, another, session):
+    def test_lost_session_is_resumed_from_another_port(self, near, controller, another, session):
         session = Session(drive_train(), Guard(limits(), 0.002), CycleRing(N), silence_timeout=0.15)
         controller.send(init_packet().encode())
         controller.send(self.packet(11))

@@ -26,19 +26,19 @@ class FarEnd(Protocol):
 
 
 class TransportContract:
-    def test_a_packet_arrives_unchanged(self, link):
+    def test_packet_arrives_unchanged(self, link):
         near, far = link
         packet = bytes(range(228))
         far.send(packet)
         assert near.receive(PATIENCE) == packet
 
     @pytest.mark.parametrize("length", [12, 48, 228, 732, 1200])
-    def test_packets_of_every_length_of_the_protocol_stay_whole(self, link, length):
+    def test_packets_of_all_lengths_arrive(self, link, length):
         near, far = link
         far.send(bytes(length))
         assert near.receive(PATIENCE) == bytes(length)
 
-    def test_the_answer_reaches_the_controller_unchanged(self, link):
+    def test_reply_arrives_unchanged(self, link):
         near, far = link
         far.send(b"question" * 8)
         near.receive(PATIENCE)
@@ -52,13 +52,13 @@ class TransportContract:
             far.send(bytes([number]) * 48)
         assert [near.receive(PATIENCE)[0] for _ in range(5)] == [0, 1, 2, 3, 4]
 
-    def test_nothing_comes_out_of_nothing(self, link):
+    def test_no_packet_is_none_after_the_timeout(self, link):
         near, _ = link
         before = near.now
         assert near.receive(0.05) is None
         assert near.now - before >= 0.05 * (1.0 - 1e-9)
 
-    def test_no_patience_is_no_wait(self, link):
+    def test_zero_timeout_does_not_wait(self, link):
         near, _ = link
         took = []
         for _ in range(5):
@@ -67,7 +67,7 @@ class TransportContract:
             took.append(near.now - before)
         assert min(took) < 0.01
 
-    def test_time_never_goes_back(self, link):
+    def test_time_is_monotonic(self, link):
         near, far = link
         times = [near.now]
         for _ in range(3):
@@ -78,14 +78,14 @@ class TransportContract:
             times.append(near.now)
         assert times == sorted(times)
 
-    def test_a_link_without_trouble_has_discarded_nothing(self, link):
+    def test_good_link_discards_nothing(self, link):
         near, far = link
         far.send(bytes(48))
         near.receive(PATIENCE)
         near.send(bytes(48))
         assert near.rejected() == {}
 
-    def test_a_forgotten_peer_that_goes_on_is_heard_and_answered(self, link):
+    def test_forgotten_peer_is_received_again(self, link):
         near, far = link
         far.send(bytes(48))
         near.receive(PATIENCE)
@@ -96,7 +96,7 @@ class TransportContract:
         far.wait()
         assert far.replies[-1] == b"answer" * 10
 
-    def test_a_closed_link_says_so(self, link):
+    def test_closed_link_raises(self, link):
         near, _ = link
         near.close()
         near.close()

@@ -139,125 +139,118 @@ def wait(for_what: Callable[[], bool]) -> None:
 
 
 def outcome(path: Path) -> ArchiveOutcome:
-    return whole(path).outcome
+    return complete_archive(path).outcome
 
 
-def whole(path: Path) -> Archive:
+def complete_archive(path: Path) -> Archive:
     archive = open_archive(path)
     assert archive.complete
     return archive
 
 
-def test_an_end_whose_event_was_overwritten_is_known_from_the_count(rig: Rig) -> None:
-    path, memory = rig.open(1), rig.memory
-    memory.control.program_accepted = 1
-    memory.cycles(20)
-    memory.events.write(MotionStarted(4, 5))
-    wait(lambda: open_archive(path).n_samples >= 0)
-    memory.control.ended_outcome, memory.control.ended_interval = OUTCOMES.index("stopped"), 4
-    memory.control.ended_count += 1
-    done = rig.closed(1)
-    assert (done.outcome, done.interval) == ("stopped", 4)
-    assert "was lost" in done.reason
-    assert outcome(path).outcome == "stopped"
-    assert [event.name for event in whole(path).events][-1] == "MotionEnded"
+class TestArchiveProcess:
+    def test_end_with_lost_event_is_detected_by_the_count(self, rig: Rig) -> None:
+        path, memory = rig.open(1), rig.memory
+        memory.control.program_accepted = 1
+        memory.cycles(20)
+        memory.events.write(MotionStarted(4, 5))
+        wait(lambda: open_archive(path).n_samples >= 0)
+        memory.control.ended_outcome, memory.control.ended_interval = OUTCOMES.index("stopped"), 4
+        memory.control.ended_count += 1
+        done = rig.closed(1)
+        assert (done.outcome, done.interval) == ("stopped", 4)
+        assert "was lost" in done.reason
+        assert outcome(path).outcome == "stopped"
+        assert [event.name for event in complete_archive(path).events][-1] == "MotionEnded"
 
+    def test_overwritten_events_are_counted(self, rig: Rig) -> None:
+        path, memory = rig.open(1, until_ended=False), rig.memory
+        memory.cycles(5)
+        for number in range(5000):  # far more than the log holds, faster than it is read
+            memory.events.write(PacketRejected("foreign", number))
+        done = rig.end()
+        assert done.events_lost > 0
+        assert outcome(path).entries["events_lost"] == str(done.events_lost)
+        assert "EventsLost" in [event.name for event in complete_archive(path).events]
 
-def test_events_that_were_overwritten_are_counted_in_the_archive(rig: Rig) -> None:
-    path, memory = rig.open(1, until_ended=False), rig.memory
-    memory.cycles(5)
-    for number in range(5000):  # far more than the log holds, faster than it is read
-        memory.events.write(PacketRejected("foreign", number))
-    done = rig.end()
-    assert done.events_lost > 0
-    assert outcome(path).entries["events_lost"] == str(done.events_lost)
-    assert "EventsLost" in [event.name for event in whole(path).events]
+    def test_late_and_unaccepted_replies_are_in_the_outcome(self, rig: Rig) -> None:
+        path, memory = rig.open(1, until_ended=False), rig.memory
+        memory.cycles(50)
+        memory.events.write(AnswersLost(2, 10))
+        memory.events.write(PacketRejected("answered late", 3))
+        memory.events.write(PacketRejected("late", 4))
+        memory.events.write(PacketRejected("foreign", 5))
+        done = rig.end()
+        assert (done.late, done.not_accepted) == (7, 2)
+        assert (outcome(path).late_replies, outcome(path).replies_not_accepted) == (7, 2)
 
+    def test_motion_never_requested_leaves_a_void_archive(self, rig: Rig) -> None:
+        path, memory = rig.open(1), rig.memory
+        memory.cycles(20)
+        rig.process.channel.close()  # the supervisor dies
+        time.sleep(0.2)
+        memory.end()
+        wait(lambda: rig.process.process.poll() is not None)
+        found = outcome(path)
+        assert (found.outcome, found.reason) == (
+            "void", "nothing was sent: the supervising program ended"
+        )  # fmt: skip
 
-def test_answers_late_and_not_taken_are_in_the_outcome(rig: Rig) -> None:
-    path, memory = rig.open(1, until_ended=False), rig.memory
-    memory.cycles(50)
-    memory.events.write(AnswersLost(2, 10))
-    memory.events.write(PacketRejected("answered late", 3))
-    memory.events.write(PacketRejected("late", 4))
-    memory.events.write(PacketRejected("foreign", 5))
-    done = rig.end()
-    assert (done.late, done.not_accepted) == (7, 2)
-    assert (outcome(path).late_replies, outcome(path).replies_not_accepted) == (7, 2)
+    def test_motion_whose_exchange_died_is_lost(self, rig: Rig) -> None:
+        path, memory = rig.open(1), rig.memory
+        memory.control.program_accepted = 1
+        memory.cycles(20)
+        memory.end()
+        assert rig.closed(1).outcome == "lost"
+        assert complete_archive(path).n_samples == 20
 
+    def test_silent_exchange_that_runs_is_waited_for(self, rig: Rig) -> None:
+        memory = rig.memory
+        memory.control.exchange_heartbeat = time.monotonic()
+        path = rig.open(1)
+        memory.control.program_accepted = 1
+        memory.cycles(20)
+        assert rig.process.answer(4.0, 1) is None, "it was taken for dead"
+        memory.control.exchange_heartbeat = time.monotonic()
+        memory.cycles(30)
+        memory.events.write(MotionEnded("completed", "the path is at its end", 0, 40))
+        assert rig.closed(1).outcome == "completed"
+        archive = complete_archive(path)
+        assert archive.n_samples == 50
+        names = [event.name for event in archive.events]
+        assert "ExchangeSilent" in names
 
-def test_a_motion_that_was_never_asked_for_leaves_a_void_archive(rig: Rig) -> None:
-    path, memory = rig.open(1), rig.memory
-    memory.cycles(20)
-    rig.process.channel.close()  # the supervisor dies
-    time.sleep(0.2)
-    memory.end()
-    wait(lambda: rig.process.process.poll() is not None)
-    found = outcome(path)
-    assert (found.outcome, found.reason) == (
-        "void", "nothing was sent: the supervising program ended"
-    )  # fmt: skip
+    def test_second_archive_interrupts_the_first(self, rig: Rig) -> None:
+        first = rig.open(1)
+        rig.memory.cycles(20)
+        second = rig.open(2, "excitation_001_a1.mcap")
+        assert outcome(first).outcome == "interrupted"
+        rig.process.send(Close(1, "completed", "too late"))
+        rig.process.send(Close(2, "completed", "enough"))  # what answers for the first is dropped
+        assert rig.closed(2).reason == "enough"
+        assert outcome(second).outcome == "completed"
+        assert rig.memory.control.archive_state == ArchiveState.NONE
 
+    def test_dead_process_is_reported(self, rig: Rig) -> None:
+        rig.process.process.kill()
+        started = time.monotonic()
+        assert rig.process.answer(10.0, 1) is None
+        assert time.monotonic() - started < 5.0
+        assert "ended" in rig.process.failure()
 
-def test_a_motion_whose_exchange_died_is_lost(rig: Rig) -> None:
-    path, memory = rig.open(1), rig.memory
-    memory.control.program_accepted = 1
-    memory.cycles(20)
-    memory.end()
-    assert rig.closed(1).outcome == "lost"
-    assert whole(path).n_samples == 20
-
-
-def test_an_exchange_without_sign_of_life_that_lives_is_waited_for(rig: Rig) -> None:
-    memory = rig.memory
-    memory.control.exchange_heartbeat = time.monotonic()
-    path = rig.open(1)
-    memory.control.program_accepted = 1
-    memory.cycles(20)
-    assert rig.process.answer(4.0, 1) is None, "it was taken for dead"
-    memory.control.exchange_heartbeat = time.monotonic()
-    memory.cycles(30)
-    memory.events.write(MotionEnded("completed", "the path is at its end", 0, 40))
-    assert rig.closed(1).outcome == "completed"
-    archive = whole(path)
-    assert archive.n_samples == 50
-    names = [event.name for event in archive.events]
-    assert "ExchangeSilent" in names
-
-
-def test_a_second_archive_ends_the_first_as_interrupted(rig: Rig) -> None:
-    first = rig.open(1)
-    rig.memory.cycles(20)
-    second = rig.open(2, "excitation_001_a1.mcap")
-    assert outcome(first).outcome == "interrupted"
-    rig.process.send(Close(1, "completed", "too late"))
-    rig.process.send(Close(2, "completed", "enough"))  # what answers for the first is dropped
-    assert rig.closed(2).reason == "enough"
-    assert outcome(second).outcome == "completed"
-    assert rig.memory.control.archive_state == ArchiveState.NONE
-
-
-def test_a_process_that_died_or_takes_no_command_is_named(rig: Rig) -> None:
-    rig.process.process.kill()
-    started = time.monotonic()
-    assert rig.process.answer(10.0, 1) is None
-    assert time.monotonic() - started < 5.0
-    assert "ended" in rig.process.failure()
-
-
-def test_a_process_that_takes_no_command_is_ended(rig: Rig) -> None:
-    rig.open(1)
-    rig.process.process.send_signal(signal.SIGSTOP)
-    rig.process.channel._socket.settimeout(0.2)
-    rig.process.send(Close(1, "x" * 4_000_000, ""))
-    failure = rig.process.failure()
-    assert failure is not None
-    assert "accepted no command" in failure
-    assert rig.process.process.poll() is not None
+    def test_process_that_accepts_no_command_is_killed(self, rig: Rig) -> None:
+        rig.open(1)
+        rig.process.process.send_signal(signal.SIGSTOP)
+        rig.process.channel._socket.settimeout(0.2)
+        rig.process.send(Close(1, "x" * 4_000_000, ""))
+        failure = rig.process.failure()
+        assert failure is not None
+        assert "accepted no command" in failure
+        assert rig.process.process.poll() is not None
 
 
 @contextmanager
-def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, PacketRing]]:
+def with_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, PacketRing]]:
     """An archive process in this one, with an archive of raw packets open; room for ten."""
     memory, ring = Memory(), PacketRing.shared(10)
     ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
@@ -281,47 +274,44 @@ def keeping_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, Packet
         memory.close()
 
 
-def test_raw_packets_overwritten_as_the_archive_closes_are_counted(tmp_path: Path) -> None:
-    with keeping_packets(tmp_path / NAME) as (process, memory, ring):
-        memory.cycles(3)
-        process._transfer()
-        for cycle in range(30):  # after the last look, and before the archive is closed
-            ring.put(cycle // 10, 0.0, False, b"packet")
-        process._close("completed", "")
-    found = outcome(tmp_path / NAME)
-    assert int(found.entries["packets_lost"]) + found.packets == 30
-    assert found.entries["packets_lost"] != "0"
+class TestRawPackets:
+    def test_packets_overwritten_at_the_end_are_counted(self, tmp_path: Path) -> None:
+        with with_packets(tmp_path / NAME) as (process, memory, ring):
+            memory.cycles(3)
+            process._transfer()
+            for cycle in range(30):  # after the last look, and before the archive is closed
+                ring.put(cycle // 10, 0.0, False, b"packet")
+            process._close("completed", "")
+        found = outcome(tmp_path / NAME)
+        assert int(found.entries["packets_lost"]) + found.packets == 30
+        assert found.entries["packets_lost"] != "0"
 
+    def test_packets_behind_their_cycle_are_waited_for(self, tmp_path: Path) -> None:
+        """The exchange was held up between the two, as the archive is closed."""
+        with with_packets(tmp_path / NAME) as (process, memory, ring):
+            memory.cycles(3)
+            for cycle in range(2):
+                ring.put(cycle, 0.0, False, b"packet")
+            process._transfer()
+            late = threading.Timer(0.05, ring.put, (2, 0.0, False, b"packet"))
+            late.start()
+            process._close("completed", "")
+            late.join()
+        found = outcome(tmp_path / NAME)
+        assert (found.packets, found.entries["packets_lost"]) == (3, "0")
 
-def test_raw_packets_that_come_after_their_cycle_are_waited_for(tmp_path: Path) -> None:
-    """The exchange was held up between the two, as the archive is closed."""
-    with keeping_packets(tmp_path / NAME) as (process, memory, ring):
-        memory.cycles(3)
-        for cycle in range(2):
-            ring.put(cycle, 0.0, False, b"packet")
-        process._transfer()
-        late = threading.Timer(0.05, ring.put, (2, 0.0, False, b"packet"))
-        late.start()
-        process._close("completed", "")
-        late.join()
-    found = outcome(tmp_path / NAME)
-    assert (found.packets, found.entries["packets_lost"]) == (3, "0")
-
-
-def test_raw_packets_that_never_come_are_not_waited_for_long(tmp_path: Path) -> None:
-    with keeping_packets(tmp_path / NAME) as (process, memory, _):
-        memory.cycles(3)
-        process._transfer()
-        process._close("completed", "")
-    assert whole(tmp_path / NAME).n_samples == 3
+    def test_wait_for_missing_packets_is_short(self, tmp_path: Path) -> None:
+        with with_packets(tmp_path / NAME) as (process, memory, _):
+            memory.cycles(3)
+            process._transfer()
+            process._close("completed", "")
+        assert complete_archive(tmp_path / NAME).n_samples == 3
 
 
 FLUSH = 100  # cycles
 
 
-def test_every_flush_waits_for_the_disk_and_the_first_comes_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_flush_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "excitation_000_a1.mcap"
     on_disk: list[int] = []
     wait = os.fdatasync

@@ -96,49 +96,47 @@ def bytes_of_an_init() -> bytes:
     return init
 
 
-def test_an_interval_is_over_when_its_motion_came_to_rest(recorder: Recorder) -> None:
-    recorder.record(cycles(0, 100), [MotionStarted(0, 10)])
-    assert not recorder.complete
-    recorder.record(cycles(100, 50), [ended("completed", 140)])
-    assert recorder.complete
-    archive = read(recorder)
-    assert archive.n_samples == 150
-    assert [event.name for event in archive.events] == ["MotionStarted", "MotionEnded"]
+class TestRecorder:
+    def test_interval_is_complete_when_its_motion_rests(self, recorder: Recorder) -> None:
+        recorder.record(cycles(0, 100), [MotionStarted(0, 10)])
+        assert not recorder.complete
+        recorder.record(cycles(100, 50), [ended("completed", 140)])
+        assert recorder.complete
+        archive = read(recorder)
+        assert archive.n_samples == 150
+        assert [event.name for event in archive.events] == ["MotionStarted", "MotionEnded"]
 
+    @pytest.mark.parametrize("outcome", ["refused", "lost"])
+    def test_aftermath_of_a_failed_motion_is_recorded(
+        self, recorder: Recorder, outcome: str
+    ) -> None:
+        recorder.record(cycles(0, 100), [ended(outcome, 80)])
+        assert not recorder.complete
+        recorder.record(cycles(100, 1000), [])
+        assert recorder.complete
+        assert read(recorder).columns["cycle"][-1] == 80 + 500
 
-@pytest.mark.parametrize("outcome", ["refused", "lost"])
-def test_half_a_second_more_is_recorded_of_a_motion_that_failed(
-    recorder: Recorder, outcome: str
-) -> None:
-    recorder.record(cycles(0, 100), [ended(outcome, 80)])
-    assert not recorder.complete
-    recorder.record(cycles(100, 1000), [])
-    assert recorder.complete
-    assert read(recorder).columns["cycle"][-1] == 80 + 500
+    def test_new_session_is_not_in_the_same_file(self, recorder: Recorder) -> None:
+        new = [StateChanged(State.INIT, State.DRIVE_OFF, 3)]
+        both = np.concatenate([cycles(1000, 50), cycles(0, 30)])
+        recorder.record(both, [ended("lost", 1049), a_new_session(), *new])
+        assert recorder.restarted
+        assert recorder.complete
+        recorder.record(cycles(30, 5000), new)
+        archive = read(recorder)
+        assert np.array_equal(archive.columns["cycle"], 1000 + np.arange(50))
+        assert [event.name for event in archive.events] == ["MotionEnded", "InitReceived"]
 
-
-def test_a_controller_that_starts_anew_has_no_place_in_the_same_file(recorder: Recorder) -> None:
-    new = [StateChanged(State.INIT, State.DRIVE_OFF, 3)]
-    both = np.concatenate([cycles(1000, 50), cycles(0, 30)])
-    recorder.record(both, [ended("lost", 1049), a_new_session(), *new])
-    assert recorder.restarted
-    assert recorder.complete
-    recorder.record(cycles(30, 5000), new)
-    archive = read(recorder)
-    assert np.array_equal(archive.columns["cycle"], 1000 + np.arange(50))
-    assert [event.name for event in archive.events] == ["MotionEnded", "InitReceived"]
-
-
-def test_a_silent_link_and_lost_records_are_noticed(recorder: Recorder) -> None:
-    recorder.record(cycles(0, 10), [LinkLost(1.2, State.CLOSED)])
-    assert recorder.link_lost
-    recorder.record(cycles(17, 10), [], lost=7)
-    archive = read(recorder)
-    assert archive.outcome.entries["records_lost"] == "7"
-    silent, lost = (event.text for event in archive.events)
-    assert "no packet for 1.200 s" in silent
-    assert lost == "7 records overwritten"
-    assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
+    def test_lost_link_and_lost_records_are_recorded(self, recorder: Recorder) -> None:
+        recorder.record(cycles(0, 10), [LinkLost(1.2, State.CLOSED)])
+        assert recorder.link_lost
+        recorder.record(cycles(17, 10), [], lost=7)
+        archive = read(recorder)
+        assert archive.outcome.entries["records_lost"] == "7"
+        silent, lost = (event.text for event in archive.events)
+        assert "no packet for 1.200 s" in silent
+        assert lost == "7 records overwritten"
+        assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
 
 
 def at(*numbers: int) -> NDArray[np.void]:
@@ -155,33 +153,33 @@ def packets(*cycles: int) -> NDArray[np.void]:
     return rows
 
 
-@pytest.mark.parametrize("batch", [7, 20, 333, 2 * BUFFERED_CYCLES])
-def test_records_and_their_packets_go_together(batch: int) -> None:
-    buffer, numbers = PreTriggerBuffer(), range(3 * BUFFERED_CYCLES)
-    for begin in numbers[::batch]:
-        part = numbers[begin : begin + batch]
-        buffer.add(at(*part), [], packets(*part))
-    kept, _, kept_packets = buffer.pop_session()
-    assert BUFFERED_CYCLES <= len(kept) < BUFFERED_CYCLES + batch
-    assert kept["cycle"].tolist() == list(numbers[-len(kept) :])
-    assert kept_packets["cycle"].tolist() == np.repeat(kept["cycle"], 2).tolist()
+class TestPreTriggerBuffer:
+    @pytest.mark.parametrize("batch", [7, 20, 333, 2 * BUFFERED_CYCLES])
+    def test_records_and_their_packets_are_dropped_together(self, batch: int) -> None:
+        buffer, numbers = PreTriggerBuffer(), range(3 * BUFFERED_CYCLES)
+        for begin in numbers[::batch]:
+            part = numbers[begin : begin + batch]
+            buffer.add(at(*part), [], packets(*part))
+        returned, _, returned_packets = buffer.pop_session()
+        assert BUFFERED_CYCLES <= len(returned) < BUFFERED_CYCLES + batch
+        assert returned["cycle"].tolist() == list(numbers[-len(returned) :])
+        assert returned_packets["cycle"].tolist() == np.repeat(returned["cycle"], 2).tolist()
 
-
-def test_only_the_session_that_began_last_counts_and_is_given_once() -> None:
-    buffer = PreTriggerBuffer()
-    buffer.add(at(7, 8, 0, 1), [], packets(7, 8, 0, 1))
-    buffer.add(at(2), [], packets(2))
-    kept, events, kept_packets = buffer.pop_session()
-    assert kept["cycle"].tolist() == [0, 1, 2]
-    assert kept_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
-    assert not events
-    assert not len(buffer.pop_session()[0])
+    def test_only_the_latest_session_is_returned_once(self) -> None:
+        buffer = PreTriggerBuffer()
+        buffer.add(at(7, 8, 0, 1), [], packets(7, 8, 0, 1))
+        buffer.add(at(2), [], packets(2))
+        returned, events, returned_packets = buffer.pop_session()
+        assert returned["cycle"].tolist() == [0, 1, 2]
+        assert returned_packets["cycle"].tolist() == [0, 0, 1, 1, 2, 2]
+        assert not events
+        assert not len(buffer.pop_session()[0])
 
 
 NAME = "excitation_000_a1.mcap"
 
 
-def keeping_packets(cell: Cell) -> Cell:
+def with_packets(cell: Cell) -> Cell:
     return cell.with_link(packets=True)
 
 
@@ -235,77 +233,70 @@ def assert_decoded_packets_are_the_cycles(archive: Archive, path: Path) -> None:
     assert times == sorted(times)
 
 
-def test_a_recording_on_the_simulated_link_keeps_every_packet_of_both_ends(
-    tmp_path: Path, cell: Cell
-) -> None:
-    path = recorded(tmp_path, keeping_packets(cell))
-    archive = open_archive(path)
-    part = {"start": 0.25, "stop": 0.35}
-    cycles = open_archive(path, topics=[CYCLE], **part).columns["cycle"]
-    some = open_archive(path, topics=[PACKETS], **part).columns["cycle"]
-    assert some.tolist() == np.repeat(cycles, 2).tolist()
-    with pytest.raises(ValueError, match="open one at a time"):
-        open_archive(path, topics=[CYCLE, PACKETS])
-    assert_decoded_packets_are_the_cycles(archive, path)
-    packets = packets_of(path)
-    inits = [place for place, packet in enumerate(packets) if is_init(packet[3])]
-    assert len(inits) == 1
-    assert packets[inits[0] + 1][1], "the init packet's answer follows it"
-    assert packets[inits[0]][3] == archive.attachments["init_packet.bin"]
-    # One answer to each packet, in turns.
-    assert [sent for _, sent, _, _ in packets] == [False, True] * (len(packets) // 2)
-    assert archive.outcome.entries["packets"] == str(len(packets))
-    assert archive.outcome.entries["packets_lost"] == "0"
-    assert check_archive(path).conforms, check_archive(path).faults
+class TestRawPackets:
+    def test_all_packets_of_a_simulated_link_are_stored(self, tmp_path: Path, cell: Cell) -> None:
+        path = recorded(tmp_path, with_packets(cell))
+        archive = open_archive(path)
+        part = {"start": 0.25, "stop": 0.35}
+        cycles = open_archive(path, topics=[CYCLE], **part).columns["cycle"]
+        some = open_archive(path, topics=[PACKETS], **part).columns["cycle"]
+        assert some.tolist() == np.repeat(cycles, 2).tolist()
+        with pytest.raises(ValueError, match="open one at a time"):
+            open_archive(path, topics=[CYCLE, PACKETS])
+        assert_decoded_packets_are_the_cycles(archive, path)
+        packets = packets_of(path)
+        inits = [place for place, packet in enumerate(packets) if is_init(packet[3])]
+        assert len(inits) == 1
+        assert packets[inits[0] + 1][1], "the init packet's answer follows it"
+        assert packets[inits[0]][3] == archive.attachments["init_packet.bin"]
+        # One answer to each packet, in turns.
+        assert [sent for _, sent, _, _ in packets] == [False, True] * (len(packets) // 2)
+        assert archive.outcome.entries["packets"] == str(len(packets))
+        assert archive.outcome.entries["packets_lost"] == "0"
+        assert check_archive(path).conforms, check_archive(path).faults
 
+    def test_lost_packet_is_missing_and_others_have_their_cycles(
+        self, tmp_path: Path, cell: Cell
+    ) -> None:
+        path = recorded(tmp_path, with_packets(cell), Lose(600, "to_pc"))
+        archive = open_archive(path)
+        assert archive.columns["gap"].sum() == 1
+        assert_decoded_packets_are_the_cycles(archive, path)
+        received = {cycle for cycle, sent, _, _ in packets_of(path) if not sent}
+        cycles = archive.columns["cycle"]
+        (hole,) = set(range(int(cycles[0]), int(cycles[-1]))) - set(cycles.tolist())
+        assert hole not in received
 
-def test_a_packet_that_was_lost_is_not_there_and_those_around_it_keep_their_cycles(
-    tmp_path: Path, cell: Cell
-) -> None:
-    path = recorded(tmp_path, keeping_packets(cell), Lose(600, "to_pc"))
-    archive = open_archive(path)
-    assert archive.columns["gap"].sum() == 1
-    assert_decoded_packets_are_the_cycles(archive, path)
-    received = {cycle for cycle, sent, _, _ in packets_of(path) if not sent}
-    cycles = archive.columns["cycle"]
-    (hole,) = set(range(int(cycles[0]), int(cycles[-1]))) - set(cycles.tolist())
-    assert hole not in received
+    def test_all_packets_of_a_udp_link_are_stored(self, tmp_path: Path, cell: Cell) -> None:
+        on_udp = with_packets(cell).with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
+        path = tmp_path / NAME
+        with loopback_link(on_udp, simulated_by=cell.path, options=("--patience", "2")) as link:
+            done = record(
+                link, on_udp, path, kind="excitation", stop=Stop(), duration=1.0, durable=False
+            )
+        assert done.outcome == "completed"
+        archive = open_archive(path)
+        assert archive.outcome.entries["packets_lost"] == "0"
+        assert_decoded_packets_are_the_cycles(archive, path)
+        first = next(packet for packet in packets_of(path) if len(packet[3]) == INIT_LENGTH)
+        assert first[3] == archive.attachments["init_packet.bin"]
+        assert check_archive(path).conforms, check_archive(path).faults
 
+    def test_truncated_archive_with_packets_is_repaired(self, tmp_path: Path, cell: Cell) -> None:
+        path = recorded(tmp_path, with_packets(cell))
+        before = packets_of(path)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+        repaired = repair(path, tmp_path / "repaired.mcap")
+        found = check_archive(repaired.output)
+        assert found.conforms, found.faults
+        after = packets_of(repaired.output)
+        assert after
+        assert before[: len(after)] == after
+        assert open_archive(repaired.output).complete
 
-def test_a_recording_over_udp_keeps_every_packet_of_both_ends(tmp_path: Path, cell: Cell) -> None:
-    on_udp = keeping_packets(cell).with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1")
-    path = tmp_path / NAME
-    with loopback_link(on_udp, simulated_by=cell.path, options=("--patience", "2")) as link:
-        done = record(
-            link, on_udp, path, kind="excitation", stop=Stop(), duration=1.0, durable=False
-        )
-    assert done.outcome == "completed"
-    archive = open_archive(path)
-    assert archive.outcome.entries["packets_lost"] == "0"
-    assert_decoded_packets_are_the_cycles(archive, path)
-    first = next(packet for packet in packets_of(path) if len(packet[3]) == INIT_LENGTH)
-    assert first[3] == archive.attachments["init_packet.bin"]
-    assert check_archive(path).conforms, check_archive(path).faults
-
-
-def test_a_torn_archive_with_packets_is_repaired_to_one_that_keeps_the_profile(
-    tmp_path: Path, cell: Cell
-) -> None:
-    path = recorded(tmp_path, keeping_packets(cell))
-    before = packets_of(path)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
-    repaired = repair(path, tmp_path / "repaired.mcap")
-    found = check_archive(repaired.output)
-    assert found.conforms, found.faults
-    after = packets_of(repaired.output)
-    assert after
-    assert before[: len(after)] == after
-    assert open_archive(repaired.output).complete
-
-
-def test_of_a_packet_too_long_for_a_controller_the_first_bytes_are_kept() -> None:
-    ring = PacketRing(2)
-    ring.put(0, 0.0, False, bytes(range(256)) * 6)
-    (kept,) = ring.drain()
-    assert kept["length"] == 1536
-    assert kept["data"].tobytes() == (bytes(range(256)) * 6)[:LONGEST_PACKET]
+    def test_long_packet_is_truncated(self) -> None:
+        ring = PacketRing(2)
+        ring.put(0, 0.0, False, bytes(range(256)) * 6)
+        (returned,) = ring.drain()
+        assert returned["length"] == 1536
+        assert returned["data"].tobytes() == (bytes(range(256)) * 6)[:LONGEST_PACKET]
