@@ -1,4 +1,4 @@
-"""Reading a motion written as comma-separated values, for tests."""
+"""Reader of motions written as comma-separated values."""
 
 from __future__ import annotations
 

@@ -501,7 +501,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
      {"folder": "an archive is entered twice"}),
     "no entry": (lambda path: entered(path, lambda one: []), {"resume": "are missing"}),
     "a rejection": (lambda path: entered(path, lambda one: [one | {"outcome": "rejected"}]),
-     {"estimate": "{name} was pooled, though"}),
+     {"estimate": "{name} was pooled although"}),
     "the cell": (cell_edited, {"folder": "cell.toml is not the one in the manifest"}),
 }  # fmt: skip
 
@@ -625,7 +625,7 @@ def test_a_model_that_predicts_other_torques_of_the_same_motion_is_found(
 def test_what_counts_must_be_pooled(observed: Observed) -> None:
     assert observed.found is not None
     less = replace(observed, found=observed.found._replace(pooled=observed.pooled[1:]))
-    assert "count and were not pooled" in found(less, "estimate")
+    assert "are valid and were not pooled" in found(less, "estimate")
 
 
 def test_the_bound_on_estimates_is_the_quantile_that_it_says() -> None:

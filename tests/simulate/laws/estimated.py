@@ -1,4 +1,4 @@
-"""What was found despite the faults is what an undisturbed run finds, within the intervals of both.
+"""Estimates with faults agree with those without, within the intervals of both.
 
 The difference of two estimates with standard deviations s and s' is held against q hypot(s, s'), q
 the quantile of Student's t at the level that makes one false alarm among all parameters of all
@@ -56,18 +56,18 @@ def estimate(observed: Observed) -> Iterator[Broken]:
 
 
 def _pooled(observed: Observed) -> Iterator[str]:
-    """Only what counts is in the estimate, each once."""
+    """The estimate uses each completed archive once, and no other."""
     entries = manifest_of(observed)[1]
     good = {e.name for e in entries if e.outcome == "completed" and e.unchanged}
     wanted = {name for name in good if parsed(name)[0] in WANTED}
     pooled = observed.pooled
     for name in pooled:
         if name not in good:
-            yield f"{name} was pooled, though it does not count"
+            yield f"{name} was pooled although it is not valid"
     if len({*pooled}) < len(pooled):
         yield "an archive was pooled twice"
     if left_out := wanted - {*pooled}:
-        yield f"{', '.join(sorted(left_out))} count and were not pooled"
+        yield f"{', '.join(sorted(left_out))} are valid and were not pooled"
 
 
 def _alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
@@ -128,5 +128,5 @@ def degrees_of_freedom(interval_factor: float) -> float:
 
 @lru_cache(maxsize=64)
 def bound(freedom: float, n_parameters: int) -> float:
-    """Deviations that no parameter of any seed differs by, but with `FALSE_ALARM`."""
+    """Return the bound in deviations that any parameter of any seed exceeds with `FALSE_ALARM`."""
     return float(student.isf(FALSE_ALARM / (2.0 * n_parameters * SEEDS), freedom))

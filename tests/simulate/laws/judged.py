@@ -1,8 +1,7 @@
-"""The judge of the session's own tests, on the whole conversation of some campaigns.
+"""The checker of the session tests, applied to all packets of some campaigns.
 
-It takes some ten times as long as the laws on arrays, with which it shares nothing but the oracle,
-and believes nothing that the session says of itself but which motions ended: it counts lost
-answers, after which the bounds of a stop apply, from the targets received.
+It takes ten times as long as the vectorised laws and shares only the oracle with them. Lost
+answers, after which the bounds of a stop apply, are counted from the received targets.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from .conversation import Talk, heard
 
 LAW: Final = "judge"
 EVERY: Final = 64
-"""One seed of so many is judged."""
+"""Every so many seeds one is checked."""
 
 
 def judge(observed: Observed) -> Iterator[Broken]:
@@ -67,9 +66,9 @@ def _conduct(observed: Observed, talk: Talk, entitled: bool) -> Conduct:
 
 
 def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
-    """Packet by packet, and what was asked for in between; yields the index of each before it."""
+    """Check packet by packet with the requests in between; yield the index before each."""
     ended = [event.cycle for event in talk.events if isinstance(event, MotionEnded)]
-    # What ended with one packet is over before whatever is asked for after it.
+    # The end of a motion with a packet precedes requests after it.
     news = [(talk.at_cycle(cycle) + 1, 0, "ended") for cycle in ended]
     news += [(act.before, 1, act.name) for act in talk.life.acts if act.before > talk.at]
     news.sort(key=lambda one: one[:2])
@@ -81,14 +80,14 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         if talk.silent[row]:
             conduct.interrupted()
         record, one = talk.records[row], talk.life.exchanged[index]
-        # Packets left out for a newer one are among those that the numbers say are missing.
+        # Superseded packets count as missing.
         missed = max(int(record["gap"]), index - last - 1)
         last = index
         conduct.judge(one.packet, one.replies[0], record, missed)
 
 
 def _note(conduct: Conduct, what: str) -> None:
-    """An act of the person, or the end of a motion."""
+    """Apply a request, or the end of a motion."""
     if what in ("request", "ended"):
         conduct.entitled, conduct.stopping, conduct.overridden = what == "request", False, False
     elif what in ("stop", "hold", "resume"):

@@ -1,4 +1,4 @@
-"""Where axes are open: what each packet of a session says, and the stretches with set-points."""
+"""Open mode: modes in the packets of a session, and the stretches with set-points."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from .wire import CLOSED, D1, MODE, PAUSES, REFUSALS, Array, Flags
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """What the packets of a session say of the axes that are to be moved, (m,) or (m, n).
+    """Modes of the axes of the arm in the packets of a session, (m,) or (m, n).
 
     Attributes:
-        ready: (m, n) joints in the mode wanted, with the drive on.
+        ready: (m, n) joints in the configured mode, with the drive on.
         all_ready: (m,) all of them.
-        is_open: some wanted axis is in any open mode, with the drive on.
-        paused, closed: some wanted axis in a pause; all closed; both with the drive on.
-        no_target: an axis that is held, of whichever arm, has a target that is no number.
-        refused: answered by 505 or 508, which is no echo of what was received.
+        is_open: some axis in any open mode, with the drive on.
+        paused, closed: some axis in a pause; all closed; both with the drive on.
+        no_target: a held axis of any arm has a target that is not finite.
+        refused: answered by 505 or 508 that is not an echo.
         asked_out: answered with the request for the end of open mode.
     """
 
@@ -40,7 +40,7 @@ class Modes:
 
 @lru_cache(maxsize=64)
 def modes_of(talk: Talk) -> Modes:
-    """Work it out; the session's axis map must be possible."""
+    """Return the modes of a session with a valid axis map."""
     safe, slots = talk.safe, list(talk.init.slots or ())
     assert safe is not None and slots
     arm = int(talk.life.settings.get("arm", 1))
@@ -63,18 +63,18 @@ def modes_of(talk: Talk) -> Modes:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Packets in a row from the first set-point on, as long as any axis is open and none refused.
+    """Consecutive packets from the first set-point on, while any axis is open and none refused.
 
     Attributes:
         talk: the session.
-        rows: those of the session.
-        leading: how many rows of these have set-points in all axes and no end of open mode was
-            asked for before.
+        rows: rows of the session.
+        leading: number of rows with set-points in all axes, before the end of open mode is
+            requested.
         sent: (k, n) D1 of the answers, motor revolutions.
         step: (k, n) D2 of the answers.
         received: (5, k, n) D1..D5 of the packets.
-        carried: packets missed before, in a motion that goes on from where a controller led it.
-        before, step_before: (n,) D1 and D2 of the answer before.
+        carried: packets missed before a motion that resumes where the controller extrapolated it.
+        before, step_before: (n,) D1 and D2 of the previous answer.
     """
 
     talk: Talk
@@ -89,7 +89,7 @@ class Stretch:
 
     @property
     def again(self) -> Flags:
-        """(k,) set-points that are those before, with the same step: sent again."""
+        """(k,) repeated set-points, with the same step as before."""
         same = (np.diff(self.sent, axis=0, prepend=np.nan) == 0.0).all(axis=1)
         same &= (np.diff(self.step, axis=0, prepend=np.nan) == 0.0).all(axis=1)
         return np.asarray(same & self.step.any(axis=1))
@@ -102,7 +102,7 @@ class Stretch:
 
 @lru_cache(maxsize=64)
 def stretches(talk: Talk) -> tuple[Stretch, ...]:
-    """All of a session, where it can be moved."""
+    """Return the stretches of a session."""
     if talk.safe is None or not talk.usable or not talk.init.slots:
         return ()
     modes = modes_of(talk)

@@ -1,7 +1,6 @@
-"""The wire read a second time, many packets at once, from the protocol alone.
+"""Vectorised decoding of packets and safe answers, independent of the product.
 
-Layout, codes and the safe answer are those of `tests/drivers/oracle.py`, which knows nothing of the
-package under test; here they are arrays, so that a law may look at every packet of a campaign.
+Layout, codes and the safe answer are those of `tests/drivers/oracle.py`.
 """
 
 from __future__ import annotations
@@ -77,7 +76,7 @@ def next_number(number: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True, eq=False)
 class SafeAnswers:
-    """What packets are answered where nobody moves an axis.
+    """Answers to packets without set-points.
 
     Attributes:
         status: (m, 4) bytes.
@@ -122,7 +121,7 @@ def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
 
 @dataclass(frozen=True, eq=False)
 class Init:
-    """What an init packet announces of one arm's joints; own decoding, offsets of the protocol.
+    """Decoded init packet, for the joints of one arm.
 
     Attributes:
         n_axes: slots of a cyclic packet.
