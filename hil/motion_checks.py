@@ -1,4 +1,4 @@
-"""What every motion of a cell is checked against before it is sent."""
+"""Checks of every motion of a cell before it is sent."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ _UNITS: Final = {
     "acceleration": " deg/s²",
     "jerk": " deg/s³",
 }
-# A distance that changes by less than this [m] is one that no motion changes.
 _UNCHANGED: Final = 0.01
+"""Change of a distance below which no motion changes it, m."""
 
 
 def violation_text(violation: Violation, frame: AngleFrame) -> str:
-    """A violation in degrees, and in the angles in which the cell's limits are written."""
+    """Return a violation in degrees, in the frame of the cell's limits."""
     joints = frame.text_of_angles(violation.posture) if violation.posture else ""
     limit = _JOINT_LIMIT.fullmatch(violation.subject) if violation.kind == "joint limit" else None
     if limit is None:
         return violation.sentence(joints)
     quantity, joint, where = limit[1], int(limit[2]), limit[3]
-    # Of a rate it is the size, which is the same in any frame.
+    # The magnitude of a rate is the same in any frame.
     sign, zero = (frame.sign[joint], frame.offset[joint]) if quantity == "position" else (1.0, 0.0)
     value, bound = (
         float(np.degrees(sign * number + zero)) for number in (violation.value, violation.bound)
@@ -52,7 +52,7 @@ def violation_text(violation: Violation, frame: AngleFrame) -> str:
 
 
 def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
-    """What is to be done about a pair that no posture brings apart; None where a motion may."""
+    """Return the remedy for a pair that is too close in any posture; None for other violations."""
     if violation.kind != "collision":
         return None
     pairs = [pair for pair in checker.pairs if " and ".join(pair) == violation.subject]
@@ -72,28 +72,26 @@ def always_so(violation: Violation, checker: CollisionChecker) -> str | None:
 Array = NDArray[np.float64]
 
 LONGEST: Final = 600.0
-"""s; a longer motion is refused. Checking takes time and memory as the motion is long, and an
-interval that fails has to be repeated whole."""
+"""Longest motion, s: checks take time and memory in proportion, and a failed motion is repeated."""
 MOST_SINES: Final = 20
-"""For each joint, as a design may have at most."""
+"""Most sines per joint, as in a design."""
 PLANNED_CURRENT: Final = 0.8
-"""Share of a motor's current limit that a motion is planned with, and that its rehearsal allows.
-The rest is for what no plan knows: noise, and what the servo spends on following. Before a motion
-is sent, the whole limit counts."""
+"""Share of a motor's current limit in planning and rehearsal. The rest is for noise and the control
+error of the servo. Before a motion is sent, the full limit counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class MotionChecks:
-    """What every motion of a cell is checked against before it is sent.
+    """Checks of every motion of a cell before it is sent.
 
     Attributes:
         limits: joint limits.
         checker: floor, walls and the arm itself.
         currents: motor currents by the nominal model, with its uncertainty, and joint torques
             where the cell limits them.
-        frame: of the angles in which refusals are worded.
-        cell_limit: (n,) A, the cell's current limits where narrower ones of the controller are in
-            force; None where they are in force themselves.
+        frame: of the angles in messages.
+        cell_limit: (n,) A, the cell's current limits if the controller has narrower ones; else
+            None.
     """
 
     limits: JointLimits
@@ -104,7 +102,7 @@ class MotionChecks:
 
     @classmethod
     def of(cls, cell: Cell) -> Self:
-        """The checks of a cell."""
+        """Return the checks of a cell."""
         return cls(
             limits=cell.joint_limits,
             checker=collision_checker(cell),
@@ -113,10 +111,9 @@ class MotionChecks:
         )
 
     def within(self, controller_limits: Array) -> Self:
-        """These checks where a controller announces current limits (n,) [A] of its own.
+        """Return the checks with the narrower of these and a controller's current limits (n,) [A].
 
-        The narrower of the two count for each motor; these very checks where that is the cell's
-        for all of them.
+        Returns `self` if the controller has no narrower ones.
         """
         below = is_narrower(controller_limits, self.currents.current_limit)
         if not below.any():
@@ -127,16 +124,16 @@ class MotionChecks:
 
     @property
     def not_checked(self) -> str | None:
-        """What is left out, in a sentence: shapes that are always too close; None for nothing."""
+        """Pairs of shapes that are not checked since they are always too close; None for none."""
         return self.checker.exceptions
 
     def refusal(self, trajectory: PiecewiseCubic | FourierSeries) -> str | None:
-        """Why a motion must not be sent, or None if it may be."""
+        """Return why a motion must not be sent, or None."""
         if trajectory.n_joints != self.limits.n_joints:
             return f"it is for {trajectory.n_joints} joints, the arm has {self.limits.n_joints}"
-        unwieldy = _unwieldy(trajectory)
-        if unwieldy is not None:
-            return unwieldy
+        unsupported = _unsupported(trajectory)
+        if unsupported is not None:
+            return unsupported
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             return self._refusal(trajectory)
 
@@ -148,7 +145,7 @@ class MotionChecks:
                 check_smooth(trajectory, self.limits)
         except NotSmooth as error:
             return str(error)
-        # First what is quick to check: nothing else can be said of a motion that is beyond limits.
+        # First the quick checks.
         violations = check_motion(trajectory, self.limits) or check_motion(
             trajectory, self.limits, checker=self.checker, currents=self.currents
         )
@@ -161,7 +158,7 @@ class MotionChecks:
         return text if remedy is None else f"{text}; {remedy}"
 
     def _whose_limit(self, motor: str) -> str:
-        """Of the current of a motor ("motor of elbow"): what to do where it is the controller's."""
+        """Return the remedy for a motor ("motor of elbow") whose limit is the controller's."""
         joint = [f"motor of {name}" for name in self.currents.model.joint_names].index(motor)
         if self.cell_limit is None:
             return ""
@@ -169,16 +166,16 @@ class MotionChecks:
         if theirs == ours:
             return ""
         return (
-            f"; the controller announces {float32_text(theirs)} A as the limit of that motor, the "
+            f"; the controller has {float32_text(theirs)} A as the limit of that motor, the "
             f"cell file says {ours:.9g} A: write the controller's into [drive_train] current_limit"
         )
 
 
 def collision_checker(cell: Cell) -> CollisionChecker:
-    """Floor, walls and the arm itself, as the limits in use let it move.
+    """Return the check of contacts with floor, walls and the arm itself.
 
     Raises:
-        CellError: its URDF has no collision shapes, or one of its meshes is not to be found.
+        CellError: the URDF has no collision shapes, or a mesh is missing.
     """
     folders, urdf = cell.mesh_folders, cell.file.cell.urdf
     try:
@@ -202,13 +199,13 @@ def collision_checker(cell: Cell) -> CollisionChecker:
             "cell.urdf",
             urdf,
             str(error),
-            "add <collision> shapes (boxes, cylinders and spheres will do); only a design can do "
-            "without, with collision = false in its [constraints]",
+            "add <collision> shapes (boxes, cylinders or spheres); only a design works without "
+            "them, with collision = false in its [constraints]",
         ) from error
 
 
 def current_model(cell: Cell) -> CurrentModel:
-    """Motor currents and joint torques of a cell's arm by its nominal model, and their limits.
+    """Return motor currents and joint torques by the nominal model of a cell, with limits.
 
     Without a drive train only torques have limits: those of `[limits] torque`.
     """
@@ -236,12 +233,12 @@ def current_model(cell: Cell) -> CurrentModel:
 
 
 def planned(currents: CurrentModel) -> CurrentModel:
-    """The same currents with the share of their limits that a motion is planned with."""
+    """Return the currents with the share of their limits for planning."""
     return replace(currents, usable=PLANNED_CURRENT)
 
 
-def _unwieldy(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
-    """Why a motion cannot even be looked at, or None."""
+def _unsupported(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
+    """Return why a motion cannot be checked, or None."""
     if not trajectory.duration <= LONGEST:
         return f"it lasts {trajectory.duration:.6g} s; at most {LONGEST:g} s are allowed"
     if not isinstance(trajectory, FourierSeries):
@@ -254,5 +251,5 @@ def _unwieldy(trajectory: PiecewiseCubic | FourierSeries) -> str | None:
     for quantity, order in (("velocity", 1), ("acceleration", 2), ("jerk", 3)):
         endless = np.flatnonzero(~np.isfinite(trajectory.derivative_bound(order)))
         if len(endless):
-            return f"the {quantity} of joint {int(endless[0])} is beyond all numbers"
+            return f"the {quantity} of joint {int(endless[0])} is not finite"
     return None

@@ -1,4 +1,4 @@
-"""What a person reads: single lines, and how far long work is (a bar, or plain lines)."""
+"""Output on the terminal: single lines, and progress of long work as a bar or as lines."""
 
 from __future__ import annotations
 
@@ -25,10 +25,7 @@ _NARROWEST = 8  # columns of a bar
 
 
 def put(console: Console, text: str) -> None:
-    """Print one line as it is, without markup; broken between words where a person reads it.
-
-    What steers a terminal is written out.
-    """
+    """Print one line without markup, with control characters escaped; wrapped on a terminal."""
     whole = not console.is_terminal
     console.print(printable(text), markup=False, emoji=False, highlight=False, soft_wrap=whole)
 
@@ -39,37 +36,37 @@ def say(text: str, *, err: bool = False) -> None:
 
 
 class Task:
-    """The running piece of work; shows how much of it is done, and what is being done now."""
+    """Progress of a task: shows how much is done, and what is being done."""
 
     def __init__(self, show: Callable[[float, str], None]) -> None:
         self._show, self._done = show, 0.0
 
     def advance(self, units: float, note: str = "") -> None:
-        """`units` more are done; `note` says what is being done now."""
+        """Add `units` that are done; `note` is what is being done."""
         self._done += units
         self._show(self._done, note)
 
 
 class Reporter(Protocol):
-    """What long work tells a person."""
+    """Receiver of messages and progress of long work."""
 
     def say(self, text: str) -> None:
-        """One line that stays."""
+        """Report a line."""
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A piece of work of `total` units; advance it through the yielded task."""
+        """Begin a task of `total` units; advance it by the yielded object."""
 
 
 class Silent:
-    """Says nothing (tests, scripts)."""
+    """Reports nothing (tests, scripts)."""
 
     def say(self, text: str) -> None:
         """Drop the line."""
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A line for `title`, and for every tenth of the way."""
+        """Report `title`, and every tenth of the task."""
         self.say(title)
         said = 0
 
@@ -107,7 +104,7 @@ class Bar:
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A bar with what is done, the time spent and the time left."""
+        """Show a bar with the units done, the time spent and the time left."""
         whole = Column(no_wrap=True)
         progress = _WithNote(
             TextColumn("{task.description}", table_column=whole),
@@ -130,7 +127,7 @@ class Bar:
 
 
 class _WithNote(Progress):
-    """Each bar with its note in a line of its own: a terminal of 80 columns holds no more."""
+    """Bars with their notes in a line of their own, for terminals of 80 columns."""
 
     def get_renderables(self) -> Iterable[RenderableType]:
         """Return bar and note of each task."""
@@ -140,7 +137,7 @@ class _WithNote(Progress):
 
 
 def reporter(*, quiet: bool = False) -> Reporter:
-    """Bars on a terminal, lines elsewhere, nothing if `quiet`."""
+    """Return a reporter: bars on a terminal, lines elsewhere, nothing if `quiet`."""
     if quiet:
         return Silent()
     console = Console()

@@ -1,7 +1,7 @@
-"""The one screen of a run: what is shown of it, the keys of its person, and plain lines elsewhere.
+"""Screen of a run: its progress, the keys of its operator, and lines without a terminal.
 
-What it looks like is a pure function of what is known and how much room there is (`lines`). It is
-shown by a thread of its own: a terminal that takes nothing more delays neither motion nor stop.
+The picture is a pure function of the state and the size of the terminal (`lines`). A thread of its
+own draws it: a terminal that blocks delays neither motion nor stop.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from hil.terminal_text import plural, printable
 # --- keys
 
 STEP: Final = 0.1
-"""Of override, per key, and the least of it; to rest, there is the hold."""
+"""Step of the override per key, and its least value."""
 _LONGEST_TYPED: Final = 3
-"""Keys that come at once from a person; more of them are pasted, and make nothing faster."""
+"""Most keys at once from an operator; of more, which are pasted, only stop and hold count."""
 HELP: Final = "h hold   space resume   s stop   + - override   1…9: 10…90 %   0: 100 %"
 SHORT_HELP: Final = "h hold  r resume  s stop  + - 1…0 %"
 _ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
@@ -49,20 +49,20 @@ _ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
     **dict.fromkeys("sSqQ", "stop"),
 }
 _SEQUENCES: Final = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]?|\x1bO.?", re.DOTALL)
-"""What a terminal sends of arrows and the like; the last may be cut off."""
+"""Sequences of arrow and function keys; the last one may be incomplete."""
 _AFTER_ESCAPE: Final = re.compile(r"\x1b([^\x1b])", re.DOTALL)
 _UNFINISHED: Final = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?\Z")
 _SEQUENCE_WAIT: Final = 0.05
-"""s for the rest of such a sequence; after that the key Esc was meant."""
+"""s to wait for the rest of a sequence; without it, it is the key Esc."""
 _CHUNK: Final = 256
 _LOCAL, _CONTROL, _INPUT = 3, 6, 0
 
 
 def typed(chunk: str) -> str:
-    """Keys among what a terminal sent: arrows and the like come as several characters.
+    """Return the keys in what a terminal sent, without sequences of arrow and function keys.
 
-    Esc holds. With whatever comes together with it (so a terminal sends Alt, too) it never does
-    less: a stop or a hold counts as itself, any other key as the hold.
+    Esc holds. With another key (as a terminal sends Alt) it is that key for stop and hold, and a
+    hold for any other.
     """
 
     def urgent(key: str) -> bool:
@@ -75,7 +75,7 @@ def typed(chunk: str) -> str:
 
 
 def after(request: OperatorRequest, key: str, override: float) -> OperatorRequest:
-    """The request after a key; the `override` of a motion may be below what is requested."""
+    """Return the request after a key; the `override` of the motion may be below the requested."""
     action = _ACTIONS.get(key)
     if action in ("hold", "resume"):
         return replace(request, held=action == "hold")
@@ -88,7 +88,7 @@ def after(request: OperatorRequest, key: str, override: float) -> OperatorReques
 
 
 def can_read(stream: TextIO) -> bool:
-    """Whether single keys can be read: a terminal, with this program in its foreground."""
+    """Return whether single keys can be read: a terminal with this program in its foreground."""
     try:
         fd = stream.fileno()
         return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
@@ -98,10 +98,10 @@ def can_read(stream: TextIO) -> bool:
 
 @contextmanager
 def single_keys(fd: int) -> Iterator[None]:
-    r"""Give keys as they are pressed and unseen; the terminal is put back on every way out.
+    r"""Read keys as they are pressed, without echo; restore the terminal at the end.
 
-    Ctrl-C and Ctrl-\ stay signals. Ctrl-Z does nothing: a program that is suspended gives no sign
-    of life, and the arm would be stopped. Nor does Ctrl-S, which would freeze the screen.
+    Ctrl-C and Ctrl-\ stay signals. Ctrl-Z is disabled: a suspended program sends no heartbeat, and
+    the arm would be stopped. So is Ctrl-S, which would freeze the screen.
     """
     before = termios.tcgetattr(fd)
     settings: list[Any] = [part[:] if isinstance(part, list) else part for part in before]
@@ -121,8 +121,8 @@ class Keyboard:
     """Reads keys of the terminal in a thread of its own.
 
     Attributes:
-        attached: whether keys are read; not where standard input is no terminal.
-        failure: why they are not read any more, None for nothing.
+        attached: whether keys are read; only if standard input is a terminal.
+        failure: why they are no longer read, or None.
     """
 
     def __init__(self, take: Callable[[str], None]) -> None:
@@ -133,7 +133,7 @@ class Keyboard:
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Read meanwhile, where somebody can type."""
+        """Read keys meanwhile, if standard input is a terminal."""
         if not can_read(sys.stdin):
             yield
             return
@@ -150,18 +150,18 @@ class Keyboard:
                 self.attached = False
 
     def read(self, fd: int) -> None:
-        """Pass on what is typed until it is over, or the terminal is gone."""
+        """Pass keys on until `over` is set, or the terminal is gone."""
         try:
             while not self.over.is_set():
-                if select.select([fd], [], [], _LOOK)[0]:
+                if select.select([fd], [], [], _POLL)[0]:
                     for key in typed(_chunk(fd).decode(errors="replace")):
                         self._take(key)
-        except Exception as error:  # whatever it is, the person is to know that keys do nothing
+        except Exception as error:  # the operator is informed that keys have no effect
             self.failure, self.attached = error, False
 
 
 def _chunk(fd: int) -> bytes:
-    """What a terminal sent at once. Raises EOFError where it is gone."""
+    """Return what a terminal sent at once; raise EOFError if it is gone."""
     chunk = os.read(fd, _CHUNK)
     if not chunk:
         raise EOFError("the terminal is gone")
@@ -173,35 +173,35 @@ def _chunk(fd: int) -> bytes:
     return chunk
 
 
-# --- what it looks like
+# --- the picture
 
 WIDE: Final = 64
-"""Columns from which on there are bars beside the numbers."""
+"""Least width with bars beside the numbers, columns."""
 STALE: Final = 1.0
-"""s without news after which the screen says so."""
+"""Age of a status that is reported, s."""
 SIMULATED: Final = "SIMULATED"
 _LEAST_TITLE: Final = 8  # columns
 _NUMBERS: Final = 28  # columns of a joint beside its name and bars
 _HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 WARNING: Final = 0.8
-"""Share of a limit from which on it is coloured."""
+"""Share of a limit from which it is coloured."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Everything that is shown.
+    """State of the screen.
 
     Attributes:
         title: of the run.
         joint_names: of the n joints.
-        status: where the run stands; None before the first.
-        request: the person's.
-        stopping: whether a stop was asked for.
-        age: s since the status came.
-        said: lines that the run said, oldest first.
+        status: progress of the run; None before the first.
+        request: of the operator.
+        stopping: whether a stop was requested.
+        age: of the status, s.
+        messages: lines of the run, oldest first.
         keys: whether keys are read.
-        far_end: what is moved: "SIMULATED", or the controller's address.
-        left: time to the end as a person waits for it, in words; that of motion if left out.
+        controller: "SIMULATED", or the controller's address.
+        left: waiting time to the end; by default that of motion.
     """
 
     title: str
@@ -210,14 +210,14 @@ class Shown:
     request: OperatorRequest = field(default_factory=OperatorRequest)
     stopping: bool = False
     age: float = 0.0
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
     keys: bool = True
-    far_end: str = ""
+    controller: str = ""
     left: str = ""
 
 
 def lines(shown: Shown, width: int, height: int) -> list[Text]:
-    """The screen, at most `height` lines of at most `width` columns."""
+    """Return the picture, at most `height` lines of at most `width` columns."""
     status = shown.status
     motion = None if status is None else status.motion
     head = [
@@ -235,7 +235,7 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
     notes, events = status.notes if status else (), motion.events if motion else ()
     rows = [
         row
-        for line in (*shown.said, *notes, *events)
+        for line in (*shown.messages, *notes, *events)
         for row in textwrap.wrap(printable(line, keep=""), max(8, width), subsequent_indent="  ")
     ]
     left = room - len(body) - 1
@@ -250,7 +250,7 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
 
 
 def status_line(status: RunStatus, left: str = "") -> str:
-    """Where a run stands, in one line; `left` says in words how long a person waits."""
+    """Return the progress of a run in one line; `left` is the waiting time to its end."""
     parts = [f"{status.phase} {status.number} of {status.total}"]
     motion = status.motion
     if motion is not None:
@@ -277,15 +277,15 @@ def status_line(status: RunStatus, left: str = "") -> str:
 
 
 def _heading(shown: Shown, width: int) -> Text:
-    status, far = shown.status, "bold green" if shown.far_end == SIMULATED else "bold yellow"
+    status, far = shown.status, "bold green" if shown.controller == SIMULATED else "bold yellow"
     at, style, left = "  beginning", "dim", ""
     if status is not None:
         at, style = f"  {status.phase} {status.number} of {status.total}", "bold cyan"
         left = shown.left or f"{clock(status.time_left)} left"
-    where = Text.assemble((f"  {shown.far_end}" if shown.far_end else "", far), (at, style))
+    where = Text.assemble((f"  {shown.controller}" if shown.controller else "", far), (at, style))
     room = max(0, width - len(left) - 2)
     text = Text(printable(shown.title), style="bold")
-    # The title gives way to what is moved and what it is doing.
+    # The title is shortened first.
     text.truncate(max(min(_LEAST_TITLE, room), room - where.cell_len), overflow="ellipsis")
     text.append_text(where)
     text.truncate(room, overflow="ellipsis")
@@ -340,7 +340,7 @@ def _health(motion: MotionProgress | None, width: int) -> Text:
 
 
 def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> list[Text]:
-    """A line of each joint: following error and current, each against its limit."""
+    """Return a line per joint: following error and current with their shares of the limits."""
     if motion is None or motion.following_error is None or motion.current is None:
         return []
     assert motion.following_share is not None
@@ -381,7 +381,7 @@ def _drift_words(drift: DriftCurve) -> str:
 
 
 def bar(share: float, width: int) -> Text:
-    """A share of a limit; above `WARNING` it is marked by colour, above 1 by the last character."""
+    """Return a bar of a share of a limit; above 1 its last character is an arrow."""
     if not math.isfinite(share):
         return Text("?".ljust(width), style="bold red")
     if share > 1.0:
@@ -392,14 +392,14 @@ def bar(share: float, width: int) -> Text:
 
 
 def colour(share: float) -> str:
-    """Style of a share of a limit; the number beside it says the same without colours."""
+    """Return the style of a share of a limit."""
     if share > 1.0:
         return "bold red"
     return "yellow" if share > WARNING else "green"
 
 
 def percent(share: float) -> str:
-    """A share in four characters."""
+    """Return a share in four characters."""
     if not math.isfinite(share):
         return "  ?%"
     value = min(100.0 * share, 999.0)
@@ -407,14 +407,14 @@ def percent(share: float) -> str:
 
 
 def curve(values: Sequence[float], width: int) -> str:
-    """The last `width` values as a row of blocks, from 0 to the largest of them."""
+    """Return the last `width` values as a row of blocks, from 0 to the largest of them."""
     shown = [max(value, 0.0) for value in values if math.isfinite(value)][-width:]
     step = (max(shown, default=0.0) or 1.0) / len(_HEIGHTS)
     return "".join(_HEIGHTS[min(len(_HEIGHTS) - 1, int(value / step))] for value in shown)
 
 
 def clock(seconds: float | None) -> str:
-    """A time as h:mm:ss or m:ss."""
+    """Return a time as h:mm:ss or m:ss."""
     if seconds is None or not math.isfinite(seconds):
         return "?"
     minutes, rest = divmod(max(0, round(seconds)), 60)
@@ -423,22 +423,22 @@ def clock(seconds: float | None) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A latency."""
+    """Return a latency as text."""
     if not math.isfinite(seconds):
         return "> 5 ms"
     return f"{1e3 * seconds:.1f} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} µs"
 
 
-# --- how long it takes
+# --- time left
 
 _KNOWN_AFTER: Final = 2.0
-"""s of motion and of waiting after which the pace of virtual time is reported."""
+"""s of motion and of waiting after which the time left in virtual time is shown."""
 _BETWEEN: Final = 0.6
-"""s from motion to motion, as if seen once before: drives go off and on."""
+"""Initial estimate of the time between two motions, s."""
 
 
 class Pace:
-    """Waiting time per second of motion, which is one unless time is virtual, and between two."""
+    """Estimates the waiting time per second of motion, 1 in real time, and between motions."""
 
     def __init__(self, *, virtual: bool) -> None:
         self._virtual = virtual
@@ -446,8 +446,8 @@ class Pace:
         self._between = self._gaps = 0.0
         self._last: tuple[float, RunStatus] | None = None
 
-    def take(self, status: RunStatus, now: float, *, held: bool) -> None:
-        """Learn from a status that came `now` [s, any monotonic clock]; not while it is held."""
+    def update(self, status: RunStatus, now: float, *, held: bool) -> None:
+        """Update the estimate with a status at `now` [s, monotonic clock], not during a hold."""
         if self._last is not None and not held:
             came, last = self._last
             waited, moved = now - came, last.time_left - status.time_left
@@ -462,11 +462,11 @@ class Pace:
         self._last = (now, status)
 
     def pause(self) -> None:
-        """What passes until the next status is a person's time."""
+        """Leave out the time until the next status, in which the operator is asked."""
         self._last = None
 
     def left(self, status: RunStatus) -> float | None:
-        """Waiting time to the end of the run [s]; None where it cannot be determined yet."""
+        """Return the waiting time to the end of the run [s]; None if it is not known yet."""
         changes = status.motions_left + (status.motion is None)
         between = changes * (_BETWEEN + self._between) / (1.0 + self._gaps)
         if not self._virtual:
@@ -478,19 +478,16 @@ class Pace:
 
 # --- questions
 
-_LOOK: Final = 0.1
-"""s between two looks at the keys, and whether a stop was asked for."""
+_POLL: Final = 0.1
+"""Period of polling keys and stop requests, s."""
 
 
 def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
-    """Show what was measured and wait for an answer; only "yes" accepts.
-
-    Where torques contradict the model, only the names of the joints concerned do.
-    """
+    """Show a dry run and ask for its acceptance: "yes", or the joints that contradict the model."""
     table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
-    for column in ("joint", "largest following error", "largest current", "torque and weight"):
+    for column in ("joint", "largest following error", "largest current", "torque and gravity"):
         table.add_column(column, justify="right" if column.startswith("largest") else "left")
-    agree = {name: Text("not seen") for name in found.gravity_not_seen}
+    agree = {name: Text("not determined") for name in found.gravity_not_seen}
     agree |= {name: Text("contradict", style="bold red") for name in found.against_gravity}
     for name, error, share in zip(
         found.joint_names, found.following_error, found.current_share, strict=True
@@ -498,14 +495,14 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
         current = f"{100.0 * share:.0f} % of its limit"
         weight = agree.get(name, Text("agree"))
         table.add_row(Text(printable(name)), f"{math.degrees(error):.3f}°", current, weight)
-    link = f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'answer')} late"
+    link = f"{plural(found.missed, 'packet')} missed, {found.late} replies late"
     table.caption = Text(printable(f"{link}; {', '.join(found.archives)}"))
     console.print(table)
     for warning in found.warnings:
         console.print(warning, style="bold red", markup=False, highlight=False)
     what = "the simulated arm" if found.simulated else "the arm"
     word = " ".join(found.against_gravity) or "yes"
-    known = f"If you know why, type {word}" if found.against_gravity else "Type yes"
+    known = f"If you know the cause, type {word}" if found.against_gravity else "Type yes"
     question = (
         f"Did {what} move as it should, with nothing in its way at {found.override:.0%} of full "
         f"speed? {known} to accept; anything else ends the run: "
@@ -514,17 +511,14 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
 
 
 def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
-    """Ask, and wait for an answer: whether it is the word. A stop asked for is a refusal.
-
-    It is looked for while nothing is typed: the heartbeat of a real link goes on meanwhile.
-    """
+    """Ask for a word and return whether it was typed; False also after a stop request."""
     console.print(question, end="", markup=False, highlight=False)
     sys.stdout.flush()
-    with contextlib.suppress(termios.error):  # what was typed before the question is no answer
+    with contextlib.suppress(termios.error):  # discard what was typed before the question
         termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
     while not stop.requested:
         with contextlib.suppress(InterruptedError):
-            if select.select([sys.stdin], [], [], _LOOK)[0]:
+            if select.select([sys.stdin], [], [], _POLL)[0]:
                 return " ".join(sys.stdin.readline().split()).lower() == word.lower()
     return False
 
@@ -535,11 +529,11 @@ REFRESH_PERIOD: Final = 0.1  # s between two pictures
 LINE_EVERY: Final = 5.0  # s between two lines where there is no terminal
 FAREWELL: Final = 0.5  # s that a terminal may take for the last picture
 NEWEST, REMEMBERED = 8, 200
-"""Lines said meanwhile that are shown, and that are left on the terminal at the end."""
+"""Messages that are shown, and that are printed at the end."""
 
 
-def far_end_of(cell: Cell) -> str:
-    """What the first line says of the cell's own link."""
+def controller_of(cell: Cell) -> str:
+    """Return what the first line shows of the cell's own link."""
     table = cell.controller
     if cell.only_simulated:
         return SIMULATED
@@ -549,7 +543,7 @@ def far_end_of(cell: Cell) -> str:
 
 
 class ScreenError(RuntimeError):
-    """The screen does not show anything any more, or does not hear its keys."""
+    """The screen is no longer drawn, or its keys are no longer read."""
 
 
 class Screen:
@@ -559,8 +553,8 @@ class Screen:
         joint_names: of the n joints.
         stop: set by the keys s and q.
         title: of the run.
-        far_end: what is moved: `SIMULATED`, or the controller's address.
-        virtual: whether the controller's time is; the time left is that of waiting all the same.
+        controller: `SIMULATED`, or the controller's address.
+        virtual: whether time is virtual; the time left is that of waiting in any case.
         quiet: show nothing and read no keys.
         console: written to; standard output if left out.
     """
@@ -571,7 +565,7 @@ class Screen:
         stop: Stop,
         *,
         title: str = "hil",
-        far_end: str = "",
+        controller: str = "",
         virtual: bool = False,
         quiet: bool = False,
         console: Console | None = None,
@@ -581,10 +575,10 @@ class Screen:
         self._quiet = quiet
         self._stop = stop
         self._request = OperatorRequest()
-        self._shown = Shown(title, tuple(joint_names), keys=False, far_end=far_end)
+        self._shown = Shown(title, tuple(joint_names), keys=False, controller=controller)
         self._pace = Pace(virtual=virtual)
         self._came = time.monotonic()
-        self._said: deque[str] = deque(maxlen=REMEMBERED)
+        self._messages: deque[str] = deque(maxlen=REMEMBERED)
         self._undo = contextlib.ExitStack()
         self._stuck = False
         self._changing = threading.Lock()  # keys come in a thread of their own
@@ -596,12 +590,12 @@ class Screen:
 
     @classmethod
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
-        """The screen of a run on a cell's own link; `title` is the cell's name if left out."""
+        """Return the screen of a run on a cell's own link; `title` is by default its name."""
         return cls(
             cell.joint_names,
             stop,
             title=title or cell.name,
-            far_end=far_end_of(cell),
+            controller=controller_of(cell),
             virtual=cell.controller.transport == "simulated",
             quiet=quiet,
         )
@@ -612,16 +606,16 @@ class Screen:
 
     def __exit__(self, *_: object) -> None:
         self._undo.close()
-        self._leave_what_was_said()
+        self._print_messages_at_end()
 
     def show(self, status: RunStatus) -> None:
-        """Show where the run stands; returns at once.
+        """Show the progress of the run; return at once.
 
         Raises:
             ScreenError: nothing is drawn any more.
         """
         self._came = time.monotonic()
-        self._pace.take(status, self._came, held=self._request.held)
+        self._pace.update(status, self._came, held=self._request.held)
         waiting = self._pace.left(status)
         left = f"{clock(status.time_left)} of motion left"
         left = left if waiting is None else f"{clock(waiting)} left"
@@ -631,10 +625,10 @@ class Screen:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
 
     def request(self) -> OperatorRequest:
-        """What the person requests.
+        """Return the present request.
 
         Raises:
-            ScreenError: keys were read, and are not any more.
+            ScreenError: keys are no longer read.
         """
         failure = None if self._keyboard is None else self._keyboard.failure
         if failure is not None:
@@ -643,37 +637,37 @@ class Screen:
 
     @property
     def can_answer(self) -> bool:
-        """Whether somebody sits at the terminal."""
+        """Whether the operator can be asked at the terminal."""
         return self._full and can_read(sys.stdin)
 
     def accept_dry_run(self, found: DryRun) -> bool:
-        """Ask on the terminal, on the shell's own page; False where nobody can answer."""
+        """Ask on the terminal's main page; False if nobody can be asked."""
         if not self.can_answer:
             return False
         self._undo.close()
         self._pace.pause()
         try:
-            self._leave_what_was_said()
+            self._print_messages_at_end()
             return not self._stuck and ask(self._console, self._shown.title, found, self._stop)
         finally:
             try:
                 self._open()
-            except Exception as error:  # the run goes on, as without a terminal
+            except Exception as error:  # the run continues as without a terminal
                 self._undrawn = error
 
     def say(self, text: str) -> None:
-        """One line that stays: printed at once, or after the screen has closed."""
+        """Print a line at once, or after the screen has closed."""
         if not self._quiet:
-            self._said.append(text)
+            self._messages.append(text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        """A piece of work; the screen shows it already."""
+        """Begin a task; the screen shows its progress already."""
         with Silent().task(title, total) as task:
             yield task
 
     def press(self, key: str) -> None:
-        """Take a key."""
+        """Apply a key."""
         if _ACTIONS.get(key) == "stop":
             self._stop.requested = True
             return
@@ -685,18 +679,18 @@ class Screen:
             self._request = after(self._request, key, override)
 
     def shown(self) -> Shown:
-        """What is shown now."""
+        """Return the present state of the screen."""
         return replace(
             self._shown,
             request=self._request,
             stopping=self._stop.requested,
             age=time.monotonic() - self._came,
-            said=tuple(self._said)[-NEWEST:],
+            messages=tuple(self._messages)[-NEWEST:],
             keys=self._keyboard is not None and self._keyboard.attached,
         )
 
     def _leave_dry_run(self, status: RunStatus) -> None:
-        """What the dry run was slowed to is not meant for what comes after; a hold is."""
+        """Reset the override after the dry run; a hold remains."""
         if status.phase == "dry run":
             self._slow_phase = True
         elif self._slow_phase and status.phase != "move":
@@ -705,7 +699,7 @@ class Screen:
                 slowed = self._request.override < 1.0
                 self._request = replace(self._request, override=1.0)
             if slowed:
-                self.say("the dry run is over: the override is 100 % again")
+                self.say("the dry run has ended: the override is 100 % again")
 
     def _open(self) -> None:
         self._undo = contextlib.ExitStack()
@@ -713,11 +707,11 @@ class Screen:
         self._undrawn = self._keyboard = None
         if self._quiet:
             return
-        display, end = self._print_line, self._print_said
+        display, end = self._print_line, self._print_messages
         if self._full:
             self._keyboard = Keyboard(self.press)
             self._undo.enter_context(self._keyboard.reading())
-            # A terminal's other page, so that the shell's own lines come back at the end.
+            # The alternate page of the terminal: the shell's lines reappear at the end.
             live = Live(console=self._console, screen=True, auto_refresh=False)
             live.start()
             display, end = partial(self._draw_page, live), live.stop
@@ -726,7 +720,7 @@ class Screen:
             try:
                 while not over.wait(REFRESH_PERIOD):
                     display(self.shown())
-            except Exception as error:  # it shows nothing more, and `show` says why
+            except Exception as error:  # reported by `show`
                 self._undrawn = error
             with contextlib.suppress(Exception):
                 end()
@@ -745,8 +739,8 @@ class Screen:
         live.update(Group(*lines(shown, *self._console.size)), refresh=True)
 
     def _print_line(self, shown: Shown) -> None:
-        """Print what is new: a line now and then, and one for whatever begins."""
-        self._print_said()
+        """Print new messages, and a status line every `LINE_EVERY` s and for each motion."""
+        self._print_messages()
         status = shown.status
         if status is None or shown.age > LINE_EVERY:
             return
@@ -755,12 +749,12 @@ class Screen:
             self._line_of, self._line_due = at, time.monotonic() + LINE_EVERY
             put(self._console, status_line(status, shown.left))
 
-    def _print_said(self) -> None:
-        while self._said:
-            put(self._console, self._said.popleft())
+    def _print_messages(self) -> None:
+        while self._messages:
+            put(self._console, self._messages.popleft())
 
-    def _leave_what_was_said(self) -> None:
-        """Print it on the shell's page, unless the terminal takes nothing any more."""
-        while self._full and self._said and not self._stuck:
+    def _print_messages_at_end(self) -> None:
+        """Print the messages on the main page, unless the terminal blocks."""
+        while self._full and self._messages and not self._stuck:
             with contextlib.suppress(OSError, ValueError):
-                put(self._console, self._said.popleft())
+                put(self._console, self._messages.popleft())

@@ -269,7 +269,7 @@ class TestTimeLeft:
         class Clock(Person):
             def show(self, status: RunStatus) -> None:
                 now = link.cycles * 0.002
-                pace.take(status, now, held=False)
+                pace.update(status, now, held=False)
                 left = pace.left(status)
                 assert left is not None
                 estimates.append((now, left))
@@ -759,7 +759,7 @@ def test_the_controllers_figures_do_not_replace_the_checked(
     assert flag.exit_code == 2
 
 
-def to_one_that_announces(campaign: Campaign, old: str, new: str) -> Link:
+def link_to_controller_with(campaign: Campaign, old: str, new: str) -> Link:
     """A link to a simulated controller whose own cell file differs in one line."""
     assert old in campaign.cell.text
     text = campaign.cell.text.replace(old, new)
@@ -775,7 +775,7 @@ CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
     ("line", "error", "told"),
     [
         (CURRENT, MotionRefusedError,
-         r"motor of shoulder: \S+ A, .*controller announces 3 A .*cell file says 20 A: write"),
+         r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file says 20 A: write"),
         (("following_error = [1.0, 1.0]", "following_error = [1.0, 0.01]"), NotRehearsedError,
          r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
         (("cycle_ms = 2", "cycle_ms = 1"), ControllerFault,
@@ -788,13 +788,13 @@ def test_what_the_controller_states_is_looked_at_first(
     campaign = copied(dry, tmp_path / "campaign")
     before = sorted(campaign.folder.archives.iterdir())
     with pytest.raises(error, match=told):
-        campaign.run(to_one_that_announces(campaign, *line))
+        campaign.run(link_to_controller_with(campaign, *line))
     assert sorted(campaign.folder.archives.iterdir()) == before
 
 
 def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campaign) -> None:
     campaign = copied(dry, tmp_path / "campaign")
-    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [30.0, 13.0]")
+    link = link_to_controller_with(campaign, CURRENT[0], "current_limit = [30.0, 13.0]")
     assert campaign.run(link, dry_run_only=True).dry_run == "accepted"
     link.connect(Stop())
     checks = MotionChecks.of(campaign.cell)
@@ -803,16 +803,16 @@ def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campai
 
 def test_a_narrower_limit_that_is_kept_is_noted(tmp_path: Path, dry: Campaign) -> None:
     campaign = copied(dry, tmp_path / "campaign")
-    link = to_one_that_announces(campaign, CURRENT[0], "current_limit = [19.5, 12.0]")
+    link = link_to_controller_with(campaign, CURRENT[0], "current_limit = [19.5, 12.0]")
     (note,) = [one for one in campaign.run(link).notes if "limits" in one]
     assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
 
 
 def test_a_single_way_keeps_the_controllers_current_limit(tmp_path: Path, dry: Campaign) -> None:
     cell = dry.cell
-    link = to_one_that_announces(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
+    link = link_to_controller_with(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
     way = straight_way(cell, link.connect(Stop()), cell.home)
-    with pytest.raises(MotionRefusedError, match=r"the way .*announces 0\.5 A"):
+    with pytest.raises(MotionRefusedError, match=r"the way .*controller has 0\.5 A"):
         send(way, cell, link, tmp_path / "move.mcap", stop=Stop())
     assert not (tmp_path / "move.mcap").exists()
 

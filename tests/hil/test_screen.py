@@ -42,7 +42,7 @@ from hil.screen import (
     ScreenError,
     Shown,
     after,
-    far_end_of,
+    controller_of,
     lines,
     single_keys,
     typed,
@@ -143,19 +143,19 @@ def test_stop_hold_and_silence_are_said() -> None:
 
 @pytest.mark.parametrize("width", [48, 64, 80])
 @pytest.mark.parametrize("far_end", ["SIMULATED", "10.2.12.150"])
-def test_the_first_line_says_what_is_moved(width: int, far_end: str) -> None:
-    shown = Shown("a long title " * 6, NAMES, status(), far_end=far_end, left="0:42 left")
+def test_the_first_line_names_the_controller(width: int, far_end: str) -> None:
+    shown = Shown("a long title " * 6, NAMES, status(), controller=far_end, left="0:42 left")
     first = drawn(width, 24, shown)[0]
     assert far_end in first
     assert first.endswith("0:42 left")
     assert "repetition" in first
 
 
-def test_the_far_end_is_simulated_or_has_an_address() -> None:
+def test_the_controller_is_simulated_or_has_an_address() -> None:
     cell = Cell.load(CELL_PATH)
 
     def said(**link: Any) -> str:
-        return far_end_of(cell.with_link(**link))
+        return controller_of(cell.with_link(**link))
 
     assert said() == said(transport="udp", host="127.0.0.1") == "SIMULATED"
     assert said(transport="udp") == "10.2.12.150"
@@ -170,13 +170,13 @@ def test_in_virtual_time_the_time_left_is_that_of_waiting() -> None:
     for tenth in range(121):
         now, left = tenth / 10.0, 100.0 - 4.0 * tenth / 10.0
         one = RunStatus("dry run", 1, 1, left, moving)
-        pace.take(one, now, held=False)
+        pace.update(one, now, held=False)
         if tenth == 10:
             assert pace.left(one) is None
     pace.pause()
     one = RunStatus("repetition", 1, 3, 60.0, moving)
     for tenth in range(11):  # a rejected repetition made it longer; nothing moves while held
-        pace.take(one, 500.0 + tenth, held=tenth > 0)
+        pace.update(one, 500.0 + tenth, held=tenth > 0)
     assert pace.left(one) == pytest.approx(15.0)
 
 
