@@ -1,8 +1,8 @@
-"""Judges a session from outside: by the packets, the answers and the records it left.
+"""Independent check of a session by its packets, replies and records.
 
-It shares nothing with the code under test but the record's layout and the drive train (which has
-tests of its own). `Conduct` says what may stand in an answer, and raises AssertionError;
-`reception.Reception` which packets get an answer at all.
+It shares with the code under test only the record's layout and the drive train (tested separately).
+`Conduct` checks the contents of replies and raises AssertionError; `oracle.Reception` predicts
+which packets get a reply.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ EPS = np.finfo(np.float64).eps
 
 @dataclass
 class Conduct:
-    """What may stand in the answers to cyclic packets, once an init packet came.
+    """Allowed contents of the replies to cyclic packets, after an init packet.
 
     Args:
         limits: of the guard.
@@ -85,12 +85,12 @@ class Conduct:
         return on and all(received.axes[slot].mode == self.mode for slot in self.slots)
 
     def interrupted(self) -> None:
-        """An init packet came, or nothing for long: closed axes have to be seen first."""
+        """After an init packet or a silence, axes have to be closed first."""
         self.barrier = True
         self.sent, self.motor, self.exiting = [], None, False
 
     def judge(self, packet: bytes, reply: bytes, record: np.void, missed: int) -> None:
-        """One fresh cyclic packet, packets before it without an answer, and what it led to."""
+        """Check the reply to one new cyclic packet, after `missed` packets without a reply."""
         n = len(self.arms)
         received, answer = oracle.parse(packet, n), oracle.parse(reply, n)
         assert len(reply) == oracle.length(n)
@@ -150,7 +150,7 @@ class Conduct:
     def _unusable(
         self, received: oracle.Packet, answer: oracle.Packet, safe: oracle.Packet, record: np.void
     ) -> None:
-        """No axis of the arm may be open: drive-off is asked for, all else is as ever."""
+        """Check that open axes of an unusable arm get drive-off, all else the safe reply."""
         axes = [a for a, arm in zip(received.axes, self.arms, strict=True) if arm == self.arm]
         on = received.status[self.arm - 1] == oracle.DRIVE_ON
         if answer != safe:
@@ -162,7 +162,7 @@ class Conduct:
         self._count("unusable")
 
     def _over(self, what: str) -> None:
-        """This interval in open mode, if it was one, is over."""
+        """End the interval in open mode, if there is one."""
         self.sent, self.motor, self.exiting = [], None, False
         self.stopping = self.overridden = False
         self._count(what)
@@ -179,7 +179,7 @@ class Conduct:
         assert answer.status == bytes(expected)
 
     def _note(self, on: bool, modes: list[int]) -> None:
-        """Closed axes lift the barrier; a drive that is off, or an unknown mode, puts it up."""
+        """Closed axes end the barrier; a drive that is off, or an unknown mode, begins it."""
         if on and all(mode in (0, 10, 501) for mode in modes):
             self.barrier = False
         else:
@@ -521,13 +521,13 @@ class Judged:
             self.reception.ended = True
 
     def silence_heard(self) -> None:
-        """More time has passed than any silence is allowed to take."""
+        """Record a silence longer than allowed."""
         if not self.reception.ended:
             self.reception.silent = self.reception.n_axes is not None
             self.conduct.interrupted()
 
     def take_events(self) -> None:
-        """What the session says of itself: which motions ended, and which arms are moved."""
+        """Read from events which motions ended and whether the arm can be moved."""
         for event in self.session.events():
             if isinstance(event, MotionEnded):
                 self.conduct.entitled = False

@@ -1,6 +1,6 @@
-"""What a PC has to answer, written from the facts on the C4G Open wire (sections 2 and 6) alone.
+"""Expected replies, written from the facts on the C4G Open wire (sections 2 and 6) alone.
 
-Knows nothing of the package under test: layout, codes and the safe answer are stated here a
+Independent of the package under test: layout, codes and the safe reply are implemented here a
 second time, on raw 4-byte words, so that NaN and signed zeros are compared bit for bit.
 """
 
@@ -33,7 +33,7 @@ class Axis(NamedTuple):
         return tuple(struct.unpack("<f", word)[0] for word in self.d)
 
     def keep(self, *fields: int) -> Axis:
-        """These fields (1 = D1) as they are, zero in the others."""
+        """Return the block with these fields (1 = D1) and zero in the others."""
         return Axis(self.mode, tuple(w if k + 1 in fields else ZERO for k, w in enumerate(self.d)))
 
 
@@ -71,11 +71,11 @@ def build(packet: Packet) -> bytes:
 
 
 def safe_axis(axis: Axis, drive_on: bool) -> Axis:
-    """The answer to an axis that nobody moves: an independent program's, on a real robot.
+    """Return the reply to an axis without motion, that of an independent program on a real robot.
 
-    In an open mode the received target is held: D1 as received, at zero velocity; where the mode
-    takes increments, by zeros, for only one status is known to mean that the drive is on, and a
-    position echoed as an increment would be a jump.
+    In an open mode the received target is held: D1 as received, at zero velocity; in a mode of
+    increments zeros, because only one status is known to mean that the drive is on, and a position
+    echoed as an increment would be a jump.
     """
     if axis.mode in TAKES_INCREMENTS:
         return axis.keep()
@@ -91,7 +91,7 @@ def safe_axis(axis: Axis, drive_on: bool) -> Axis:
 
 
 def safe_answer(received: Packet, arms: tuple[int, ...]) -> Packet:
-    """The whole answer where nothing is moved; `arms` says whose axis stands in which slot."""
+    """Return the reply without motion; `arms` is the arm of each slot."""
     on = [byte == DRIVE_ON for byte in received.status]
     status = bytes(
         0 if on[arm] or arm + 1 not in arms else received.status[arm] for arm in range(4)
@@ -103,7 +103,7 @@ def safe_answer(received: Packet, arms: tuple[int, ...]) -> Packet:
 
 
 def lost_target(received: Packet, arms: tuple[int, ...]) -> bool:
-    """An axis open with its drive on, of whichever arm, has a target that is no number."""
+    """Whether the target of an open axis of any arm with its drive on is not finite."""
     return any(
         axis.mode in HOLDS_A_POSITION
         and received.status[arm - 1] == DRIVE_ON
@@ -117,7 +117,7 @@ def drive_off(answer: Packet) -> bool:
 
 
 def echo(data: bytes) -> bytes:
-    """The answer to sync and init packets."""
+    """Return the reply to sync and init packets."""
     number = int.from_bytes(data[:4], "little", signed=True)
     return answer_number(number).to_bytes(4, "little") + data[4:]
 
@@ -150,7 +150,7 @@ def number_of(packet: bytes) -> int:
 
 @dataclass
 class Reception:
-    """Which packets get an answer, and which packets are the last one once more.
+    """Which packets get a reply, and which are duplicates.
 
     Attributes:
         silence: s after which a packet is none of the same session any more.
@@ -170,7 +170,7 @@ class Reception:
     last_packet: bytes = b""
 
     def expect(self, packet: bytes) -> Kind:
-        """What kind of answer it gets; takes note of a packet that gets one."""
+        """Return the kind of reply to a packet, and record a packet that gets one."""
         kind = self._expect(packet)
         if kind in ("echo", "init", "cyclic"):
             self.last, self.last_packet, self.silent = number_of(packet), packet, False

@@ -1,4 +1,4 @@
-"""A session on a bench: a controller that sends what the test says, and motions to ask for."""
+"""Test bench of a session: a controller sending given packets, and motions to request."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def drive_train() -> DriveTrain:
 
 
 def train_of(n: int) -> DriveTrain:
-    """An arm of so many joints, each unlike the next."""
+    """Return the drive train of an arm with n different joints."""
     return DriveTrain(
         gear_ratio=np.where(np.arange(n) % 3, 1.0, -1.0) * np.linspace(120.0, 60.0, n),
         calibration=np.linspace(-1.0, 2.0, n),
@@ -91,7 +91,7 @@ def init_packet(**changes) -> InitPacket:
 
 
 class Cruise:
-    """Joint 1 gathers speed, cruises for ever, and stops when asked to; the others stand."""
+    """Joint 1 accelerates, moves at constant speed and stops on request; the others rest."""
 
     RAMP = 0.4
     SPEED = 0.3
@@ -155,7 +155,7 @@ class Table:
         return self.index + 1 >= len(self.positions)
 
     def begin(self, position):
-        # The wire rounds to float32; a jump by that much would be a jerk.
+        # Float32 rounding of the wire would be a jump.
         self.positions = self.positions + (position - self.start)
 
     def advance(self):
@@ -167,7 +167,7 @@ class Table:
 
 
 class Correction:
-    """Plays rows of corrections (m, n), motion and current, to their end even if stopped."""
+    """Rows of corrections (m, n), motion and current, executed to their end even if stopped."""
 
     def __init__(self, motion=None, current=None, rows=0):
         rows = next((len(part) for part in (motion, current) if part is not None), rows)
@@ -191,7 +191,7 @@ class Correction:
 
 
 class GoesOn(Table):
-    """A table of a stop: has the bounds of one from the request on, and plays on to its end."""
+    """A table with the bounds of a stop from `stop` on, executed to its end."""
 
     def stop(self):
         self.bounds = "stop"
@@ -221,14 +221,14 @@ def accelerating(acceleration: float, cycles: int = 40) -> np.ndarray:
 
 
 class Unspeakable(BaseException):
-    """One whose message cannot be had either."""
+    """An exception whose `__str__` raises."""
 
     def __str__(self):
         raise KeyboardInterrupt
 
 
 class Rig:
-    """Session and controller. The arm is where the last answer commands it to be."""
+    """Session and controller. The arm is where the last reply commands it."""
 
     def __init__(
         self,
@@ -276,7 +276,7 @@ class Rig:
         self.axes["mode"] = mode
 
     def send(self, packet: bytes) -> bytes | None:
-        """Any bytes, one cycle later."""
+        """Deliver any bytes, one cycle later; return the reply."""
         self.now += self.period
         reply = self.session.reply(packet, self.now, self.ages)
         self.events += self.session.events()
@@ -284,7 +284,7 @@ class Rig:
         return reply
 
     def start(self, *, cold: bool = False) -> None:
-        """The hand-shake."""
+        """Exchange sync and init packets."""
         if cold:
             for number in range(1, 10):
                 self.sync(number)
@@ -311,7 +311,7 @@ class Rig:
             self.now += self.period
 
     def cycle(self, count: int = 1, *, mode=None, status=None) -> CyclicPacket | None:
-        """Whole cycles, in this mode and with this status from now on; the last answer."""
+        """Run cycles, in this mode and status from now on; return the last reply."""
         self.modes = self.modes if mode is None else mode
         self.status = self.status if status is None else status
         answer = None
@@ -322,10 +322,10 @@ class Rig:
                 assert len(reply) == cyclic_length(self.init.n_axes)
                 answer = CyclicPacket.decode(reply, self.init.n_axes)
                 assert answer.number == next_number(self.number)
-                self._obey(answer)
+                self._follow(answer)
         return answer
 
-    def _obey(self, answer: CyclicPacket) -> None:
+    def _follow(self, answer: CyclicPacket) -> None:
         self.exits_asked += answer.status[0] == 1
         commanded = answer.axes
         if np.isin(commanded["mode"], NOT_SET_POINTS).any():
@@ -346,7 +346,7 @@ class Rig:
         return self.cycle(mode=self.mode)
 
     def run(self, cycles: int = 2000) -> None:
-        """Obey until the session asks for the end of open mode, then leave it."""
+        """Follow replies until the session asks for the end of open mode, then leave it."""
         for _ in range(cycles):
             self.cycle()
             if self.exits_asked:
@@ -369,12 +369,12 @@ class Rig:
 
     @property
     def refusal(self):
-        """Why the last refused set-point was refused."""
+        """Error of the last refused set-point."""
         return self.seen(Refused)[-1].error
 
     @property
     def path(self):
-        """States walked through so far."""
+        """States entered so far."""
         return [event.after for event in self.seen(StateChanged)]
 
     @property
@@ -397,7 +397,7 @@ def closed(**options) -> Rig:
 
 
 def opened(cycles: int = 0, **options) -> Rig:
-    """In open mode without a motion, for so many cycles more."""
+    """In open mode without a motion, after this number of cycles."""
     rig = Rig(**options)
     rig.open()
     rig.cycle(cycles)
@@ -405,7 +405,7 @@ def opened(cycles: int = 0, **options) -> Rig:
 
 
 def running(source, cycles: int = 0, **options) -> Rig:
-    """In open mode, so many cycles after the first set-point of a motion."""
+    """In open mode, this number of cycles after the first set-point of a motion."""
     rig = Rig(**options)
     rig.session.request(source)
     rig.open()
@@ -460,13 +460,13 @@ def at(joint: int, value: float) -> np.ndarray:
 
 
 def only(**bounds: float) -> GuardLimits:
-    """Every rate but those given is out of reach."""
+    """Limits that are wide for every rate but those given."""
     wide = dict.fromkeys(("velocity", "acceleration", "jerk"), WIDE)
     return limits(**{name: np.full(N, bound) for name, bound in (wide | bounds).items()})
 
 
 def refused(kind: type, check: Callable[..., object], *args: Any, **named: Any) -> GuardError:
-    """What a check raises, which is of exactly this kind."""
+    """Return the error that a check raises, which must be of this class."""
     with pytest.raises(GuardError) as caught:
         check(*args, **named)
     assert type(caught.value) is kind

@@ -68,7 +68,7 @@ class Controller:
         if reply is None or self.cycle <= 12:
             return
         answer = CyclicPacket.decode(reply, N)
-        self.rig._obey(answer)
+        self.rig._follow(answer)
         if answer.status[0] == 1 and self.closing is None:
             self.closing = self.cycle
 

@@ -177,21 +177,22 @@ def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
 
 def report_late(rig: Rig) -> None:
     """From now on the controller takes each answer, and reports its target, a cycle late."""
-    take, late = rig._obey, [rig.axes["d"].copy()]
+    take, late = rig._follow, [rig.axes["d"].copy()]
 
     def obey(answer):
         take(answer)
         late.append(rig.axes["d"].copy())
         rig.axes["d"][:] = late[-2]
 
-    rig._obey = obey
+    rig._follow = obey
 
 
 def lose(rig: Rig, count: int):
     """Cycles whose answers never reach the controller, which holds its target."""
-    take, rig._obey = rig._obey, lambda answer: rig.axes["d"].__setitem__((slice(None), [1, 3]), 0)
+    take = rig._follow
+    rig._follow = lambda answer: rig.axes["d"].__setitem__((slice(None), [1, 3]), 0)
     answer = rig.cycle(count)
-    rig._obey = take
+    rig._follow = take
     return answer
 
 
