@@ -245,7 +245,7 @@ def draw_design(
     if front is not None or references:
         polished = ", polished" if front is not None and chosen is None else ""
         marks["chosen" + polished] = excitation.criteria.measures
-        if front is not None and chosen is not None:  # those by which it lies on the front
+        if front is not None and chosen is not None:  # at the sample period of the front
             marks["chosen"] = tuple(float(front.measure(name)[chosen]) for name in CRITERIA)
         marks |= {} if knee is None else {GREW: knee}
         marks |= references

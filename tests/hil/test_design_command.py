@@ -44,7 +44,7 @@ generations = 2
 
 @pytest.fixture(scope="module")
 def drawing():
-    """What draws the page; `made` and Ctrl-C draw the real one, all else saves the seconds."""
+    """Replacement of the slow drawing; `made` and Ctrl-C tests draw the page."""
     return design_picture.draw_design
 
 
@@ -71,7 +71,7 @@ def invoke(drawing):
 
 @pytest.fixture(scope="module")
 def bare(invoke, tmp_path_factory):
-    """A design with joint limits only, as JSON; tests only read it."""
+    """A design with joint limits only and its JSON output, read only."""
     root = tmp_path_factory.mktemp("bare")
     (root / "my.toml").write_text(SETTINGS)
     arguments = ("--settings", root / "my.toml", "--kinematic", "-o", root / "out", "--json")
@@ -80,7 +80,7 @@ def bare(invoke, tmp_path_factory):
 
 @pytest.fixture
 def copied(bare, tmp_path) -> Path:
-    """The same, to be changed."""
+    """A copy of it."""
     return Path(shutil.copytree(bare[0], tmp_path / "copied"))
 
 
@@ -93,7 +93,7 @@ def settings(tmp_path) -> Path:
 
 @pytest.fixture(scope="module")
 def made(invoke, drawing, tmp_path_factory):
-    """A design of a real cell's motion: all its constraints on."""
+    """A design with all constraints."""
     root = tmp_path_factory.mktemp("made")
     (root / "my.toml").write_text(SETTINGS)
     given = ("--settings", root / "my.toml", "-o", root / "out", "--seed", 3)
@@ -102,7 +102,7 @@ def made(invoke, drawing, tmp_path_factory):
     return root / "out", result.output
 
 
-def test_leaves_motion_picture_settings_and_journal(made):
+def test_motion_picture_settings_and_journal_are_written(made):
     folder, output = made
     files = {"excitation.toml", "excitation.png", "settings.toml", "search.journal"}
     files |= {"cell.toml", "robot.urdf", "plan.json", "manifest.json", "archives"}
@@ -118,7 +118,7 @@ def test_leaves_motion_picture_settings_and_journal(made):
     assert 0.02 < np.mean(np.any(pixels[..., :3] < 0.8, axis=2)) < 0.6
 
 
-def test_the_motion_keeps_the_constraints_of_the_cell_and_returns_home(made):
+def test_the_motion_satisfies_the_constraints_and_is_closed(made):
     cell = Cell.load(CELL_PATH)
     excitation = load_design(made[0], cell)
     ends = excitation.trajectory.sample(np.array([0.0, excitation.trajectory.duration]))
@@ -130,14 +130,14 @@ def test_the_motion_keeps_the_constraints_of_the_cell_and_returns_home(made):
     assert MotionChecks.of(cell).refusal(excitation.trajectory) is None
 
 
-def test_one_seed_is_one_file_whatever_the_number_of_processes(invoke, made, settings, tmp_path):
+def test_the_result_does_not_depend_on_the_number_of_processes(invoke, made, settings, tmp_path):
     arguments = ("--settings", settings, "--seed", 3, "-o", tmp_path / "out", "--workers", 3)
     assert invoke(CELL_PATH, *arguments).exit_code == 0
     one, three = (folder / "excitation.toml" for folder in (made[0], tmp_path / "out"))
     assert one.read_bytes() == three.read_bytes()
 
 
-def test_an_earlier_design_is_not_overwritten_unless_asked_to(invoke, settings, copied):
+def test_an_earlier_design_is_only_overwritten_with_force(invoke, settings, copied):
     arguments = (CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--seed", 5)
     before = (copied / "excitation.toml").read_bytes()
     with pytest.raises(InputError, match=r"has a design already.*--resume.*--force"):
@@ -149,14 +149,14 @@ def test_an_earlier_design_is_not_overwritten_unless_asked_to(invoke, settings, 
     assert (copied / "notes.txt").read_text() == "mine"
 
 
-def test_settings_that_cannot_be_used_cost_no_earlier_design(invoke, settings, copied):
+def test_invalid_settings_do_not_remove_an_earlier_design(invoke, settings, copied):
     settings.write_text(SETTINGS + "[sines]\nfastest = [1.0, 2.0]\n")
     with pytest.raises(InputError, match="2 entries"):
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--force")
     load_design(copied)
 
 
-def test_what_is_not_a_design_is_never_removed(invoke, settings, tmp_path):
+def test_other_files_are_never_removed(invoke, settings, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "settings.toml").write_text("mine = true\n")
@@ -167,7 +167,7 @@ def test_what_is_not_a_design_is_never_removed(invoke, settings, tmp_path):
 
 
 @pytest.mark.parametrize("option", [(), ("--force",), ("--resume",)])
-def test_a_folder_in_which_a_search_is_running_is_left_alone(invoke, settings, copied, option):
+def test_a_locked_folder_is_refused(invoke, settings, copied, option):
     def content():
         return {path.name: path.read_bytes() for path in copied.iterdir()}
 
@@ -180,10 +180,10 @@ def test_a_folder_in_which_a_search_is_running_is_left_alone(invoke, settings, c
         invoke(CELL_PATH, *given, "-o", copied, *option)
     assert "--force" not in str(caught.value)
     assert content() == before
-    invoke(CELL_PATH, "--resume", "-o", copied)  # nobody is there any more
+    invoke(CELL_PATH, "--resume", "-o", copied)
 
 
-def test_the_folder_is_held_until_the_picture_is_drawn(invoke, copied):
+def test_the_folder_is_locked_until_the_picture_is_drawn(invoke, copied):
     def meanwhile(*_, **__):
         with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).locked():
             pass
@@ -192,7 +192,7 @@ def test_the_folder_is_held_until_the_picture_is_drawn(invoke, copied):
     invoke(CELL_PATH, "--resume", "-o", copied, draw=meanwhile)
 
 
-def test_a_file_system_without_locks_is_no_other_search(invoke, settings, tmp_path, monkeypatch):
+def test_a_file_system_without_locks_is_reported(invoke, settings, tmp_path, monkeypatch):
     def refused(*_):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
@@ -223,7 +223,7 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
     assert not list(copied.glob("*.tmp"))
 
 
-def test_a_search_that_ends_early_says_why(invoke, settings, tmp_path):
+def test_an_exhausted_search_is_reported(invoke, settings, tmp_path):
     settings.write_text(SETTINGS + "crossover = 0.0\nmutation = 0.0\n")
     given = (CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
     output = invoke(*given).output
@@ -232,14 +232,14 @@ def test_a_search_that_ends_early_says_why(invoke, settings, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["a", "b", "balanced", "front"])
-def test_settings_are_shown_as_a_file_to_begin_with(invoke, method):
+def test_show_settings_prints_the_preset(invoke, method):
     result = invoke("--show-settings", method)
     assert result.exit_code == 0
     assert result.output == preset_text(method)
     assert tomllib.loads(result.output)["method"] == method
 
 
-def test_json_says_the_same_as_the_file(bare):
+def test_json_agrees_with_the_file(bare):
     printed, found = json.loads(bare[1]), DesignResult.load(bare[0])
     for name in ("log10_det", "coupling_index", "condition"):
         assert printed[name] == getattr(found.excitation.criteria, name)
@@ -249,7 +249,7 @@ def test_json_says_the_same_as_the_file(bare):
     assert not (kept.closed or kept.collision or kept.current)
 
 
-def test_a_finished_search_resumed_is_the_same_file_and_quiet_leaves_one_line(invoke, bare, copied):
+def test_resuming_a_complete_search_gives_the_same_file(invoke, bare, copied):
     (copied / "excitation.toml").unlink()
     output = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet")
     assert len(output.stdout.splitlines()) == 1
@@ -257,7 +257,7 @@ def test_a_finished_search_resumed_is_the_same_file_and_quiet_leaves_one_line(in
     assert (copied / "excitation.toml").read_bytes() == whole
 
 
-def test_a_bare_series_is_said_to_be_for_looking_only(invoke, tmp_path):
+def test_sines_without_a_ramp_are_reported(invoke, tmp_path):
     path = tmp_path / "bare.toml"
     path.write_text('method = "a"\n[search]\npopulation = 8\ngenerations = 1\n[sines]\nramp = 0\n')
     output = invoke(CELL_PATH, "--settings", path, "--kinematic", "-o", tmp_path / "o").output
@@ -280,9 +280,7 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
 
-def test_a_wall_that_home_touches_is_named_with_depth_before_anything_is_tried(
-    invoke, settings, tmp_path
-):
+def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_path):
     cell = Cell.load(CELL_PATH)
     wall = "walls = [{lower = [0.3, -2.0, 0.8], upper = [0.4, 2.0, 2.5]}]"
     (tmp_path / "cell.toml").write_text(cell.text.replace("walls = []", wall))
@@ -332,7 +330,7 @@ def test_a_search_is_not_resumed_with_other_settings_or_another_cell(invoke, bar
 
 
 class Seen:
-    """What the page is asked to show."""
+    """Arguments of the drawing."""
 
     def __init__(self) -> None:
         self.drawn: dict = {}
@@ -352,7 +350,7 @@ def test_other_designs_are_named_on_the_front(made, bare, invoke, copied):
     }
 
 
-def test_what_was_not_looked_at_is_in_picture_json_and_stderr_however_quiet(invoke, bare, copied):
+def test_unchecked_constraints_are_in_picture_json_and_stderr(invoke, bare, copied):
     unchecked = ["floor", "walls", "the arm itself", "motor currents"]
     seen = Seen()
     said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
@@ -371,14 +369,14 @@ def test_a_real_cells_motion_is_drawn_with_its_margins(invoke, made, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["excitation.toml", "settings.toml"])
-def test_the_settings_of_an_earlier_design_are_taken_from_its_file(invoke, bare, tmp_path, name):
+def test_settings_are_read_from_a_result_file(invoke, bare, tmp_path, name):
     out = tmp_path / "out"
     assert invoke(CELL_PATH, "--settings", bare[0] / name, "-o", out).exit_code == 0
     one, two = (folder / "excitation.toml" for folder in (bare[0], out))
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_what_is_no_finite_number_is_null(bare):
+def test_numbers_that_are_not_finite_are_null(bare):
     result = DesignResult.load(bare[0])
     criteria = replace(
         result.excitation.criteria, log10_det=-np.inf, coupling_index=np.inf, condition=np.nan
@@ -390,7 +388,7 @@ def test_what_is_no_finite_number_is_null(bare):
     assert [printed[name] for name in CRITERIA] == [None, None] and printed["condition"] is None
 
 
-def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeypatch):
+def test_parameters_that_are_hardly_separated_are_named(invoke, copied, monkeypatch):
     monkeypatch.setattr("hil.cli.design.weakest", lambda *_: pytest.fail("named for a fine motion"))
     invoke(CELL_PATH, "--resume", "-o", copied)
     monkeypatch.setattr("hil.cli.design.WEAK", 1.0)
@@ -400,7 +398,7 @@ def test_parameters_that_are_hardly_told_apart_are_named(invoke, copied, monkeyp
     )
 
 
-def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
+def test_a_stop_without_a_motion_is_an_operator_stop():
     settings = preset("b").kinematic()
     with pytest.raises(OperatorStopError, match="stopped before a feasible motion") as caught:
         run_search(Cell.load(CELL_PATH), settings, Silent(), workers=1, stop=lambda: True)
@@ -410,7 +408,7 @@ def test_stopped_before_there_is_a_motion_is_a_stop_and_no_refusal():
 def interrupted(
     command: list[str], journal: Path, kind: signal.Signals = signal.SIGINT
 ) -> tuple[int, str]:
-    """Run a search, interrupt it once it has journalled three generations."""
+    """Run a search and interrupt it after three generations in the journal."""
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as run:
@@ -424,7 +422,7 @@ def interrupted(
     return run.returncode, said
 
 
-def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(invoke, tmp_path):
+def test_ctrl_c_writes_the_best_motion_and_resume_continues(invoke, tmp_path):
     settings = tmp_path / "my.toml"
     settings.write_text(SETTINGS.replace("generations = 2", "generations = 25"))
     arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic"]
@@ -442,7 +440,7 @@ def test_ctrl_c_leaves_the_best_so_far_and_resuming_ends_where_it_would_have(inv
 
 
 @pytest.mark.slow
-def test_whoever_ends_the_process_gets_the_best_so_far(tmp_path):
+def test_sigterm_writes_the_best_motion(tmp_path):
     settings, out = tmp_path / "my.toml", tmp_path / "out"
     settings.write_text(SETTINGS.replace("generations = 2", "generations = 2000"))
     arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic", "-o", str(out)]
@@ -452,7 +450,7 @@ def test_whoever_ends_the_process_gets_the_best_so_far(tmp_path):
     assert not DesignResult.load(out).complete
 
 
-def test_ctrl_c_while_it_is_still_loading_leaves_no_traceback():
+def test_ctrl_c_during_start_up_has_no_traceback():
     script = """
 import os, signal, sys
 class Interrupting:

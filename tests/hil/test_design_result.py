@@ -1,4 +1,4 @@
-"""Sequential design: what earlier archives say joins what the new motion is going to say."""
+"""Result files of designs, comparison of designs, and sequential design."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_file_restores_everything(made, ns16):
     assert "polished_from" not in again.data
 
 
-def test_its_criteria_are_those_of_the_motion_at_a_millisecond(made, ns16):
+def test_criteria_are_sampled_every_millisecond(made, ns16):
     excitation = load_design(made[0].result)
     again = Objective(ns16.model).criteria(excitation.trajectory, 0.001)
     assert again == excitation.criteria
@@ -87,7 +87,7 @@ def test_its_criteria_are_those_of_the_motion_at_a_millisecond(made, ns16):
     assert excitation.criteria.scaled_condition is not None
 
 
-def test_a_motion_through_via_points_shows_its_moves_and_sines_their_amplitudes(made, text):
+def test_the_file_has_moves_or_amplitudes(made, text):
     sines = isinstance(made[1].design.excitation.trajectory, FourierSeries)
     assert len(text) < 20_000 and "coupling_index_max = 1653.0" in text
     assert ("amplitude_deg" in text) == sines
@@ -105,7 +105,7 @@ def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
 
 
 def resealed(text: str) -> str:
-    """The text with the seal that belongs to what it says now."""
+    """Return the text with a matching seal."""
     new, count = re.subn(r'(?m)^sha256 = "\w+"', f'sha256 = "{_seal(text)}"', text)
     assert count == 1
     return new
@@ -118,8 +118,8 @@ def resealed(text: str) -> str:
         *('seed = "1"', "method = 3", "complete = 1"),
     ],
 )
-def test_figures_that_are_none_are_refused(text, tmp_path, line):
-    """Even with the seal that belongs to them."""
+def test_invalid_numbers_are_refused(text, tmp_path, line):
+    """With a matching seal."""
     changed, count = re.subn(rf"(?m)^{line.partition(' ')[0]} = .*$", line, text, count=1)
     assert count == 1
     with pytest.raises(InputError, match=r"excitation\.toml: .*design it again"):
@@ -146,12 +146,12 @@ def test_another_file_is_refused(text, tmp_path, old, new, words):
     assert "design it again" in str(caught.value)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(InputError, match=r"excitation\.toml: cannot be read"):
         load_design(tmp_path)
 
 
-def test_another_planner_may_differ_in_the_last_digits_and_no_more(made, text, tmp_path):
+def test_a_motion_may_differ_by_rounding_only(made, text, tmp_path):
     other = re.sub(r'motion_sha256 = "\w+"', 'motion_sha256 = "0"', text)
     assert load_design(written(tmp_path, other)).to_dict() == made[1].design.excitation.to_dict()
     elsewhere = re.sub(r"(positions_deg = \[\[)[^,]+", r"\g<1>45.0", other)
@@ -203,11 +203,11 @@ def test_a_subset_and_a_polish_are_recorded(ns16, tmp_path):
     assert grown["point"] == design.origin
     before = (grown["log10_det"], grown["coupling_index"])
     assert before == design.origin_criteria.measures
-    # never worse in either, by the millisecond
+    # not worse in either, sampled every millisecond
     assert criteria.log10_det >= before[0] and criteria.coupling_index <= before[1]
 
 
-def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
+def test_special_files_in_a_folder_are_refused(tmp_path):
     folder = DesignFolder(tmp_path)
     os.mkfifo(folder.settings)
     with pytest.raises(InputError, match="has no design to resume"):
@@ -219,7 +219,7 @@ def test_what_is_no_file_in_a_folder_is_neither_waited_for_nor_read(tmp_path):
         folder.journal.unlink()
 
 
-# Only what means the same is compared.
+# Comparison of designs.
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +242,7 @@ def changed(result: DesignResult, **tables: Any) -> DesignResult:
     return replace(result, data={**result.data, **tables})
 
 
-def test_what_was_searched_without_looking_at_everything_is_marked(ns16, result, saved):
+def test_designs_without_all_checks_are_marked(ns16, result, saved):
     path = saved(result)
     found = references([path, path], ns16, preset("b"), together=False)
     name, measures = "method A (kinematic)", result.excitation.criteria.measures
@@ -258,7 +258,7 @@ def test_another_robot_is_refused(ns16, result, saved):
         references([saved(result)], heavier, preset("b"), together=False)
 
 
-def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(ns16, result, saved):
+def test_sequential_and_single_designs_are_not_compared(ns16, result, saved):
     archives = changed(result, earlier={"archives": [["a.mcap", "0" * 64]]})
     with pytest.raises(InputError, match=r"excitation\.toml: --compare: was designed with --earl"):
         references([saved(archives)], ns16, preset("b"), together=False)
@@ -267,7 +267,7 @@ def test_what_adds_to_archives_is_not_drawn_beside_what_does_not(ns16, result, s
     assert references([], ns16, preset("b"), together=True) == {}
 
 
-def test_other_parameters_are_not_drawn_beside_all(ns16, result, saved):
+def test_criteria_of_other_parameters_are_not_compared(ns16, result, saved):
     names = list(ns16.model.parameter_names)
     some = preset("b").replaced(objective={"parameters": names[:3]})
     words = r"\.toml: --compare: has criteria of 58 parameters, this design of 3, of which"
@@ -289,7 +289,7 @@ def known(campaign, cell) -> EarlierEstimate:
 
 
 @pytest.mark.slow
-def test_joints_count_by_the_noise_of_their_torque(known, campaign):
+def test_joints_are_weighted_by_their_torque_noise(known, campaign):
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
     options = replace(FIXED, in_sample=True)
@@ -299,10 +299,9 @@ def test_joints_count_by_the_noise_of_their_torque(known, campaign):
     np.testing.assert_array_equal(known.std, pooled.std)
 
 
-def test_running_the_same_motion_again_says_about_the_same_again(excitations, cell, plan):
-    # The archives hold a sample for each cycle of 1 ms, the search takes one every 8 ms. A fit
-    # also leaves out rows near reversals, where a smoothed acceleration says little: up to one in
-    # twenty of those in which a joint accelerates.
+def test_a_repeated_motion_adds_about_the_same_information(excitations, cell, plan):
+    # The archives have one sample per ms, the search one every 8 ms. A fit also leaves out rows
+    # near reversals: up to 5 % of those in which a joint accelerates.
     known = estimate_earlier(excitations, cell, Silent())
     objective = problem_of(cell, preset("b").kinematic(), known).objective
     assert objective.repetitions == len(excitations) == 3
@@ -316,15 +315,15 @@ def excitations(campaign) -> list[Path]:
 
 
 def rows(found: EarlierEstimate) -> np.ndarray:
-    """Squares of each joint's friction columns; they depend on no weight."""
+    """Return sums of squares of each joint's friction columns, without weights."""
     of_friction = [k for k, name in enumerate(found.names) if name.startswith("f")]
     joints = [int(found.names[k].rpartition("_")[2]) - 1 for k in of_friction]
     return np.diag(found.gram)[of_friction] / found.joint_weights[joints]
 
 
 @pytest.mark.slow
-def test_every_motion_counts_whether_fitted_or_held_out(known, excitations, campaign, cell):
-    """Of three repetitions alone one is held out, of one the end; a campaign has other motions."""
+def test_fitted_and_held_out_motions_are_used(known, excitations, campaign, cell):
+    """Excitations and validation motions count, in any split."""
     three = estimate_earlier(excitations, cell, Silent())
     one = estimate_earlier(excitations[:1], cell, Silent())
     assert one.samples == pytest.approx(three.samples / 3.0, rel=0.01)
@@ -346,11 +345,11 @@ class Listening(Silent):
 
 
 @pytest.mark.slow
-def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell, run):
+def test_a_joint_at_rest_is_weighted_like_the_others(tmp_path, cell, run):
     short = cell.with_campaign(repetitions=1, validation_runs=1)
     limits, random = cell.joint_limits, np.random.default_rng(12)
     amplitude = random.uniform(-0.5, 0.5, (6, 3))
-    amplitude[5] *= 1e-3  # its peak speed stays below what counts as standstill
+    amplitude[5] *= 1e-3  # its peak speed is below standstill
     series = FourierSeries(
         offset=0.5 * (limits.lower + limits.upper),
         amplitude=amplitude,
@@ -370,7 +369,7 @@ def test_a_joint_that_stood_is_weighted_like_the_others_and_named(tmp_path, cell
     strength = np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
     share = known.joint_weights**-0.5 / strength
     assert share[5] == pytest.approx(np.median(share[:5]))
-    # A design with it asks for what is missing: the sixth joint's parameters.
+    # A design with it excites the sixth joint.
     assert np.isinf(known.std[known.names.index("f0_6")])
     assert known.gram[known.names.index("f0_6")].tolist() == [0.0] * len(known.names)
     problem = problem_of(cell, preset("b").kinematic(), known)
@@ -400,7 +399,7 @@ def test_a_folder_without_archives_is_refused(tmp_path, cell):
 
 
 @pytest.mark.slow
-def test_a_second_design_names_what_it_adds_to(campaign, tmp_path, monkeypatch):
+def test_a_sequential_design_lists_its_archives(campaign, tmp_path, monkeypatch):
     drawn = {}
 
     def draw(*_, **asked):

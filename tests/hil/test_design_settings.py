@@ -1,4 +1,4 @@
-"""What is said where a search finds no motion, and of a motion beside its criteria."""
+"""Settings of designs, search problems of cells, and messages about motions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def cell() -> Cell:
     return Cell.load(CELL_PATH)
 
 
-def test_methods_have_the_papers_figures():
+def test_presets_have_the_values_of_table_1():
     a, b = preset("a"), preset("b")
     assert (a.search.population, a.search.generations) == (100, 120)
     assert (a.search.mutation, a.search.crossover, a.search.polish) == (0.01, 0.7, 0)
@@ -68,8 +68,8 @@ def test_presets_are_files_with_all_constraints_on(method, tmp_path):
     assert load_settings(path) == changed
 
 
-def test_a_file_may_leave_out_what_its_method_says_already():
-    """Sines can be searched by any method, via points by method A."""
+def test_missing_settings_are_those_of_the_preset():
+    """All methods can search both kinds of motion."""
     assert settings_of({"method": "b"}) == preset("b")
     assert settings_of({}) == preset("front")
     mine = settings_of({"method": "b", "via_points": {"n_via": 9}})
@@ -118,7 +118,7 @@ def test_a_file_may_leave_out_what_its_method_says_already():
         ("[search\n", ["is not TOML", "--show-settings"]),
     ],
 )
-def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_path):
+def test_invalid_settings_name_file_field_value_and_remedy(text, words, tmp_path):
     path = tmp_path / "my.toml"
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
@@ -132,7 +132,7 @@ def test_nonsense_is_refused_with_file_field_value_and_remedy(text, words, tmp_p
         load_settings(tmp_path / "none.toml")
 
 
-def test_via_points_lead_home_unless_the_path_is_open(cell):
+def test_motions_through_via_points_are_closed_by_default(cell):
     closed = problem_of(cell, preset("b")).genome
     np.testing.assert_array_equal(closed.home, cell.home)
     open_path = problem_of(cell, preset("b").kinematic())
@@ -142,7 +142,7 @@ def test_via_points_lead_home_unless_the_path_is_open(cell):
 
 
 def test_sines_have_the_papers_frequencies_or_those_of_the_limits(cell):
-    """Offsets are in the frame of the limits; a bare series is not asked to rest."""
+    """Offsets are in the frame of the limits; sines without a ramp need not rest."""
     settings, limits = preset("a").kinematic(), cell.joint_limits
     slowest, fastest = problem_of(cell, settings).genome.frequency_range
     np.testing.assert_array_equal(slowest, np.full(6, 0.314))
@@ -169,7 +169,7 @@ def test_an_offset_outside_the_limits_is_named_as_it_was_written(cell):
     assert "teach pendant angles" in text and "rad" not in text
 
 
-def test_what_is_not_looked_at_is_named():
+def test_unchecked_constraints_are_named():
     assert preset("b").unchecked == preset("a").unchecked == ()
     everything = ("floor", "walls", "the arm itself", "motor currents")
     assert preset("b").kinematic().unchecked == everything
@@ -177,7 +177,7 @@ def test_what_is_not_looked_at_is_named():
     assert bare.unchecked == ("motor currents", "rest at both ends")
 
 
-def test_named_parameters_are_the_ones_that_count(cell):
+def test_listed_parameters_are_in_the_criteria(cell):
     names = cell.model.parameter_names
     settings = preset("b").kinematic()
     chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
@@ -188,7 +188,7 @@ def test_named_parameters_are_the_ones_that_count(cell):
             problem_of(cell, settings.replaced(objective={"parameters": wrong}))
 
 
-def test_a_cell_without_drives_can_be_designed_for_as_far_as_its_joints_go():
+def test_a_cell_without_drive_train_has_torque_limits_only():
     cell = Cell.load(CELL_PATH)
     start, end = cell.text.index("[nominal]"), cell.text.index("[limits]")
     without = Cell.from_texts(cell.text[:start] + cell.text[end:], cell.urdf, cell.path)
@@ -202,7 +202,7 @@ def known_of(names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> Ear
     return EarlierEstimate(names, values, std, np.ones(6), np.eye(p), samples=100, repetitions=30)
 
 
-def test_what_is_known_too_badly_is_left_out(cell):
+def test_parameters_with_a_large_deviation_are_left_out(cell):
     names, p = cell.model.parameter_names, cell.model.n_parameters
     known = known_of(names, np.full(p, -2.0), np.linspace(0.01, 3.0, p))
     settings = preset("b").kinematic().replaced(objective={"max_relative_std": 30.0})
@@ -247,14 +247,14 @@ def test_text_restores_every_bit(angles, numbers, words, key):
 
 class TestPayload:
     @pytest.mark.parametrize("method", METHODS)
-    def test_a_load_is_weighed_by_a_motion_of_ten_seconds(self, method):
+    def test_a_motion_for_a_payload_takes_ten_seconds(self, method):
         asked = preset(method).for_payload()
         assert asked.objective.parameters == "payload"
         assert asked.constraints.max_duration == 10.0
         assert asked.sines is None or asked.sines.length <= 10.0
 
-    def test_ten_parameters_of_the_load_are_judged(self, cell):
-        """All else is known: the regressor of the load alone, as its torque is computed."""
+    def test_the_objective_has_ten_parameters_of_the_payload(self, cell):
+        """The regressor is that of the load alone."""
         objective = problem_of(cell, preset("front").for_payload()).objective
         assert objective.n_parameters == 10
         rng = np.random.default_rng(2)
@@ -264,15 +264,15 @@ class TestPayload:
         torque = objective.model.torque(load.parameters, q, qd, qdd)
         np.testing.assert_allclose(torque, expected, atol=1e-9)
 
-    def test_what_no_motion_tells_apart_is_left_out(self):
-        """Two joints about y feel mass, moments in their plane and Iyy."""
+    def test_parameters_that_no_motion_separates_are_left_out(self):
+        """Mass, moments in the plane and Iyy act on two joints about y."""
         flat = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
         objective = problem_of(flat, preset("front").for_payload()).objective
         assert objective.parameters is not None
         names = [objective.model.parameter_names[k] for k in objective.parameters]
         assert names == ["Iyy", "mcx", "mcz", "m"]
 
-    def test_earlier_archives_add_nothing(self, cell):
+    def test_earlier_archives_are_refused(self, cell):
         names = cell.model.parameter_names
         known = known_of(names, np.ones(len(names)), np.ones(len(names)))
         with pytest.raises(SettingsError, match=r"known.*leave out --earlier"):
@@ -302,13 +302,13 @@ def advised(*arguments, **more) -> str:
 @pytest.mark.parametrize(
     ("settings", "rejected", "more", "words", "absent"),
     [
-        # Every kind that forbids more than half.
+        # Every kind that excludes more than half.
         (VIA, {"collision": 900, "current": 501}, {}, ("range_share", "current limits"), ""),
         (VIA, {"collision": 900, "current": 500}, {}, ("range_share",), "current limits"),
         (VIA, {"collision": 400, "current": 450}, {}, ("current limits",), "range_share"),
         (VIA, {"collision": 1000}, {}, ("[via_points]",), "evaluate more"),
         (VIA, {"current": 1000}, {}, ("[via_points]",), "evaluate more"),
-        # About sines for sines, and after a tiny search a longer one.
+        # Sines have other remedies; after a small search a larger one is proposed.
         (SINES, {"collision": 1000}, {}, ("[sines] offset",), "via"),
         (SINES, {"current": 1000}, {}, ("[sines] slowest, fastest",), "via"),
         (VIA, {"collision": 24}, {"tried": 24}, ("evaluate more than 24 motions",), "nan"),
@@ -316,7 +316,7 @@ def advised(*arguments, **more) -> str:
          "range_share"),
     ],
 )  # fmt: skip
-def test_what_forbids_most_gets_advice(cell, settings, rejected, more, words, absent):
+def test_frequent_violations_have_remedies(cell, settings, rejected, more, words, absent):
     nearest = [one for one in (CONTACT, CURRENT) if one.kind in rejected]
     advice = advised(cell, settings, rejected, nearest, **more)
     assert all(word in advice for word in words)
@@ -332,7 +332,7 @@ def test_what_forbids_most_gets_advice(cell, settings, rejected, more, words, ab
         (20.3, (19.9, 20.0), "allowed are 19.9 to 20 s: allow more time", True),
     ],
 )
-def test_a_duration_is_reported_with_what_is_asked_for(cell, value, asked, words, longer):
+def test_a_duration_is_reported_with_its_limits(cell, value, asked, words, longer):
     settings = VIA.replaced(constraints={"min_duration": asked[0], "max_duration": asked[1]})
     bound = asked[value > asked[1]]
     advice = advised(cell, settings, {"duration": 100}, [duration(value, bound)], tried=100)
@@ -347,7 +347,7 @@ def test_the_closest_motion_has_one_violation_of_each_kind(cell):
     assert breaks.count("current of") == 1
 
 
-def test_currents_that_home_needs_are_refused_at_once(cell):
+def test_too_large_currents_at_home_are_reported(cell):
     limits = cell.drive_train.current_limit.tolist()
     limits[1] = 0.1
     weak = cell.with_values({"drive_train.current_limit": limits})
@@ -363,7 +363,7 @@ def test_currents_that_home_needs_are_refused_at_once(cell):
         problem_of(cell, folded)
 
 
-# A motion that was found
+# Margins and weak directions of a motion
 
 
 def swinging(cell: Cell, joints: list[int], frequency: float = 1.0) -> FourierSeries:
@@ -382,9 +382,9 @@ def test_margins_name_the_motor_and_the_pair(cell):
     currents, pair = found.split("; ")
     assert currents.startswith("current at most ") and "% of its limit (motor of joint_" in currents
     assert pair.startswith("nearest 0.") and "(link_" in pair
-    assert margins(cell, problem_of(cell, preset("b").kinematic()), motion) == ""  # not looked at
+    assert margins(cell, problem_of(cell, preset("b").kinematic()), motion) == ""  # not checked
 
-    # The checks agree: with a limit that little lower, or a margin that little wider, it is broken.
+    # The checks agree: a slightly lower limit or wider margin is violated.
     share = float(currents.split()[3]) / 100.0
     checks = MotionChecks.of(cell)
     for factor, ok in ((share + 0.01, True), (share - 0.01, False)):
@@ -410,7 +410,7 @@ def test_the_nearest_pair_is_no_contact_even_where_the_margin_is_narrow(cell):
     assert contact is not None and (contact.first, contact.second) == (first, second)
 
 
-def test_what_a_motion_cannot_tell_apart_is_named(cell):
+def test_weakly_excited_parameters_are_named(cell):
     still = weakest(Objective(cell.model), swinging(cell, [0, 1, 2, 3, 4]))
     assert {"I6zz", "f0_6", "f1_6"} & set(still)
     names = cell.model.parameter_names

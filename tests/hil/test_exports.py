@@ -1,6 +1,4 @@
-"""The identified model in a user's tools: what is written can be relied on, or is not written.
-
-And `hil export`: files for simulators, and variants that differ as the parameters are uncertain."""
+"""Files of the identified model, and `hil export`: files for simulators, ensembles."""
 
 from __future__ import annotations
 
@@ -82,15 +80,13 @@ def parameters_of(arm: IdentifiedArm, folder: Path) -> dict[str, Any]:
 
 
 def command(*words: object) -> Any:
-    """`hil` with these words; a verdict may be good or not."""
+    """Run `hil` with these arguments, with any verdict."""
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code in (0, 5), result.output
     return result
 
 
-def test_six_files_are_written_and_say_where_they_come_from(
-    arm: IdentifiedArm, tmp_path: Path
-) -> None:
+def test_six_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -> None:
     found = exported(arm, tmp_path)
     assert ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
     assert not found.withheld
@@ -126,7 +122,7 @@ def any_arm(request: pytest.FixtureRequest) -> IdentifiedArm:
 def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
     any_arm: IdentifiedArm, tmp_path: Path
 ) -> None:
-    """By files alone: pinocchio on the URDF, numbers of the JSON, friction of a bare process."""
+    """From the files: pinocchio on the URDF, JSON, friction source in a separate interpreter."""
     parameters = parameters_of(any_arm, tmp_path)
     model, consistent = any_arm.cell.model, any_arm.consistency.consistent
     motion = a_motion(model.n_joints, seed=5)
@@ -142,7 +138,7 @@ def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
 
 
 def rigid_torque(urdf: Path, parameters: dict[str, Any], q: Array, qd: Array, qdd: Array) -> Array:
-    """Inverse dynamics by pinocchio, joints by name, locked ones held."""
+    """Return pinocchio's inverse dynamics with locked joints."""
     model = pin.buildModelFromUrdf(str(urdf))
     held = pin.neutral(model)
     for name, position in parameters["locked_joints"].items():
@@ -161,7 +157,7 @@ def rigid_torque(urdf: Path, parameters: dict[str, Any], q: Array, qd: Array, qd
 
 
 def bare_friction(source: Path, speeds: Array) -> Array:
-    """Friction torques by an interpreter that sees no package at all."""
+    """Return friction torques from an interpreter without packages."""
     given = json.dumps(speeds.tolist())
     words = [sys.executable, "-I", "-S", "-c", BARE, str(source)]
     done = subprocess.run(words, input=given, capture_output=True, text=True, check=True)
@@ -173,8 +169,8 @@ def table(path: Path) -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
-def test_possible_parameters_alone_become_a_urdf(arm: IdentifiedArm, tmp_path: Path) -> None:
-    """Without them an old one goes; friction is then that of the free estimate."""
+def test_only_consistent_parameters_become_a_urdf(arm: IdentifiedArm, tmp_path: Path) -> None:
+    """Otherwise an old URDF is removed; friction is that of the free estimate."""
     exported(arm, tmp_path)
     (tmp_path / "mine.urdf").write_text("kept")
     found = write_exports(tmp_path, arm.cell, arm.estimate, "the solver gave up")
@@ -194,7 +190,7 @@ def test_possible_parameters_alone_become_a_urdf(arm: IdentifiedArm, tmp_path: P
 
 
 def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
-    """Neither those of archives nor those in a URDF."""
+    """Names of archives and in a URDF."""
     evil = {"archives": 'a --> ---> <robot> """ \x00\x1b[2J\nimport os\udc80 b', "robot": "€"}
     write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent, provenance=evil)
     model = arm.cell.model
@@ -224,7 +220,7 @@ def test_provenance_has_digests_and_the_verdict(tmp_path: Path, good: bool, word
     assert found["robot"] == results.cell
 
 
-def test_a_joint_that_never_moved_keeps_its_description(tmp_path: Path) -> None:
+def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
     arm = identified_arm(SLIDER, still=(1,))
     assert {"f0_2", "f1_2"} <= set(arm.estimate.undetermined)
     exported(arm, tmp_path)
@@ -245,7 +241,7 @@ def test_a_joint_that_never_moved_keeps_its_description(tmp_path: Path) -> None:
     assert np.abs(consistent.standard).max() < 100.0
 
 
-# docs/results.md names every field, and its program runs as it stands
+# docs/results.md explains every field; its programs run unchanged
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "results.md"
 CODE = re.compile(r"```(\w+)\n(.*?)```", re.S)
@@ -261,7 +257,7 @@ def named(text: str) -> set[str]:
 
 
 def fields(model: type[BaseModel]) -> Iterator[str]:
-    """Names of all fields, those of nested models included."""
+    """Return the names of all fields, with those of nested models."""
     for name, info in model.model_fields.items():
         yield name
         pending = [info.annotation]
@@ -285,7 +281,7 @@ def test_every_file_and_field_is_explained(text: str, arm: IdentifiedArm) -> Non
 def test_the_python_example_predicts_the_torque_of_the_model(
     text: str, arm: IdentifiedArm, tmp_path: Path
 ) -> None:
-    """Word for word, in a process of its own, on the files alone."""
+    """Verbatim, in a separate process, from the files."""
     folder = tmp_path / "runs" / "demo"
     folder.mkdir(parents=True)
     write_exports(folder, arm.cell, arm.estimate, arm.consistency.consistent)
@@ -302,7 +298,7 @@ def test_the_python_example_predicts_the_torque_of_the_model(
 def test_the_formula_for_the_centre_of_mass_is_that_of_the_urdf(
     arm: IdentifiedArm, tmp_path: Path
 ) -> None:
-    """Reading standard.csv as the document says gives the inertial of the written URDF."""
+    """standard.csv with the documented formula gives the inertial of the written URDF."""
     write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent)
     root = ElementTree.parse(tmp_path / "identified.urdf").getroot()
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
@@ -343,10 +339,10 @@ def log(arm: IdentifiedArm, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestEnsemble:
-    """Variants are possible machines that spread as the covariance says."""
+    """Variants are consistent and have the covariance of the estimate."""
 
     def test_torque_spreads_as_wide_as_its_interval(self, arm: IdentifiedArm) -> None:
-        """A standard deviation from 200 variants is known to 5 %: three times that is allowed."""
+        """A standard deviation of 200 variants has an error of 5 %; three times that is allowed."""
         variants = sample_ensemble(arm.cell.model, arm.estimate, 200, 1)
         motion, consistent = a_motion(2, 7), arm.consistency.consistent
         spread = spread_of(arm_of(arm.cell, consistent), variants, arm.estimate.covariance, motion)
@@ -357,7 +353,7 @@ class TestEnsemble:
 
     @pytest.mark.parametrize("factor", [1.0, 1e6])
     def test_every_variant_is_a_possible_machine(self, arm: IdentifiedArm, factor: float) -> None:
-        """Also where the intervals reach far beyond what is possible."""
+        """Also with intervals far beyond consistent values."""
         model = arm.cell.model
         wide = replace(arm.estimate, covariance=factor * arm.estimate.covariance)
         variants = sample_ensemble(model, wide, 20, 1)
@@ -383,7 +379,7 @@ class TestEnsemble:
 
 
 class TestCommand:
-    """What the command leaves and says."""
+    """Files and output of the command."""
 
     def test_an_arm_and_its_variants(self, log: Path, tmp_path: Path) -> None:
         output = tmp_path / "deep" / "arm.sdf"
@@ -420,7 +416,7 @@ class TestCommand:
     def test_a_replay_goes_into_a_report_of_the_same_parameters(
         self, log: Path, tmp_path: Path
     ) -> None:
-        """Not into that of another estimate, and a new identification takes it out."""
+        """Not into that of another estimate; a new identification removes it."""
         (tmp_path / log.name).write_bytes(log.read_bytes())
         reports = []
         few = ("replay", "--ensemble", "2")

@@ -62,7 +62,7 @@ def via(tmp_path):
     return path
 
 
-def test_says_how_each_via_point_is_passed(run, via):
+def test_each_via_point_is_reported(run, via):
     lines = run("--via", via, "--fly", 50).splitlines()
     assert lines[0].split()[:3] == ["target", "joint_1", "joint_2"]
     rows = [line.split() for line in lines[2:6]]
@@ -73,7 +73,7 @@ def test_says_how_each_via_point_is_passed(run, via):
     assert times == sorted(times) and times[0] == 0.0
 
 
-def test_degrees_are_the_teach_pendants_and_end_up_in_the_frame_of_the_urdf(run, via, cell):
+def test_degrees_are_converted_to_the_frame_of_the_urdf(run, via, cell):
     out = json.loads(run("--via", via, "--json"))
     assert out["angles"] == "controller"
     np.testing.assert_allclose(out["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
@@ -90,7 +90,7 @@ def test_fly_by_distance_and_slower_moves(run, via):
     assert slow["duration"] > 2.0 * out["duration"]
 
 
-def test_random_via_points_are_legal_and_repeatable(run):
+def test_random_via_points_are_within_limits_and_repeatable(run):
     first, second, other = (
         json.loads(run("--random", 5, "--seed", seed, "--json")) for seed in (1, 1, 2)
     )
@@ -177,14 +177,14 @@ def test_says_what_is_wrong(app, via, arguments, problem):
         ("0 0 -90 0 90 0\u00a0\n", "1 via points"),
     ],
 )
-def test_says_what_is_wrong_with_via_points(app, tmp_path, text, problem):
+def test_invalid_via_points_are_reported(app, tmp_path, text, problem):
     path = tmp_path / "via.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=problem):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
 
 
-def test_a_byte_order_mark_is_no_part_of_the_start(run, via, tmp_path):
+def test_a_byte_order_mark_is_ignored(run, via, tmp_path):
     plain, marked = tmp_path / "plain.csv", tmp_path / "marked.csv"
     plain.write_text(VIA.split("\n", 2)[2])
     marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
@@ -193,7 +193,7 @@ def test_a_byte_order_mark_is_no_part_of_the_start(run, via, tmp_path):
 
 @pytest.mark.parametrize("suffix", ["toml", "json"])
 def test_a_motion_that_is_not_that_of_its_moves_is_refused(app, run, via, tmp_path, suffix):
-    """Limits may be left out where they are the cell's, and the motion where it is planned anew."""
+    """Limits of the cell and the planned motion may be left out."""
     path, edited = tmp_path / "plan.json", tmp_path / f"edited.{suffix}"
     out = run("--via", via, "--output", path)
     data = json.loads(path.read_text())
@@ -218,7 +218,7 @@ ruckig.Ruckig = Crashing
 
 
 @pytest.mark.parametrize("how", ["via", "file"])
-def test_a_solver_that_crashes_is_one_sentence(run, via, tmp_path, how):
+def test_a_crash_of_the_solver_is_reported(run, via, tmp_path, how):
     (tmp_path / "sitecustomize.py").write_text(CRASH)
     arguments = ["--via", str(via)]
     if how == "file":
@@ -273,7 +273,7 @@ def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
     assert np.mean(straight[inside]) < 0.2
 
 
-def test_a_plan_without_corners_is_drawn_too(cell):
+def test_a_plan_without_corners_is_drawn(cell):
     limits = cell.joint_limits
     middle = (limits.lower + limits.upper) / 2.0
     still = plan_moves(middle, [Move(middle), Move(middle)], limits)

@@ -1,4 +1,4 @@
-"""A small arm whose searches take a second, and a genome some of whose motions are deadly."""
+"""A small arm whose searches take a second, and a genome with motions that fail."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def problem(genome: Any = None, **constraints: Any) -> Problem:
 
 
 @dataclass(frozen=True, eq=False)
-class MoodyGenome:
-    """Via points, but some values of the first gene are bad for the process that plans them."""
+class FaultyGenome:
+    """Via points; some values of the first gene crash, delay or fail the planning."""
 
     inner: ViaPointGenome
     crash: tuple[float, float] = (2.0, 2.0)
     hang: tuple[float, float] = (2.0, 2.0)
     refuse: tuple[float, float] = (2.0, 2.0)
-    still: bool = False
+    elbow_at_rest: bool = False
 
     @property
     def n_genes(self) -> int:
@@ -57,12 +57,12 @@ class MoodyGenome:
             os.abort()
         if np.any(self.within(genes, self.hang)):
             time.sleep(60.0)
-        if self.still:  # the elbow at least
+        if self.elbow_at_rest:
             genes = genes.copy()
             genes[:, 1:-2:2] = 0.5
         motions: list[Any] = self.inner.motions(genes)
         for index in np.flatnonzero(self.within(genes, self.refuse)):
-            motions[index] = PlanningError("this motion cannot be")
+            motions[index] = PlanningError("planning failed")
         return motions
 
     def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
@@ -76,13 +76,13 @@ class MoodyGenome:
         return (genes[:, 0] >= bounds[0]) & (genes[:, 0] <= bounds[1])
 
 
-def moody(**moods: Any) -> MoodyGenome:
-    return replace(MoodyGenome(ViaPointGenome(LIMITS, n_via=3)), **moods)
+def faulty(**faults: Any) -> FaultyGenome:
+    return replace(FaultyGenome(ViaPointGenome(LIMITS, n_via=3)), **faults)
 
 
 def bits(design: Design) -> dict[str, Any]:
-    """Everything that a design says, arrays as bytes."""
-    said = vars(design) | {"genes": design.genes.tobytes(), "history": design.history.tobytes()}
-    said["excitation"] = design.excitation.to_dict()
-    said["front"] = [array.tobytes() for array in vars(design.front).values()]
-    return said
+    """Return the fields of a design, arrays as bytes."""
+    fields = vars(design) | {"genes": design.genes.tobytes(), "history": design.history.tobytes()}
+    fields["excitation"] = design.excitation.to_dict()
+    fields["front"] = [array.tobytes() for array in vars(design.front).values()]
+    return fields

@@ -20,7 +20,7 @@ def model() -> RobotModel:
     return RobotModel.from_urdf(urdf_text())
 
 
-def test_the_ns16_groups_exactly_as_the_papers_table_2(model: RobotModel) -> None:
+def test_the_groups_of_the_ns16_are_those_of_table_2(model: RobotModel) -> None:
     rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
     assert set(model.base.names) == set(rows)
     for name, group in zip(model.base.names, model.base.grouping, strict=True):
@@ -90,7 +90,7 @@ def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
     assert "orders of magnitude" in text
 
 
-def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:
+def test_an_unclear_rank_is_reported(model: RobotModel) -> None:
     """The first axis a ten-thousandth of a radian off gravity: more is felt, but hardly."""
     skewed = urdf_text().replace("1.5707963267948966", "1.5709")
     base = RobotModel.from_urdf(skewed).base
@@ -101,7 +101,7 @@ def test_a_rank_that_hangs_on_a_hair_is_said_to(model: RobotModel) -> None:
     assert f"whether {weakest} is independent" in base.explanation()
 
 
-def test_an_arm_without_choice_needs_no_decision() -> None:
+def test_a_full_rank_needs_no_decision() -> None:
     slider = (
         '<robot name="r"><link name="a"/><link name="b"/><joint name="s" type="prismatic">'
         '<parent link="a"/><child link="b"/><axis xyz="1 0 0"/>'
@@ -198,7 +198,7 @@ def fitted(recording: Recording, coupling: Coupling | None) -> tuple[Estimate, P
     return found, error
 
 
-def test_the_coupling_explains_what_its_rivals_say_it_does(recording: Recording) -> None:
+def test_the_coupling_explains_a_published_recording(recording: Recording) -> None:
     """Comparators, with linear friction: 10.9 % with, 14.3 % without; joint 5: 19 %, 53 %."""
     _, without = fitted(recording, None)
     _, coupled = fitted(recording, Coupling(TURNS))

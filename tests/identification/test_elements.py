@@ -1,4 +1,4 @@
-"""Springs and balancers: their torque, as known and as identified parameters of a model."""
+"""Springs and balancers with known and identified parameters."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 KR300 = Path(__file__).resolve().parents[3] / "shared" / "data" / "kr300"
 ANCHORS = Anchors(base=0.8, link=0.2, angle=math.radians(5.0))
-# A balancer of a heavy arm: 163 bar in 0.96 litres where it is 0.6 m long.
+# A balancer of a heavy arm: 163 bar in 0.96 litres at a length of 0.6 m.
 BALANCER = GasCylinder(
     "joint2",
     ANCHORS,
@@ -49,7 +49,7 @@ POSITIONS = np.linspace(-3.0, 3.0, 41)
 
 
 def apart(anchors: Anchors, q: Array) -> Array:
-    """Distance of two points in a plane, one of which turns with the joint."""
+    """Return the distance of two points in a plane, one of which rotates with the joint."""
     base = np.array([anchors.base, 0.0])
     turned = q + anchors.angle
     link = anchors.link * np.column_stack([np.cos(turned), np.sin(turned)])
@@ -66,7 +66,7 @@ def extension_energy(q: Array) -> Array:
 
 
 def gas_energy(cylinder: GasCylinder, q: Array) -> Array:
-    """Work on a gas of constant temperature, ``-p0 V0 log(V / V0)``."""
+    """Return the work on an isothermal gas, ``-p0 V0 log(V / V0)``."""
     longer = apart(cylinder.anchors, q) - cylinder.length
     volume = cylinder.volume - (longer if cylinder.pulls else -longer) * cylinder.area
     return np.asarray(-cylinder.pressure * cylinder.volume * np.log(volume / cylinder.volume))
@@ -82,10 +82,10 @@ class TestElementTorque:
             (GAS_SPRING, lambda q: gas_energy(GAS_SPRING, q)),
         ],
     )
-    def test_is_the_slope_of_an_energy(
+    def test_is_the_derivative_of_an_energy(
         self, element: Element, energy: Callable[[Array], Array]
     ) -> None:
-        """What the drive holds is the derivative of the energy that is stored."""
+        """The torque of the drive is the derivative of the stored energy."""
         h = 1e-5
         slope = (energy(POSITIONS + h) - energy(POSITIONS - h)) / (2.0 * h)
         np.testing.assert_allclose(element.known(POSITIONS), slope, rtol=1e-6, atol=1e-5)
@@ -99,7 +99,7 @@ class TestElementTorque:
         np.testing.assert_allclose(torque, element.known(POSITIONS), rtol=1e-12)
 
     def test_a_given_preload_stays_known(self) -> None:
-        """Of an identified extension spring the preload is a parameter unless it is given."""
+        """The preload of an identified spring is a parameter unless it is given."""
         both = replace(EXTENSION, preload=None, identified=True)
         one = replace(EXTENSION, identified=True)
         assert (both.symbols, one.symbols) == (("spring", "preload"), ("spring",))
@@ -108,8 +108,8 @@ class TestElementTorque:
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
 
-    def test_a_published_balancer_is_the_torque_subtracted(self) -> None:
-        """A recording with and one without its balancer differ by the formula, to rounding."""
+    def test_a_published_balancer_is_reproduced(self) -> None:
+        """A recording with and one without its balancer differ by the computed torque."""
         if not KR300.is_dir():
             pytest.skip(f"there is no recording {KR300}")
         raw, off = (
@@ -130,11 +130,11 @@ class TestElementFigures:
             (lambda: replace(BALANCER, volume=5e-4), "the gas has -0.000168 m³ left"),
         ],
     )
-    def test_impossible_ones_are_refused(self, make: Callable[[], object], words: str) -> None:
+    def test_invalid_values_are_refused(self, make: Callable[[], object], words: str) -> None:
         with pytest.raises(ModelError, match=words):
             make()
 
-    def test_joint_must_exist_and_turn(self) -> None:
+    def test_joint_must_exist_and_be_revolute(self) -> None:
         with pytest.raises(ModelError, match="no joint 'joint2'"):
             JointElements.of([TORSION], ["a"], [True])
         with pytest.raises(ModelError, match="prismatic"):
@@ -168,7 +168,7 @@ class TestElementModel:
         assert not model.friction_columns[model.element_part].any()
 
     def test_torque_adds_to_that_of_the_arm(self) -> None:
-        """W pi with elements is W pi without them plus their torque, at any chunk of samples."""
+        """W pi with elements is W pi without them plus their torque."""
         model, motion = with_elements(SPRING, GAS), two_link.a_motion()
         values = np.concatenate([two_link.truth(), [35.0, 0.8]])
         expected = two_link.MODEL.torque(two_link.truth(), *motion[1:])
@@ -181,7 +181,7 @@ class TestElementModel:
         assert other.parameter_names[other.element_part] == model.elements.names
 
     def test_ripple_turns_with_the_motor(self) -> None:
-        """Cosine and sine of each order of the motor's angle, which several joints may turn."""
+        """Cosine and sine of each order of the angle of a coupled motor."""
         motor = tuple(zip(JOINTS, (20.0, -30.0), strict=True))
         model, motion = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2))), two_link.a_motion()
         assert model.parameter_names[model.element_part] == tuple(
@@ -193,7 +193,7 @@ class TestElementModel:
         expected[:, 1] += 0.5 * np.sin(2.0 * angle + np.arctan2(0.3, 0.4))
         np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
 
-    def test_known_ones_are_load_and_no_parameter(self) -> None:
+    def test_known_elements_are_load(self) -> None:
         known = with_elements(replace(SPRING, identified=False))
         motion = two_link.a_motion(1.0)
         assert known.parameter_names == two_link.MODEL.parameter_names
@@ -202,12 +202,12 @@ class TestElementModel:
         assert not load[:, 1].any()
         assert known.has_load and not two_link.MODEL.has_load
 
-    def test_one_of_the_form_of_another_is_refused(self) -> None:
+    def test_equal_elements_are_refused(self) -> None:
         with pytest.raises(ElementError, match=r"spring_1b .* cannot be distinguished"):
             with_elements(SPRING, SPRING)
 
-    def test_one_of_the_form_of_a_weight_is_refused(self) -> None:
-        """A spring of no free length turns a pendulum as its weight does."""
+    def test_an_element_equal_to_a_weight_is_refused(self) -> None:
+        """A spring with free length zero has the torque of a weight."""
         pendulum = one_joint("revolute", axis="1 0 0")
         spring = ExtensionSpring(
             "strange", Anchors(0.8, 0.2, 0.4), free_length=0.0, preload=0.0, identified=True
@@ -246,7 +246,7 @@ class TestIdentifiedElements:
     def test_the_consistent_solution_leaves_them_free(
         self, model: RobotModel, values: Array, factor: Factor
     ) -> None:
-        """Neither inertia nor friction: a stiffness may be negative, and is not shrunk."""
+        """A stiffness may be negative and has no prior."""
         free = estimate(model, factor)
         found = consistent_estimate(model, factor, free)
         assert len(found.friction) == len(model.friction.terms)

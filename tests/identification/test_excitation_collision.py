@@ -58,7 +58,7 @@ def robot(*parts: str) -> str:
 
 
 def ball_chain(*radii: float) -> str:
-    """Balls 0.1 m apart, each on a joint of its own; radius 0 for a link without shape."""
+    """Balls 0.1 m apart, one per joint; radius 0 for a link without shape."""
     parts = [link("base")]
     for k, radius in enumerate(radii):
         shape = f'<sphere radius="{radius}"/>' if radius else ""
@@ -98,7 +98,7 @@ def test_joint_frames_are_those_of_pinocchio():
             np.testing.assert_allclose(translations[i, k], data.oMi[i].translation, atol=1e-12)
 
 
-def test_shapes_that_were_read_are_let_go_of(arm):
+def test_shapes_are_freed(arm):
     def living():
         gc.collect()
         return sum(isinstance(thing, pin.GeometryModel) for thing in gc.get_objects())
@@ -111,7 +111,7 @@ def test_shapes_that_were_read_are_let_go_of(arm):
 
 @pytest.fixture(scope="module")
 def brute(arm):
-    """The least distance of all that may meet, floor included, posture by posture."""
+    """Smallest distance of all pairs that may touch, floor included, by posture."""
     shapes = pin.buildGeomFromUrdfString(arm, urdf_text(), pin.GeometryType.COLLISION)
     floor = pin.GeometryObject(
         "floor", 0, pin.SE3.Identity(), coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
@@ -135,7 +135,7 @@ def brute(arm):
 
 @given(seed=st.integers(0, 10**6), margin=st.sampled_from([0.0, 0.05, 0.15]))
 @settings(max_examples=20)
-def test_the_deepest_contact_is_that_of_looking_at_every_sample(arm, brute, seed, margin):
+def test_the_deepest_contact_agrees_with_brute_force(arm, brute, seed, margin):
     ends = np.concatenate((np.zeros((1, 6)), postures(arm, seed, 3)))
     q = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(ends)])
     distances = brute(q)
@@ -159,7 +159,7 @@ def checkers(margin, made={}):  # noqa: B006 - the cache is the point
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=10)
-def test_no_slab_is_thicker_than_the_distance_of_what_it_lies_between(arm, seed):
+def test_bounds_do_not_exceed_distances(arm, seed):
     scene = mixed_shapes()
     path = scene.path(np.random.default_rng(seed).uniform(-2.0, 2.0, (30, 3)))
     count = len(scene.separation.first)
@@ -178,7 +178,7 @@ def test_no_slab_is_thicker_than_the_distance_of_what_it_lies_between(arm, seed)
 
 
 def mixed_shapes():
-    """An arm of every kind of shape, one joint a slide, among all kinds of obstacles."""
+    """An arm with all kinds of shapes and joints among all kinds of obstacles."""
     urdf = robot(
         link("base", '<box size="0.3 0.2 0.1"/>'),
         link("a", '<cylinder radius="0.05" length="0.3"/>', at="0.1 0.2 0"),
@@ -236,7 +236,7 @@ FAST = JointLimits(
 )
 @settings(max_examples=20, deadline=None)
 def test_a_motion_is_clear_if_and_only_if_every_instant_of_it_is(brute, seed, kind, beyond):
-    # The margin is set close to the least distance, where whether they touch is hard to tell.
+    # The margin is close to the smallest distance.
     motion = kind(seed)
     time = np.linspace(0.0, motion.duration, int(motion.duration / 0.008) + 2)
     coarse = brute(motion.sample(time)[0])
@@ -259,7 +259,7 @@ def test_a_motion_is_clear_if_and_only_if_every_instant_of_it_is(brute, seed, ki
 
 
 @pytest.mark.parametrize("steps", [7, 40])
-def test_what_is_met_only_between_two_samples_is_found(steps):
+def test_contacts_between_samples_are_found(steps):
     # A ball on an arm of 1 m sweeps past a post of 2 cm in a hundredth of a second.
     urdf = robot(
         link("base"),
@@ -278,14 +278,14 @@ def test_what_is_met_only_between_two_samples_is_found(steps):
     assert contact is not None
     assert (contact.first, contact.second) == ("arm", "box 0")
     assert abs(np.sin(contact.posture[0])) < 0.011
-    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the way
+    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the path
     lying = Workspace(floor=None, boxes=(aside,), margin=0.0)
     assert CollisionChecker(urdf, lying).deepest_along(motion, samples) is None
 
 
 @given(st.integers(0, 10**6))
 @settings(max_examples=20)
-def test_no_point_leaves_the_straight_line_by_more_than_its_acceleration_allows(seed):
+def test_bulges_bound_the_deviation_from_straight_lines(seed):
     scene = mixed_shapes()
     random = np.random.default_rng(seed)
     q0, rate, bend = random.uniform(-1.0, 1.0, (3, 3)) * [[1.0], [3.0], [8.0]]
@@ -309,7 +309,7 @@ def test_no_point_leaves_the_straight_line_by_more_than_its_acceleration_allows(
         assert left <= bulge + 1e-12
 
 
-def test_a_checker_sent_to_another_process_finds_the_same(arm):
+def test_a_pickled_checker_finds_the_same(arm):
     checker = CollisionChecker(
         urdf_text(), Workspace(floor=0.1, boxes=(Box((1, 0, 0), (2, 1, 1)),))
     )
@@ -320,7 +320,7 @@ def test_a_checker_sent_to_another_process_finds_the_same(arm):
     assert again.deepest_contact(q) == checker.deepest_contact(q)
 
 
-def test_reaching_into_the_floor_is_named(arm):
+def test_a_contact_with_the_floor_is_named(arm):
     # Upper arm straight forward and down, forearm stretched: the wrist is below the ground.
     into_floor = np.array([0.0, 0.0872, np.pi / 2, 0.0, 0.0, 0.0])
     upright = np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
@@ -334,11 +334,11 @@ def test_reaching_into_the_floor_is_named(arm):
     height = wrist[contact.sample, 2] - 0.06 - 0.3
     assert contact.distance == pytest.approx(height, abs=1e-6)
     assert contact.sample == np.argmin(wrist[:, 2])
-    # Without the floor the same way is free.
+    # Without the floor the same path is free.
     assert CollisionChecker(urdf_text(), NOWHERE).deepest_contact(q) is None
 
 
-def test_walls_and_boxes_are_named_and_met_where_they_stand():
+def test_contacts_with_walls_and_boxes():
     urdf = robot(
         link("base"),
         link("arm", '<sphere radius="0.1"/>', at="1 0 0"),
@@ -364,7 +364,7 @@ def test_walls_and_boxes_are_named_and_met_where_they_stand():
     assert contact.distance == pytest.approx(np.cos(shallow[-1, 0]) + 0.5 - 0.1, abs=0.005)
 
 
-def test_every_pair_that_can_meet_is_looked_at():
+def test_all_pairs_that_can_touch_are_checked():
     pairs = {frozenset(pair) for pair in checkers(0.05).pairs}
     links = ["base_link", *(f"link_{k}" for k in range(1, 7))]
     for (i, a), (k, b) in combinations(enumerate(links), 2):
@@ -376,7 +376,7 @@ def test_every_pair_that_can_meet_is_looked_at():
         assert checkers(wider).pairs == checkers(0.05).pairs
 
 
-def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
+def test_only_close_pairs_of_a_wrist_are_unchecked():
     wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
     assert ("link_0", "link_2") not in wrist.pairs
     (pair,) = wrist.unchecked
@@ -385,7 +385,7 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
     assert "link_0_0 and link_2_0" in str(wrist.exceptions)
     assert checkers(0.05).unchecked == ()
     assert checkers(0.05).exceptions is None
-    # Four joints between base and tip: always touching is a fault, and is reported as one.
+    # Four joints between base and tip: permanent contact is reported.
     far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
     contact = far.deepest_contact(np.zeros((1, 4)))
     assert contact is not None
@@ -394,7 +394,7 @@ def test_a_wrist_that_always_overlaps_is_left_out_but_never_a_farther_pair():
 
 
 @pytest.mark.parametrize("limit", ['lower="-2" upper="2"', "", 'lower="-0.02" upper="0.02"'])
-def test_limits_missing_or_narrow_in_the_description_leave_nothing_out(limit):
+def test_missing_or_narrow_limits_leave_no_pair_unchecked(limit):
     # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
     rod = '<cylinder radius="0.05" length="0.5"/>'
     parts = [link("base")]
@@ -426,11 +426,11 @@ def test_limits_missing_or_narrow_in_the_description_leave_nothing_out(limit):
     ],
     ids=["floor above the foot", "floor above all", "box around all"],
 )
-def test_obstacles_in_the_wrong_place_leave_no_moving_link_unchecked(arm, workspace):
+def test_misplaced_obstacles_leave_no_moving_link_unchecked(arm, workspace):
     checker = CollisionChecker(urdf_text(), workspace, limits=FAST)
     with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
     assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
-    # The first link turns in it: no motion can mend that, so it is told and not checked.
+    # The first link turns in it in all motions: reported, not checked.
     assert {pair.first[:6] for pair in checker.unchecked} == {"link_1"}
     home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
     contact = checker.deepest_contact(home)
@@ -455,7 +455,7 @@ def test_limits_and_postures_of_another_arm_are_refused():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_postures_that_are_no_numbers_are_refused(value):
+def test_postures_that_are_not_finite_are_refused(value):
     q = np.zeros((3, 6))
     q[1, 4] = value
     for look in (checkers(0.05).clear, checkers(0.05).deepest_contact):
@@ -490,13 +490,13 @@ SIZES = [(1e-9, 1e5), (1e-3, 30.0), (0.2, 3.0), (3.0, 50.0)]
         *map(violent_pieces, (1e3, 1e6, 1e9, 1e12)),
     ],
 )
-def test_the_most_violent_motions_are_looked_at_in_no_time(motion):
+def test_violent_motions_are_checked_quickly(motion):
     began = time.process_time()
     checkers(0.05).deepest_along(motion, sampled(motion))
     assert time.process_time() - began < 3.0
 
 
-def test_a_long_motion_is_looked_at_part_by_part_and_not_otherwise(monkeypatch):
+def test_long_motions_are_checked_in_parts(monkeypatch):
     motion = short_sines(7)
     whole = [checkers(m).deepest_along(motion, sampled(motion)) for m in (0.0, 0.05, 0.3)]
     monkeypatch.setattr(checker_module, "_PART", 50)
@@ -558,7 +558,7 @@ def test_a_description_without_usable_shapes_is_refused(shape):
         lambda: Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)),
     ],
 )
-def test_obstacles_that_mean_nothing_are_refused(build):
+def test_invalid_obstacles_are_refused(build):
     with pytest.raises(WorkspaceError):
         build()
 

@@ -4,7 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel
@@ -69,7 +69,7 @@ def swing():
     return plan([[0.0, 0.0], [1.5, -1.0], [0.0, 0.0]], LIMITS, fly=0.0)
 
 
-def test_currents_hold_the_arm_as_the_textbook_says(make_currents, swing):
+def test_static_currents_agree_with_the_textbook(make_currents, swing):
     motion = sampled(swing, 0.008)
     currents, unsure = make_currents([1.0, 1.0]), make_currents([1.0, 1.0], uncertainty=0.2)
     torque = currents.torque(motion)
@@ -151,7 +151,7 @@ def test_the_deepest_contact_is_reported_with_pair_and_instant():
     assert "joints at (-0." in text
 
 
-def test_a_prediction_that_is_no_number_is_beyond_every_limit(model, values, swing):
+def test_a_prediction_that_is_not_finite_violates_every_limit(model, values, swing):
     broken = CurrentModel(
         model, values * np.nan, MOTOR_FROM_JOINT, TORQUE_CONSTANT, np.array([1e9, 1e9])
     )
@@ -177,8 +177,9 @@ def series(seed, *, ramp, scale=1.0):
     joint=st.integers(0, 1),
     share=st.sampled_from([0.9, 1 - 1e-5, 1 - 1e-8, 1 + 1e-8, 1 + 1e-5, 1.1]),
 )
+@example(seed=120, ramp=0.0, quantity="position", joint=1, share=1 + 1e-8)
 @settings(max_examples=60, deadline=None)
-def test_sines_obey_the_limits_as_their_exact_extremes_do(seed, ramp, quantity, joint, share):
+def test_limits_of_sines_agree_with_exact_extrema(seed, ramp, quantity, joint, share):
     motion = series(seed, ramp=ramp)
     exact = motion.extrema()
     bounds = {
@@ -198,18 +199,18 @@ def test_sines_obey_the_limits_as_their_exact_extremes_do(seed, ramp, quantity, 
     except LimitExceeded:
         (violation,) = violations
         assert violation.subject == f"{quantity} of joint {joint}"
-        assert getattr(exact, name)[joint] * 0.98 <= violation.value
-        assert violation.value <= getattr(exact, name)[joint]
+        extremum = getattr(exact, name)[joint]
+        assert extremum - 0.02 * abs(extremum) - 1e-4 <= violation.value <= extremum
         assert violation.value > violation.bound
 
 
-def test_sines_within_limits_are_accepted_without_their_exact_extremes(monkeypatch):
+def test_sines_far_from_limits_need_no_exact_extrema(monkeypatch):
     motion = series(3, ramp=2.0, scale=0.1)
     monkeypatch.setattr(FourierSeries, "extrema", lambda self: pytest.fail("looked at exactly"))
     assert not check_motion(motion, LIMITS)
 
 
-def test_a_bare_series_is_refused_with_a_remedy():
+def test_sines_without_a_ramp_are_refused_with_a_remedy():
     bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
     (violation,) = check_motion(bare, LIMITS)
     assert violation.kind == "joint limit"
@@ -233,7 +234,7 @@ def test_a_motion_too_short_or_too_long_is_named(swing, shortest, longest, side)
     assert f"at {side} {bound:g} s" in str(violation)
 
 
-def test_every_kind_counts_by_its_worst(make_currents, swing):
+def test_excess_by_kind_is_the_largest(make_currents, swing):
     constraints = Constraints(
         LIMITS.scaled(velocity=0.5),
         max_duration=1.0,

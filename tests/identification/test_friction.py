@@ -26,7 +26,7 @@ from tests.identification.two_link import URDF as TWO_LINK
 
 @pytest.mark.parametrize("kind", TERMS)
 class TestFrictionTerms:
-    """Each term is one column, in whatever form it is written."""
+    """Column, source code and slope of each term agree."""
 
     SPEED = np.array([-2.0, -0.3, 0.1, 0.7])
     STEP = 1e-6
@@ -42,7 +42,7 @@ class TestFrictionTerms:
         assert pickle.loads(pickle.dumps(replace(kind, speed=0.4))) == replace(kind, speed=0.4)
 
     def test_slope_is_the_derivative_of_the_column(self, kind: FrictionTerm) -> None:
-        """At a speed that the direction has no part in; the fall of Stribeck's is left out."""
+        """At a speed without change of direction, without the exponential of Stribeck."""
         if kind.label == "Stribeck":
             return
         sign, term = np.sign(self.SPEED), replace(kind, speed=0.4)
@@ -52,7 +52,7 @@ class TestFrictionTerms:
 
 
 class TestFrictionTable:
-    """A law as `[robot.friction]` has it."""
+    """Laws and their tables `[robot.friction]`."""
 
     @pytest.mark.parametrize(
         "law", [FrictionLaw(), FrictionLaw(third=None, stribeck=0.1, zone="linear", offset=True)]
@@ -83,7 +83,7 @@ LAWS = st.builds(
 
 
 def torque_of(law: FrictionLaw, coefficients: dict[str, float], v: float) -> float:
-    """Friction of one joint, written out as in the documentation."""
+    """Return the friction of one joint by the documented formula."""
     sign = np.sign(v)
     if law.zone == "linear" and abs(v) < law.standstill:
         sign = v / law.standstill
@@ -100,7 +100,7 @@ def torque_of(law: FrictionLaw, coefficients: dict[str, float], v: float) -> flo
 
 @given(st.lists(LAWS, min_size=6, max_size=6), st.integers(0, 2**16))
 @settings(max_examples=25, deadline=None)
-def test_every_joint_obeys_its_own_law(laws: list[FrictionLaw], seed: int) -> None:
+def test_joints_can_have_different_laws(laws: list[FrictionLaw], seed: int) -> None:
     names = [f"joint_{j}" for j in range(1, 7)]
     model = RobotModel.from_urdf(
         urdf_text(), friction=laws[0], joint_friction=dict(zip(names[1:], laws[1:], strict=True))
@@ -118,7 +118,7 @@ def test_every_joint_obeys_its_own_law(laws: list[FrictionLaw], seed: int) -> No
     np.testing.assert_allclose(torque, expected, atol=1e-11)
 
 
-def test_names_go_term_by_term_over_the_joints_that_have_it() -> None:
+def test_parameters_are_ordered_by_term() -> None:
     model = RobotModel.from_urdf(
         TWO_LINK,
         friction=FrictionLaw(third=None),
@@ -132,7 +132,7 @@ def test_names_go_term_by_term_over_the_joints_that_have_it() -> None:
         model.friction.table(np.arange(4.0))
 
 
-def test_only_joints_with_an_excluded_zone_stand() -> None:
+def test_rows_at_rest_are_excluded_only_with_that_zone() -> None:
     model = RobotModel.from_urdf(
         TWO_LINK,
         friction=FrictionLaw(standstill=0.1),
@@ -143,7 +143,7 @@ def test_only_joints_with_an_excluded_zone_stand() -> None:
     np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
 
 
-def test_offsets_are_no_friction() -> None:
+def test_offsets_do_not_count_as_friction() -> None:
     model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
     friction = [n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f]
     assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
@@ -162,19 +162,19 @@ def test_offsets_are_no_friction() -> None:
         ({"third": "stribeck"}, "quadratic.*cubic"),
     ],
 )
-def test_senseless_settings_are_refused(settings: dict[str, object], words: str) -> None:
+def test_invalid_settings_are_refused(settings: dict[str, object], words: str) -> None:
     with pytest.raises(ModelError, match=words):
         FrictionLaw(**settings)  # type: ignore[arg-type]
 
 
-def test_a_law_for_no_joint_is_refused_with_their_names() -> None:
+def test_a_law_of_an_unknown_joint_is_refused() -> None:
     with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
         RobotModel.from_urdf(TWO_LINK, joint_friction={"wrist": FrictionLaw()})
 
 
 @given(st.lists(LAWS, min_size=2, max_size=2), st.booleans(), st.integers(0, 2**16))
 @settings(max_examples=30, deadline=None)
-def test_dissipative_combinations_take_energy(
+def test_dissipative_combinations_dissipate_energy(
     laws: list[FrictionLaw], coupled: bool, seed: int
 ) -> None:
     coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]])) if coupled else None
@@ -190,7 +190,7 @@ def test_dissipative_combinations_take_energy(
             assert torque_of(law, own, v) * v >= -1e-12
 
 
-def test_no_friction_that_takes_energy_is_left_out() -> None:
+def test_all_dissipative_friction_is_allowed() -> None:
     law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
     friction = JointFriction((law,), (True,))
     combine, not_negative = dissipation(friction)
@@ -220,7 +220,7 @@ class TestPreslidingState:
         np.testing.assert_allclose(found, expected, atol=1e-12)
         assert np.all(np.abs(found) <= 1.0)
 
-    def test_at_rest_it_is_what_the_motion_left(self) -> None:
+    def test_at_rest_it_is_constant(self) -> None:
         position = np.array([0.0, 0.1, 0.1, 0.1, 0.1])
         np.testing.assert_allclose(presliding_state(position, 1e-4)[1:], 1.0, rtol=1e-12)
 
@@ -235,15 +235,15 @@ class TestDirectionOfFriction:
         motion = a_motion()
         sliding = MODEL.with_friction(presliding=1e-7)
         moved = motion._replace(direction=sliding.friction.direction(*motion[:3]))
-        fast = np.abs(motion.velocity).min(axis=1) > 0.3  # as much as changes in one step
-        fast[0] = False  # nothing is known of what was before
+        fast = np.abs(motion.velocity).min(axis=1) > 0.3  # more than the change in one step
+        fast[0] = False  # the motion before is unknown
         np.testing.assert_allclose(
             sliding.torque(truth(), *moved[1:])[fast],
             MODEL.torque(truth(), *motion[1:])[fast],
             rtol=1e-9,
         )
 
-    def test_the_torque_of_a_motion_takes_its_direction(self) -> None:
+    def test_the_torque_uses_the_direction_of_a_motion(self) -> None:
         motion = a_motion()
         half = motion._replace(direction=0.5 * np.sign(motion.velocity))
         dry = np.zeros_like(truth())
@@ -258,7 +258,7 @@ GEARS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0])
 
 
 def wrist(k54: float = 0.2, k64: float = -0.1, k65: float = 0.3) -> Array:
-    """Motors 5 and 6 turn with the axes before them, as on the COMAU wrist."""
+    """Motors 5 and 6 are coupled to the axes before them, as in the COMAU wrist."""
     turns = np.eye(6)
     turns[4, 3], turns[5, 4], turns[5, 3] = -k54, -k65, k65 * k54 - k64
     return GEARS @ turns
@@ -273,7 +273,7 @@ def states(m: int = 40) -> Array:
     return np.random.default_rng(4).uniform(-3.0, 3.0, (3, m, 6))
 
 
-def test_the_ns16_has_three_coupling_inertias_more(model: RobotModel) -> None:
+def test_the_ns16_has_three_coupling_inertias(model: RobotModel) -> None:
     assert model.base.rank == 43
     assert set(model.base.names) == {row.pivot for row in TABLE2[:N_ESSENTIAL]} | {
         "I45", "I46", "I56",
@@ -289,7 +289,7 @@ def test_the_ns16_has_three_coupling_inertias_more(model: RobotModel) -> None:
         assert np.abs(group - expected).max() < 1e-10, name
 
 
-def test_names_and_units_of_what_coupling_adds(model: RobotModel) -> None:
+def test_names_and_units_of_coupling_parameters(model: RobotModel) -> None:
     assert model.parameter_names[40:43] == ("I45", "I46", "I56")
     assert model.parameter_names[-4:] == ("f0_m5", "f0_m6", "f1_m5", "f1_m6")
     assert model.units[40:43] == ("kg m²",) * 3
@@ -297,7 +297,7 @@ def test_names_and_units_of_what_coupling_adds(model: RobotModel) -> None:
     assert model.friction_columns.tolist() == [False] * 43 + [True] * 22
 
 
-def test_rotors_and_motor_friction_act_as_the_drive_train_says(model: RobotModel) -> None:
+def test_rotors_and_motor_friction_act_through_the_coupling(model: RobotModel) -> None:
     """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
     q, qd, qdd = states()
     inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
@@ -318,9 +318,9 @@ def test_rotors_and_motor_friction_act_as_the_drive_train_says(model: RobotModel
     np.testing.assert_allclose(model.torque(values, q, qd, qdd), expected, atol=1e-9)
 
 
-def test_rows_count_while_every_motor_on_them_turns(model: RobotModel) -> None:
+def test_rows_need_moving_motors(model: RobotModel) -> None:
     qd = np.ones((1, 6))
-    # Joint speeds at which motor 5 stands: c_5 qd = 0.
+    # Joint speeds at which motor 5 is at rest: c_5 qd = 0.
     qd[0, 4] = 0.2
     assert model.moving(qd).tolist() == [[True, True, True, False, False, True]]
 
@@ -354,7 +354,7 @@ def test_uncoupled_motors_add_nothing() -> None:
         (np.ones((2, 2)), "singular"),
     ],
 )
-def test_a_matrix_that_is_no_drive_train_is_refused(matrix: Array, words: str) -> None:
+def test_an_invalid_coupling_is_refused(matrix: Array, words: str) -> None:
     with pytest.raises(ModelError, match=words):
         Coupling(matrix)
 

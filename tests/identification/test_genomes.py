@@ -46,7 +46,7 @@ GENOMES = pytest.mark.parametrize(
 
 
 def genes_of(genome, rows: int = 1) -> st.SearchStrategy[np.ndarray]:
-    """Any genes, ends included more often than chance would have it."""
+    """Genes with frequent ends of their range."""
     one = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.0, 1.0))
     return arrays(np.float64, (rows, genome.n_genes), elements=one)
 
@@ -65,7 +65,7 @@ def bits(motion: PiecewiseCubic | FourierSeries) -> bytes:
 
 
 @GENOMES
-def test_neither_company_nor_process_changes_a_bit(genome):
+def test_motions_do_not_depend_on_batch_and_process(genome):
     genes = some_genes(genome, 5)
     together = [bits(motion) for motion in genome.motions(genes)]
     assert [bits(genome.motions(genes[[k]])[0]) for k in range(5)] == together
@@ -84,7 +84,7 @@ def test_a_first_population_is_uniform_and_its_seed_decides_it(genome):
     assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
 
 
-def test_a_genome_does_not_change_with_the_array_it_was_made_of():
+def test_a_genome_copies_its_arrays():
     posture, rates = HOME.copy(), np.full(6, 2.0)
     closed = ViaPointGenome(LIMITS, n_via=2, home=posture)
     swinging = SineGenome(LIMITS, length=20.0, ramp=2.0, offset=posture, fastest=rates)
@@ -113,7 +113,7 @@ def test_genes_reach_the_ends_of_range_and_speed(genome):
 @pytest.mark.parametrize("genome", [OPEN, CLOSED])
 @given(data=st.data())
 @settings(max_examples=50, deadline=None)
-def test_no_genes_lead_via_points_or_speeds_beyond_their_range(genome, data):
+def test_via_points_and_speeds_are_within_their_range(genome, data):
     points, speed = genome.decode(data.draw(genes_of(genome, rows=2)))
     assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
     assert np.all((speed >= genome.slowest) & (speed <= 1.0))
@@ -131,7 +131,7 @@ def test_each_gene_moves_one_coordinate_or_one_speed():
 
 
 @pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_motions_are_the_planners_and_keep_its_limits(genome):
+def test_motions_are_those_of_the_planner(genome):
     genes = some_genes(genome, 6)
     for motion, points, speed in zip(genome.motions(genes), *genome.decode(genes), strict=True):
         check_limits(motion, LIMITS.scaled(velocity=speed))
@@ -141,7 +141,7 @@ def test_motions_are_the_planners_and_keep_its_limits(genome):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_an_error_of_planning_has_its_motions_place(monkeypatch):
+def test_planning_errors_are_in_place_of_their_motion(monkeypatch):
     # No legal genes are known to fail; so the second's via points leave the range on the way.
     genes = some_genes(OPEN, 3)
     points, speed = OPEN.decode(genes)
@@ -160,7 +160,7 @@ def checker():
 
 
 def feasible(genome, genes, checker) -> float:
-    """Share of genes whose whole motion keeps the clearance, rounded corners and all."""
+    """Fraction of genes whose motion is clear of contacts."""
     motions = genome.motions(genes)
     return float(np.mean([not check_motion(m, LIMITS, checker=checker) for m in motions]))
 
@@ -183,7 +183,7 @@ def test_a_population_among_obstacles_is_mostly_feasible(checker):
     assert feasible(blind, blind.sample(random(3), 25), checker) <= 0.7
 
 
-def test_it_is_as_wide_as_the_obstacles_allow_and_its_seed_decides_it(checker):
+def test_a_population_among_obstacles_covers_the_free_range(checker):
     genome = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
     genes = genome.sample(np.random.default_rng(4), 30)
     np.testing.assert_array_equal(genome.sample(np.random.default_rng(4), 30), genes)
@@ -194,13 +194,13 @@ def test_it_is_as_wide_as_the_obstacles_allow_and_its_seed_decides_it(checker):
     assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
 
 
-def test_a_population_is_drawn_where_nothing_is_free(checker):
+def test_a_population_is_drawn_without_free_space(checker):
     everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
-    buried = CollisionChecker(urdf_text(), everywhere)
-    genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=buried)
+    blocked = CollisionChecker(urdf_text(), everywhere)
+    genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=blocked)
     genes = genome.sample(np.random.default_rng(1), 2)
     assert genes.shape == (2, 12)
-    assert feasible(genome, genes, buried) == 0.0
+    assert feasible(genome, genes, blocked) == 0.0
 
 
 # Sines
@@ -297,7 +297,7 @@ def through_json(excitation: Excitation) -> Excitation:
     seed=st.integers(0, 2**32 - 1),
 )
 @settings(max_examples=30, deadline=None)
-def test_every_bit_of_an_excitation_comes_back(make, seed):
+def test_an_excitation_is_restored_bit_for_bit(make, seed):
     excitation = make(seed)
     restored = through_json(excitation)
     assert restored.to_dict() == excitation.to_dict()
@@ -319,14 +319,14 @@ def test_every_bit_of_an_excitation_comes_back(make, seed):
         assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
 
 
-def test_sines_have_no_moves_and_say_nothing_of_via_points():
+def test_sines_have_no_moves_and_via_points():
     excitation = through_json(sines(1))
     assert excitation.moves is None
     assert (excitation.via_points, excitation.speed, excitation.fly) == (None, None, None)
     assert not {"via_points", "speed", "fly"} & excitation.to_dict().keys()
 
 
-def test_records_from_before_methods_still_load():
+def test_data_without_method_are_restored():
     excitation = planned(5)
     old = excitation.to_dict()
     del old["method"]
@@ -360,13 +360,13 @@ def test_records_from_before_methods_still_load():
         {"rejected": {"limits": "many"}},
     ],
 )
-def test_data_that_are_no_excitation_are_refused(damage):
+def test_invalid_data_are_refused(damage):
     with pytest.raises(ValueError, match="not an excitation"):
         Excitation.from_dict({**sines(1).to_dict(), **damage})
 
 
 @pytest.mark.parametrize("missing", ["trajectory", "criteria", "seed", "rejected", "via_points"])
-def test_data_that_lack_something_are_refused(missing):
+def test_incomplete_data_are_refused(missing):
     data = planned(1).to_dict()
     del data[missing]
     with pytest.raises(ValueError, match=f"not an excitation.*{missing}"):

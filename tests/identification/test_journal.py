@@ -28,7 +28,7 @@ def opened(file: io.BytesIO) -> Journal:
 
 
 def written(count: int) -> tuple[io.BytesIO, list[int]]:
-    """A journal of so many generations, and how long it was after each, first after none."""
+    """Return a journal of some generations, and its lengths, first without any."""
     file = io.BytesIO()
     journal = opened(file)
     lengths = [len(file.getvalue())]
@@ -39,7 +39,7 @@ def written(count: int) -> tuple[io.BytesIO, list[int]]:
 
 
 def known(file: io.BytesIO) -> int:
-    """How many generations a journal still knows, each to the last bit."""
+    """Return the number of generations in a journal, each bit for bit."""
     journal = opened(file)
     count = 0
     while (scores := journal.recall(generation(count)[0])) is not None:
@@ -48,19 +48,19 @@ def known(file: io.BytesIO) -> int:
     return count
 
 
-def test_where_writing_was_cut_off_one_generation_is_lost():
+def test_a_truncated_journal_loses_one_generation():
     file, lengths = written(3)
-    whole = file.getvalue()
-    assert known(io.BytesIO(whole)) == 3
-    for length in {*range(0, lengths[0], 7), *range(lengths[2], len(whole), 31), *lengths}:
-        torn = io.BytesIO(whole[:length])
-        count = known(torn)
+    content = file.getvalue()
+    assert known(io.BytesIO(content)) == 3
+    for length in {*range(0, lengths[0], 7), *range(lengths[2], len(content), 31), *lengths}:
+        truncated = io.BytesIO(content[:length])
+        count = known(truncated)
         assert count == sum(length >= end for end in lengths[1:])
-        opened(torn).record(*generation(count))  # goes on as if nothing had happened
-        assert known(torn) == count + 1
+        opened(truncated).record(*generation(count))
+        assert known(truncated) == count + 1
 
 
-def test_from_a_wrong_bit_on_all_is_scored_anew():
+def test_records_after_a_damaged_one_are_dropped():
     file, lengths = written(4)
     for offset in range(lengths[1], lengths[2], 97):
         damaged = bytearray(file.getvalue())
@@ -74,7 +74,7 @@ def test_from_a_wrong_bit_on_all_is_scored_anew():
         assert known(again) == 2
 
 
-def test_what_was_not_recorded_is_not_recalled():
+def test_other_genes_are_not_recalled():
     file, _ = written(3)
     journal = opened(file)
     others, scores = generation(7)
@@ -90,7 +90,7 @@ def test_what_was_not_recorded_is_not_recalled():
 
 
 class FullDisk(io.BytesIO):
-    """A disk that takes a part of what is written, then no more, until there is room again."""
+    """A file with partial writes, and errors while there is no room."""
 
     room = True
 
@@ -101,7 +101,7 @@ class FullDisk(io.BytesIO):
         return super().write(bytes(content)[:1000])
 
 
-def test_what_waits_for_a_full_disk_is_written_later():
+def test_pending_records_are_written_later():
     file = FullDisk()
     journal = opened(file)
     journal.record(*generation(0))
@@ -123,7 +123,7 @@ def test_what_waits_for_a_full_disk_is_written_later():
     assert known(io.BytesIO(file.getvalue())) == 5
 
 
-def test_the_disk_is_waited_for_at_times_and_at_the_end(tmp_path, monkeypatch):
+def test_the_file_is_synced_at_intervals_and_at_the_end(tmp_path, monkeypatch):
     synced = []
     monkeypatch.setattr(os, "fsync", synced.append)
     with (tmp_path / "journal").open("x+b", buffering=0) as file:
@@ -143,7 +143,7 @@ def test_the_disk_is_waited_for_at_times_and_at_the_end(tmp_path, monkeypatch):
         ({"earlier": {"x.mcap": "00"}}, "earlier x.mcap was None, is '00'"),
     ],
 )
-def test_another_searchs_journal_is_refused_by_name(other, words):
+def test_the_journal_of_another_search_is_refused(other, words):
     file, _ = written(1)
     before = file.getvalue()
     with pytest.raises(JournalError, match=words):
@@ -151,7 +151,7 @@ def test_another_searchs_journal_is_refused_by_name(other, words):
     assert file.getvalue() == before
 
 
-def test_so_is_one_that_another_release_wrote(monkeypatch):
+def test_the_journal_of_another_release_is_refused(monkeypatch):
     file, _ = written(1)
     journal = identification.excitation.searches.journal
     ours = journal.versions()
@@ -174,7 +174,7 @@ FIRST_LINE = b"hil search journal 2\n"
         *(FIRST_LINE + framed(c) for c in (b'{"cell": 3}', b"[]", b"null", b"[" * 100_000)),
     ],
 )
-def test_a_file_that_is_no_journal_is_left_alone(content):
+def test_another_file_is_refused_and_unchanged(content):
     file = io.BytesIO(content + b" ")
     with pytest.raises(JournalError):
         opened(file)
@@ -207,7 +207,7 @@ SCORES = array(np.zeros((1, ROW)))
         array(np.array([print], dtype=object)),  # a pickle, which is not run
     ],
 )
-def test_a_forged_record_counts_as_none(content):
+def test_invalid_records_are_ignored(content):
     file, lengths = written(1)
     file.seek(lengths[1])
     file.write(framed(content))

@@ -37,7 +37,7 @@ TILTED = (2.0, -3.0, -9.0)
 def inverse_dynamics(
     urdf: str, gravity: tuple[float, ...], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
 ) -> np.ndarray:
-    """Pinocchio's recursive Newton-Euler torques, rigid bodies alone."""
+    """Return pinocchio's torques of the rigid bodies."""
     model = pin.buildModelFromXML(urdf)
     model.gravity.linear = np.array(gravity)
     data = model.createData()
@@ -98,7 +98,7 @@ def test_the_ns16_has_40_base_and_18_friction_parameters_in_this_order() -> None
     assert unit["f1_6"] == "N·m·s/rad"
 
 
-def test_a_sliding_joint_has_linear_units() -> None:
+def test_a_prismatic_joint_has_linear_units() -> None:
     model = RobotModel.from_urdf(slider("1 0 0"))
     assert model.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
     assert model.units == ("kg", "N", "N·s/m", "N·s²/m²")
@@ -115,7 +115,7 @@ def test_a_new_arm_is_ready_in_a_third_of_a_second() -> None:
     assert min(took) < 0.3
 
 
-def test_a_model_survives_the_way_to_another_process() -> None:
+def test_a_pickled_model_gives_the_same_torque() -> None:
     model = RobotModel.from_urdf(urdf_text())
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 10, 6))
     values = np.arange(58.0)
@@ -136,7 +136,7 @@ def test_other_joints_are_refused_by_name(kind: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "no xml", "<robot name='r'/>", one_joint("fixed")])
-def test_a_text_without_a_robot_that_moves_is_refused(text: str) -> None:
+def test_a_text_without_moving_joints_is_refused(text: str) -> None:
     with pytest.raises(ModelError, match="robot description"):
         RobotModel.from_urdf(text)
 
@@ -147,11 +147,11 @@ def test_gravity_is_three_finite_numbers(gravity: tuple[float, ...]) -> None:
         RobotModel.from_urdf(urdf_text(), gravity=gravity)
 
 
-def test_an_offset_that_is_a_weight_is_refused_by_joint() -> None:
+def test_an_offset_equal_to_a_weight_is_refused() -> None:
     law = FrictionLaw(offset=True)
     with pytest.raises(ModelError, match=r"'strange'.*offset"):
         RobotModel.from_urdf(slider("0 0 1"), friction=law)
-    # Without a rotor the weight is known from the inertia, and across gravity there is none.
+    # accepted without a rotor inertia, and across gravity
     assert (
         RobotModel.from_urdf(slider("0 0 1"), friction=law, rotor_inertia=False).n_parameters == 5
     )
@@ -173,8 +173,8 @@ PAIRS = ((0, 1), (1, 3))
 LAYOUT = StandardLayout((True, False, True, False), rotor_inertia=True, pairs=PAIRS)
 
 
-def test_parameters_of_a_layout_have_places_and_units() -> None:
-    """Joint by joint, couplings last; what slides has a rotor that weighs."""
+def test_parameters_of_a_layout_have_indices_and_units() -> None:
+    """Joint by joint, couplings last; rotors of prismatic joints have mass."""
     assert LAYOUT.size == len(LAYOUT.names) == len(LAYOUT.units) == 46
     assert LAYOUT.names[22:33] == (
         "I3xx", "I3xy", "I3xz", "I3yy", "I3yz", "I3zz", "mc3x", "mc3y", "mc3z", "m3", "I3m",
@@ -184,7 +184,7 @@ def test_parameters_of_a_layout_have_places_and_units() -> None:
     assert LAYOUT.rotors.tolist() == [10, 21, 32, 43]
     assert LAYOUT.couplings.tolist() == [44, 45]
     assert [LAYOUT.units[k] for k in LAYOUT.rotors] == ["kg m²", "kg", "kg m²", "kg"]
-    # Torque of a turning joint per acceleration of a sliding one; force per acceleration.
+    # torque of a revolute joint per acceleration of a prismatic one; force per acceleration
     assert [LAYOUT.units[k] for k in LAYOUT.couplings] == ["kg m", "kg"]
     assert LAYOUT.split([0, 9, 10, 25, 45]) == (
         [[0, 9], [], [3], []], [True, False, False, False], [1],
@@ -214,8 +214,8 @@ def panda() -> str:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_locked_joint_is_one_that_never_moves(seed: int) -> None:
-    """Torques of the other joints, with the locked ones held where they are."""
+def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
+    """Torques of the other joints agree with constant positions of the locked ones."""
     urdf = random_urdf(seed)
     whole = RobotModel.from_urdf(urdf)
     random = np.random.default_rng(seed)
@@ -248,7 +248,7 @@ def test_any_kind_of_joint_can_be_locked_at_zero() -> None:
         RobotModel.from_urdf(floating, locked={"strange": 0.5})
 
 
-def test_what_cannot_be_locked_is_refused_by_name() -> None:
+def test_invalid_locked_joints_are_refused_by_name() -> None:
     with pytest.raises(ModelError, match=r"no moving joint 'wrist' .* shoulder, elbow"):
         chain_from_urdf(TWO_LINK, {"wrist": 0.0})
     with pytest.raises(ModelError, match=r"'elbow'.*finite number"):
@@ -259,7 +259,7 @@ def test_what_cannot_be_locked_is_refused_by_name() -> None:
 
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
 def test_an_axis_without_a_direction_is_refused(kind: str) -> None:
-    """Its placement would be no rotation: the cosine of the angle times the identity."""
+    """Its placement would not be a rotation."""
     still = one_joint(kind, "0 0 0").replace("</robot>", "") + (
         '<link name="c"/><joint name="turns" type="continuous"><parent link="b"/>'
         '<child link="c"/><axis xyz="0 0 1"/></joint></robot>'
@@ -278,7 +278,7 @@ def inertials(urdf: str) -> dict[str, ElementTree.Element | None]:
     return {link.get("name", ""): link.find("inertial") for link in links}
 
 
-def test_written_back_locked_joints_stay_as_they_were() -> None:
+def test_written_urdf_keeps_locked_joints() -> None:
     urdf = panda()
     model = RobotModel.from_urdf(urdf, locked=FINGERS)
     standard = model.nominal
@@ -287,17 +287,17 @@ def test_written_back_locked_joints_stay_as_they_were() -> None:
     before, after = inertials(urdf), inertials(written)
     for finger in ("panda_leftfinger", "panda_rightfinger"):
         assert text(after[finger]) == text(before[finger])
-    # The whole arm, read anew, carries what was identified with the fingers where they were.
+    # The whole arm, read again, has the identified inertia at the locked positions.
     arm = pin.buildModelFromXML(written)
     assert arm.nv == 9
     again = chain_from_urdf(written, FINGERS).inertial
     np.testing.assert_allclose(again, standard[model.layout.links], atol=1e-8)
-    # Fingers elsewhere move with it: their mass did not go into the hand.
+    # The mass of the fingers is still theirs.
     left = arm.inertias[arm.getJointId("panda_finger_joint1")].mass
     assert left == pin.buildModelFromXML(urdf).inertias[8].mass > 0.0
 
 
-def test_where_nothing_possible_would_be_left_locked_links_are_merged() -> None:
+def test_locked_links_are_merged_if_the_rest_is_inconsistent() -> None:
     urdf = panda()
     model = RobotModel.from_urdf(urdf, locked=FINGERS)
     standard = some_bodies(7)
@@ -308,7 +308,7 @@ def test_where_nothing_possible_would_be_left_locked_links_are_merged() -> None:
     np.testing.assert_allclose(again, standard[model.layout.links], atol=1e-8)
 
 
-def test_a_joint_that_is_not_locked_is_still_asked_for() -> None:
+def test_a_missing_joint_is_refused() -> None:
     fixed = TWO_LINK.replace('name="elbow" type="revolute"', 'name="elbow" type="fixed"')
     model = RobotModel.from_urdf(fixed)
     with pytest.raises(WriteBackError, match="'elbow'"):
@@ -316,7 +316,7 @@ def test_a_joint_that_is_not_locked_is_still_asked_for() -> None:
 
 
 def test_a_joint_may_have_the_name_of_a_link() -> None:
-    """The gripper of the SO-100 does."""
+    """As in the gripper of the SO-100."""
     named = TWO_LINK.replace('joint name="elbow"', 'joint name="lower"')
     assert '<link name="lower"' in named
     model = RobotModel.from_urdf(named, locked={"lower": 0.4})
@@ -336,7 +336,7 @@ def point_masses(seed: int, count: int = 8) -> tuple[Array, Array]:
 
 
 def of_points(masses: Array, places: Array) -> Array:
-    """Inertial parameters by the definition: sums over the masses."""
+    """Return inertial parameters by definition: sums over point masses."""
     tensor = sum(
         m * ((p @ p) * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
     )
@@ -354,7 +354,7 @@ def test_it_is_the_matrix_of_second_moments_of_the_mass(seed: int) -> None:
 
 @given(seeds)
 def test_consistent_is_positive_mass_and_the_triangle_inequalities(seed: int) -> None:
-    """Of the tensor about the centre of mass; the definition that needs no pseudo-inertia."""
+    """Of the tensor about the centre of mass."""
     rng = np.random.default_rng(seed)
     moments = rng.uniform(0.05, 1.0, 3)
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -391,10 +391,10 @@ SOUND, FLAT, POINT = (0.1, 0.1, 0.02), (0.001, 0.002, 0.02), (0.0, 0.0, 0.0)
 @pytest.mark.parametrize(
     ("moments", "words"), [(SOUND, AS_GIVEN), (FLAT, MADE_POSSIBLE), (POINT, MADE_POSSIBLE)]
 )
-def test_as_much_of_a_link_is_used_as_is_possible(
+def test_reference_bodies_use_consistent_parts_of_a_link(
     moments: tuple[float, float, float], words: str
 ) -> None:
-    """All of a possible one, mass and centre of another, those of the others without mass."""
+    """All of a consistent link, mass and centre of an inconsistent one."""
     links = np.array([a_link(moments), a_link(SOUND), np.zeros(10)])
     found = reference_bodies(links, STEPS)
     assert found.origins == (words, AS_GIVEN, ASSUMED)
@@ -406,7 +406,7 @@ def test_as_much_of_a_link_is_used_as_is_possible(
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_whatever_is_given_the_result_is_a_possible_body(seed: int) -> None:
+def test_reference_bodies_are_consistent(seed: int) -> None:
     rng = np.random.default_rng(seed)
     links = rng.normal(size=(3, 10)) * 10.0 ** rng.uniform(-3, 3, (3, 1))
     links[rng.random(3) < 0.3] = 0.0

@@ -1,4 +1,4 @@
-"""How motions are judged: measures of the information in them, and the front of scored motions."""
+"""Criteria of motions, objective of a search, scale and Pareto front."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def assert_measures(found: Mapping[str, float], columns: np.ndarray, n_samples: 
     assert found["coupling_index"] == pytest.approx(index, rel=1e-8, abs=1e-12)
 
 
-# What is judged.
+# Measures.
 
 
 @given(seed=seeds, chosen=st.sets(st.integers(0, P - 1), min_size=1))
@@ -86,7 +86,7 @@ def test_measures_are_of_the_chosen_weighted_columns(seed: int, chosen: set[int]
     assert_measures(found, weighted, motion.n_samples)
 
 
-def test_the_same_motion_is_judged_alike_in_any_company() -> None:
+def test_measures_do_not_depend_on_earlier_calls() -> None:
     motions = [midpoints(some_motion(seed, n_via)) for seed, n_via in enumerate((3, 40, 7, 90, 4))]
     alone = [Objective(RobotModel.from_urdf(URDF)).measures(m) for m in motions]
     objective = Objective(MODEL)
@@ -95,7 +95,7 @@ def test_the_same_motion_is_judged_alike_in_any_company() -> None:
             assert objective.measures(motions[k]) == alone[k]  # to the last bit
 
 
-def test_a_factor_of_the_same_samples_says_the_same() -> None:
+def test_information_agrees_with_a_factor() -> None:
     motion, weights = midpoints(some_motion(2)), np.array([2.0, 0.5])
     factor = Factor.from_samples(MODEL, motion, np.ones_like(motion.position))
     for objective, gram in (
@@ -115,7 +115,7 @@ def test_criteria_are_the_measures_and_more() -> None:
 
 
 @pytest.mark.parametrize("last", [[[1.0, 0.5], [-1.0, 0.5]], [[0.0, 0.5]]])
-def test_a_joint_at_rest_is_worst_of_all(last: list[list[float]]) -> None:
+def test_a_joint_at_rest_has_the_worst_measures(last: list[list[float]]) -> None:
     still = plan([[0.0, 0.5], *last], LIMITS)
     assert Objective(MODEL).measures(midpoints(still)) == WORST
 
@@ -147,17 +147,17 @@ def test_earlier_archives_and_repetitions_add_up(seed: int, repetitions: int) ->
 
 
 def assert_more(gram: np.ndarray, other: np.ndarray) -> None:
-    """More in every direction: no combination of parameters gets less certain."""
+    """Check that no combination of parameters has less information."""
     scale = np.sqrt(np.diag(gram))
     assert np.linalg.eigvalsh((gram - other) / scale / scale[:, None])[0] >= -1e-12
 
 
 @given(seed=seeds, share=st.floats(0.05, 0.95), repetitions=st.integers(1, 30))
 @settings(max_examples=40, deadline=None)
-def test_more_of_everything_never_counts_for_less(
+def test_additional_information_never_lowers_the_criterion(
     seed: int, share: float, repetitions: int
 ) -> None:
-    """A motion and its beginning: per second the beginning may say more, in all it does not."""
+    """A motion and its beginning, which may have more information per second."""
     known = earlier_of(some_motion(seed))
     known = {name: 30 * value for name, value in known.items()}
     motion = midpoints(some_motion(seed + 1000))
@@ -172,7 +172,7 @@ def test_more_of_everything_never_counts_for_less(
     assert often.measures(motion)["log10_det"] > more
 
 
-def test_rows_at_rest_are_left_out_beside_earlier_ones_only() -> None:
+def test_rows_at_rest_are_left_out_in_sequential_design_only() -> None:
     motion = midpoints(plan([[0.0, 0.5], [1.0, 0.5], [-1.0, 0.5]], LIMITS))  # the elbow rests
     alone = Objective(MODEL).information(motion)
     beside = Objective(MODEL, earlier=np.zeros((P, P)), earlier_samples=1).information(motion)
@@ -189,7 +189,7 @@ def test_repetitions_alone_change_nothing() -> None:
     assert once == often
 
 
-def test_a_second_counts_alike_at_any_sampling() -> None:
+def test_the_sample_period_does_not_change_the_weight() -> None:
     trajectory = some_motion(7, n_via=12)
     known = earlier_of(trajectory)
     n_earlier = known["earlier_samples"]
@@ -202,7 +202,7 @@ def test_a_second_counts_alike_at_any_sampling() -> None:
         assert both.log10_det == pytest.approx(alone + P * math.log10(2.0), abs=room)
 
 
-def test_an_objective_judges_alike_in_another_process() -> None:
+def test_a_pickled_objective_gives_the_same_measures() -> None:
     known = earlier_of(some_motion(9))
     weights = np.array([1.0, 3.0])
     objective = Objective(MODEL, np.arange(1, P), weights, **known, repetitions=3)
@@ -265,7 +265,7 @@ def test_a_small_case_by_hand() -> None:
 
 
 def exact_inverse(gram: list[list[int]]) -> tuple[Fraction, list[list[Fraction]]]:
-    """Determinant and inverse in exact fractions, by elimination without a thought for speed."""
+    """Return determinant and inverse in exact fractions, by elimination."""
     p = len(gram)
     rows = [
         [Fraction(x) for x in row] + [Fraction(i == j) for j in range(p)]
@@ -334,7 +334,7 @@ def test_orthogonal_columns_are_not_coupled() -> None:
 
 
 @pytest.mark.parametrize("p", [2, 5, 12])
-def test_errors_in_step_reach_the_largest_coupling(p: int) -> None:
+def test_fully_correlated_errors_reach_the_largest_coupling(p: int) -> None:
     assert coupling_index_max(58) == 1653.0
     together = np.linspace(1.0, 2.0, p) * (-1.0) ** np.arange(p)
     apart = 1e-7
@@ -381,9 +381,7 @@ def motion(request: pytest.FixtureRequest) -> PiecewiseCubic:
 # Section 3.2 on planned motions.
 
 
-def test_a_motion_is_judged_alike_at_8_ms_and_at_1_ms(
-    model: RobotModel, motion: PiecewiseCubic
-) -> None:
+def test_criteria_agree_at_8_ms_and_1_ms(model: RobotModel, motion: PiecewiseCubic) -> None:
     coarse, fine = (Objective(model).criteria(motion, period) for period in (0.008, 0.001))
     assert fine.n_samples == pytest.approx(8 * coarse.n_samples, rel=0.01)
     # From one random motion to the next they spread by 12 and by 9: a thousandth, a fiftieth.
@@ -434,23 +432,23 @@ def front_of_motions(rows):
 @given(motions)
 def test_the_front_is_what_brute_force_finds(rows):
     feasible = [row for row in rows if row[5]]
-    unbeaten = {
+    nondominated = {
         (c, d)
         for d, c, *_ in feasible
         if not any((e >= d and f <= c) and (e > d or f < c) for e, f, *_ in feasible)
     }
     expected = [
         min((t, g, h) for d, c, t, g, h, _ in feasible if (c, d) == pair)
-        for pair in sorted(unbeaten)
+        for pair in sorted(nondominated)
     ]
     front = front_of_motions(rows)
     found = zip(front.measure("coupling_index"), front.measure("log10_det"), strict=True)
-    assert list(found) == sorted(unbeaten)
+    assert list(found) == sorted(nondominated)
     assert [tuple(row) for row in np.column_stack((front.duration, front.genes))] == expected
 
 
 @given(motions, motions, motions, st.randoms(use_true_random=False))
-def test_a_front_is_of_the_set_of_motions_alone(a, b, c, random):
+def test_a_front_does_not_depend_on_order(a, b, c, random):
     shuffled = a + b + c
     random.shuffle(shuffled)
     whole = front_of_motions(shuffled)
@@ -483,8 +481,8 @@ FAR_END = ([-300.0, 90.0, 104.0, 104.5, 105.0], [59.9, 60.0, 64.0, 80.0, 100.0])
         ([100.0, 100.9], [80.0, 110.0], RANDOM_MOTIONS, 100.0),
         (*BENT, None, 104.0),
         (*FAR_END, RANDOM_MOTIONS, 104.0),
-        (*FAR_END, None, 90.0),  # everything lies above the chord from one silly motion
-        # Where nothing beats the median random motion the whole front counts.
+        (*FAR_END, None, 90.0),  # all lie above the chord from an extreme motion
+        # Without a motion better than the median the whole front counts.
         ([5.0, 10.0, 11.0], [151.0, 152.0, 170.0], RANDOM_MOTIONS, 10.0),
     ],
 )
@@ -494,7 +492,7 @@ def test_the_knee_is_the_corner_of_the_front(size, coupled, scale, knee):
 
 
 @pytest.mark.parametrize("units", [(1.0, 1.0), (7.0, 0.1)])
-def test_the_knee_of_a_quarter_circle_is_half_way(units):
+def test_the_knee_of_a_quarter_circle_is_in_its_middle(units):
     angle = np.radians(np.arange(0.0, 91.0, 5.0))
     size, coupled = 100.0 + 10.0 * np.sin(angle), 70.0 + 40.0 * (1.0 - np.cos(angle))
     front = front_of(units[0] * size - 300.0, units[1] * coupled)
@@ -531,7 +529,7 @@ def test_units_of_parameters_do_not_change_the_fitness(shift, first):
     np.testing.assert_allclose(*found, rtol=0, atol=1e-10)
 
 
-def test_only_feasible_motions_count_where_there_are_enough(random_motions):
+def test_a_scale_uses_feasible_motions_if_there_are_enough(random_motions):
     size, coupled = random_motions
     expected = Scale.of(scores_of(size, coupled))
     broken = np.arange(300) < 100

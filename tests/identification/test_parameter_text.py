@@ -54,7 +54,7 @@ def table(text: str) -> list[dict[str, str]]:
 
 
 class TestParameters:
-    def test_json_gives_every_number_back(self, fit: Fit) -> None:
+    def test_json_restores_every_number(self, fit: Fit) -> None:
         model, found, consistent = fit
         text = parameters_json(model, found, consistent=consistent, provenance=PROVENANCE)
         read = json.loads(text)
@@ -69,7 +69,7 @@ class TestParameters:
         assert [link["rotor_inertia"] for link in links] == consistent.standard[[10, 21]].tolist()
         assert links[1]["friction"] == {"f0": consistent.friction[1], "f1": consistent.friction[3]}
 
-    def test_json_has_words_for_what_is_not_determined(self, fit: Fit) -> None:
+    def test_json_has_texts_for_undetermined_values(self, fit: Fit) -> None:
         model, found, _ = fit
         covariance = found.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0
@@ -79,7 +79,7 @@ class TestParameters:
         assert read["parameters"][0]["std"] == read["condition"] == "Infinity"
         assert (read["undetermined"], read["standard"]) == (["I1yy"], None)
 
-    def test_csv_gives_values_and_covariance_back(self, fit: Fit) -> None:
+    def test_csv_restores_values_and_covariance(self, fit: Fit) -> None:
         model, found, _ = fit
         text = parameters_csv(model, found, provenance=PROVENANCE)
         assert "# recording: run_1.mcap sha256 0a1b" in text.splitlines()
@@ -103,7 +103,9 @@ class TestParameters:
         assert "a,'=1+1.mcap;'@b, -3" in text
 
     @pytest.mark.parametrize("write", [parameters_json, parameters_csv])
-    def test_those_of_another_model_are_refused(self, fit: Fit, write: Callable[..., str]) -> None:
+    def test_parameters_of_another_model_are_refused(
+        self, fit: Fit, write: Callable[..., str]
+    ) -> None:
         with pytest.raises(IdentificationError):
             write(RobotModel.from_urdf(URDF), fit[1])
 
@@ -141,7 +143,7 @@ class TestFrictionSource:
             assert [friction(j, float(speed)) for j in range(2)] == pytest.approx(list(expected))
 
     @pytest.mark.parametrize("tanh", [None, 0.02])
-    def test_it_knows_every_term_and_coupled_motors(self, tanh: float | None) -> None:
+    def test_it_has_every_term_and_coupled_motors(self, tanh: float | None) -> None:
         model = with_law(
             FrictionLaw(asymmetric=True, stribeck=0.4, zone="linear", standstill=0.1),
             joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", tanh=tanh)},
@@ -156,7 +158,7 @@ class TestFrictionSource:
             assert torques([float(v) for v in speeds]) == pytest.approx(list(expected))
             assert torques(speeds) == pytest.approx(list(expected))  # an array will do
 
-    def test_on_demand_it_has_no_jump_at_zero_speed(self) -> None:
+    def test_smooth_friction_has_no_jump_at_zero_speed(self) -> None:
         friction = in_source(with_law(), np.array([4.0, 2.0, 1.5, 0.8]))["friction"]
         assert friction(0, 0.0) == 0.0
         assert friction(0, 0.005) == pytest.approx(4.0 + 0.0075)
@@ -172,13 +174,13 @@ class TestFrictionSource:
         assert "'shoulder', 'elbow'" in source
         assert "N·m·s/rad" in source
 
-    def test_what_is_not_known_stays_valid(self) -> None:
+    def test_values_that_are_not_finite_are_valid_source(self) -> None:
         friction = in_source(with_law(), np.array([1.0, np.nan, 1.0, np.inf]))["friction"]
         assert friction(0, 1.0) == 2.0
         assert np.isnan(friction(1, 1.0))
 
 
-class TestFrictionInWords:
+class TestFrictionText:
     @pytest.mark.parametrize(
         ("third", "formula"), [("quadratic", "f2 sgn(v) v²"), ("cubic", "f2 v³")]
     )
@@ -189,12 +191,12 @@ class TestFrictionInWords:
         assert "shoulder: f0 = 4 N·m, f1 = 1.5 N·m·s/rad, f2 = -0.1" in words
         assert "0.01 rad/s" in words
 
-    def test_without_friction_it_says_so(self) -> None:
+    def test_without_friction_it_is_stated(self) -> None:
         model = with_law(FrictionLaw(coulomb=False, viscous=False, third=None))
         assert "no friction" in friction_text(model, np.empty(0))
         assert in_source(model, np.empty(0))["friction"](0, 1.0) == 0.0
 
-    def test_what_is_special_about_a_joint_or_motor(self) -> None:
+    def test_special_cases_of_joints_and_motors(self) -> None:
         model = with_law(
             FrictionLaw(third=None, asymmetric=True, zone="linear", standstill=0.1),
             joint_friction={"elbow": FrictionLaw(third=None, stribeck=0.4)},
@@ -217,7 +219,7 @@ class TestFrictionInWords:
         with pytest.raises(ShapeError):
             write(with_law(FrictionLaw()), np.ones(4))
 
-    def test_names_are_data_in_source_and_one_line_in_words(self) -> None:
+    def test_names_are_quoted_in_source_and_on_one_line_in_text(self) -> None:
         evil = "a'\\,); raise SystemExit #&quot;&quot;&quot;"
         model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=DRY)
         values = np.array([1.0, 2.0, 3.0, 4.0])

@@ -1,4 +1,4 @@
-"""The body on the flange: weighed, possible, with intervals that hold the truth."""
+"""Identification of a payload: consistency, intervals, frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INERTIA = (0.05, 0.01, -0.02, 0.04, 0.005, 0.03)
 
 
 def pinocchio_torque(urdf: str, payload: Payload | None, joint: int, where: pin.SE3) -> np.ndarray:
-    """Torques with a body of pinocchio's own added to a joint."""
+    """Return pinocchio's torques with a body added to a joint."""
     model = pin.buildModelFromXML(urdf)
     model.gravity.linear = np.array(TILTED)
     if payload is not None:
@@ -54,7 +54,7 @@ def states(n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("case", ["ns16", "ur10 at its tool", *range(6)])
-def test_the_load_is_what_pinocchio_needs_more_with_it(case: str | int) -> None:
+def test_the_load_torque_is_the_difference_in_pinocchio(case: str | int) -> None:
     frame, where = None, pin.SE3.Identity()
     urdf = urdf_text()
     if isinstance(case, int):
@@ -70,7 +70,7 @@ def test_the_load_is_what_pinocchio_needs_more_with_it(case: str | int) -> None:
     np.testing.assert_allclose(model.load_torque(*states(model.n_joints)), expected, atol=1e-9)
 
 
-def test_a_payload_changes_no_parameter_and_no_torque_of_theirs() -> None:
+def test_a_payload_does_not_change_the_parameters() -> None:
     plain = RobotModel.from_urdf(urdf_text())
     loaded = RobotModel.from_urdf(urdf_text(), payload=Payload(16.0, (0.1, 0.0, 0.2)))
     assert loaded.parameter_names == plain.parameter_names
@@ -81,7 +81,7 @@ def test_a_payload_changes_no_parameter_and_no_torque_of_theirs() -> None:
     assert not plain.load_torque(*states(6)).any()
 
 
-def test_a_frame_that_is_not_there_is_refused_with_those_that_are() -> None:
+def test_an_unknown_frame_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ModelError, match=r"'tool9' is not a link .* link_6"):
         RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="tool9"))
     with pytest.raises(ModelError, match="fixed to the base"):
@@ -89,12 +89,12 @@ def test_a_frame_that_is_not_there_is_refused_with_those_that_are() -> None:
 
 
 @pytest.mark.parametrize("mass", [-1.0, np.nan])
-def test_a_mass_that_cannot_be_is_refused(mass: float) -> None:
+def test_an_invalid_mass_is_refused(mass: float) -> None:
     with pytest.raises(ModelError, match="weighs"):
         Payload(mass, (0.0, 0.0, 0.0))
 
 
-def test_an_inertia_that_no_body_has_is_told() -> None:
+def test_an_inconsistent_inertia_is_reported() -> None:
     at = (0.0, 0.0, 0.0)
     assert Payload(1.0, at).possible
     assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
@@ -144,7 +144,7 @@ def recordings(
     pace: float = 1.0,
     seed: int = 0,
 ) -> tuple[RobotModel, list[Run]]:
-    """Recordings of one motion of two links that turn about y, with friction that drifts."""
+    """Recordings of one motion of two links about y, with drifting friction."""
     rng, motion = np.random.default_rng(seed), lively(2, speed=pace)
     runs = []
     for k, load in enumerate(loads):
@@ -177,8 +177,8 @@ class TestMass:
         once = estimate([LOAD, None])
         assert np.diff(found.intervals[0]) < np.diff(once.intervals[0])
 
-    def test_nothing_carried_is_no_body(self) -> None:
-        """The loaded recordings carry what the bare ones do."""
+    def test_no_load_is_no_body(self) -> None:
+        """With the same load in all recordings."""
         model, runs = recordings([None, None])
         found = identify_payload(model, [runs[0], replace(runs[1], loaded=True)])
         assert found.body is None
@@ -201,21 +201,23 @@ def many() -> list[PayloadEstimate]:
 
 
 class TestIntervals:
-    def test_they_hold_the_truth_under_drifting_friction(self, many: list[PayloadEstimate]) -> None:
-        """Of 24 draws with 95 %, fewer than 19 inside come once in a thousand times."""
+    def test_they_contain_the_truth_with_drifting_friction(
+        self, many: list[PayloadEstimate]
+    ) -> None:
+        """Of 24 draws at 95 % fewer than 19 inside have a probability of 0.1 %."""
         truth = {"mass": 4.0, "cx": 0.2, "cz": 0.1, "Iyy": 0.03}
         for name, value in truth.items():
             intervals = np.array([one.intervals[NAMES.index(name)] for one in many])
             inside = (intervals[:, 0] <= value) & (value <= intervals[:, 1])
             assert inside.sum() >= 19, name
 
-    def test_they_are_no_wider_than_the_scatter_asks(self, many: list[PayloadEstimate]) -> None:
+    def test_they_are_not_wider_than_the_scatter(self, many: list[PayloadEstimate]) -> None:
         masses = np.array([one.parameters[9] for one in many])
         half = np.median([np.diff(one.intervals[0]) / 2.0 for one in many])
         assert half < 1.5 * 1.96 * masses.std(ddof=1)
 
-    def test_friction_of_another_day_does_not_bias_the_mass(self) -> None:
-        """Drift of 30 % of the friction, three times what the prior expects."""
+    def test_changed_friction_does_not_bias_the_mass(self) -> None:
+        """Drift of 30 % of the friction, three times that of the prior."""
         model, runs = recordings([None, LOAD])
         low, high = identify_payload(model, runs).intervals[0]
         drifting = estimate([None, LOAD], drift=0.3, seed=3)
@@ -230,21 +232,21 @@ class TestIntervals:
 
 class TestPossibleBody:
     @pytest.mark.parametrize("seed", range(5))
-    def test_a_motion_that_says_little_gives_a_possible_body(self, seed: int) -> None:
+    def test_a_poor_motion_gives_a_consistent_body(self, seed: int) -> None:
         found = identify_payload(*recordings([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed))
         assert found.body is not None
         own = inertial_parameters(found.body)
         assert margin(own) > -1e-9 * own[9]
 
-    def test_what_no_axis_feels_is_named(self) -> None:
-        """Both axes turn about y: only mass, moments in the plane and Iyy act on them."""
+    def test_undetermined_parameters_are_named(self) -> None:
+        """Only mass, moments in the plane and Iyy act on two axes about y."""
         found = estimate([None, LOAD])
         assert found.undetermined == ("cy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
         assert found.body is not None
         assert found.body.centre[1] == pytest.approx(0.0, abs=1e-6)
 
     def test_a_large_body_is_not_moved_towards_a_point(self) -> None:
-        """A bar of 1 m: its inertia is many times that of the reference, and significant."""
+        """A bar of 1 m with a significant inertia, many times that of the reference."""
         bar = Payload(2.0, (0.2, 0.0, 0.1), (0.17, 0.0, 0.0, 0.17, 0.0, 0.001))
         found = estimate([None, bar])
         low, high = found.intervals[NAMES.index("Iyy")]
@@ -254,7 +256,7 @@ class TestPossibleBody:
         assert found.body.inertia[1, 1] == pytest.approx(middle, abs=0.05 * (high - low))
 
     def test_an_undetermined_inertia_is_that_of_a_box(self) -> None:
-        """Slow motion is weight alone."""
+        """In slow motion only the weight acts."""
         model, runs = recordings([None, LOAD], pace=0.1, noise=3.0 * NOISE)
         point, box = identify_payload(model, runs), identify_payload(model, runs, (0.2, 0.3, 0.1))
         assert {"Ixx", "Iyy", "Izz"} <= {*point.undetermined} & {*box.undetermined}
@@ -264,8 +266,8 @@ class TestPossibleBody:
         assert np.diag(box.body.inertia) == pytest.approx(expected, rel=0.2)
         assert np.trace(point.body.inertia) < 0.2 * np.trace(box.body.inertia)
 
-    def test_an_impossible_body_is_said_to_contradict(self) -> None:
-        """A tensor that no distribution of mass has: negative about the centre of mass."""
+    def test_an_inconsistent_body_is_reported(self) -> None:
+        """A tensor that is negative about the centre of mass."""
         impossible = Payload(4.0, (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, -0.15, 0.0, 0.0))
         found = identify_payload(*recordings([None, impossible], noise=0.01 * NOISE))
         assert found.contradicted
@@ -294,8 +296,8 @@ class TestDifference:
 
 
 class TestFrame:
-    def test_figures_are_in_the_frame_asked_for(self) -> None:
-        """A body stated in the frame of a tool comes back in that frame."""
+    def test_results_are_in_the_requested_frame(self) -> None:
+        """A body in the frame of a tool is identified in that frame."""
         tool = (
             '<link name="tool"/><joint name="mount" type="fixed"><parent link="lower"/>'
             '<child link="tool"/><origin xyz="0.1 0 0.3" rpy="0 0.5 0"/></joint></robot>'

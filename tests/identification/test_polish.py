@@ -33,16 +33,16 @@ def scores_of(log10_det, coupling_index, excess=0.0):
 
 
 class Bowl:
-    """Motions whose determinant is 100 at the target and less around it."""
+    """Motions with a maximum of the determinant, 100, at the target."""
 
-    def __init__(self, forbidden=lambda genes: 0.0):
-        self.asked = []
-        self.forbidden = forbidden
+    def __init__(self, excess=lambda genes: 0.0):
+        self.scored = []
+        self.excess = excess
 
     def score(self, genes):
-        self.asked.append(genes.copy())
-        found = scores_of(100.0 - bowl(genes), 80.0, self.forbidden(genes))
-        genes.fill(np.nan)  # whoever scores may do with its copy as it likes
+        self.scored.append(genes.copy())
+        found = scores_of(100.0 - bowl(genes), 80.0, self.excess(genes))
+        genes.fill(np.nan)  # callers must pass copies
         return found
 
 
@@ -63,13 +63,13 @@ def size_of(scores):
 def polished(population, genes, fitness=size_of, **others):
     """Polish from genes whose scores are known; returns genes and scores."""
     scores = population.score(np.array(genes, dtype=np.float64, ndmin=2))
-    if hasattr(population, "asked"):
-        population.asked.clear()
+    if hasattr(population, "scored"):
+        population.scored.clear()
     others = {"evaluations": 200, "seed": 1} | others
     return polish(population.score, genes, scores, fitness, **others)
 
 
-def test_it_finds_the_top_of_a_narrow_ridge():
+def test_it_finds_the_maximum_of_a_narrow_ridge():
     genes, scores = polished(Bowl(), START, evaluations=6000)
     np.testing.assert_allclose(genes, TARGET, atol=1e-3)
     assert scores.rows.tobytes() == Bowl().score(genes[None].copy()).rows.tobytes()
@@ -82,19 +82,19 @@ def test_more_evaluations_never_give_less():
 
 
 @pytest.mark.parametrize("evaluations", [1, 7, 40, 333])
-def test_whole_generations_are_scored_as_many_as_allowed(evaluations):
+def test_complete_generations_are_scored(evaluations):
     population = Bowl()
     polished(population, START, evaluations=evaluations)
     size = generation_size(N)
-    assert [len(genes) for genes in population.asked] == [size] * (evaluations // size)
+    assert [len(genes) for genes in population.scored] == [size] * (evaluations // size)
 
 
-def test_a_start_stays_whatever_becomes_of_scoring():
-    def unlucky(genes):  # as if every process was ended from outside
+def test_failing_scores_do_not_replace_the_start():
+    def failing(genes):  # as if every process was killed
         return Scores.of_rows(np.tile(unplanned(), (len(genes), 1)))
 
     known = Bowl().score(START[None].copy())
-    genes, scores = polish(unlucky, START, known, size_of, evaluations=100, seed=1)
+    genes, scores = polish(failing, START, known, size_of, evaluations=100, seed=1)
     assert genes.tobytes() == START.tobytes()
     assert scores.rows.tobytes() == known.rows.tobytes()
 
@@ -103,7 +103,7 @@ def test_a_start_stays_whatever_becomes_of_scoring():
     ("start", "fitness"),
     [(TARGET, size_of), (START, lambda scores: np.zeros(len(scores.duration)))],
 )
-def test_only_what_is_better_replaces_the_start(start, fitness):
+def test_only_improvements_replace_the_start(start, fitness):
     assert polished(Bowl(), start, fitness)[0].tobytes() == start.tobytes()
 
 
@@ -111,18 +111,18 @@ def test_only_what_is_better_replaces_the_start(start, fitness):
 def test_genes_stay_within_bounds_from_a_corner_too(corner):
     population = Bowl()
     polished(population, np.full(N, corner), evaluations=1500)
-    asked = np.concatenate(population.asked)
+    asked = np.concatenate(population.scored)
     assert np.all((asked >= 0.0) & (asked <= 1.0))
     assert np.all(np.ptp(asked, axis=0) > 0.0)
 
 
 def test_constraints_come_before_the_fitness():
-    def behind(genes):  # the target lies behind it
+    def beyond(genes):  # excludes the target
         return np.maximum(0.0, START[0] - 0.02 - genes[:, 0])
 
-    genes, scores = polished(Bowl(behind), START, evaluations=2000)
+    genes, scores = polished(Bowl(beyond), START, evaluations=2000)
     assert scores.feasible.all() and size_of(scores)[0] > 100.0 - bowl(START[None])[0]
-    assert genes[0] == pytest.approx(START[0] - 0.02, abs=2e-3)  # as far as it may
+    assert genes[0] == pytest.approx(START[0] - 0.02, abs=2e-3)  # at the constraint
 
     def around(genes):
         return np.maximum(0.0, genes[:, 0] - START[0] + 0.03)
@@ -148,20 +148,20 @@ def test_it_is_never_worse_than_its_start(seed, genes):
         assert rugged(after)[0] >= rugged(before)[0]
 
 
-def test_it_ends_when_asked_to_and_where_nothing_moves():
+def test_it_ends_on_request_and_when_steps_are_tiny():
     population = Bowl()
 
     def enough() -> bool:
-        return len(population.asked) > 5
+        return len(population.scored) > 5
 
     _, scores = polished(population, START, evaluations=10_000, stop=enough)
-    assert len(population.asked) == 6
-    assert size_of(scores)[0] == max(100.0 - bowl(genes).min() for genes in population.asked)
+    assert len(population.scored) == 6
+    assert size_of(scores)[0] == max(100.0 - bowl(genes).min() for genes in population.scored)
     polished(population, START, evaluations=100_000)
-    assert sum(map(len, population.asked)) < 50_000
+    assert sum(map(len, population.scored)) < 50_000
 
 
-def test_a_compromise_gets_better_in_all_measures_or_stays():
+def test_a_compromise_improves_in_all_measures_or_stays():
     genes = np.clip(0.5 * (TARGET + TARGET[::-1]) + 0.1, 0.0, 1.0)
     before = TwoGoals().score(genes[None])
     _, after = polished(TwoGoals(), genes, dominating(before), evaluations=2000)
@@ -176,7 +176,7 @@ SPREADS = Scale((20.0, 150.0), (10.0, 30.0))
 
 
 @given(st.floats(50, 150), st.floats(30, 300), st.sampled_from([None, SPREADS]))
-def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index, scale):
+def test_fitness_is_positive_only_for_dominating_motions(log10_det, coupling_index, scale):
     fitness = dominating(scores_of([100.0], [80.0]), scale)
     merit = fitness(scores_of([log10_det], [coupling_index]))[0]
     assert fitness(scores_of([100.0], [80.0]))[0] == 0.0
@@ -186,7 +186,7 @@ def test_nothing_that_is_worse_in_a_measure_dominates(log10_det, coupling_index,
         assert merit > 0.0
 
 
-ON_ITS_OWN = """
+SCRIPT = """
 import numpy as np
 from identification.excitation.searches.run import polish
 from tests.identification.test_polish import scores_of, size_of
@@ -205,7 +205,7 @@ print(genes.tobytes().hex())
 def test_the_threads_of_linear_algebra_change_nothing():
     genes = [
         subprocess.run(
-            [sys.executable, "-c", ON_ITS_OWN],
+            [sys.executable, "-c", SCRIPT],
             env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
             capture_output=True,
             text=True,

@@ -1,4 +1,4 @@
-"""One recording or many pieces of it: every estimator gives the same to nine digits."""
+"""The regressor, and estimators of one recording or its parts, equal to nine digits."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_inertial_columns_are_pinocchios(model: RobotModel) -> None:
             assert np.abs(dense[t, :, column] - expected[:, theirs]).max() < 1e-12
 
 
-def test_blocks_hold_what_acts_on_a_joint_and_nothing_else(model: RobotModel) -> None:
+def test_blocks_have_only_columns_that_act_on_the_joint(model: RobotModel) -> None:
     regressor = model.regressor(*states(50))
     for joint, (block, columns) in enumerate(
         zip(regressor.blocks, regressor.columns, strict=True), start=1
@@ -71,11 +71,11 @@ def test_blocks_hold_what_acts_on_a_joint_and_nothing_else(model: RobotModel) ->
         assert min(link) >= joint, "a link that the joint does not move"
         alone = [n for n in names if "_" in n or (n.endswith("m") and n[0] == "I")]
         assert all(str(joint) in n for n in alone)
-    # The last joint: its link, its rotor, its friction.
+    # the last joint: link, rotor, friction
     assert len(regressor.columns[5]) == 8 + 3
 
 
-def test_a_sliding_joint_has_no_inertia_columns() -> None:
+def test_a_prismatic_joint_has_no_inertia_columns() -> None:
     urdf = (
         '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
         '<joint name="s" type="prismatic"><parent link="a"/><child link="b"/>'
@@ -92,7 +92,7 @@ def test_a_sliding_joint_has_no_inertia_columns() -> None:
 
 
 @pytest.mark.parametrize("m", [0, 1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
-def test_a_sample_does_not_feel_its_neighbours(model: RobotModel, m: int) -> None:
+def test_samples_are_independent(model: RobotModel, m: int) -> None:
     q, qd, qdd = states(m)
     whole = model.regressor(q, qd, qdd)
     assert [len(block) for block in whole.blocks] == [m] * 6
@@ -102,7 +102,7 @@ def test_a_sample_does_not_feel_its_neighbours(model: RobotModel, m: int) -> Non
             assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
 
 
-def test_two_users_of_one_model_do_not_share_working_memory(model: RobotModel) -> None:
+def test_threads_do_not_share_working_arrays(model: RobotModel) -> None:
     first, second = states(300, seed=1), states(300, seed=2)
     alone = [np.concatenate([b.copy() for b in rows]) for _, rows in model.plan.chunks(*first)]
     together = []
@@ -112,8 +112,8 @@ def test_two_users_of_one_model_do_not_share_working_memory(model: RobotModel) -
 
 
 @pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi, 1e4])
-def test_no_angle_is_special(model: RobotModel, angle: float) -> None:
-    # The rotation is made from the tangent of half the angle, which has a pole at pi.
+def test_all_angles_agree_with_pinocchio(model: RobotModel, angle: float) -> None:
+    # tan(q / 2), from which the rotation is computed, has a pole at pi
     q, qd, qdd = states(3)
     q[:] = angle
     nearby = model.regressor(q + 1e-9, qd, qdd)
@@ -129,8 +129,8 @@ def test_a_model_without_friction_or_rotors_has_inertial_columns_only() -> None:
     assert [len(c) for c in model.regressor(*states(2)).columns] == [36, 35, 28, 21, 14, 7]
 
 
-def test_the_working_arrays_go_with_their_model() -> None:
-    """Not when the cycle collector comes: in a process with many objects that takes minutes."""
+def test_working_arrays_are_freed_with_the_model() -> None:
+    """Without the cycle collector, which may run minutes later."""
     model = RobotModel.from_urdf(urdf_text())
     model.regressor(*states(CHUNK))
     plan = weakref.ref(model.plan)
@@ -144,7 +144,7 @@ def test_the_working_arrays_go_with_their_model() -> None:
 
 Array = NDArray[np.float64]
 Pieces = Sequence[tuple[Samples, Motion]]
-"""Pieces of a recording, each with its piece of the plan."""
+"""Parts of a recording with the parts of the plan."""
 
 
 @cache
@@ -153,12 +153,12 @@ def whole() -> tuple[Samples, Motion]:
     rng = np.random.default_rng(7)
     motion = plan._replace(acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
     samples = recording(coloured(rng, len(plan.time), 5e-3, 0.02), motion)
-    samples.torque[100:110] += 40.0  # something for a robust loss to doubt
+    samples.torque[100:110] += 40.0  # outliers
     return samples, plan
 
 
 def cut(places: Sequence[int]) -> Pieces:
-    """The recording in pieces, as archives of one run have it: with a common origin."""
+    """Return the parts of a recording with a common time origin."""
     samples, plan = whole()
     edges = [0, *sorted(places), len(plan.time)]
     parts = [slice(a, b) for a, b in pairwise(edges) if b > a]
@@ -209,7 +209,7 @@ ESTIMATORS: dict[str, Callable[[Pieces], Estimate]] = {
 
 
 def deviations(one: Estimate, other: Estimate) -> Array:
-    """Difference of the values in standard deviations."""
+    """Return the difference of the values in standard deviations."""
     return np.asarray(np.abs(one.values - other.values) / one.std)
 
 
@@ -221,19 +221,17 @@ def from_one(name: str) -> Estimate:
 @pytest.mark.parametrize("name", ESTIMATORS)
 @given(places=st.lists(st.integers(1, 999), max_size=12))
 @settings(max_examples=6, deadline=None)
-def test_pieces_of_any_length_give_the_same_values_and_covariance(
-    name: str, places: list[int]
-) -> None:
+def test_any_split_gives_the_same_values_and_covariance(name: str, places: list[int]) -> None:
     one, many = from_one(name), ESTIMATORS[name](cut(places))
     assert deviations(one, many).max() < 1e-9
     np.testing.assert_allclose(many.std, one.std, rtol=1e-9)
     assert many.method.rpartition(", ")[2] == one.method.rpartition(", ")[2]  # the blocks
 
 
-# The factor itself
+# Factors
 
 
-def test_blocks_can_be_picked_put_in_a_row_merged_and_restricted() -> None:
+def test_blocks_can_be_selected_joined_merged_and_restricted() -> None:
     phase = total_phase(MODEL, recordings(cut([])))
     half = len(phase) // 2
     again = joined([phase.blocks(slice(0, half)), phase.blocks(slice(half, None))])
@@ -253,7 +251,7 @@ def test_blocks_can_be_picked_put_in_a_row_merged_and_restricted() -> None:
     )
 
 
-def test_blocks_without_rows_are_left_out_and_change_nothing() -> None:
+def test_blocks_without_rows_change_nothing() -> None:
     samples, _ = whole()
     late = replace(samples, origin=samples.origin - 3.0)
     phase, same = (PhaseFactor.from_samples(MODEL, one) for one in (late, samples))

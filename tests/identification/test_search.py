@@ -35,17 +35,14 @@ from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits, plan_moves
 from planner.errors import LimitExceeded
-from tests.identification.searching import LIMITS, bits, moody, problem
+from tests.identification.searching import LIMITS, bits, faulty, problem
 
 SETTINGS = SearchSettings(population=12, generations=4, seed=3)
 METHODS = ("a", "b", "balanced", "front")
 
 
-class Watched(Population):
-    """Remembers everything that was scored, and can be interrupted.
-
-    What it has scored before it does not score again: many tests ask for the same motions.
-    """
+class RecordingPopulation(Population):
+    """Population that records and caches all scores, and can be interrupted."""
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
@@ -74,7 +71,7 @@ class Watched(Population):
 
 
 class Stop:
-    """True once it was asked so many times."""
+    """Stop request after a number of calls."""
 
     def __init__(self, after: int):
         self.left = after
@@ -86,13 +83,13 @@ class Stop:
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch):
-    """A child finds the genomes of these tests under the name that they have here."""
+    """Make the genomes of these tests importable in child processes."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
 
 
 @pytest.fixture(scope="module")
 def shared():
-    with Watched(problem()) as population:
+    with RecordingPopulation(problem()) as population:
         yield population
 
 
@@ -106,7 +103,7 @@ def settings(method, **others) -> SearchSettings:
 
 
 def fitness_of(settings, scores, scale=None) -> np.ndarray:
-    """What the three methods with one number make as large as they can."""
+    """Return the fitness of the three methods with a single objective."""
     size, coupled = scores.measure("log10_det"), scores.measure("coupling_index")
     if settings.method == "a":
         return size
@@ -119,7 +116,7 @@ def fitness_of(settings, scores, scale=None) -> np.ndarray:
 
 @pytest.mark.parametrize("method", ["a", "b", "balanced"])
 @pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
-def test_the_largest_fitness_of_all_wins(population, method, weights):
+def test_the_largest_fitness_is_chosen(population, method, weights):
     """Determinant, eq. 7, or both measures in units of their spread over 200 random motions."""
     chosen = settings(method, weights=weights)
     design = search(population, chosen)
@@ -132,7 +129,7 @@ def test_the_largest_fitness_of_all_wins(population, method, weights):
         np.testing.assert_allclose(design.history[-1, 0], fitness.max(), rtol=1e-12)
 
 
-def test_the_front_is_what_nothing_beats_and_its_knee_wins(population):
+def test_the_front_is_not_dominated_and_its_knee_is_chosen(population):
     design = search(population, settings("front"))
     best = Front.of(np.concatenate(population.genes), population.everything)
     assert design.front.measures.tolist() == best.measures.tolist()
@@ -141,7 +138,7 @@ def test_the_front_is_what_nothing_beats_and_its_knee_wins(population):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_polish_never_costs_anything(population, method):
+def test_a_polish_is_never_worse(population, method):
     unpolished = search(population, settings(method))
     chosen = settings(method, polish=60)
     polished = search(population, chosen)
@@ -165,7 +162,7 @@ def test_a_polish_never_costs_anything(population, method):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_more_generations_never_give_less_and_begin_alike(population, method):
+def test_more_generations_are_never_worse(population, method):
     short = search(population, settings(method, generations=3)).history
     long = search(population, settings(method, generations=6)).history
     assert (len(short), len(long)) == (3, 6)
@@ -177,7 +174,7 @@ def test_more_generations_never_give_less_and_begin_alike(population, method):
         assert np.all(np.diff(long[:, 0]) >= 0.0)
 
 
-def test_a_search_finds_more_than_chance_does(population):
+def test_a_search_is_better_than_random_motions(population):
     """Among as many motions: a larger determinant, or more room under the front."""
     sought = {"population": 30, "generations": 25, "mutation": 0.1}
     design = search(population, settings("a", **sought))
@@ -217,7 +214,7 @@ def test_sums_of_sines_are_searched_like_via_points():
     assert not check_motion(design.excitation.trajectory, LIMITS)
 
 
-class Finer(Watched):
+class FinePopulation(RecordingPopulation):
     """At a millisecond all motions but one are worse in a measure, or the same without one."""
 
     def __init__(self, best, measure):
@@ -239,10 +236,10 @@ class Finer(Watched):
     ("method", "measure"),
     [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index"), ("front", None)],
 )
-def test_a_polish_no_better_at_a_millisecond_is_left_alone(population, method, measure):
+def test_a_polish_must_be_better_at_a_millisecond(population, method, measure):
     unpolished = search(population, settings(method))
     assert search(population.begin(), settings(method, polish=60)).chosen is None
-    with Finer(unpolished.genes, measure) as finer:
+    with FinePopulation(unpolished.genes, measure) as finer:
         design = search(finer, settings(method, polish=60))
     assert design.genes.tobytes() == unpolished.genes.tobytes()
     assert design.chosen == design.origin == unpolished.chosen
@@ -259,7 +256,7 @@ def test_motions_are_counted_as_they_are_scored():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_a_seed_is_one_design_to_the_last_bit(population, method, capsys):
+def test_a_seed_determines_the_design_bit_for_bit(population, method, capsys):
     chosen = settings(method, polish=40)
     np.random.seed(1)  # noqa: NPY002  the generator that everybody shares
     first = search(population, chosen)
@@ -290,7 +287,7 @@ def opened(file, chosen) -> Journal:
 
 @pytest.mark.parametrize("method", ["b", "front"])
 @pytest.mark.parametrize("after", [1, 3, 5, 6])
-def test_a_resumed_search_is_one_that_was_not_stopped(population, method, after):
+def test_a_resumed_search_equals_an_uninterrupted_one(population, method, after):
     chosen = settings(method, polish=60)
     whole = bits(search(population.begin(), chosen))
     everything = sum(map(len, population.genes))
@@ -321,7 +318,7 @@ def test_an_interrupt_loses_one_generation_only(population, after):
 
 
 @pytest.mark.slow
-def test_ctrl_c_ends_the_processes_and_the_journal_is_whole(population, tmp_path):
+def test_ctrl_c_ends_the_processes_and_the_journal_is_complete(population, tmp_path):
     chosen = settings("front", generations=40, polish=60)
     path = tmp_path / "search.journal"
     script = f"""
@@ -371,7 +368,7 @@ def test_a_finished_search_is_read_without_scoring(population):
     assert len(file.getvalue()) == size
 
 
-def test_a_journal_that_lost_its_tail_costs_only_that(population):
+def test_a_truncated_journal_costs_one_generation(population):
     chosen = settings("b")
     file = io.BytesIO()
     whole = bits(search(population, chosen, journal=opened(file, chosen)))
@@ -381,7 +378,7 @@ def test_a_journal_that_lost_its_tail_costs_only_that(population):
     assert torn.getvalue() == file.getvalue()
 
 
-def test_progress_says_how_far_it_is_and_the_best(population):
+def test_progress_reports_counts_and_the_best_motion(population):
     seen = []
     design = search(population, settings("front", polish=40), progress=seen.append)
     assert [each.phase for each in seen] == ["sample"] + 4 * ["search"] + 2 * ["polish"]
@@ -394,7 +391,7 @@ def test_progress_says_how_far_it_is_and_the_best(population):
 
 
 def test_a_search_gets_from_infeasible_motions_to_feasible_ones(population):
-    """Infeasible motions lead to feasible ones by how little they miss them."""
+    """Infeasible motions are ranked by their excess."""
     random = population.problem.score(np.random.default_rng(5).random((400, 8)))
     bound = float(np.quantile(random.duration, 0.005))
     seen = []
@@ -408,11 +405,11 @@ def test_a_search_gets_from_infeasible_motions_to_feasible_ones(population):
     assert np.all(design.front.duration <= bound)
 
 
-def test_it_says_what_forbids_every_motion_and_by_how_much(shared):
+def test_the_error_has_the_smallest_violations(shared):
     slow = JointLimits(
         LIMITS.lower, LIMITS.upper, LIMITS.velocity * [1.0, 0.2], LIMITS.acceleration, LIMITS.jerk
     )
-    with Watched(problem(limits=slow, max_duration=0.5)) as impossible:
+    with RecordingPopulation(problem(limits=slow, max_duration=0.5)) as impossible:
         with pytest.raises(NoFeasibleMotionError) as caught:
             search(impossible, settings("front"))
         scores = impossible.everything
@@ -438,7 +435,7 @@ def test_it_says_what_forbids_every_motion_and_by_how_much(shared):
         assert part in str(error)
 
 
-def test_a_search_stopped_too_early_says_so(population):
+def test_an_early_stop_is_reported(population):
     with pytest.raises(NoFeasibleMotionError, match=r"no motion was tried.*stopped") as caught:
         search(population, settings("a"), stop=lambda: True)
     assert (caught.value.tried, caught.value.stopped) == (0, True)
@@ -451,8 +448,8 @@ def test_a_search_stopped_too_early_says_so(population):
 
 
 def test_motions_that_excite_too_little_are_no_result():
-    """The elbow rests: every constraint is satisfied, and its friction cannot be identified."""
-    with Population(problem(moody(still=True))) as population:
+    """The elbow rests: all constraints are satisfied, its friction is not excited."""
+    with Population(problem(faulty(elbow_at_rest=True))) as population:
         for method in METHODS:
             with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:
                 search(population, settings(method, generations=2))
@@ -463,14 +460,14 @@ def test_motions_that_excite_too_little_are_no_result():
 def test_a_motion_that_crashes_its_process_does_not_win(population):
     small = settings("b", population=6, generations=1)
     best = search(population, small).genes[0]
-    deadly = moody(crash=(best - 0.01, best + 0.01))
-    with Population(problem(deadly), workers=2) as others:
+    crashing = faulty(crash=(best - 0.01, best + 0.01))
+    with Population(problem(crashing), workers=2) as others:
         design = search(others, small)
     assert design.excitation.rejected == {"planning": 1}
     assert abs(design.genes[0] - best) > 0.01
 
 
-def test_a_search_that_mates_nothing_new_ends_and_is_whole(population):
+def test_a_search_without_new_motions_ends_as_exhausted(population):
     design = search(population, settings("b", population=2, crossover=0.0, mutation=0.0))
     assert design.complete and design.exhausted
     assert len(design.history) == 1
@@ -494,7 +491,7 @@ def scorers():
         yield scorers
 
 
-def test_processes_company_and_order_change_no_bit(scorers):
+def test_scores_do_not_depend_on_processes_batch_and_order(scorers):
     rows = genes(37)
     expected = scorers.score(rows)
     assert same(scorers.problem.score(rows), expected)
@@ -511,9 +508,9 @@ def test_a_motion_that_crashes_its_process_costs_no_other_motion(scorers):
     rows = genes(20, seed=3)
     rows[:, 0] *= 0.9
     rows[11, 0] = 0.99
-    with Population(problem(moody(crash=(0.95, 1.0))), workers=2) as deadly:
-        scores = deadly.score(rows)
-        assert same(deadly.score(rows[:12]), Scores.of_rows(scores.rows[:12]))  # nor is it chance
+    with Population(problem(faulty(crash=(0.95, 1.0))), workers=2) as crashing:
+        scores = crashing.score(rows)
+        assert same(crashing.score(rows[:12]), Scores.of_rows(scores.rows[:12]))  # nor is it chance
     crashed = rows[:, 0] >= 0.95
     np.testing.assert_array_equal(scores.feasible, ~crashed)
     np.testing.assert_array_equal(scores.rows[crashed], unplanned()[None])
@@ -522,11 +519,11 @@ def test_a_motion_that_crashes_its_process_costs_no_other_motion(scorers):
 
 
 @pytest.mark.slow
-def test_a_motion_is_late_only_if_it_was_alone(scorers):
-    """Those that shared its process wait and are scored after all."""
+def test_a_timeout_applies_to_a_motion_alone(scorers):
+    """The other motions of its batch are scored."""
     rows = genes(8, seed=4) * 0.9
     rows[5, 0] = 1.0
-    with Population(problem(moody(hang=(0.99, 1.0))), timeout=5.0) as slow:
+    with Population(problem(faulty(hang=(0.99, 1.0))), timeout=5.0) as slow:
         begin = time.monotonic()
         scores = slow.score(rows)
         assert time.monotonic() - begin > 10.0  # once in company, once with all the time for itself
@@ -535,23 +532,23 @@ def test_a_motion_is_late_only_if_it_was_alone(scorers):
     assert scores.rows[others].tobytes() == scorers.score(rows[others]).rows.tobytes()
 
 
-def test_genes_without_a_motion_are_worst_and_say_why(scorers):
+def test_unplannable_genes_are_worst_with_a_violation(scorers):
     rows = genes(3)
     rows[1, 0] = 1.0
-    with Population(problem(moody(refuse=(0.999, 1.0)))) as refusing:
+    with Population(problem(faulty(refuse=(0.999, 1.0)))) as refusing:
         scores = refusing.score(rows)
         (violation,) = refusing.violations(rows[1])
         assert refusing.violations(rows[0]) == ()
     np.testing.assert_array_equal(scores.feasible, [True, False, True])
     np.testing.assert_array_equal(scores.rows[1], unplanned())
     np.testing.assert_array_equal(unplanned()[:3], [-np.inf, np.inf, np.nan])
-    assert violation.kind == "planning" and "this motion cannot be" in str(violation)
-    with Population(problem(moody(crash=(0.0, 1.0)))) as deadly:
-        (violation,) = deadly.violations(rows[0])
+    assert violation.kind == "planning" and "planning failed" in str(violation)
+    with Population(problem(faulty(crash=(0.0, 1.0)))) as crashing:
+        (violation,) = crashing.violations(rows[0])
     assert violation.kind == "planning" and "signal 6" in str(violation)
 
 
-def test_a_process_ended_from_outside_changes_nothing(scorers):
+def test_a_killed_process_changes_nothing(scorers):
     rows = genes(2)
     expected = scorers.score(rows[:1]), scorers.evaluate(rows[0], 0.01)[1]
     for pid in (child.pid for child in scorers._children):
@@ -570,7 +567,7 @@ def currents(limit: float) -> CurrentModel:
 
 
 def test_excess_is_that_of_the_violations_by_kind(scorers):
-    """A search sees what the last check sees, in the middle of steps and at their ends."""
+    """Scores agree with the violations of the final check."""
     slower = replace(LIMITS, velocity=0.8 * LIMITS.velocity)
     asked = problem(max_duration=2.0, limits=slower, currents=currents(20.0))
     rows = genes(16, seed=5)
@@ -610,7 +607,7 @@ def scored(log10_det: float, coupling_index: float, excess: float) -> np.ndarray
 
 
 @pytest.mark.parametrize(("method", "n_objectives"), [("b", 1), ("front", 2)])
-def test_what_cannot_be_judged_ranks_behind_the_rest(method, n_objectives):
+def test_unexciting_and_unplannable_motions_rank_last(method, n_objectives):
     rows = np.array(
         [
             unplanned(),

@@ -1,4 +1,4 @@
-"""What simulators read is the identified arm, what they cannot read is named; motions replayed."""
+"""Files for simulators, parts of torque, noise, and replays of motions."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WRIST[5, 4] = 0.5
 
 
 def an_arm(urdf: str, **options: object) -> Arm:
-    """Possible bodies that have nothing to do with the description, and friction of all kinds."""
+    """Random consistent bodies, and friction of all kinds."""
     model = RobotModel.from_urdf(urdf, **options)  # type: ignore[arg-type]
     n = model.n_joints
     standard = np.zeros(model.layout.size)
@@ -63,7 +63,7 @@ FORMS = pytest.mark.parametrize("form", FORMATS)
 
 
 class TestReadBack:
-    """Inverse dynamics of the file are those of the model, in what the format has room for."""
+    """Inverse dynamics of the file agree with the supported parts of the model."""
 
     @FORMS
     @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -75,7 +75,7 @@ class TestReadBack:
 
     @FORMS
     def test_a_published_description(self, form: str) -> None:
-        """Its angles are rounded; locked joints are part of the links that carry them."""
+        """With rounded angles and locked joints."""
         readable(form)
         arm = an_arm(robot_text("panda_description/urdf/panda.urdf"),
                      locked={"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02})  # fmt: skip
@@ -124,7 +124,7 @@ class TestReadBack:
             np.testing.assert_allclose(found.left_out["rotor inertias"], rms)
 
     @FORMS
-    def test_another_text_is_refused(self, form: str) -> None:
+    def test_a_changed_text_is_refused(self, form: str) -> None:
         readable(form)
         arm = an_arm(urdf_text())
         other = replace(arm, standard=1.01 * arm.standard)
@@ -134,7 +134,7 @@ class TestReadBack:
 
 
 class TestTexts:
-    """What stands in the files beside the inertia."""
+    """Content of the files beside the inertia."""
 
     def test_limits_springs_and_names(self) -> None:
         arm = an_arm(urdf_text(), elements=[TorsionSpring("joint_2", 0.3, 50.0)])
@@ -237,7 +237,7 @@ class TestParts:
 
 
 class TestFrictionCurve:
-    """The law of a joint over speed and after a reversal."""
+    """Friction of a joint over speed and after a reversal."""
 
     def test_jumps_at_zero_and_has_the_offset(self) -> None:
         model = model_with()
@@ -250,7 +250,7 @@ class TestFrictionCurve:
         assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
         assert np.isnan(curve.travel).all() and np.isnan(curve.turning).all()
 
-    def test_turns_round_over_the_presliding_displacement(self) -> None:
+    def test_reverses_over_the_presliding_displacement(self) -> None:
         model = model_with(presliding=PRESLIDING)
         curve = friction_curve(model, values_of(model), 0, -1.0, 1.0)
         assert curve.turning[0] == pytest.approx(FO[0] - F0[0])
@@ -259,15 +259,15 @@ class TestFrictionCurve:
         assert zero == pytest.approx(PRESLIDING * np.log(2.0), rel=0.02)
 
     def test_of_an_arm_with_an_identified_spring(self) -> None:
-        """Parameters behind those of friction are none of the curve's."""
+        """Parameters after those of friction are ignored."""
         law = FrictionLaw(third=None, offset=True)
         spring = TorsionSpring("shoulder", 0.2, identified=True)
         model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
         curve = friction_curve(model, np.append(values_of(model_with()), 25.0), 0, -1.0, 1.0)
         assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
 
-    def test_is_what_the_data_lie_on(self) -> None:
-        """Torque without the other parts, of a perfect model, lies on the curve."""
+    def test_agrees_with_the_data(self) -> None:
+        """Torque minus the other parts is on the curve for a perfect model."""
         model = model_with()
         values, samples = values_of(model), samples_of(model)
         speed = samples.motion.velocity[:, 0]
@@ -291,7 +291,7 @@ class TestSpectrum:
         assert level == pytest.approx(expected, rel=0.05)
 
     def test_has_its_peak_at_the_sine(self) -> None:
-        """Uneven stamps are the times of the samples, not their numbers."""
+        """Uneven time stamps are used as times."""
         rng = np.random.default_rng(2)
         time = np.sort(np.arange(4000) * 0.01 + rng.uniform(0.0, 0.003, 4000))
         frequency, density = spectrum(
@@ -309,7 +309,7 @@ class TestSpectrum:
 
 
 class TestNoise:
-    """A measured torque has noise at every frequency, unless it came through a low-pass."""
+    """Measured torque has noise at every frequency, unless it is low-passed."""
 
     TIME = np.arange(4000) * 0.005
     SHAPE = LowPassShape(order=4)
@@ -351,7 +351,7 @@ def an_ns16(**options: object) -> Simulated:
 
 
 def recorded(arm: Simulated, step: float = 2e-3) -> Samples:
-    """A motion of three seconds of sines, with the torque that it takes."""
+    """A motion of three seconds of sines with its torque."""
     time = np.arange(0.0, 3.0, step)
     rng = np.random.default_rng(2)
     size, rate, phase = (rng.uniform(low, high, 6) for low, high in ((0.2, 0.5), (2, 4), (0, 6)))
@@ -372,7 +372,7 @@ OPTIONS = {
 
 
 class TestReplay:
-    """The model that made the torques makes the motion; another one does not."""
+    """The true model reproduces the motion; another one does not."""
 
     @pytest.mark.parametrize("name", OPTIONS)
     def test_the_true_arm_makes_the_motion(self, name: str) -> None:
@@ -391,13 +391,13 @@ class TestReplay:
         np.testing.assert_allclose(found[0], alone[0], atol=1e-12)
         assert not np.allclose(found[1], heavy[0], atol=1e-6)  # another inertia's feedback
 
-    def test_an_arm_of_another_weight_goes_astray(self) -> None:
+    def test_an_arm_of_another_weight_drifts(self) -> None:
         arm = an_ns16()
         good, bad = replay(together(arm, changed_weight(arm, 1.2)), recorded(arm))
         assert np.all(np.sqrt(np.mean(bad**2, axis=0)) > 3.0 * np.sqrt(np.mean(good**2, axis=0)))
 
     def test_dry_friction_holds_an_arm_at_rest(self) -> None:
-        """Gravity alone would let every joint fall."""
+        """Without friction every joint would fall."""
         arm = an_ns16(friction=FrictionLaw(viscous=False, third=None))
         values = arm.values.copy()
         values[:, arm.model.friction_part] = 1e4
@@ -406,7 +406,7 @@ class TestReplay:
         error = replay(arm._replace(values=values), samples(arm.model, motion, 0.0 * still))
         assert np.abs(error).max() < 1e-9
 
-    def test_a_gap_begins_anew(self) -> None:
+    def test_a_gap_starts_a_new_simulation(self) -> None:
         arm = an_ns16()
         given = recorded(arm)
         parts = replace(given, segments=(slice(0, 600), slice(800, 1500)))
@@ -415,7 +415,7 @@ class TestReplay:
         assert not error[:, [0, 800]].any()
 
     def test_mujoco_makes_the_same_motion(self) -> None:
-        """From the same description, with the same feedback, half as heavy as the truth."""
+        """With half of the true mass, from the same description with the same feedback."""
         pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
         truth = an_ns16(coupling=Coupling(WRIST))
         given, arm = recorded(truth, 1e-3), changed_weight(truth, 0.5)
@@ -458,10 +458,10 @@ def by_mujoco(arm: Simulated, given: Samples) -> Array:
 
 
 class TestSlowResidual:
-    """What makes a replay drift is told apart by how it depends on the motion."""
+    """Causes of drift are separated by their dependence on the motion."""
 
     @pytest.mark.parametrize("joint", [0, 3])
-    def test_an_offset_and_friction_are_told_apart(self, joint: int) -> None:
+    def test_an_offset_and_friction_are_separated(self, joint: int) -> None:
         arm = an_ns16()
         right = recorded(arm)
         velocity = right.motion.velocity[:, joint]

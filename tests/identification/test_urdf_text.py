@@ -1,4 +1,4 @@
-"""Robot descriptions that anybody may have written: refused in a sentence, never a crash."""
+"""Untrusted robot descriptions: refused with a message; writing of URDFs."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ ARM = (
 
 
 def arm(old: str, new: str) -> str:
-    """The arm with something of it replaced."""
+    """Return the arm with replaced text."""
     assert old in ARM
     return ARM.replace(old, new)
 
 
 def chain(n: int, kind: str) -> str:
-    """The arm with a chain of `n` more links."""
+    """Return the arm with a chain of `n` more links."""
     links = ["upper", *(f"l{i}" for i in range(n))]
     more = "".join(
         f'<link name="{after}"/>{HINGE.format(f"j_{after}", kind, before, after)}'
@@ -68,7 +68,7 @@ def declaring(entity: str, used: str = "") -> str:
 
 
 def expanding() -> str:
-    """Ten entities, each ten of the one before: "a billion laughs"."""
+    """Ten nested entities ("billion laughs")."""
     lines = [f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10)]
     return declaring('<!ENTITY e0 "ha">' + "".join(lines), "&e9;")
 
@@ -172,7 +172,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_it_is_refused_in_a_sentence_and_at_once(case: str) -> None:
+def test_invalid_texts_are_refused_quickly(case: str) -> None:
     text, why = REFUSED[case]
     began = time.process_time()
     with pytest.raises(ModelError) as caught:
@@ -195,8 +195,8 @@ LOST = {
 
 
 @pytest.mark.parametrize("left_out", LOST)
-def test_an_inertia_of_which_a_part_is_missing_is_refused(left_out: str) -> None:
-    """The reader drops the tensor, the mass too or not, and the shapes of the link."""
+def test_an_incomplete_inertia_is_refused(left_out: str) -> None:
+    """The reader drops the tensor, sometimes the mass, and the shapes of the link."""
     text = without(left_out)
     whole, read = (pin.buildModelFromXML(urdf) for urdf in (ARM, text))
     assert not np.allclose(read.inertias[1].inertia, whole.inertias[1].inertia)
@@ -206,12 +206,12 @@ def test_an_inertia_of_which_a_part_is_missing_is_refused(left_out: str) -> None
 
 
 @pytest.mark.parametrize("left_out", [INERTIAL, '<origin xyz="0.2 0 0"/>', ' xyz="0.2 0 0"'])
-def test_what_may_be_missing_is_not_asked_for(left_out: str) -> None:
+def test_optional_parts_may_be_missing(left_out: str) -> None:
     assert RobotModel.from_urdf(without(left_out)).n_joints == 1
 
 
 @pytest.mark.parametrize("encoding", ["GB2312", "Shift_JIS", "UTF-32", "ISO-8859-1", "nonsense"])
-def test_the_encoding_that_a_decoded_text_names_counts_no_longer(encoding: str) -> None:
+def test_the_declared_encoding_is_ignored(encoding: str) -> None:
     joint = "\N{GREEK CAPITAL LETTER ALPHA}"  # its bytes cannot be printed in ISO-8859-1
     text = f'<?xml version="1.0" encoding="{encoding}"?>{arm("shoulder", joint)}'
     model = RobotModel.from_urdf(text)
@@ -221,13 +221,13 @@ def test_the_encoding_that_a_decoded_text_names_counts_no_longer(encoding: str) 
 
 
 @pytest.mark.parametrize("number", ["6", " 6", "+6", "6.", "6e0", "0.6E+1", "006"])
-def test_what_passes_as_a_number_is_read_as_that_number(number: str) -> None:
+def test_accepted_numbers_are_read_correctly(number: str) -> None:
     model = RobotModel.from_urdf(arm('value="6"', f'value="{number}"'))
     mass = model.chain.inertial[0, list(model.layout.names).index("m1")]
     assert math.isclose(mass, 6.0)
 
 
-def test_attributes_in_lines_of_their_own_are_as_good() -> None:
+def test_attributes_may_be_on_separate_lines() -> None:
     assert refusal(ARM.replace('" i', '"\n\ti').replace('" value', '"\n value')) is None
     assert refusal("<!-- a > b -->\n" + arm("<mass ", "<mass\n\t")) is None
 
@@ -246,15 +246,15 @@ def checker(urdf: str) -> CollisionChecker:
         ("0.3 1e308 0.1", r"a collision shape of link 'upper' is larger than 1e\+06 m"),
     ],
 )
-def test_no_collision_shape_is_left_out_without_a_word(size: str, why: str) -> None:
-    """A second, sound one hides the first otherwise: the arm would be thinner than it is."""
+def test_unreadable_collision_shapes_are_refused(size: str, why: str) -> None:
+    """A second, valid shape must not hide an invalid one."""
     urdf = arm(SHAPE, SHAPE.replace("0.3 0.1 0.1", size))
     both = chain(1, "revolute").replace(SHAPE, SHAPE.replace("0.3 0.1 0.1", size))
     both = both.replace('<link name="l0"/>', f'<link name="l0">{SHAPE}</link>')
     for text in (urdf, both):
         with pytest.raises(CollisionModelError, match=why):
             checker(text)
-    assert RobotModel.from_urdf(urdf).n_joints == 1  # to an estimate shapes are nothing
+    assert RobotModel.from_urdf(urdf).n_joints == 1  # shapes do not affect an estimate
 
 
 AWAY = r"more than 1e\+06 m away from its parent"
@@ -262,7 +262,7 @@ FAR = '<origin xyz="1e300 0 0"/>'
 
 
 @pytest.mark.parametrize("kind", ["revolute", "fixed"])
-def test_what_is_farther_away_than_a_robot_is_refused(kind: str) -> None:
+def test_too_distant_parts_are_refused(kind: str) -> None:
     sound = chain(1, kind)
     joint = '<joint name="j_l0" type="' + kind + '">'
     assert joint in sound
@@ -293,14 +293,14 @@ PIPE = '<collision><geometry><{0} radius="0.1" length="1"/></geometry></collisio
         (SHAPE.replace("</geo", '<sphere radius="2"/></geo'), "2 .* 1 .* needs one box"),
     ],
 )
-def test_what_is_wrong_with_a_shape_is_told(shapes: str, why: str) -> None:
+def test_errors_of_shapes_are_reported(shapes: str, why: str) -> None:
     with pytest.raises(CollisionModelError, match=why):
         checker(arm(SHAPE, shapes))
 
 
 @pytest.mark.parametrize("corner", [math.nan, math.inf, 0.0])
-def test_a_mesh_that_is_no_body_is_named(corner: float, tmp_path: Path) -> None:
-    """Four triangles in one point, or nowhere."""
+def test_a_mesh_without_volume_is_named(corner: float, tmp_path: Path) -> None:
+    """Four triangles in one point, or with invalid corners."""
     triangle = b"\0" * 12 + struct.pack("<9f", *[corner] * 9) + b"\0\0"
     mesh = tmp_path / "mesh.stl"
     mesh.write_bytes(b"\0" * 80 + struct.pack("<I", 4) + 4 * triangle)
@@ -310,8 +310,8 @@ def test_a_mesh_that_is_no_body_is_named(corner: float, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [ARM, ARM[:-1]])
-def test_a_description_that_was_read_is_not_kept(text: str) -> None:
-    """It may have 20 MB, and the cycle collector may take minutes to come."""
+def test_a_description_is_freed_after_reading(text: str) -> None:
+    """It may have 20 MB; the cycle collector may run minutes later."""
     refusal(text)
     gc.collect()
     gc.disable()
@@ -388,7 +388,7 @@ def test_pinocchio_reads_the_parameters_back(name: str) -> None:
             np.concatenate([base, np.zeros(4 * n)]), q[None], qd[None], qdd[None]
         )[0]
         found = pin.rnea(read, data, pin.integrate(read, pin.neutral(read), q), qd, qdd)
-        # The base parameters leave out what rounded angles make of a dependent column.
+        # The base parameters neglect the effect of rounded angles on dependent columns.
         np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
     np.testing.assert_array_equal(read.damping, friction[n : 2 * n])
     np.testing.assert_allclose(
@@ -397,7 +397,7 @@ def test_pinocchio_reads_the_parameters_back(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_nothing_but_inertia_and_friction_changes(name: str) -> None:
+def test_only_inertia_and_friction_change(name: str) -> None:
     urdf = ROBOTS[name]()
     model = RobotModel.from_urdf(urdf)
     friction = np.ones(3 * model.n_joints)
@@ -420,14 +420,14 @@ def test_nothing_but_inertia_and_friction_changes(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["two_link", "ns16"])
-def test_writing_what_is_there_changes_rounding_only(name: str) -> None:
+def test_writing_nominal_values_changes_rounding_only(name: str) -> None:
     urdf = ROBOTS[name]()
     model = RobotModel.from_urdf(urdf)
     again = RobotModel.from_urdf(write_urdf(urdf, model, model.nominal))
     np.testing.assert_allclose(again.nominal, model.nominal, rtol=1e-12, atol=1e-12)
 
 
-def test_friction_is_left_alone_if_none_is_given() -> None:
+def test_friction_is_unchanged_if_not_given() -> None:
     urdf = ROBOTS["panda"]()
     model = RobotModel.from_urdf(urdf)
     before = [e.attrib for e in ElementTree.fromstring(urdf).iter("dynamics")]
@@ -459,7 +459,7 @@ WITH_TOOL = TWO_LINK.replace(
 )
 
 
-def test_what_is_fixed_to_a_link_is_counted_with_it_once() -> None:
+def test_fixed_links_are_included_once() -> None:
     model = RobotModel.from_urdf(WITH_TOOL)
     assert model.nominal[20] == pytest.approx(4.0)  # 3 kg and 1 kg
     written = write_urdf(WITH_TOOL, model, model.nominal)
@@ -485,7 +485,7 @@ def test_the_base_keeps_its_inertia() -> None:
     assert '<mass value="50"/>' in write_urdf(urdf, model, some_bodies(2))
 
 
-def test_a_turned_inertial_frame_stays_turned() -> None:
+def test_a_rotated_inertial_frame_is_kept() -> None:
     urdf = TWO_LINK.replace('<origin xyz="0.02 0 0.25" rpy="0 0 0"/>', '<origin rpy="0.3 -1 2"/>')
     model = RobotModel.from_urdf(urdf)
     standard = some_bodies(2)
@@ -510,7 +510,7 @@ FIXED = TWO_LINK.replace('name="elbow" type="revolute"', 'name="elbow" type="fix
 @pytest.mark.parametrize(
     ("standard", "friction", "error", "words"),
     [
-        # I2yy about the joint: less than the centre of mass alone makes
+        # I2yy about the joint: less than the share of the centre of mass
         ({14: 0.0}, (), NotConsistentError, "'elbow'"),
         ({10: -0.1}, (), NotConsistentError, "'shoulder'"),
         *(({10: value}, (), NotConsistentError, "I1m") for value in (np.nan, np.inf)),
@@ -521,7 +521,7 @@ FIXED = TWO_LINK.replace('name="elbow" type="revolute"', 'name="elbow" type="fix
         ({}, np.ones(3), ShapeError, "coefficients"),
     ],
 )
-def test_what_no_machine_has_is_not_written(standard, friction, error, words) -> None:
+def test_inconsistent_parameters_are_refused(standard, friction, error, words) -> None:
     model = RobotModel.from_urdf(TWO_LINK)
     values = model.nominal.copy()
     values[[*standard]] = [*standard.values()]
@@ -561,7 +561,7 @@ TEXT = """<?xml version="1.0"?>
 
 
 class TestXmlSource:
-    """Bytes of an edit change, and no others."""
+    """An edit changes only its own bytes."""
 
     def test_elements_are_found_where_they_stand(self) -> None:
         source, data = XmlSource(TEXT), TEXT.encode()

@@ -61,7 +61,7 @@ def found(limits, checker, make_currents):
     )
 
 
-def test_they_are_feasible_wide_and_all_different(found, limits, checker, make_currents):
+def test_motions_are_feasible_wide_and_different(found, limits, checker, make_currents):
     motions = [each.trajectory for each in found]
     assert len(motions) == 6
     for motion in motions:
@@ -79,9 +79,7 @@ def test_they_are_feasible_wide_and_all_different(found, limits, checker, make_c
     assert np.all((high - low) / (limits.upper - limits.lower) > 0.7)
 
 
-def test_a_seed_gives_the_same_ones_however_many_are_asked_for(
-    found, limits, checker, make_currents
-):
+def test_motions_do_not_depend_on_their_number(found, limits, checker, make_currents):
     again = random_validation_motions(
         limits, home=HOME, seed=3, count=2, checker=checker, currents=make_currents(1)
     )
@@ -100,7 +98,7 @@ def test_the_motions_of_a_seed_never_change(limits):
     )
 
 
-def test_motions_that_ask_for_too_much_current_are_not_chosen(limits, checker, make_currents):
+def test_motions_satisfy_the_current_limits(limits, checker, make_currents):
     modest = make_currents(0.5)
     free = random_validation_motions(limits, home=HOME, seed=3, count=6, checker=checker)
     chosen = random_validation_motions(
@@ -110,7 +108,7 @@ def test_motions_that_ask_for_too_much_current_are_not_chosen(limits, checker, m
     assert not any(check_motion(m.trajectory, limits, currents=modest) for m in chosen)
 
 
-def test_a_motion_whose_planning_kills_its_process_is_passed_over(limits, monkeypatch):
+def test_a_motion_that_crashes_its_planner_is_skipped(limits, monkeypatch):
     first, second = random_validation_motions(limits, home=HOME, seed=3, count=2)
     calls = []
 
@@ -126,7 +124,7 @@ def test_a_motion_whose_planning_kills_its_process_is_passed_over(limits, monkey
     np.testing.assert_array_equal(same.via_points, second.via_points)
 
 
-def test_the_error_says_what_forbids_every_motion(limits, make_currents, monkeypatch):
+def test_the_error_names_the_violated_constraints(limits, make_currents, monkeypatch):
     with pytest.raises(NoFeasibleMotionError) as refusal:
         random_validation_motions(limits, home=HOME, seed=3, count=1, currents=make_currents(0.01))
     error = refusal.value
@@ -149,7 +147,7 @@ def test_a_home_posture_in_collision_is_refused_by_the_pair(limits):
     assert refusal.value.nearest["collision"].value < 0.0
 
 
-def test_a_full_cell_is_refused_by_the_obstacle(model, limits, monkeypatch):
+def test_a_blocked_cell_is_refused_with_the_obstacle(model, limits, monkeypatch):
     tries = "identification.excitation.validation_motions._TRIES_PER_MOTION"
     monkeypatch.setattr(tries, 3)  # each looks at fifty ways
     monkeypatch.setattr("identification.excitation.validation_motions._RANGE_SHARE", 0.02)
