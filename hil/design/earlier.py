@@ -41,9 +41,9 @@ def estimate_earlier(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> E
     """
     archives = list(archives_in(paths))
     recorded = cell_of(open_archive(archives[0]))
-    theirs, ours = fingerprint(recorded), fingerprint(cell)
+    recorded_parts, parts = fingerprint(recorded), fingerprint(cell)
     for part in ("urdf", "robot"):  # these determine the parameters
-        if theirs[part] != ours[part]:
+        if recorded_parts[part] != parts[part]:
             problem = f"is of the cell {recorded.name!r}, whose {part} is not that of {cell.name!r}"
             remedy = "name archives of this robot with the same URDF and [robot]"
             raise InputError(archives[0], problem, field="--earlier", remedy=remedy)

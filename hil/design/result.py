@@ -332,18 +332,18 @@ def references(
         problem = "cannot be combined with --earlier, which adds the information of other archives"
         raise refused(None, problem, "leave out one of the two")
     found: dict[str, tuple[float, ...]] = {}
-    ours = parameters_of(settings, settings.objective.named)
+    new = parameters_of(settings, settings.objective.named)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
         if "earlier" in result.data:
             problem = "was designed with --earlier: its criteria include the earlier archives"
             raise refused(path, problem, "name designs without --earlier")
-        theirs = parameters_of(result.settings, result.data["search"].get("parameters"))
-        if ours != theirs:
+        old = parameters_of(result.settings, result.data["search"].get("parameters"))
+        if new != old:
             problem = (
-                f"has criteria of {len(theirs)} parameters, this design of {len(ours)}, of which "
-                f"{len(ours & theirs)} are the same"
+                f"has criteria of {len(old)} parameters, this design of {len(new)}, of which "
+                f"{len(new & old)} are the same"
             )
             raise refused(path, problem, "name designs with the same [objective]")
         method = result.excitation.method

@@ -1,4 +1,4 @@
-"""The objective of a search: information on selected parameters beside earlier archives."""
+"""The objective of a search: information on selected parameters, with that of earlier archives."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class Objective:
     model: RobotModel  #: the robot, with p parameters
     parameters: NDArray[np.intp] | None = None  #: indices (e,) of those in the criteria; None: all
     joint_weights: Array | None = None  #: 1 / variance of each joint's torque (n,); None: equal
-    #: Gram matrix (p, p) of earlier archives, weighted alike, at one sample per SAMPLE_PERIOD
-    #: (divide one of 1 kHz by 8)
+    #: Gram matrix (p, p) of earlier archives with the same weights, at one sample per
+    #: SAMPLE_PERIOD (divide one of 1 kHz by 8)
     earlier: Array | None = None
     earlier_samples: int = 0  #: N of the earlier archives, at the same rate
     repetitions: int = 1  #: planned runs of the new motion; without effect if `earlier` is None

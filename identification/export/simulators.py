@@ -210,8 +210,8 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
         if stiffness:
             figures |= {"spring_stiffness": stiffness, "spring_reference": rest}
         _nested(_add(axis, "dynamics"), **{k: as_text(v) for k, v in figures.items()})
-        for frame, own in arm.fixed(j).items():
-            _add(_add(root, "frame", name=frame, attached_to=links[j]), "pose").text = _rpy(*own)
+        for frame, pose in arm.fixed(j).items():
+            _add(_add(root, "frame", name=frame, attached_to=links[j]), "pose").text = _rpy(*pose)
     return _text(document)
 
 

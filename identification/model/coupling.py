@@ -34,9 +34,9 @@ class Coupling:
             raise ModelError(f"the coupling has shape {matrix.shape}; it must be square")
         if not np.all(np.isfinite(matrix)):
             raise ModelError("the coupling has an entry that is not finite")
-        own, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
-        if np.any(own <= _UNCOUPLED * most):
-            motor = int(np.argmax(own <= _UNCOUPLED * most)) + 1
+        direct, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
+        if np.any(direct <= _UNCOUPLED * most):
+            motor = int(np.argmax(direct <= _UNCOUPLED * most)) + 1
             raise ModelError(
                 f"motor {motor} of the coupling does not turn with joint {motor}; order the motors"
                 " by the joints that they drive"

@@ -571,8 +571,8 @@ class _Step:
     ) -> None:
         axis = _clean(chain.axis[joint])
         revolute = bool(chain.revolute[joint])
-        own = 0 if revolute else 1
-        after[-1, own] = axis[:, None]
+        part = 0 if revolute else 1  # angular or linear
+        after[-1, part] = axis[:, None]
         # The rotation's nine entries as sums of 1, cos q and sin q (9, 3).
         self.blend = _blend(axis, chain.rotation[joint].T, revolute)
         self._position, self._speed, self._rate_of_speed = motion
@@ -580,7 +580,9 @@ class _Step:
         self._axis = [(a, float(axis[a])) for a in range(3) if axis[a] != 0.0]
         self._carried = after[:-1]
         self._velocity, self._acceleration = after[0], after[1]
-        self._own = [(after[0, own, a], after[1, own, a], float(axis[a])) for a, _ in self._axis]
+        self._along = [
+            (after[0, part, a], after[1, part, a], float(axis[a])) for a, _ in self._axis
+        ]
         self._plan_shift(chain.translation[joint], before)
         self._plan_rotation(rotation)
 
@@ -632,7 +634,7 @@ class _Step:
             else:
                 _add_cross(self._carried[:, 1], self._carried[:, 0], a, component * self._position)
                 _add_cross(acceleration[1], velocity[0], a, rate)
-        for own_velocity, own_acceleration, component in self._own:
+        for own_velocity, own_acceleration, component in self._along:
             own_velocity += component * speed
             own_acceleration += component * self._rate_of_speed
 

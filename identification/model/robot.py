@@ -73,9 +73,9 @@ class StandardLayout:
     def names(self) -> tuple[str, ...]:
         """Names (s,): I3xy, mc2y, m4, I5m, I45."""
         symbols = LINK_SYMBOLS + (("Im",) if self.rotor_inertia else ())
-        own = [_name(symbol, j) for j in range(1, self.n_joints + 1) for symbol in symbols]
+        links = [_name(symbol, j) for j in range(1, self.n_joints + 1) for symbol in symbols]
         between = "" if self.n_joints <= _N_SINGLE_DIGITS else "_"
-        return (*own, *(f"I{i + 1}{between}{j + 1}" for i, j in self.pairs))
+        return (*links, *(f"I{i + 1}{between}{j + 1}" for i, j in self.pairs))
 
     @cached_property
     def units(self) -> tuple[str, ...]:
@@ -212,8 +212,8 @@ class RobotModel:
         pairs = coupling.pairs if coupling is not None and coupling.inertia else ()
         layout = StandardLayout(revolute, rotor_inertia, pairs if rotor_inertia else ())
         all_friction = JointFriction(laws, revolute, coupling)
-        beside = JointElements.of(elements, chain.joint_names, revolute)
-        base = _base_parameters(chain, down, layout, all_friction, beside)
+        placed = JointElements.of(elements, chain.joint_names, revolute)
+        base = _base_parameters(chain, down, layout, all_friction, placed)
         load = None if payload is None else Load(chain, down, payload)
         return cls(
             chain=chain,
@@ -224,7 +224,7 @@ class RobotModel:
             coupling=coupling,
             payload=payload,
             _load=load,
-            **_parameters(chain, down, layout, base, all_friction, beside),
+            **_parameters(chain, down, layout, base, all_friction, placed),
         )
 
     def with_friction(self, **changes: Any) -> RobotModel:
@@ -450,10 +450,10 @@ def _require_separate_elements(
     offsets = [j for j, law in enumerate(friction.laws) if OFFSET.symbol in law.symbols]
     columns = np.column_stack([columns, np.tile(np.eye(n)[:, offsets], (m, 1))])
     for one in elements.identified:
-        own, owner = one.columns(q), one.element.joint
+        values, owner = one.columns(q), one.element.joint
         for k, name in enumerate(elements.names[one.part]):
             torque = np.zeros((m, n))
-            torque[:, one.joint] = own[:, k]
+            torque[:, one.joint] = values[:, k]
             column = torque.reshape(-1, 1)
             if share_left(column, columns)[0] <= TOLERANCE:
                 raise ElementError(

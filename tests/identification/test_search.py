@@ -357,27 +357,6 @@ with open({str(path)!r}, "xb+") as file, Population(problem(), workers=2) as pop
     assert bits(resumed) == bits(search(population.begin(), chosen))
 
 
-def test_a_finished_search_is_read_without_scoring(population):
-    chosen = settings("front", polish=40)
-    file = io.BytesIO()
-    whole = bits(search(population, chosen, journal=opened(file, chosen)))
-    size = len(file.getvalue())
-    again = search(population.begin(), chosen, journal=opened(file, chosen))
-    assert bits(again) == whole
-    assert population.genes == []
-    assert len(file.getvalue()) == size
-
-
-def test_a_truncated_journal_costs_one_generation(population):
-    chosen = settings("b")
-    file = io.BytesIO()
-    whole = bits(search(population, chosen, journal=opened(file, chosen)))
-    torn = io.BytesIO(file.getvalue()[:-100])
-    assert bits(search(population.begin(), chosen, journal=opened(torn, chosen))) == whole
-    assert [len(genes) for genes in population.genes] == [12]
-    assert torn.getvalue() == file.getvalue()
-
-
 def test_progress_reports_counts_and_the_best_motion(population):
     seen = []
     design = search(population, settings("front", polish=40), progress=seen.append)

@@ -1,1 +1,1 @@
-"""Where a motion brings the arm too close to itself or to what stands around it."""
+"""Collisions of an arm with itself and with obstacles."""

@@ -322,8 +322,8 @@ class Curvature:
         if not np.all(self._chain.revolute):
             deviation = acceleration.max(axis=1) * step**2 / 8.0
             arms = self._arms(np.abs(q).max(axis=0) + deviation)
-        own = np.where(self._chain.revolute[:, None], velocity, 0.0)
-        turned = velocity * (own + 2.0 * (self._before @ velocity)) + acceleration
+        revolute = np.where(self._chain.revolute[:, None], velocity, 0.0)
+        turned = velocity * (revolute + 2.0 * (self._before @ velocity)) + acceleration
         bulges: Array = (arms[:, None] @ turned)[:, 0] * (step**2 / 8.0)
         return bulges[self._class]
 

@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 # Pairs closer than this [m] (and than the margin) in all sampled postures are not checked; a wider
 # margin does not exclude more.
 _NEAR: Final = 0.05
-# Largest variation [m] of the distance of a foot from the obstacle that it stands in.
+# Largest variation [m] of the distance of a rotating foot from its obstacle.
 _CONSTANT: Final = 0.002
 # A link that never has the margin must have the largest sampled distance less this [m].
 _SLACK: Final = 0.005
