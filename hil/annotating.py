@@ -30,7 +30,7 @@ _CHUNK: Final = 10**9  # ns
 
 
 def annotate(found: Identification, output: Path, reporter: Reporter) -> list[Path]:
-    """Write a copy of each archive that was fitted or predicted into a folder of `output`.
+    """Write a copy of each fitted or predicted archive into a folder of `output`.
 
     Raises:
         InputError: two archives have one file name.
@@ -44,7 +44,7 @@ def annotate(found: Identification, output: Path, reporter: Reporter) -> list[Pa
             next(path for path in predictions if path.name == twice),
             "has the file name of another archive",
             field="--annotate",
-            remedy="annotate the archives of each folder by themselves",
+            remedy="annotate the archives of each folder separately",
         )
     folder = output / FOLDER
     make_folder(folder)
@@ -57,7 +57,7 @@ def annotate(found: Identification, output: Path, reporter: Reporter) -> list[Pa
 
 
 def _predictions(found: Identification) -> Iterator[tuple[Path, dict[str, Array]]]:
-    """Of each archive the time since its first sample [s], and the effort predicted at it."""
+    """Yield path, and time since the first sample [s] and predicted effort, of each archive."""
     prepared = found.prepared
     sources = prepared.sources.training, prepared.training
     pairs = [*zip(*sources, strict=True)]
@@ -71,7 +71,7 @@ def _predictions(found: Identification) -> Iterator[tuple[Path, dict[str, Array]
 def _prediction(found: Identification, source: Source, samples: Samples) -> dict[str, Array]:
     predicted = samples.predicted_torque(found.cell.model, found.estimate.pooled.values)
     recorded = source.recording.torque
-    assert recorded is not None  # what is fitted or predicted has torques
+    assert recorded is not None  # fitted and predicted recordings have torques
     return {
         "time": source.recording.time,
         "effort": recorded - (samples.torque - predicted),  # known payloads act on both
@@ -79,11 +79,11 @@ def _prediction(found: Identification, source: Source, samples: Samples) -> dict
 
 
 def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
-    """An MCAP file of what viewers show of an archive, and of the torque that a model predicts.
+    """Return an MCAP file with the channels for viewers and the predicted torque.
 
-    Times are those of the day where the archive knows the day.
+    Times are those of the day where the archive states it.
 
-    The prediction has ``time`` since the first sample (m,) [s], and the ``effort`` at it (m, n).
+    The prediction has ``time`` since the first sample (m,) [s], and ``effort`` (m, n).
     """
     columns, names = archive.columns, archive.joint_names
     stamp = np.asarray(columns["stamp"], np.int64)
@@ -92,8 +92,9 @@ def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
         begin = datetime.fromisoformat(archive.header.recorded_at or "").timestamp()
         shift = round(begin) * 10**9 - int(stamp[0])
     first = int(stamp[0]) + shift
-    words = {"position": "position", "velocity": "velocity", "effort": "torque"}
-    states = {schema.MEASURED: (stamp, {w: columns[c] for w, c in words.items() if c in columns})}
+    fields = {"position": "position", "velocity": "velocity", "effort": "torque"}
+    measured_values = {f: columns[c] for f, c in fields.items() if c in columns}
+    states = {schema.MEASURED: (stamp, measured_values)}
     if "commanded_position" in columns:
         commands = {name: schema.set_points(columns, name) for name in ("position", "velocity")}
         states[schema.COMMANDED] = (stamp, commands)

@@ -1,4 +1,4 @@
-"""Folders and files that a command leaves behind: written whole, locked, and their SHA-256."""
+"""Files and folders written atomically, locks, and SHA-256 digests."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from hil.reading import open_file
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents, if it is not there.
+    """Create a folder and its parents if missing.
 
     Raises:
-        InputError: it cannot be made, or not be written to.
+        InputError: it cannot be created, or is not writable.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            path, f"cannot be made a folder ({error.strerror})", remedy="name another one"
+            path, f"cannot be created ({error.strerror})", remedy="name another folder"
         ) from error
     if not os.access(path, os.W_OK | os.X_OK):
         raise InputError(path, "cannot be written to", remedy="name another folder")
@@ -37,22 +37,22 @@ def make_folder(path: Path) -> None:
 
 @contextmanager
 def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
-    """Make a folder, and keep every other process with the same work out of it until this is left.
+    """Create a folder and lock it against other processes with the same work.
 
-    The lock is on the folder itself, which nobody removes, and goes with this process. `work` is a
-    noun for it, `option` the one of the command line that names another folder.
+    The lock is on the folder itself and ends with this process. `work` is a noun for the work,
+    `option` the command-line option that names another folder.
 
     Raises:
-        InputError: another one is at work in it, it cannot be made, or not be locked.
+        InputError: it is locked, or cannot be created or locked.
     """
     make_folder(root)
 
     def refusal(error: OSError) -> InputError:
         if isinstance(error, BlockingIOError):
             problem = f"a {work} is running in it"
-            remedy = f"wait for its end, stop it (Ctrl-C), or name another folder ({option})"
+            remedy = f"wait until it ends, stop it (Ctrl-C), or name another folder ({option})"
         else:
-            problem = f"cannot be locked against a second {work} ({error.strerror})"
+            problem = f"cannot be locked ({error.strerror})"
             remedy = f"name a folder on a disk of this PC ({option})"
         return InputError(root, problem, remedy=remedy)
 
@@ -61,7 +61,7 @@ def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Replace `path` by `content`: a crash leaves the old or the new file, never half of one."""
+    """Replace `path` by `content`; after a crash it has the old or the new content."""
     with replace_file(path, path.with_suffix(path.suffix + ".tmp")) as temporary:
         _write_through(temporary, content)
     _sync(path.parent)
@@ -69,7 +69,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def replace_file(path: Path, temporary: Path | None = None) -> Iterator[Path]:
-    """Replace `path` by what is written to the yielded name beside it; keep it if that fails."""
+    """Replace `path` by the yielded file beside it; keep `path` if writing fails."""
     temporary = temporary or path.with_name(f".{path.name[:200]}.{token_hex(4)}.tmp")
     try:
         yield temporary
@@ -81,10 +81,10 @@ def replace_file(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 
 
 def write_output(path: Path, content: str | bytes) -> None:
-    """As `write_atomically`, with an error of ours.
+    """Write as `write_atomically`.
 
     Raises:
-        OutputError: the disk refuses.
+        OutputError: the file cannot be written.
     """
     try:
         write_atomically(path, content)
@@ -95,11 +95,7 @@ def write_output(path: Path, content: str | bytes) -> None:
 
 @contextmanager
 def convert_write_errors(folder: Path) -> Iterator[None]:
-    """Tell in words what a disk refuses meanwhile.
-
-    Raises:
-        InputError: a file could not be written; files written before it stay.
-    """
+    """Convert errors of writing to `InputError`; files written before remain."""
     try:
         yield
     except OSError as error:
@@ -111,15 +107,14 @@ def convert_write_errors(folder: Path) -> Iterator[None]:
 def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
     """Replace several files of a folder, or none of them.
 
-    All are written beside the old ones first. These are held until the last is in its place, and
-    put back if one of them cannot get there.
+    New files are written first; old ones are moved back if one cannot be replaced.
 
     Args:
         folder: it exists.
-        contents: by file name; None takes a file away.
+        contents: by file name; None removes a file.
 
     Raises:
-        OutputError: one could not be written; the folder is as it was.
+        OutputError: one could not be written; the folder is unchanged.
     """
     try:
         in_the_way = next((name for name in contents if (folder / name).is_dir()), None)
@@ -133,7 +128,7 @@ def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> Non
 
 
 def _replace_all(folder: Path, contents: Mapping[str, str | bytes | None], stage: Path) -> None:
-    """Replace files by way of a folder beside them; should one fail, put the others back."""
+    """Replace files by way of a folder beside them; if one fails, restore the others."""
     new, old = stage / "new", stage / "old"
     new.mkdir()
     old.mkdir()
@@ -160,20 +155,20 @@ def _replace_all(folder: Path, contents: Mapping[str, str | bytes | None], stage
 
 
 def _keep(path: Path, copy: Path) -> None:
-    """Have a file under a second name, where there is one; its own may be lost."""
+    """Give an existing file a second name; its own may be lost."""
     if not os.path.lexists(path):
         return
     try:
         os.link(path, copy, follow_symlinks=False)
-    except OSError:  # a file system without links, or somebody else's file
+    except OSError:  # a file system without links, or another user's file
         path.replace(copy)
 
 
 def _write_through(path: Path, content: str | bytes) -> None:
-    """Write a new file and have it on the disk.
+    """Write a new file and wait until it is on the disk.
 
-    What lies there is removed before: in a folder that came from elsewhere it may be a link to
-    a file of the user's, or a pipe.
+    An existing one is removed first: in an untrusted folder it may be a link to another file, or a
+    pipe.
     """
     path.unlink(missing_ok=True)
     with path.open("xb") as file:
@@ -183,10 +178,10 @@ def _write_through(path: Path, content: str | bytes) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Have the names in a folder outlive a loss of power.
+    """Wait until the names in a folder are on the disk.
 
     Raises:
-        OSError: its file system cannot do that.
+        OSError: its file system does not support that.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -196,31 +191,31 @@ def sync_folder(path: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """The same where it can be done."""
+    """Do the same where supported."""
     with suppress(OSError):
         sync_folder(path)
 
 
 _FLAGS: Final = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-"""The folder may come from elsewhere: no link is followed, and no pipe waited for."""
+"""In untrusted folders, no link is followed and no pipe blocks."""
 _PAUSE: Final = 0.02
 
 
 def digest(content: str | bytes) -> str:
-    """Digest of a text, as UTF-8, or of bytes."""
+    """Return the SHA-256 of a text, as UTF-8, or of bytes."""
     return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()
 
 
 def json_digest(value: Any) -> str:
-    """Digest of a JSON value; the order of keys does not count."""
+    """Return the SHA-256 of a JSON value, independent of the order of keys."""
     return digest(json.dumps(value, sort_keys=True))
 
 
 def file_digest(path: Path) -> str:
-    """Digest of all bytes of a file.
+    """Return the SHA-256 of a file.
 
     Raises:
-        OSError: there is none, it is no regular file, or it cannot be read.
+        OSError: there is none, it is not a regular file, or it cannot be read.
     """
     with open_file(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -230,13 +225,13 @@ def file_digest(path: Path) -> str:
 def file_lock(
     path: Path, refusal: Callable[[OSError], Exception], *, patience: float = 0.0
 ) -> Iterator[None]:
-    """Hold an exclusive lock until this is left.
+    """Hold an exclusive lock.
 
     Args:
-        path: a folder, or a file, which is made if it is not there.
-        refusal: makes the error that is raised: of a BlockingIOError where another process holds
-            the lock, else of what the disk refuses.
-        patience: time to wait for another process [s].
+        path: a folder, or a file, which is created if missing.
+        refusal: returns the error to raise: for a BlockingIOError where another process holds the
+            lock, else for the error of the disk.
+        patience: longest wait for another process [s].
     """
     kind = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT
     try:
@@ -254,10 +249,10 @@ def file_lock(
 
 
 def is_locked(path: Path) -> bool:
-    """Whether another process holds the lock on a file at this moment."""
+    """Return whether another process holds the lock on a file now."""
     try:
         descriptor = os.open(path, _FLAGS | os.O_RDONLY)
-    except OSError:  # nobody ever did, or it is not ours to look
+    except OSError:  # never locked, or not readable
         return False
     try:
         _acquire(descriptor, fcntl.LOCK_SH, 0.0)

@@ -1,7 +1,7 @@
-"""Untrusted files in a folder: read only if they are files, and of a size.
+"""Reading of untrusted files: regular files only, of limited size.
 
-A pipe without a writer is waited for without end, and a device has none. What is refused is an
-`OSError` whose `strerror` says why, so that whoever reads has one kind of trouble to name.
+A pipe without a writer or a device would block without end. Refusals are `OSError` with the reason
+as `strerror`.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from hil.errors import InputError
 
 _FIRST: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
-"""Of the years that calendars, time zones and figures agree on."""
+"""Range of times that calendars and time zones support."""
 
 
 def parse_time(when: str) -> datetime | None:
-    """The moment of an ISO 8601 text, in UTC; None where it is none, or no robot's."""
+    """Return the time of an ISO 8601 text in UTC; None where it is invalid or out of range."""
     try:
         at = datetime.fromisoformat(when)
         at = (at if at.tzinfo else at.replace(tzinfo=UTC)).astimezone(UTC)
@@ -35,27 +35,27 @@ def parse_time(when: str) -> datetime | None:
 
 LARGEST_PORT: Final = 65535
 _MOST_DIGITS: Final = 18
-"""So that 64 bits hold it, and Python reads it at all."""
+"""Digits of a number that fits into 64 bits."""
 
 
 def parse_count(text: str | None) -> int | None:
-    """A number of 0 or more; None where the text is none, or longer than anything is counted."""
+    """Return a number of 0 or more; None where the text is none, or too long."""
     if text is None or not (text.isascii() and text.isdecimal()) or len(text) > _MOST_DIGITS:
         return None
     return int(text)
 
 
 def parse_port(text: str) -> int | None:
-    """The number of a UDP or TCP port, 1 to 65535; None where the text is none."""
+    """Return the number of a UDP or TCP port, 1 to 65535; None where the text is none."""
     port = parse_count(text)
     return port if port is not None and 0 < port <= LARGEST_PORT else None
 
 
 LONGEST_TEXT: Final = 1 << 28
-"""Bytes of the longest text that is read as a whole; the largest of ours has a hundredth of it."""
+"""Bytes of the longest text that is read; own files have at most a hundredth of it."""
 _DEEPEST: Final = 32
-"""Tables and lists in one another; ours have four."""
-_NO_FILE: Final = "it is a pipe or a device, no file"
+"""Nesting of tables and lists; own files have four levels."""
+_NO_FILE: Final = "it is a pipe or a device, not a file"
 _ABSENT: Final = frozenset(
     {
         *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
@@ -65,7 +65,7 @@ _ABSENT: Final = frozenset(
 
 
 def open_file(path: Path) -> BufferedReader:
-    """A file of bytes, to be read.
+    """Open a file for reading bytes.
 
     Raises:
         OSError: there is none, or it is a folder, a pipe or a device.
@@ -73,7 +73,7 @@ def open_file(path: Path) -> BufferedReader:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     except ValueError as error:  # a zero byte in its name
-        raise OSError(errno.EINVAL, f"it is no path: {error}", str(path)) from error
+        raise OSError(errno.EINVAL, f"it is not a path: {error}", str(path)) from error
     try:
         mode = os.fstat(descriptor).st_mode
         if stat.S_ISDIR(mode):
@@ -87,11 +87,11 @@ def open_file(path: Path) -> BufferedReader:
 
 
 def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
-    """A text file as a whole, any line ends as one.
+    """Return the text of a file, with line feeds as line ends.
 
     Raises:
         OSError: as `open_file`; or it has more bytes than `longest`.
-        UnicodeDecodeError: it is no UTF-8.
+        UnicodeDecodeError: it is not UTF-8.
     """
     with open_file(path) as stream:
         if os.fstat(stream.fileno()).st_size > longest:
@@ -100,25 +100,25 @@ def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def is_not_a_file(trouble: OSError) -> bool:
+def is_not_a_file(error: OSError) -> bool:
     """Return whether the error says that there is no regular file, not that reading failed."""
-    return trouble.errno in _ABSENT
+    return error.errno in _ABSENT
 
 
 def path_exists(path: Path) -> bool:
-    """Whether anything lies there: a link that leads nowhere does, and is no absent file."""
+    """Return whether anything has this path, also a broken link."""
     return path.is_symlink() or path.exists()
 
 
-def _remedy(trouble: OSError | UnicodeDecodeError, otherwise: str) -> str:
-    """What a person can do who named what `read_text` refuses."""
-    if isinstance(trouble, UnicodeDecodeError):
+def _remedy(error: OSError | UnicodeDecodeError, otherwise: str) -> str:
+    """Return the remedy for a file that `read_text` refuses."""
+    if isinstance(error, UnicodeDecodeError):
         return "save it as UTF-8"
-    return "write it to a file first, and name that" if trouble.strerror == _NO_FILE else otherwise
+    return "write it to a file first, and name that" if error.strerror == _NO_FILE else otherwise
 
 
 def read_input(path: Path, otherwise: str = "name another file") -> str:
-    """The text of a file that a person named.
+    """Return the text of a file named by the user.
 
     Raises:
         InputError: it cannot be read; the remedy is `otherwise` unless the reason suggests one.
@@ -133,10 +133,10 @@ def read_input(path: Path, otherwise: str = "name another file") -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text holds.
+    """Return the value of a JSON text.
 
     Raises:
-        ValueError: it is no JSON, or nested deeper than anybody reads.
+        ValueError: it is not JSON, or nested too deep.
     """
     try:
         return json.loads(text)
@@ -145,17 +145,17 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """What a TOML text holds.
+    """Return the tables of a TOML text.
 
     Raises:
-        ValueError: it is no TOML, or nested deeper than anybody reads.
+        ValueError: it is not TOML, or nested too deep.
     """
     try:
         found = tomllib.loads(text)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
     level: list[Any] = [found]
-    for _ in range(_DEEPEST):  # dotted keys nest without end, and the parser does not mind
+    for _ in range(_DEEPEST):  # the parser does not limit dotted keys
         level = [
             inner
             for table in level

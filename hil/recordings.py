@@ -1,4 +1,4 @@
-"""From archive files to what identification reads."""
+"""Conversion of archives to recordings, which identification reads."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _CHANNELS = {
     "commanded_position": ("commanded_position", "target_position"),
     "velocity": ("velocity",),
 }
-"""Columns of an archive that a recording takes, by what they become there."""
+"""Columns of an archive by channel of a recording."""
 
 
 def open_recording(
@@ -34,26 +34,22 @@ def open_recording(
     start: float | None = None,
     stop: float | None = None,
 ) -> Recording:
-    """Read an archive as a recording.
+    """Read an archive, recorded or imported, as a recording.
 
-    Works on archives of this package and on imported ones. An archive that was cut off gives what
-    is whole of it; the recording's provenance then has an entry ``missing`` that says what is not.
-    The recording is as it was made: `Recording.checked` decides whether it can be identified from.
-
-    Only what is wanted is decoded, chunk by chunk, and of a range of times only the chunks it lies
-    in are read where the index of the file is whole.
+    A truncated archive gives its intact part; the provenance then has an entry ``missing``. The
+    recording is not checked; `Recording.checked` decides whether it can be identified from. Only
+    the wanted columns are decoded, and the chunks of the wanted times where the index is intact.
 
     Args:
         path: the archive.
-        channels: of ``velocity``, ``torque``, ``motor_current`` and ``commanded_position`` those
-            that are wanted beside the position; None for all that were recorded.
-        start: first instant wanted [s], on the archive's clock; the recording's own time begins at
-            zero all the same.
-        stop: end of the time wanted [s]; what happened then is left out.
+        channels: wanted beside the position, of ``velocity``, ``torque``, ``motor_current`` and
+            ``commanded_position``; None for all that were recorded.
+        start: first time wanted [s], on the archive's clock; time in the recording begins at zero.
+        stop: end of the times wanted [s], exclusive.
 
     Raises:
-        ArchiveError: the file is no archive, cannot be read, or holds no sample (of that time).
-        ValueError: a channel that recordings do not have.
+        ArchiveError: the file is not an archive, cannot be read, or has no sample (in this time).
+        ValueError: an unknown channel.
     """
     wanted = _CHANNELS.keys() if channels is None else set(channels)
     unknown = sorted(wanted - _CHANNELS.keys())
@@ -67,24 +63,24 @@ def open_recording(
     part += "its end" if stop is None else f"{stop:g} s"
     if not archive.n_samples and archive.complete:
         raise ArchiveError(
-            Path(path), f"holds no sample from {part}", remedy="name a time within the recording"
+            Path(path), f"has no sample from {part}", remedy="name a time within the recording"
         )
     recording = recording_of(archive)
     return replace(recording, provenance={**recording.provenance, "part": part})
 
 
 def recording_of(archive: Archive) -> Recording:
-    """The recording in an opened archive; see `open_recording`.
+    """Return the recording of an opened archive; see `open_recording`.
 
-    Its time begins at zero and is counted in the controller's cycles (samples, where an imported
-    recording has a fixed rate), not in times of arrival.
+    Time begins at zero and is counted in cycles of the controller (in samples of an imported
+    recording at a fixed rate), not in times of arrival.
 
     Raises:
-        ArchiveError: the archive holds no sample.
+        ArchiveError: the archive has no sample.
     """
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
-        problem = f"holds no sample{f' ({archive.damage})' if archive.damage else ''}"
+        problem = f"has no sample{f' ({archive.damage})' if archive.damage else ''}"
         remedy = "record it again"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     imported, own = archive.kind == "imported", archive.header.by_controller_program
@@ -98,10 +94,10 @@ def recording_of(archive: Archive) -> Recording:
         position=columns["position"],
         joint_names=archive.joint_names,
         torque=_known(columns.get("torque")),
-        # A controller's own velocity is the slope of its positions.
+        # The velocity of a controller is the derivative of its positions.
         velocity=_known(columns.get("velocity")) if imported else None,
         motor_current=columns.get("target_current", columns.get("motor_current")),
-        # By the PC, or by the controller's own program.
+        # Commanded by the PC, or by a program of the controller.
         commanded_position=columns.get("target_position" if own else "commanded_position"),
         gap_before=_gaps(archive),
         held_joints=archive.header.held_joints,
@@ -110,12 +106,12 @@ def recording_of(archive: Archive) -> Recording:
 
 
 def _time(archive: Archive) -> Array:
-    """Seconds since the first sample."""
+    """Return seconds since the first sample."""
     columns, period = archive.columns, archive.period
     if "cycle" in columns:
         if period is None:
-            problem = "has cycles but no period, so that their times are not known"
-            remedy = "copy it again from where it was recorded; something changed it"
+            problem = "has cycles but no period, so their times are unknown"
+            remedy = "copy it again from its source: it was changed"
             raise ArchiveError(archive.path, problem, field="period", remedy=remedy)
         cycles = columns["cycle"]
         return np.asarray((cycles - cycles[0]) * period)
@@ -124,9 +120,9 @@ def _time(archive: Archive) -> Array:
 
 
 def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
-    """Where motion is not smooth: cycles lost by the link or not archived, answers not accepted.
+    """Return where motion may jump: cycles lost or not archived, replies not accepted.
 
-    Of several such answers within 0.1 s the first and the last are known.
+    Of several such replies within 0.1 s the first and the last are known.
     """
     if "cycle" not in archive.columns:
         return None
@@ -140,5 +136,5 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
 
 
 def _known(torque: Array | None) -> Array | None:
-    """None where the recording has no torque at all."""
+    """Return None where all values are NaN."""
     return None if torque is None or np.isnan(torque).all() else torque

@@ -1,4 +1,4 @@
-"""Held-out motions simulated forwards under the torques that were recorded."""
+"""Forward simulation of held-out motions under the recorded torques."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 ENSEMBLE: Final = 10  #: Variants: a standard deviation from ten is known to 24 %
 SEED: Final = 0
 DRIFT: Final = 3.0
-"""Times the spread of the ensemble; below it a drift is what the uncertainty allows."""
+"""Drift over spread of the ensemble, below which the uncertainty explains it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,38 +33,38 @@ class Replayed:
 
     joint_names: tuple[str, ...]  #: (n,)
     units: tuple[str, ...]  #: of the errors of each joint (n,), degrees or mm
-    time: Array  #: since the beginning of the first motion, one after the other (m,) [s]
+    time: Array  #: since the begin of the first motion, motions one after the other (m,) [s]
     errors: dict[str, Array]  #: of each model by name (m, n), in `units`; NaN in gaps
     #: standard deviation of the positions of variants of the identified arm (m, n), in `units`;
     #: None without variants
     spread: Array | None
-    #: why the identified model drifts by more than its uncertainty, in sentences
+    #: sentences on drifts of the identified model beyond its uncertainty
     reasons: tuple[str, ...]
-    tested_on: str  #: which motions, in words
-    verdict: str  #: on the identified model, in a sentence
+    tested_on: str  #: description of the motions
+    verdict: str  #: on the identified model
 
     @property
     def figures(self) -> dict[str, tuple[Array, Array]]:
-        """Root mean square and largest error (n,) by model, and of the ensemble's spread."""
+        """RMS and largest error (n,) by model, and of the ensemble's spread."""
         rows = dict(self.errors)
         if self.spread is not None:
             rows["spread of the ensemble"] = self.spread
         return {name: _figures(error) for name, error in rows.items()}
 
     def lines(self) -> list[str]:
-        """Root mean square and largest error of each joint, model by model."""
+        """Return text lines with RMS and largest error of each joint by model."""
         lines = [f"simulated on {self.tested_on}, with a feedback of {FEEDBACK:g} Hz:"]
         for name, figures in self.figures.items():
             joints = zip(self.joint_names, *figures, self.units, strict=True)
-            words = (
+            errors = (
                 f"{joint} {rms:.2g} (at most {most:.2g}) {unit}"
                 for joint, rms, most, unit in joints
             )
-            lines.append(f"{name}: {', '.join(words)}")
+            lines.append(f"{name}: {', '.join(errors)}")
         return [*lines, *self.reasons, self.verdict]
 
     def to_dict(self) -> dict[str, object]:
-        """The same for JSON."""
+        """Return the result for JSON."""
         return {
             "joints": [*self.joint_names],
             "units": [*self.units],
@@ -77,7 +77,7 @@ class Replayed:
         }
 
     def figure(self) -> Figure:
-        """Errors over time, a row for each joint."""
+        """Return the figure of errors over time, a row for each joint."""
         n = len(self.joint_names)
         with page():
             figure = Figure(figsize=(8.0, 0.6 + 1.3 * n), layout="constrained")
@@ -99,7 +99,7 @@ class Replayed:
         return figure
 
     def beside(self, series: ReportSeries) -> ReportSeries:
-        """The series of a report with those of the replay."""
+        """Return the series of a report with those of the replay added."""
         some = slice(None, None, max(1, len(self.time) // FIGURE_SAMPLES))
         nothing = np.empty((0, 0))
         return replace(
@@ -117,9 +117,9 @@ def _figures(error: Array) -> tuple[Array, Array]:
 
 
 def replay_motions(found: Identification, reporter: Reporter, ensemble: int = ENSEMBLE) -> Replayed:
-    """Simulate the motions that were predicted, by the identified and by the nominal model.
+    """Simulate the predicted motions by the identified and by the nominal model.
 
-    An ensemble of two or more variants of the identified arm is simulated as well.
+    With `ensemble` of two or more, variants of the identified arm are simulated as well.
 
     Raises:
         InputError: there are no physically consistent parameters to simulate.
@@ -165,21 +165,21 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
 def _reasons(
     found: Identification, arms: Simulated, error: Array, spread: Array
 ) -> tuple[str, ...]:
-    """Why joints drift by more than the parameters are uncertain."""
-    strays, uncertain = _figures(error)[0], _figures(spread)[0]
+    """Return sentences on joints that drift by more than the uncertainty of their parameters."""
+    drift, uncertain = _figures(error)[0], _figures(spread)[0]
     left = slow_residual(arms, found.prepared.held_out)
     sentences = []
-    for joint in np.flatnonzero(strays > DRIFT * uncertain):
+    for joint in np.flatnonzero(drift > DRIFT * uncertain):
         constant, friction = left.constant[joint], left.friction[joint]
         share, cause = max(
             (constant, "constant: an offset of the torque, a payload, or gravity"),
             (friction, "in the direction of motion: friction that differs from the fitted one"),
-            (1.0 - constant - friction, "neither: it depends on posture or time"),
+            (1.0 - constant - friction, "dependent on posture or time"),
         )
         unit = "N·m" if arms.model.chain.revolute[joint] else "N"
         sentences.append(
-            f"{found.cell.joint_names[joint]} drifts {strays[joint] / uncertain[joint]:.1f} times"
-            f" as far as its parameters are uncertain: averaged over {1.0 / FEEDBACK:g} s the model"
-            f" leaves out {left.rms[joint]:.2g} {unit}, {share:.0%} of its square {cause}"
+            f"{found.cell.joint_names[joint]} drifts {drift[joint] / uncertain[joint]:.1f} times"
+            f" as far as its uncertainty: the residual torque averaged over {1.0 / FEEDBACK:g} s is"
+            f" {left.rms[joint]:.2g} {unit}, {share:.0%} of its square {cause}"
         )
     return tuple(sentences)

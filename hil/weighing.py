@@ -1,6 +1,6 @@
-"""A payload weighed while it is recorded: one motion without it and with it, in ABBA order.
+"""Payload identification during recording: one motion without and with the payload, in ABBA order.
 
-Friction that drifts steadily is then the same in both on average.
+A steady drift of friction then has the same mean in both.
 """
 
 from __future__ import annotations
@@ -21,40 +21,40 @@ from hil.simulation import simulated_link
 FOLDER: Final = "payload"
 SIDES: Final = ("bare", "loaded")
 ENOUGH: Final = 0.0076
-"""Half the 95 % interval of mass and wrist torque, as a share of them, from which on no pair is
-worth it: in 99 of 100 cases they are then within 1 %."""
+"""Half the 95 % interval of mass and wrist torque, relative, at which recording ends: in 99 of 100
+cases the error is then below 1 %."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]{0,63}")
 
 Run = Callable[[Campaign, int, Link | None], object]
-"""Runs a campaign up to so many repetitions, on a simulated arm or on the cell's own link."""
+"""Runs a campaign up to a number of repetitions, on a simulated arm or on the cell's link."""
 
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """A payload after some pairs."""
+    """Estimate of a payload after some pairs of recordings."""
 
-    found: PayloadFound  #: what it weighs
-    pairs: int  #: of one recording without and one with it
+    found: PayloadFound
+    pairs: int
 
     @property
     def width(self) -> tuple[float, float]:
-        """Half the 95 % intervals of mass and of the torque of the weight, as shares of them."""
+        """Half the relative 95 % intervals of mass and of the torque of the weight."""
         torque, low, high = self.found.wrist_torque
         least, most = self.found.estimate.intervals[0].tolist()
         return 0.5 * (most - least) / self.found.figures[0], 0.5 * (high - low) / torque
 
     @property
     def enough(self) -> bool:
-        """Whether another pair is not worth it."""
+        """Whether the intervals are narrow enough to end."""
         return max(self.width) <= ENOUGH
 
     @property
     def sentence(self) -> str:
-        """How narrow the intervals are, and whether another pair is worth it."""
+        """Text with the intervals now and after another pair."""
         shrunk = math.sqrt(self.pairs / (self.pairs + 1.0))
         mass, torque = (f"{100.0 * share:.2g} %" for share in self.width)
         next_mass, next_torque = (f"{100.0 * shrunk * share:.2g} %" for share in self.width)
-        worth = "is not worth it" if self.enough else "is worth it"
+        worth = "is not needed" if self.enough else "is recommended"
         return (
             f"{self.pairs} {'pair' if self.pairs == 1 else 'pairs'}: mass"
             f" {self.found.figures[0]:.4g} kg ± {mass}, torque of its weight at the flange"
@@ -71,19 +71,23 @@ def weigh(
     mount: Callable[[bool], bool],
     reporter: Reporter,
 ) -> Weighed:
-    """Record pairs until another is not worth it, and weigh after each of them.
+    """Record pairs until the intervals are narrow enough, and estimate after each of them.
 
     The recordings are two campaigns below the folder of the campaign, with its cell, its plan and,
-    where it was passed, its rehearsal. What is there already is not recorded again.
+    where passed, its rehearsal. Existing recordings are not repeated. The campaign's repetitions
+    limit the number of pairs.
 
-    The campaign's repetitions are the most pairs; the name is that of the payload and of the
-    folder. `mount` says whether the payload was mounted (True) or taken off (False); no ends the
-    recording.
+    Args:
+        campaign: with the motion.
+        name: of the payload and of the folder.
+        run: runs a campaign.
+        mount: asks whether the payload was mounted (True) or removed (False); False ends.
+        reporter: of progress.
 
     Raises:
-        InputError: the name is no name of a folder.
-        OperatorStopError: the recording was ended before there was a pair.
-        HilError: what `Campaign.run` and `find_payload` raise.
+        InputError: the name is not a valid folder name.
+        OperatorStopError: the operator ended before the first pair.
+        HilError: raised by `Campaign.run` and `find_payload`.
     """
     bare, loaded = sides = [_side(campaign, name, side) for side in SIDES]
     simulated = campaign.cell.controller.transport == "simulated"
@@ -113,7 +117,7 @@ def weigh(
 
 def _side(campaign: Campaign, name: str, side: str) -> Campaign:
     if not _NAME.fullmatch(name):
-        problem = f"{name!r} is no name of a payload"
+        problem = f"{name!r} is not a valid name of a payload"
         remedy = "use letters, digits, dots and dashes"
         raise InputError(None, problem, field="--payload", remedy=remedy)
     root = campaign.folder.root / FOLDER / name / side

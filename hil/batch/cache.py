@@ -1,8 +1,8 @@
-"""Results of archives between runs: small files, checked, replaced as a whole.
+"""Cache of results of archives between runs: small files with checksum, replaced atomically.
 
-Below a folder ``.hil-cache`` beside the archives a file is named by its key, a digest of everything
-the content depends on, so nothing is ever out of date. An entry whose checksum fails, or that was
-written for another key, counts as absent; the content of any other is not checked again.
+In a folder ``.hil-cache`` beside the archives a file is named by its key, a digest of everything
+that the content depends on, so no entry is ever out of date. An entry with a wrong checksum or key
+is ignored; the content of any other is not validated again.
 """
 
 from __future__ import annotations
@@ -59,20 +59,20 @@ _TYPES: Final[dict[str, type[Any]]] = {
 }
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")
-"""Packages that decide about the numbers."""
+"""Packages that determine the numbers."""
 
 
 @dataclass(frozen=True)
 class CacheLocation:
-    """Which folder caches what belongs to an archive."""
+    """Location of the cache of an archive."""
 
-    #: of the whole cache; None: beside each archive, and below the user's own cache folder (XDG)
-    #: where that cannot be written to or something else has its name
+    #: folder of the whole cache; None: beside each archive, or in the user's cache folder (XDG)
+    #: where that is not writable or not a folder
     root: str | None = None
-    keep: bool = True  #: whether anything is cached at all
+    keep: bool = True  #: whether to cache at all
 
     def store(self, location: str) -> Store:
-        """That of the archives in the folder of this one."""
+        """Return the cache folder of the archives in the same folder as this one."""
         if not self.keep:
             return Store(None)
         folder = location.rsplit("/", 1)[0] if "/" in location else "."
@@ -90,12 +90,12 @@ class CacheLocation:
 
 @dataclass(frozen=True)
 class Store:
-    """One such folder; it need not exist. None holds nothing."""
+    """A cache folder, which need not exist. None is empty."""
 
     folder: Path | None
 
     def get(self, key: str, kind: type[T]) -> T | None:
-        """The content under a key; None if there is none of this type, or none that is whole."""
+        """Return the content of a key; None if there is no intact entry of this type."""
         if self.folder is None:
             return None
         try:
@@ -106,19 +106,19 @@ class Store:
         return found if isinstance(found, kind) else None
 
     def has(self, key: str) -> bool:
-        """Whether there is a file for the key, whole or not."""
+        """Return whether there is a file for the key, intact or not."""
         return self.folder is not None and self._path(key).is_file()
 
     def put(self, key: str, content: Any) -> None:
-        """Write JSON with arrays of numbers, and dataclasses of `_TYPES`, in it.
+        """Write JSON with arrays of numbers and dataclasses of `_TYPES`.
 
         Raises:
-            CacheError: the disk refuses.
+            CacheError: the file cannot be written.
         """
         if self.folder is None:
             return
         path = self._path(key)
-        # No fsync: what a power cut damages fails its checksum and is made anew.
+        # No fsync: an entry damaged by a power cut fails its checksum and is computed again.
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(path) as temporary, temporary.open("xb") as file:
@@ -142,7 +142,7 @@ class Store:
 
 
 def encoded(key: str, content: Any) -> bytes:
-    """An entry as its file has it: JSON, and behind it the arrays.
+    """Return the file of an entry: JSON, then the arrays.
 
     Of symmetric matrices (..., k, k) the lower triangles (..., k (k + 1) / 2) are written.
     """
@@ -170,7 +170,7 @@ def encoded(key: str, content: Any) -> bytes:
 
 
 def decoded(data: bytes, key: str) -> Any:
-    """The content of an entry; None if it is damaged or of another key."""
+    """Return the content of an entry; None if it is damaged or of another key."""
     if len(data) < _HEAD.size:
         return None
     magic, size, checksum = _HEAD.unpack_from(data)
@@ -195,12 +195,12 @@ def decoded(data: bytes, key: str) -> Any:
     try:
         entry = json.loads(bytes(body[:size]), object_hook=restored)
         return entry["content"] if entry["key"] == key else None
-    except DAMAGED:  # a checksum that is right, and none of our entries
+    except DAMAGED:  # a valid checksum, but not an entry of this program
         return None
 
 
 def _fixed(value: Any) -> Any:
-    """Lists as tuples; words, which many archives share, are held once."""
+    """Return lists as tuples, and strings interned, because many archives share them."""
     if isinstance(value, list):
         return tuple(map(_fixed, value))
     return intern(value) if isinstance(value, str) else value
@@ -208,7 +208,7 @@ def _fixed(value: Any) -> Any:
 
 @lru_cache(maxsize=64)
 def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows and columns of the lower triangle of a square."""
+    """Return rows and columns of the lower triangle of a square."""
     row, column = np.tril_indices(width)
     return row, column
 
@@ -223,10 +223,7 @@ def _resolved(folder: str) -> str:
 
 @cache
 def code_digest() -> str:
-    """Digest of the programs' own text, and of the libraries that they use.
-
-    So a change counts even where nobody has raised a version.
-    """
+    """Return the digest of the source code and of the versions of `LIBRARIES`."""
     found: list[Any] = [f"{name} {version(name)}" for name in LIBRARIES]
     for package in (drivers, hil, identification):
         root = Path(package.__path__[0])
@@ -236,10 +233,10 @@ def code_digest() -> str:
 
 
 def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
-    """Digest of what makes a robot the same one: links, joints, friction law, drives.
+    """Return the digest that identifies a robot: links, joints, friction law, drives.
 
-    Not of a payload or a delay (see :func:`hil.batch.discovery.setup_of`). The drive train in
-    force is that of the archive, if it has one.
+    Payload and delay are not part of it (see :func:`hil.batch.discovery.describe_setup`). The drive
+    train of the archive has precedence over that of the cell.
     """
     drives = cell.file.drive_train
     parts = {
@@ -249,22 +246,22 @@ def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False
         "drives": drives.model_dump(mode="json") if drives is not None else None,
         "in force": None if drive_train is None else digest(drive_train),
     }
-    # It stands in tables that people keep: the same text as ever.
+    # Users store it in tables, so the text must not change.
     return digest(json.dumps(parts, sort_keys=True, separators=(",", ":")))
 
 
 def settings_digest(settings: Settings) -> str:
-    """Digest of all that, beside its bytes, decides about the factor of an archive."""
+    """Return the digest of the settings that determine the factor of an archive."""
     entries = asdict(settings)
-    for later in ("shrinkage", "choices"):  # of the estimate
+    for later in ("shrinkage", "choices"):  # of the estimate only
         del entries[later]
     return json_digest([entries, code_digest()])
 
 
 def decision_digest(options: Options, arms: Settings | None, refs: Sequence[ArchiveRef]) -> str:
-    """Digest of what settings are decided from: options or the arm's settings, archives, programs.
+    """Return the digest of the inputs of a decision: options or the arm's settings, archives, code.
 
-    Of the estimators only the automatic one asks anything.
+    Of the estimators only the automatic one influences the settings.
     """
     asked = asdict(options) | {"estimator": options.estimator == "auto"}
     known = None if arms is None else asdict(arms)
@@ -272,5 +269,5 @@ def decision_digest(options: Options, arms: Settings | None, refs: Sequence[Arch
 
 
 def sum_key(refs: Sequence[ArchiveRef], settings: str) -> str:
-    """Key of the sum over archives, added from first to last; settings by their digest."""
+    """Return the key of the sum over archives, added in this order; settings by their digest."""
     return json_digest(["sum", [ref.sha256 for ref in refs], settings])

@@ -1,7 +1,7 @@
 """Re-identification on a Dask cluster: archives are read on its workers.
 
-Workers may join, leave and die: what a dead worker held is made anew, as Dask does from the tasks
-it holds. Dask is imported here, and only when it is called.
+Workers may join, leave and die; Dask computes the results of a dead worker again. Dask is imported
+only when it is used.
 """
 
 from __future__ import annotations
@@ -36,25 +36,27 @@ from .workers import (
 
 T = TypeVar("T")
 
-_LOOK: Final = 2.0
-"""s between looks at the cluster while nothing comes from it."""
+_POLL: Final = 2.0
+"""Interval of polling the cluster while no result arrives, s."""
 _RETRIES: Final = 3
-"""How often a task is given out anew for reasons that are not its own."""
+"""Number of times that a task is repeated because its worker failed."""
 _AHEAD: Final = 8
-"""Tasks given out per thread of the cluster: enough that none waits, few enough to keep in mind."""
+"""Tasks submitted per thread of the cluster: no thread waits, few futures are held."""
 
 _LOST: Final = Unused("", "ended every worker that read it")
 
 
 class ClusterError(HilError):
-    """The cluster is gone, or cannot be used."""
+    """The cluster is lost or cannot be used."""
 
 
 class DaskWorkers(Workers):
     """The workers of a Dask cluster.
 
-    The scheduler has an address such as ``tcp://host:8786``; a task may last for `timeout`, and
-    scheduler and worker are waited for with `patience` [s].
+    Args:
+        address: of the scheduler, such as ``tcp://host:8786``.
+        timeout: longest time of a task [s].
+        patience: longest wait for scheduler and workers [s].
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers at the address.
@@ -89,17 +91,17 @@ class DaskWorkers(Workers):
 
     @property
     def n_workers(self) -> int:
-        """How many there are now."""
+        """Number of workers now."""
         return len(self._client.nthreads())
 
     def close(self) -> None:
-        """Leave the cluster to others."""
+        """Disconnect from the cluster."""
         if self._connected:
             self._on_all(release_children)
         self._client.close()
 
     def require_folders(self, folders: Sequence[Path]) -> None:
-        """Check that every worker sees folders under the same names as this machine does.
+        """Check that every worker has these folders under the same names.
 
         Raises:
             ClusterError: one does not.
@@ -118,14 +120,14 @@ class DaskWorkers(Workers):
         """See :class:`Workers`.
 
         Raises:
-            ClusterError: all workers, or the scheduler, are gone for longer than the patience.
-            WorkerSoftwareError: a worker that joined later runs other software.
+            ClusterError: all workers, or the scheduler, are lost for longer than the patience.
+            WorkerSoftwareError: a worker that joined later has other software.
         """
         waiting, begun = iter(tasks), deque[tuple[ArchiveTask[T], Any]]()
         most = 0
         try:
             while True:
-                if len(begun) <= most // 2:  # each look at the cluster takes milliseconds
+                if len(begun) <= most // 2:  # a poll of the cluster takes milliseconds
                     most = _AHEAD * self._threads()
                     for task in islice(waiting, max(0, most - len(begun))):
                         begun.append((task, self._begin(task)))
@@ -133,7 +135,7 @@ class DaskWorkers(Workers):
                     return
                 task, future = begun.popleft()
                 result = self._result(future)
-                if result is _LOST:  # perhaps by another task: again with nothing beside
+                if result is _LOST:  # perhaps because of another task: repeat it alone
                     for other in begun:
                         self._wait(other[1])
                     result = self._result(self._begin(task))
@@ -152,17 +154,17 @@ class DaskWorkers(Workers):
         return max(1, int(sum(self._client.nthreads().values())))
 
     def _on_all(self, function: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-        """What a function returns or raises, by worker."""
+        """Return the result or exception of a function by worker."""
         found: dict[str, Any] = self._client.run(function, *arguments, on_error="return")
         return found
 
     def _result(self, future: Any) -> Any:
-        """What came of a task, or what it raised; `_LOST` if every worker that took it up died."""
+        """Return the result of a task or raise its error; `_LOST` if all its workers died."""
         from distributed import KilledWorker
 
         self._wait(future)
         if future.status not in ("finished", "error"):
-            raise ClusterError("the Dask scheduler dropped the work: it was ended or started anew")
+            raise ClusterError("the Dask scheduler dropped the work: it was ended or restarted")
         error = future.exception()
         if isinstance(error, KilledWorker):
             return _LOST
@@ -174,19 +176,19 @@ class DaskWorkers(Workers):
         return self._client.submit(self._work, task, pure=False, retries=_RETRIES)
 
     def _wait(self, future: Any) -> None:
-        """Wait for a run; see meanwhile that there is somebody to wait for."""
+        """Wait for a task, while there is a scheduler with workers."""
         last_seen = monotonic()
-        while future.status in ("pending", "lost"):  # lost with a worker: it is made anew
+        while future.status in ("pending", "lost"):  # lost with a worker: computed again
             ended = threading.Event()
             future.add_done_callback(lambda _, event=ended: event.set())
-            ended.wait(_LOOK)
+            ended.wait(_POLL)
             if self._connected and self.n_workers:
                 last_seen = monotonic()
             elif monotonic() - last_seen > self._patience:
                 missing = "all workers" if self._connected else "the scheduler"
                 raise ClusterError(
-                    f"{missing} of the Dask cluster went away and did not come back within "
-                    f"{self._patience:g} s; what was finished is in the cache"
+                    f"{missing} of the Dask cluster disappeared and did not return within "
+                    f"{self._patience:g} s; finished results are in the cache"
                 )
 
 
@@ -216,13 +218,13 @@ def _connected(address: str, patience: float) -> Any:
 
 
 def software_versions() -> dict[str, str]:
-    """What decides about the bits of a result here: this code, and what it computes with."""
+    """Return the versions that determine the bits of a result: code, Python and libraries."""
     python = ".".join(str(part) for part in sys.version_info[:3])
     return {"hil": code_digest(), "python": python} | {name: version(name) for name in LIBRARIES}
 
 
 def version_differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -> str:
-    """What is other there, in words; empty if nothing."""
+    """Return the differences between versions as text; empty if there are none."""
     if isinstance(there, Exception):
         return str(there)
     return ", ".join(
@@ -235,13 +237,16 @@ def version_differences(here: Mapping[str, str], there: Mapping[str, str] | Exce
 def perform_task(
     task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]
 ) -> T | Unused:
-    """Do a task in a child process.
+    """Run a task in a child process of a worker.
 
-    It may last for `timeout` [s]; `expected` is the `software_versions` of whoever asks.
+    Args:
+        task: to run.
+        timeout: longest time [s].
+        expected: `software_versions` of the client.
 
     Raises:
-        WorkerSoftwareError: other software runs here.
-        PlannerNotStarted: no child process can be started here.
+        WorkerSoftwareError: the worker has other software.
+        PlannerNotStarted: no child process can be started.
     """
     checked = ArchiveTask[T | Unused](task.path, _checked, (task, expected))
     with _borrowed(timeout) as child:
@@ -250,9 +255,9 @@ def perform_task(
 
 
 def _checked(task: ArchiveTask[T], expected: Mapping[str, str]) -> T | Unused:
-    """In the child: what comes of a task, by the same code as the caller's."""
+    """Run a task in the child, which must have the same software as the client."""
     if other := version_differences(expected, software_versions()):
-        raise WorkerSoftwareError(f"a worker runs other software: {other}")
+        raise WorkerSoftwareError(f"a worker has other software: {other}")
     return run_task(task)
 
 
@@ -262,7 +267,7 @@ _idle: defaultdict[float, list[LocalWorkers]] = defaultdict(list)
 
 @contextmanager
 def _borrowed(timeout: float) -> Iterator[LocalWorkers]:
-    """A child of one's own, warm where one is idle; a worker may have several threads."""
+    """Yield a child process, an idle one if there is one; a worker may have several threads."""
     with _lock:
         child = _idle[timeout].pop() if _idle[timeout] else LocalWorkers(1, timeout=timeout)
     try:

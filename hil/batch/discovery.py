@@ -1,7 +1,7 @@
-"""Which archives there are: found below folders, examined where they lie, sorted.
+"""Search for archives below folders and URLs, and selection of those that are fitted.
 
-Workers hash an archive and look into it; no sample is decoded. What an archive is goes into the
-cache, and is believed as long as nobody has touched the file and the programs are the same.
+Workers hash each archive and read its metadata, no samples. The result is cached, and valid until
+the file or the programs change.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from .types import ArchiveRef, ChangedError, Stamp, Unused
 from .workers import ArchiveTask, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
-"""What archives are used for; those of other kinds are left alone."""
+"""Uses of archives in a batch; archives of other kinds are skipped."""
 
 _SUFFIX: Final = ".mcap"
 _ARCHIVES: Final = "archives"  # folder of a campaign's archives
@@ -42,17 +42,17 @@ _FOR_VIEWERS: Final = "/annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _UNTOUCHED: Final = 2_000_000_000
-"""ns that a file must have been left alone before its time stamps are believed to show the next
-change: file systems count in steps, some of them of two seconds."""
+"""Age of a file's time stamps from which on they are trusted to show the next change, ns: some file
+systems have steps of two seconds."""
 
 
 class Discovery(NamedTuple):
-    """What was found."""
+    """Result of a search."""
 
-    refs: tuple[ArchiveRef, ...]  #: archives to use, in canonical order
-    #: files that cannot be used and folders that cannot be looked into, by path
+    refs: tuple[ArchiveRef, ...]  #: archives to use, in the order of sums
+    #: files that cannot be used and folders that cannot be read, by path
     broken: tuple[Unused, ...]
-    skipped: tuple[Unused, ...]  #: archives that are not meant to be fitted, and why, by path
+    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting, by path
 
 
 def discover(
@@ -63,7 +63,7 @@ def discover(
 ) -> Discovery:
     """Find every archive at or below some places.
 
-    An archive that was examined before, and whose file nobody has touched since, is not opened.
+    An archive whose file has not changed since the last search is not opened.
 
     Raises:
         InputError: a place does not exist, an address cannot be read, or there is no archive.
@@ -76,8 +76,8 @@ def discover(
             problem += f", and {refused[0].path} {refused[0].reason}"
         raise InputError(roots[0] if roots else None, problem, remedy="name others")
     known: dict[Location, ArchiveRef | Unused] = {}
-    with reporter.task("looking into archives", len(places)) as task:
-        if workers.local:  # else the cache is where the archives are
+    with reporter.task("reading the metadata of archives", len(places)) as task:
+        if workers.local:  # else the cache is on the workers
             for place in places:
                 try:
                     if (ref := _known(place, cache)) is not None:
@@ -88,18 +88,18 @@ def discover(
         unknown = [place for place in places if place not in known]
         tasks = [ArchiveTask(place.location, inspect_archive, (place, cache)) for place in unknown]
         known.update(zip(unknown, workers.results(tasks, task.advance), strict=True))
-    found = _sorted_out([(place, known[place]) for place in places])
+    found = _select([(place, known[place]) for place in places])
     return Discovery(found.refs, (*refused, *found.broken), (*left, *found.skipped))
 
 
-# Where archives lie
+# Locations
 
 
 class Location(NamedTuple):
-    """Where an archive lies, and what is known of its file without opening it."""
+    """Location of an archive, and the version of its file without opening it."""
 
     location: str  #: path or URL
-    version: str = ""  #: of a remote object's content, "" where its store does not say
+    version: str = ""  #: of a remote object's content, "" where its store states none
 
     @property
     def name(self) -> str:
@@ -113,13 +113,13 @@ class Location(NamedTuple):
 
     @property
     def campaign(self) -> str:
-        """The campaign's folder: that of the archives, or the one above."""
+        """Folder of the campaign: that of the archives, or the one above."""
         above, _, name = self.folder.rpartition("/")
         return above if name == _ARCHIVES and above else self.folder
 
     @property
     def stamp(self) -> Stamp | None:
-        """Of the file as it is now; None of a remote one.
+        """Stamp of the file now; None of a remote one.
 
         Raises:
             ArchiveError: there is no such file.
@@ -130,11 +130,10 @@ class Location(NamedTuple):
 def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], list[Unused]]:
     """Find every archive at or below some folders, archives, or URLs of either.
 
-    Links are followed, and a folder that several lead to is looked into once, under its own name.
+    Links are followed; a folder reached by several links is searched once, under its own name.
 
     Returns:
-        Archives in the order of their locations; folders and files that cannot be looked into;
-        links that lead nowhere.
+        Archives sorted by location; folders and files that cannot be read; broken links.
 
     Raises:
         InputError: a place does not exist, or an address cannot be read.
@@ -146,21 +145,21 @@ def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], l
 
     def refuse(error: OSError) -> None:
         cache = Path(os.fsdecode(error.filename)).as_posix()
-        refused.append(Unused(cache, f"cannot be looked into: {error.strerror}"))
+        refused.append(Unused(cache, f"cannot be read: {error.strerror}"))
 
-    def look_at(path: Path) -> None:
+    def add_file(path: Path) -> None:
         try:
             regular = S_ISREG(path.stat().st_mode)
         except OSError as error:
             if path.suffix == _SUFFIX:
                 refuse(error)
             elif path.is_symlink():
-                left.append(Unused(path.as_posix(), "is a link that leads nowhere"))
+                left.append(Unused(path.as_posix(), "is a broken link"))
             return
         if path.suffix == _SUFFIX and regular:
             found.add(Location(path.as_posix()))
         elif path.suffix == _SUFFIX:
-            refused.append(Unused(path.as_posix(), "is no file"))
+            refused.append(Unused(path.as_posix(), "is not a regular file"))
 
     def walk(root: Path) -> None:
         for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
@@ -171,7 +170,7 @@ def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], l
             visited.add(folder)
             folders[:] = [one for one in folders if one != BESIDE]
             for file in files:
-                look_at(folder / file)
+                add_file(folder / file)
 
     for root in roots:
         path = Path(root)
@@ -186,11 +185,11 @@ def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], l
     return sorted(found), refused, left
 
 
-# What an archive is
+# Metadata
 
 
 def describe_setup(cell: Cell) -> str:
-    """Delay of the torque and payload of a cell in words, with every digit; "" for neither."""
+    """Return torque delay and payload of a cell as text, with all digits; "" for neither."""
 
     def row(figures: Iterable[float]) -> str:
         return f"({', '.join(f'{figure:.12g}' for figure in figures)})"
@@ -205,17 +204,17 @@ def describe_setup(cell: Cell) -> str:
 
 
 def inspect_archive(place: Location, cache: CacheLocation) -> ArchiveRef:
-    """Find out what an archive is, and cache it.
+    """Return the reference of an archive, and cache it.
 
     Raises:
-        HilError: it cannot be read, is torn, or was changed meanwhile.
+        HilError: it cannot be read, is damaged, or was changed meanwhile.
         CacheError: the cache cannot be written.
     """
     if (known := _known(place, cache)) is not None:
         return known
     begun, stamp = time.time_ns(), place.stamp
     with local_file(place.location) as path:
-        ref = _inspected(place, path, cache)
+        ref = _read_ref(place, path, cache)
         if stamp is not None and stamp_of(path) != stamp:
             raise ChangedError(place.location)
     ref = replace(ref, stamp=stamp)
@@ -226,9 +225,9 @@ def inspect_archive(place: Location, cache: CacheLocation) -> ArchiveRef:
 
 
 def _known(place: Location, cache: CacheLocation) -> ArchiveRef | None:
-    """What is known of an archive without opening it, if its file is there; None if nothing."""
+    """Return the cached reference of an archive whose file has not changed; None if none."""
     stamp = place.stamp
-    if stamp is None and not place.version:  # only its bytes show a change
+    if stamp is None and not place.version:  # only its bytes would show a change
         return None
     note = cache.store(place.location).get(_key(place), dict)
     if note is None or note.get("token") != _token(place, stamp):
@@ -245,15 +244,15 @@ def _token(place: Location, stamp: Stamp | None) -> list[Any]:
     return [code_digest(), place.version, *(stamp or ())]
 
 
-def _inspected(place: Location, path: Path, cache: CacheLocation) -> ArchiveRef:
-    """Hash a file, look into it, and cache the texts of its cell."""
+def _read_ref(place: Location, path: Path, cache: CacheLocation) -> ArchiveRef:
+    """Hash a file, read its metadata, and cache the texts of its cell."""
     sha256 = digest_of(path)
-    # Of a whole file this reads its summary and what stands outside of chunks, and one chunk.
+    # Of an intact file this reads summary, metadata, attachments and one chunk.
     archive = open_archive(path, fields=(), stop=-1.0)
     require_complete(archive, place.location)
     header, plan = archive.header, archive.attachments.get("plan.json")
     index, attempt = header.index, header.attempt
-    if index is None or attempt is None:  # else as the archive says, whatever its name is now
+    if index is None or attempt is None:  # else as stated in the archive, even if renamed
         name = ArchiveName.parse(place.name)
         index, attempt = (0, 0) if name is None else (name.index, name.attempt)
     ref = ArchiveRef(
@@ -287,25 +286,25 @@ def _inspected(place: Location, path: Path, cache: CacheLocation) -> ArchiveRef:
     )
 
 
-# Which archives are meant to be fitted
+# Selection
 
 _Attempts = dict[tuple[str, str, int], int]
 """The last attempt by folder, kind and index."""
 
 
-def _sorted_out(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
-    """Tell archives that are meant to be fitted from copies, failures and earlier attempts."""
+def _select(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
+    """Separate archives to be fitted from copies, failures and earlier attempts."""
     manifests, broken = _manifests([place for place, _ in found])
     read: list[ArchiveRef] = []
-    harmed: list[tuple[Location, str]] = []
+    unusable: list[tuple[Location, str]] = []
     skipped: list[Unused] = []
     for place, one in found:
         entries = None if place.campaign == place.folder else manifests.get(place.campaign)
         entry = None if entries is None else entries.get(place.name)
         if isinstance(one, Unused):
-            harmed.append((place, one.reason))
+            unusable.append((place, one.reason))
         elif entry is not None and entry.sha256 != one.sha256:
-            harmed.append((place, "is not what its campaign's manifest.json says"))
+            unusable.append((place, "differs from its entry in the campaign's manifest.json"))
         elif entry is not None and entry.outcome not in ("", _COMPLETED):
             read.append(replace(one, outcome=entry.outcome))
         elif (
@@ -314,10 +313,10 @@ def _sorted_out(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discov
             and one.use in USES
             and ArchiveName.parse(place.name)
         ):
-            # A run that was killed may have closed it and not lived to judge it.
+            # A run that was killed may have closed it without judging it.
             reason = (
-                "is not named in its campaign's manifest.json: nobody has judged it (a run was "
-                "killed; the next one takes it in)"
+                "is not listed in its campaign's manifest.json: its quality was not checked (the "
+                "run was killed; the next run adds it)"
             )
             skipped.append(Unused(place.location, reason))
         else:
@@ -327,13 +326,13 @@ def _sorted_out(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discov
         if ref.attempt and ref.outcome == _COMPLETED:
             key = (Location(ref.location).folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
-    for place, reason in harmed:
+    for place, reason in unusable:
         replaced = _replaced(place, latest)
         (skipped if replaced else broken).append(Unused(place.location, replaced or reason))
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
-        if reason := _objection(ref, latest, seen):
+        if reason := _exclusion(ref, latest, seen):
             skipped.append(Unused(ref.location, reason))
         else:
             refs.append(ref)
@@ -342,7 +341,7 @@ def _sorted_out(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discov
 
 
 def _manifests(places: Iterable[Location]) -> tuple[dict[str, dict[str, Entry]], list[Unused]]:
-    """Entries by name of each campaign that has a manifest; and those that cannot be read."""
+    """Return the manifest entries by name of each campaign, and unreadable manifests."""
     found: dict[str, dict[str, Entry]] = {}
     broken = []
     for campaign in dict.fromkeys(one.campaign for one in places if one.campaign != one.folder):
@@ -357,10 +356,10 @@ def _manifests(places: Iterable[Location]) -> tuple[dict[str, dict[str, Entry]],
 
 
 def _replaced(place: Location, latest: _Attempts) -> str:
-    """Why nothing is missing with an archive that cannot be used; "" if something is.
+    """Return why an unusable archive is not needed; "" if it is.
 
-    A run that was killed, or whose disk was full, leaves torn ones, and the next run makes the
-    motion again.
+    A run that was killed, or whose disk was full, leaves truncated archives; the next run repeats
+    the motion.
     """
     name = ArchiveName.parse(place.name)
     if place.folder.endswith(_FOR_VIEWERS):
@@ -370,28 +369,28 @@ def _replaced(place: Location, latest: _Attempts) -> str:
     if name.kind in _NEVER_FITTED:
         return f"is a {name.kind}"
     last = latest.get((place.folder, name.kind, name.index), 0)
-    return f"attempt {last} took the place of this unusable one" if name.attempt < last else ""
+    return f"was replaced by attempt {last}" if name.attempt < last else ""
 
 
-def _objection(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
-    """Why an archive is not meant to be fitted; "" if it is, and then it was seen."""
+def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
+    """Return why an archive is not to be fitted; "" if it is, and then add it to `seen`."""
     if ref.use not in USES:
         return f"is a {ref.use}"
     if ref.simulated and _REHEARSAL in ref.location:
         return "belongs to a rehearsal"
     if _LOADED.search(ref.location):
-        return "carries a payload that its cell does not state"
+        return "was recorded with a payload that its cell does not state"
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
     folder = Location(ref.location).folder
     last = latest.get((folder, ref.kind, ref.index), ref.attempt)
     if ref.attempt and ref.attempt < last:
-        return f"attempt {last} took its place"
+        return f"was replaced by attempt {last}"
     if ref.sha256 in seen and ref.use != "standstill":
-        return f"holds the same as {seen[ref.sha256]}"
+        return f"is a copy of {seen[ref.sha256]}"
     if ref.attempt:
         first = seen.setdefault(f"{folder} {ref.record}", ref.name)
         if first != ref.name:
-            return f"is a copy of {first}, or was repaired from it"
+            return f"is a copy or a repaired version of {first}"
     seen[ref.sha256] = ref.location
     return ""

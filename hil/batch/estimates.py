@@ -1,4 +1,4 @@
-"""From factors to estimates, by those estimators that need no sample."""
+"""Estimates from factors, by the estimators that need no samples."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ from .types import ArchiveRef, BatchEstimator, Bundle, Level, LevelEstimate, Sum
 Array = NDArray[np.float64]
 
 _NAMED: Final = 12
-"""Different warnings that are named; of very many archives there may be very many."""
+"""Number of different warnings that are listed."""
 
 
 @dataclass(eq=False)
 class Group:
-    """What is fitted together, and what is predicted by it."""
+    """Archives that are fitted together, and the sums that predict and are predicted."""
 
     refs: list[ArchiveRef] = field(default_factory=list)  #: archives that were fitted
-    phase: PhaseFactor | None = None  #: sum of their factors; None before there is one
-    repetitions: list[LevelEstimate] = field(default_factory=list)  #: the estimate of each
-    unseen: PhaseFactor | None = None  #: sum of the totals of what is predicted; None if nothing is
+    phase: PhaseFactor | None = None  #: sum of their factors; None if there are none
+    repetitions: list[LevelEstimate] = field(default_factory=list)  #: estimates of each
+    unseen: PhaseFactor | None = None  #: sum of the totals of validation runs; None if none
     #: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`
     products: Array | None = None
     #: every archive, with the warnings about it
@@ -54,7 +54,7 @@ class Group:
     settings: set[str] = field(default_factory=set)  #: digests
 
     def add_bundle(self, bundle: Bundle) -> None:
-        """Add archives; their estimates are added apart."""
+        """Add archives without their estimates."""
         self.phase = plus(self.phase, bundle.phase)
         for summary in bundle.summaries:
             self.warned.append((summary.ref, summary.warnings))
@@ -65,7 +65,7 @@ class Group:
                 self.unseen = plus(self.unseen, summary.total)
 
     def add(self, other: Group) -> None:
-        """Add what was fitted elsewhere."""
+        """Add another group."""
         self.refs += other.refs
         self.phase = plus(self.phase, other.phase)
         self.repetitions += other.repetitions
@@ -76,22 +76,22 @@ class Group:
 
 
 def plus(one: Any, other: Any) -> Any:
-    """The sum of two terms, each of which may be None, which is nothing."""
+    """Return the sum of two terms, of which None is zero."""
     return one if other is None else other if one is None else one + other
 
 
 class Estimator:
-    """One of the estimators, for one arm; its model has the law of its settings."""
+    """An estimator for one arm; the model has the friction law of its settings."""
 
     def __init__(self, name: BatchEstimator, model: RobotModel, settings: Settings) -> None:
         self.name, self.model, self.delay_variance = name, model, settings.delay_variance
         self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
 
     def centre(self, phase: PhaseFactor) -> Array | None:
-        """What estimates from a sum and its archives are shrunk towards (p,); None for nothing.
+        """Return the centre of shrinkage of a sum and its archives (p,); None for none.
 
         Raises:
-            IdentificationError: there is not one usable row.
+            IdentificationError: there is no usable row.
         """
         total = phase.total
         if not total.samples.any():
@@ -101,11 +101,11 @@ class Estimator:
         return centre_of(self.model, total, self._shrinkage)[0]
 
     def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
-        """The estimate from one archive alone, shrunk towards the centre of all.
+        """Return the estimate from one archive, shrunk towards the centre of all.
 
-        Of the consistent estimator this is the free one, as in `hil identify`: the scatter of
-        repetitions is about noise. A summary has no blocks of time: the covariance of what is
-        shrunk is that of the free estimate, shrunk alike.
+        The consistent estimator returns the unconstrained estimate, as `hil identify` does: the
+        scatter of repetitions describes noise. A summary has no blocks of time: the covariance is
+        that of the unconstrained estimate, shrunk by the same factor.
         """
         own, total = summary.fit, summary.total.total
         assert own is not None, "it was fitted"
@@ -131,9 +131,9 @@ class Estimator:
         )
 
     def of_group(self, group: Group, centre: Array | None) -> Estimate:
-        """The estimate from a sum over archives, shrunk towards its centre.
+        """Return the estimate from a sum over archives, shrunk towards its centre.
 
-        Its intervals are no narrower than the repetitions of one motion scatter.
+        Its intervals are at least as wide as the scatter of repetitions of one motion.
 
         Raises:
             IdentificationError: there is no consistent solution.
@@ -151,7 +151,7 @@ class Estimator:
 
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
-    """Warnings about archives in sentences, each with what it concerns; most archives first."""
+    """Return warnings with the archives they concern, most frequent first."""
     counts: Counter[str] = Counter()
     first: dict[str, ArchiveRef] = {}
     for ref, warnings in warned:
@@ -164,16 +164,16 @@ def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[s
         some = f"{name}: " if count == 1 else f"{count} of {len(warned)} archives, such as {name}: "
         found.append(text if count == len(warned) else some + text)
     if len(counts) > _NAMED:
-        found.append(f"{len(counts) - _NAMED} more warnings stand with the repetitions")
+        found.append(f"{len(counts) - _NAMED} more warnings are listed with the repetitions")
     return tuple(found)
 
 
 def repetition_level(
     estimator: Estimator, summary: Summary, settings: str, centre: Array | None = None
 ) -> LevelEstimate:
-    """The estimate of one archive, shrunk towards the centre of those that are fitted together.
+    """Return the estimate of one archive, shrunk towards the centre of its group.
 
-    It refers to nothing else in memory: of a batch there may be very many.
+    It references no other arrays: a batch may have very many.
     """
     ref, model = summary.ref, estimator.model
     found = estimator.of_archive(summary, centre)
@@ -206,7 +206,15 @@ def sum_level(
     warnings: Sequence[str] = (),
     payload: Payload | None = None,
 ) -> LevelEstimate:
-    """The estimate of a campaign, or of all campaigns of an arm; centre see `Estimator.centre`.
+    """Return the estimate of a campaign, or of all campaigns of an arm.
+
+    Args:
+        level: "campaign" or "pooled".
+        estimator: of the arm.
+        group: its archives.
+        centre: see `Estimator.centre`.
+        warnings: further warnings.
+        payload: stated by the cell.
 
     Raises:
         IdentificationError: there is no estimate.
@@ -247,20 +255,20 @@ def sum_level(
 
 
 def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
-    """RMS per joint (n,) of the torque that is left by parameters (p,), and of the torque."""
+    """Return the RMS per joint (n,) of the residual of parameters (p,), and of the torque."""
     return _rms(factor, factor.squared_errors(values)), _rms(factor)
 
 
 def _rms(factor: Factor, squares: Array | None = None) -> Array:
-    """Root mean square per joint (n,) of sums over rows, by default of the torque; NaN of none."""
+    """Return the RMS per joint (n,) of sums over rows, by default of the torque; NaN of none."""
     squares = factor.gram[:, -1, -1] if squares is None else squares
     return np.asarray(np.sqrt(squares / np.where(factor.samples > 0, factor.samples, np.nan)))
 
 
 def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = None) -> float:
-    """Error over torque, root of the sums of squares over all joints; NaN where unknown.
+    """Return the RMS error over the RMS torque of all joints; NaN where unknown.
 
-    Each is an RMS per joint (n,), of so many rows (n,), or of equally many.
+    Both are given per joint (n,), for `rows` (n,) rows or equally many.
     """
     count = np.ones(len(error)) if rows is None else rows.astype(np.float64)
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
@@ -269,9 +277,9 @@ def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = 
 
 
 def speed_rms(model: RobotModel, factor: Factor) -> Array:
-    """Root mean square speed per axis (n,) [rad/s, m/s], from the columns of viscous friction.
+    """Return the RMS speed per axis (n,) [rad/s, m/s] from the columns of viscous friction.
 
-    That of the motor where only the coupled motor has friction; NaN where no column is a speed.
+    It is that of the motor where only the coupled motor has friction; NaN without such a column.
     """
     squares = np.full(model.n_joints, np.nan)
     for k, term in enumerate(model.friction.terms):

@@ -1,6 +1,6 @@
-"""What is done on a worker: an archive opened, settings decided, archives reduced to factors.
+"""Tasks of a worker: open an archive, decide settings, reduce archives to factors.
 
-Everything here is a pure function of the bytes of archives and of settings.
+All are pure functions of the bytes of archives and of settings.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from .remote import local_file
 from .types import ArchiveRef, Bundle, ChangedError, Stamp, Summary, Unused
 
 BUNDLE: Final = 16
-"""Archives of a campaign that are reduced together: a summary of each and one sum of all, which is
-fifty times the size of a summary, are one entry of the cache."""
+"""Number of archives of a campaign in one entry of the cache: a summary of each and one sum of all,
+which is fifty times the size of a summary."""
 
 _FIELDS: Final = (
     "cycle",
@@ -65,11 +65,11 @@ _FIELDS: Final = (
 
 @contextmanager
 def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
-    """The archive with what identification reads, as long as its file is there.
+    """Open an archive with the columns that identification reads.
 
     Raises:
-        ChangedError: it is not the file that was found.
-        ArchiveError: it cannot be read, or is not whole.
+        ChangedError: the file has changed since it was found.
+        ArchiveError: it cannot be read, or is damaged.
     """
     with local_file(ref.location) as path:
         _require_same(path, ref)
@@ -78,17 +78,17 @@ def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
             if archive.header.by_controller_program:
                 archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
         finally:
-            if ref.stamp is not None:  # what was written meanwhile is no fault of the archive
+            if ref.stamp is not None:  # an error may be due to a change
                 _require_same(path, ref)
         require_complete(archive, ref.location)
         yield archive
 
 
 def require_complete(archive: Archive, location: str) -> None:
-    """Refuse an archive with damage; a batch uses none in part.
+    """Refuse a damaged archive.
 
     Raises:
-        ArchiveError: says how it is repaired.
+        ArchiveError: with the command of the repair.
     """
     if archive.damage is not None:
         remedy = f"hil archive repair {location}"
@@ -96,13 +96,13 @@ def require_complete(archive: Archive, location: str) -> None:
 
 
 def _require_same(path: Path, ref: ArchiveRef) -> None:
-    """Of a fetched copy only the bytes tell whether it is what was found."""
+    """Check that a file is unchanged; of a downloaded copy by its bytes."""
     if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
         raise ChangedError(ref.location)
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of all bytes of a file.
+    """Return the SHA-256 of a file.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -114,7 +114,7 @@ def digest_of(path: Path) -> str:
 
 
 def stamp_of(path: Path) -> Stamp:
-    """What the file system says about a file.
+    """Return size, times and inode of a file.
 
     Raises:
         ArchiveError: there is none.
@@ -127,11 +127,11 @@ def stamp_of(path: Path) -> Stamp:
 
 
 def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
-    """The cell that travels in an archive, with the law of settings if there are any.
+    """Return the cell of an archive, with the friction law of settings if given.
 
     Raises:
-        ArchiveError: the archive carries no cell or no URDF, or one that is no text.
-        CellError: the cell is not right.
+        ArchiveError: the archive has no cell or no URDF, or they are not text.
+        CellError: the cell is invalid.
     """
     friction = {} if settings is None else settings.friction
     return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
@@ -139,23 +139,23 @@ def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
 
 @lru_cache(maxsize=8)
 def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
-    """The cell of these texts, with a friction law of these entries if there are any."""
+    """Return the cell of these texts, with a friction law of these entries if given."""
     cell = Cell.from_texts(text, urdf, Path("cell.toml"))
     return cell.with_friction(**dict(friction)) if friction else cell
 
 
 def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
-    """An archive, and what of it is of use.
+    """Return an archive and its usable signals.
 
     Raises:
-        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
+        HilError: it cannot be read, is damaged, was changed, or cannot be identified from.
     """
     with open_ref(ref) as archive:
         source = source_of(archive, cell_in(archive), to_fit=to_fit)
     if to_fit and source.recording.torque is None:
         raise ArchiveError(
             ref.location,
-            "holds motor currents and no torques",
+            "has motor currents and no torques",
             remedy="find the torque constants with `hil gains` and import it again",
         )
     return archive, source
@@ -167,14 +167,14 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
 class Decision(NamedTuple):
     """Settings of a campaign."""
 
-    settings: Settings | None  #: None where there is not one archive to decide them from
-    broken: tuple[Unused, ...] = ()  #: archives that could not be read for it
+    settings: Settings | None  #: None without any archive to decide them from
+    broken: tuple[Unused, ...] = ()  #: archives that could not be read
 
 
 def archives_for_settings(
     refs: Sequence[ArchiveRef], arms: Settings | None
 ) -> tuple[ArchiveRef, ...]:
-    """The archives of a campaign that its settings depend on, those at standstill first."""
+    """Return the archives that determine a campaign's settings, those at standstill first."""
     ordered = sorted(refs, key=lambda ref: ref.order)
     rest = [ref for ref in ordered if ref.use == "standstill"]
     fitted = [ref for ref in ordered if ref.use == "excitation"]
@@ -184,7 +184,7 @@ def archives_for_settings(
 def cached_settings(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
 ) -> Settings | None:
-    """Settings that were decided from these archives before."""
+    """Return the settings that were decided from these archives before."""
     if not refs:
         return None
     return cache.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
@@ -195,11 +195,11 @@ def decide_settings(
 ) -> Decision:
     """Decide a campaign's settings from `archives_for_settings` and cache them.
 
-    They are those of the arm with the campaign's own noise; None where it decides on them.
+    They are those of the arm, if it has any, with the campaign's own noise.
 
     Raises:
         RecordingError: a recording cannot be prepared.
-        IdentificationError: a delay was asked for and there is not one usable row.
+        IdentificationError: a delay was requested and there is no usable row.
     """
     broken: list[Unused] = []
     rest: Source | None = None
@@ -230,11 +230,11 @@ def decide_settings(
 
 
 def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseFactor]:
-    """Reduce one archive: its summary, and its factor block by block of time.
+    """Reduce one archive to its summary and its factor by blocks of time.
 
     Raises:
-        HilError: it cannot be read, is torn, was changed, or is not fit to be identified from.
-        IdentificationError: there is not one usable row in it.
+        HilError: it cannot be read, is damaged, was changed, or cannot be identified from.
+        IdentificationError: it has no usable row.
     """
     archive, source = load_source(ref)
     source = signals_of(source, settings)
@@ -247,7 +247,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     if source.merged:
         warnings.append(source.merged)
     if archive.outcome is not None and archive.outcome.repaired:
-        warnings.append("it was repaired, and something is lost")
+        warnings.append("it was repaired with loss")
     return Summary(
         ref=ref,
         total=phase.merged(max(1, len(phase))),
@@ -259,7 +259,7 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
 
 
 def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor) -> tuple[Estimate, float]:
-    """With the mean ratio of the estimate's variances to those of white residuals."""
+    """Return the estimate, and the mean ratio of its variances to those of white residuals."""
     found = fit_least_squares(model, [samples], phase=phase)
     weights = joint_weights(phase.total)
     if found.undetermined:
@@ -270,19 +270,19 @@ def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor) -> tuple[Estim
 
 
 def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
-    """Archives of one campaign in canonical order, in runs that are reduced together."""
+    """Divide the archives of one campaign into bundles, in the order of sums."""
     ordered = sorted(refs, key=lambda ref: ref.order)
     return [tuple(ordered[k : k + BUNDLE]) for k in range(0, len(ordered), BUNDLE)]
 
 
 def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> Bundle:
-    """Reduce archives of one campaign, or those that are not in the cache, and cache the result.
+    """Reduce archives of one campaign that are not in the cache, and cache the result.
 
-    The sum goes from first to last in canonical order, so that one that is known of the first ones
-    can be continued. Of an archive that could not be used, nothing is in it.
+    The sum is added in the order of archives, so that a cached sum of the first ones is continued.
+    Unusable archives are not part of it.
 
     Raises:
-        CacheError: the disk refuses.
+        CacheError: the cache cannot be written.
     """
     store, used = cache.store(refs[0].location), settings_digest(settings)
     counts = range(len(refs), 0, -1)
@@ -294,7 +294,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
     if known == len(refs):
         return found
     summaries, broken, phase = list(found.summaries), dict(found.broken), found.phase
-    lasting = True  # whether what is broken will be so again, as long as it stays the same
+    lasting = True  # whether errors are due to the bytes of the archives
     for ref in refs[known:]:
         try:
             summary, own = archive_factor(ref, settings)
@@ -303,7 +303,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
             of_the_bytes = isinstance(error, ArchiveError | CellError | IdentificationError)
             changed = isinstance(error, ChangedError) or isinstance(error.__cause__, OSError)
             lasting &= of_the_bytes and not changed
-        except Exception as error:  # a fault of ours: it costs this archive, not the batch
+        except Exception as error:  # an internal error costs this archive, not the batch
             broken[ref.location] = f"{type(error).__name__}: {error}"
             lasting = False
         else:
@@ -322,7 +322,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
 def cached_bundle(
     refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
 ) -> Bundle | None:
-    """Archives reduced earlier; None unless all of them are in the cache."""
+    """Return the cached bundle of these archives; None unless all are in the cache."""
     store = cache.store(refs[0].location)
     found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
     if found is None:
@@ -337,5 +337,5 @@ def cached_bundle(
 
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:
-    """Whether there is an entry of the sum of these archives; it may turn out to be damaged."""
+    """Return whether there is a cache entry of these archives, intact or not."""
     return cache.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))

@@ -1,6 +1,6 @@
-"""Archives in an object store or behind a web server, at any address that fsspec knows.
+"""Archives in an object store or on a web server, at any address that fsspec supports.
 
-Some need a package of their own, which the error names. fsspec is imported with the first address.
+Some need a further package, which the error names. fsspec is imported with the first address.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from hil.version import install_command
 
 _SUFFIX: Final = ".mcap"
 _VERSIONS: Final = ("ETag", "etag", "md5Hash", "content_md5", "Content-MD5")
-"""What stores say of the content of an object, by the names they have for it."""
+"""Names of the version of an object in different stores."""
 
 
 def is_url(text: str) -> bool:
-    """Whether a location is an address and not a path."""
+    """Return whether a location is an address and not a path."""
     return "://" in text
 
 
 def archives_below(url: str) -> list[tuple[str, str]]:
-    """Every archive at or below an address, in the order of their addresses.
+    """Return every archive at or below an address, sorted.
 
     Args:
         url: of an archive, or of a folder (of a web server: one that lists its folders as links).
 
     Returns:
         Address and version of each. The version changes when the object does; it is "" where the
-        store says nothing of the kind, and only its bytes tell.
+        store states none.
 
     Raises:
         InputError: it cannot be read, or a package for it is missing.
@@ -53,9 +53,7 @@ def archives_below(url: str) -> list[tuple[str, str]]:
 
 @contextmanager
 def local_file(location: str) -> Iterator[Path]:
-    """The file at a path; a copy of a remote one under its own name, for as long as it is needed.
-
-    The copy lies in the folder for temporary files (``TMPDIR``); nothing of it is held in memory.
+    """Yield the file of a path, or a temporary copy of a remote one in ``TMPDIR``.
 
     Raises:
         InputError: it cannot be read, or a package for it is missing.
@@ -72,7 +70,7 @@ def local_file(location: str) -> Iterator[Path]:
 
 @contextmanager
 def _store(url: str) -> Iterator[tuple[Any, str]]:
-    """The file system of an address, and the place in it."""
+    """Yield the file system of an address, and the path in it."""
     if find_spec("fsspec") is None:
         remedy = f"install it with: {install_command('cluster')}"
         problem = "an address needs the package fsspec, which is not installed"
@@ -84,6 +82,6 @@ def _store(url: str) -> Iterator[tuple[Any, str]]:
         yield store, str(place)
     except FileNotFoundError as error:
         raise InputError(None, "is not there, or its server does not answer", field=url) from error
-    except Exception as error:  # each store has errors of its own, and names missing packages
+    except Exception as error:  # stores have their own errors
         reason = str(error) or type(error).__name__
         raise InputError(None, f"cannot be read: {reason}", field=url) from error

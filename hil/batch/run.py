@@ -1,4 +1,4 @@
-"""The whole batch: archives found, settings decided, archives reduced, added up, estimated."""
+"""The batch: find archives, decide settings, reduce archives to factors, add and estimate."""
 
 from __future__ import annotations
 
@@ -49,18 +49,22 @@ def reidentify(
     cache: CacheLocation = CacheLocation(),  # noqa: B008 - frozen
     check: Callable[[Sequence[ArchiveRef]], None] = lambda _: None,
 ) -> BatchResult:
-    """Identify every arm from all its archives: repetition by repetition, campaign, and pooled.
+    """Identify every arm from all its archives: by repetition, by campaign, and pooled.
 
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
-    They do not depend on the order in which archives are found, nor on who computes what.
+    They depend neither on the order in which archives are found nor on the workers.
 
-    Roots are folders, archives, or URLs of either; options have a `BatchEstimator`, and a single
-    recording is never split. `check` is given the archives that were found, before their samples
-    are read, and may refuse them.
+    Args:
+        roots: folders, archives, or URLs of either.
+        options: with a `BatchEstimator`; a single recording is never split.
+        workers: that read the archives.
+        reporter: of progress.
+        cache: location of the cache.
+        check: receives the archives found, before samples are read, and may raise.
 
     Raises:
-        InputError: a place does not exist, there is not one archive that can be fitted, or the
-            estimator is not one of a batch.
+        InputError: a place does not exist, no archive can be fitted, or the estimator is not one of
+            a batch.
         CacheError: the cache cannot be written.
     """
     if options.estimator not in (known := get_args(BatchEstimator)):
@@ -76,31 +80,31 @@ def reidentify(
 
 
 def try_open(ref: ArchiveRef) -> None:
-    """Open an archive, to see whether that fails, or ends this process."""
+    """Open an archive, to find out whether that fails or ends this process."""
     with factors.open_ref(ref):
         pass
 
 
 @dataclass(eq=False)
 class _Campaign:
-    """Archives of one group on their way."""
+    """Archives of one group in progress."""
 
     key: GroupKey  #: of the group
-    refs: list[ArchiveRef]  #: archives
-    settings: Settings | None = None  #: None until they are decided
-    #: what is reduced together, and whether it is in the cache
+    refs: list[ArchiveRef]
+    settings: Settings | None = None  #: None until decided
+    #: archives of each bundle, and whether it is in the cache
     bundles: list[tuple[tuple[ArchiveRef, ...], bool]] = field(default_factory=list)
 
     @property
     def ready(self) -> Settings:
-        """The settings, once they are decided."""
+        """The decided settings."""
         assert self.settings is not None
         return self.settings
 
 
 @dataclass(eq=False)
 class _Batch:
-    """One run: gives out work, and estimates arm by arm with few bundles in memory at a time."""
+    """State of a batch; estimates arm by arm with few bundles in memory at a time."""
 
     options: Options
     workers: Workers
@@ -114,11 +118,10 @@ class _Batch:
     # Settings
 
     def with_settings(self, campaigns: Sequence[_Campaign]) -> list[_Campaign]:
-        """Give each campaign its settings; returns those that have some.
+        """Decide the settings of campaigns; return those that have some.
 
-        Those of an arm are decided on the first of its campaigns that can be read, and the others
-        take them over with their own noise: comparisons in time need one law, and sums the same
-        columns.
+        Those of an arm are decided on its first readable campaign; the others use them with their
+        own noise: comparisons in time need one friction law, and sums the same columns.
         """
         arms: dict[str, Settings] = {}
         waiting = list(campaigns)
@@ -131,7 +134,7 @@ class _Batch:
         return [one for one in campaigns if one.settings is not None]
 
     def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> None:
-        """Decide settings; what turns out broken is left out, and its campaign asked again."""
+        """Decide settings; repeat without archives that turn out to be unusable."""
         asked: list[tuple[_Campaign, tuple[Any, ...]]] = []
         for one in campaigns:
             own = arms.get(one.key.arm)
@@ -167,7 +170,7 @@ class _Batch:
             self._decide(again, arms)
 
     def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> list[T | Unused]:
-        """What comes of tasks."""
+        """Return the results of tasks."""
         if not tasks:
             return []
         with self.reporter.task(title, len(tasks)) as progress:
@@ -179,7 +182,7 @@ class _Batch:
         return ArchiveTask(refs[0].location, factors.reduce_bundle, (refs, one.ready, self.cache))
 
     def _reduced(self, one: _Campaign) -> Iterator[Bundle]:
-        """The bundles of a campaign in turn; what ends its process is looked for one by one."""
+        """Yield the bundles of a campaign; one that ends its process is repeated by archive."""
         for refs, known in one.bundles:
             found: Any = (
                 factors.cached_bundle(refs, one.ready, self.cache) if known else next(self.stream)
@@ -196,7 +199,7 @@ class _Batch:
     # Estimates
 
     def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Unused, ...]) -> BatchResult:
-        """Reduce and estimate everything; what the cache has is read here if that can be seen."""
+        """Reduce and estimate everything; local cache entries are read in this process."""
         tasks = []
         for one in campaigns:
             for refs in factors.split_bundles([ref for ref in one.refs if ref.use != "standstill"]):
@@ -234,7 +237,7 @@ class _Batch:
                         centre = estimator.centre(everything.phase)
                         apart = _setups({ref.key for ref in everything.refs})
                         pooled.append(sum_level("pooled", estimator, everything, centre, apart))
-        # The path stands in the reason of some as well.
+        # Some reasons begin with the path.
         broken = tuple(
             dict.fromkeys(
                 Unused(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
@@ -258,10 +261,7 @@ class _Batch:
     def _campaign(
         self, one: _Campaign, estimator: Estimator, advance: Callable[[float, str], None]
     ) -> tuple[Group, list[LevelEstimate]]:
-        """Archives of one campaign, those that are fitted with their sum; and the estimate if any.
-
-        Its repetitions count as such where the campaign is estimated.
-        """
+        """Return the group of a campaign with its repetitions, and its estimate if any."""
         used = settings_digest(one.ready)
         group, summaries = Group(settings={used}), list[Summary]()
         for bundle in self._reduced(one):
@@ -285,14 +285,14 @@ class _Batch:
 
     @contextmanager
     def _failing(self, name: str) -> Iterator[None]:
-        """What cannot be estimated is reported with the reason, and costs nothing else."""
+        """Report a failed estimate with its reason, and continue."""
         try:
             yield
         except IdentificationError as error:
             self.broken.append(Unused(name, str(error)))
 
     def _cell(self, ref: ArchiveRef) -> Cell:
-        """The cell of an archive."""
+        """Return the cell of an archive."""
         texts = self.cache.store(ref.location).get(ref.cell, list)
         if texts is not None and json_digest(texts) == ref.cell:
             return factors.cell_from(*texts)
@@ -311,7 +311,7 @@ def _nothing_to_fit(broken: Sequence[Unused]) -> InputError:
 
 
 def _setups(keys: Collection[GroupKey]) -> list[str]:
-    """What is to be known of campaigns whose cells state different things."""
+    """Return warnings about campaigns whose cells state different setups."""
     counts = Counter(key.setup for key in keys)
     if len(counts) < 2:
         return []
@@ -320,5 +320,6 @@ def _setups(keys: Collection[GroupKey]) -> list[str]:
         for setup, count in sorted(counts.items())
     )
     return [
-        f"pooled over campaigns whose cells state different things, known and compensated: {stated}"
+        f"pooled over campaigns whose cells state different payloads or delays, which are "
+        f"compensated: {stated}"
     ]

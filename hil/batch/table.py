@@ -1,7 +1,7 @@
-"""The result of a batch as tables that any other program can read: CSV, and Parquet with pyarrow.
+"""Tables of the result of a batch: CSV, and Parquet with pyarrow.
 
-`parameters` has a row per estimate and parameter, `axes` a row per estimate and joint, `not_used`
-one per archive that was left out. `docs/batch.md` describes every column.
+`parameters` has a row per estimate and parameter, `axes` a row per estimate and joint, `not_used` a
+row per archive that was left out. `docs/batch.md` describes every column.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from .estimates import relative_error
 from .types import BatchResult, LevelEstimate
 
 SCHEMA_VERSION: Final = 1
-"""Raised when a column changes its meaning or goes; new columns do not raise it."""
+"""Increased when a column changes its meaning or is removed, not when one is added."""
 
 Row = dict[str, Any]
 
-# Rows in memory at a time, however large the batch.
+# Rows in memory at a time.
 _PORTION = 20_000
 
 
 class Table(NamedTuple):
-    """A table: name of its files without their endings, kind of each column, rows of a result."""
+    """A table: file name without suffix, kind of each column, rows of a result."""
 
     name: str
     kinds: dict[str, str]
@@ -41,14 +41,14 @@ class Table(NamedTuple):
 
     @property
     def csv_columns(self) -> list[str]:
-        """Those that CSV has: all but lists."""
+        """Columns of CSV: all but lists."""
         return [name for name, kind in self.kinds.items() if kind != "numbers"]
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
-    """Write all tables into a folder that exists, and return their paths.
+    """Write all tables into an existing folder, and return their paths.
 
-    Parquet files are written if pyarrow is installed. Each file is replaced whole.
+    Parquet files are written if pyarrow is installed. Each file is replaced atomically.
 
     Raises:
         OSError: a file cannot be written.
@@ -64,12 +64,12 @@ def write_tables(folder: Path, result: BatchResult) -> list[Path]:
 
 
 def has_parquet() -> bool:
-    """Whether Parquet can be written: whether pyarrow is installed."""
+    """Return whether pyarrow is installed, so that Parquet can be written."""
     return find_spec("pyarrow") is not None
 
 
 def _levels(result: BatchResult) -> Iterator[tuple[LevelEstimate, Row]]:
-    """Estimates, each with what all its rows have."""
+    """Yield estimates, each with the columns that all its rows share."""
     for level in (*result.repetitions, *result.campaigns, *result.pooled):
         yield (
             level,
@@ -145,7 +145,7 @@ def _unused_rows(result: BatchResult) -> Iterator[Row]:
 
 
 def _kinds(columns: str) -> dict[str, str]:
-    """Kind of each column by name: behind a colon unless it is text."""
+    """Return the kind of each column by name: after a colon, or text."""
     pairs = (one.partition(":") for one in columns.split())
     return {name: kind or "text" for name, _, kind in pairs}
 
@@ -175,7 +175,7 @@ TABLES: Final = (
 
 
 def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
-    """Numbers in full precision; time in ISO 8601; nothing for what is not known."""
+    """Write numbers in full precision, times in ISO 8601, and nothing for unknown values."""
 
     def text(value: Any) -> Any:
         if isinstance(value, datetime):
@@ -191,7 +191,7 @@ def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
 
 
 def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
-    # Half a second to import, and not installed everywhere.
+    # Takes half a second to import, and is optional.
     import pyarrow
     import pyarrow.parquet
 
@@ -215,5 +215,5 @@ def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
 
 
 def _clean(value: Any) -> Any:
-    """Without the bytes in a file name that are no text."""
+    """Return text without the bytes of a file name that are not UTF-8."""
     return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value

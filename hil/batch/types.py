@@ -1,4 +1,4 @@
-"""What passes between the parts of a batch: references, summaries, estimates, results, errors."""
+"""Types of a batch: references, summaries, estimates, results, errors."""
 
 from __future__ import annotations
 
@@ -19,54 +19,54 @@ Array = NDArray[np.float64]
 
 Level = Literal["repetition", "campaign", "pooled"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
-"""The estimators that need factors only, and no sample."""
+"""Estimators that need factors only, and no samples."""
 
 Stamp = tuple[int, ...]
-"""What changes when a file is written to: size, times [ns], inode."""
+"""Values that change when a file is written to: size, times [ns], inode."""
 
 
 class ChangedError(ArchiveError):
-    """An archive that was written to while the batch ran."""
+    """An archive was written to while the batch ran."""
 
     def __init__(self, location: str) -> None:
         super().__init__(location, "was changed while it was read", remedy="run the batch again")
 
 
 class CacheError(InputError):
-    """A cache folder that cannot be written to."""
+    """The cache folder cannot be written to."""
 
 
 class GroupKey(NamedTuple):
-    """Archives that are fitted together."""
+    """Key of archives that are fitted together."""
 
     arm: str  #: digest of URDF, model, friction law and drive train
     campaign: str  #: the folder the archives were recorded into
-    setup: str = ""  #: delay and payload that their cells state, in words; "" for neither
+    setup: str = ""  #: delay and payload stated by their cells, as text; "" for neither
 
 
 @dataclass(frozen=True, slots=True)
 class ArchiveRef:
-    """One archive: where it lies, and what it is, without its samples."""
+    """Location and properties of an archive, without its samples."""
 
     location: str  #: path or URL
     sha256: str  #: of all bytes
     #: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of an
-    #: archive that a batch does not use; of such a one `arm` and `cell` are ""
+    #: archive that a batch does not use, for which `arm` and `cell` are ""
     use: str
     #: see :class:`GroupKey`
     arm: str
     campaign: str
     index: int  #: of the interval within its kind; 0 for imported ones
     cell: str  #: digest of the texts of cell file and URDF
-    motion: str  #: digest of the planned motion, "" where none is known
+    motion: str  #: digest of the planned motion, "" where unknown
     when: str = ""  #: time of recording, ISO 8601; "" in simulation
     setup: str = ""
     stamp: Stamp | None = None  #: of the file when it was hashed; None of a remote one
-    kind: str = ""  #: as its metadata say
-    attempt: int = 0  #: at the interval; 0 where the archive does not number them
+    kind: str = ""  #: as in its metadata
+    attempt: int = 0  #: 0 where the archive does not number them
     outcome: str = "completed"  #: how the recording ended
     record: str = ""  #: digest of the metadata
-    simulated: bool = False  #: whether no arm moved
+    simulated: bool = False  #: whether only a simulated arm moved
 
     @property
     def name(self) -> str:
@@ -75,17 +75,17 @@ class ArchiveRef:
 
     @property
     def key(self) -> GroupKey:
-        """The group it belongs to."""
+        """The group of the archive."""
         return GroupKey(self.arm, self.campaign, self.setup)
 
     @property
     def order(self) -> tuple[str, str, str, int, str, str]:
-        """Sums go in this order, whatever order archives were found in."""
+        """Sort key: sums are added in this order."""
         return *self.key, self.index, self.name, self.sha256
 
 
 class Unused(NamedTuple):
-    """An archive of which nothing was used, and why."""
+    """An archive or campaign that was not used, and why."""
 
     path: str
     reason: str
@@ -93,41 +93,41 @@ class Unused(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What is cached of each archive beside the sum of all."""
+    """Cached results of one archive, beside the sum of several."""
 
     ref: ArchiveRef  #: the archive
     total: PhaseFactor  #: its factor as one block
     #: the estimate from it alone, with cluster-robust covariance; None of a validation run
     fit: Estimate | None
     design_effect: float  #: ratio of its mean variance to that of white residuals
-    warnings: tuple[str, ...] = ()  #: what a reader must know of it
+    warnings: tuple[str, ...] = ()  #: about the archive
     #: (n, p, p + 1), see :func:`identification.estimators.delay.rate_products`; None where the
-    #: delay is known, or nothing is fitted
+    #: delay is known, or the archive is not fitted
     products: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Some archives of one campaign, reduced together."""
+    """Results of several archives of one campaign."""
 
-    refs: tuple[ArchiveRef, ...]  #: those asked for, in their order
-    summaries: tuple[Summary, ...] = ()  #: of those that could be read, in their order
-    #: sum of the factors of those that are fitted; None where none is
+    refs: tuple[ArchiveRef, ...]  #: all archives, in their order
+    summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
+    #: sum of the factors of those that are fitted; None if there are none
     phase: PhaseFactor | None = None
     broken: tuple[Unused, ...] = ()  #: the others
-    read: int = 0  #: archives that were read for it; the rest comes from the cache
+    read: int = 0  #: number of archives that were read; the others were cached
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A robot that archives belong to: its digest, see :class:`GroupKey`, and one of its cells."""
+    """A robot by its digest, see :class:`GroupKey`, with one of its cells."""
 
     digest: str
     cell: Cell
 
     @property
     def name(self) -> str:
-        """The cell's name, and enough of the digest to tell arms with one name apart."""
+        """The cell's name with the begin of the digest, since names may be equal."""
         return f"{self.cell.name}-{self.digest[:8]}"
 
 
@@ -162,30 +162,30 @@ class LevelEstimate:
     undetermined: tuple[str, ...]
     method: str
     settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
-    warnings: tuple[str, ...] = ()  #: what a reader must know
+    warnings: tuple[str, ...] = ()  #: about the archives and the estimate
     #: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition
     speed_rms: Array | None = None
     #: weighted Gram matrix (p, p) of the fitted rows; None for a repetition
     information: Array | None = None
-    #: what the cell states that archives of one arm may differ in, in words; "" if nothing, or if
-    #: campaigns with different ones are pooled
+    #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
+    #: different ones are pooled
     setup: str = ""
-    payload: Payload | None = None  #: that the cell states; None for none, or if pooled
+    payload: Payload | None = None  #: stated by the cell; None if not stated, or pooled
     #: sum of the factors of the validation runs; None if there are none
     unseen: Factor | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """Everything a batch found."""
+    """Result of a batch."""
 
     estimator: str  #: by name
     arms: Mapping[str, Arm]  #: by digest
     repetitions: tuple[LevelEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[LevelEstimate, ...]  #: likewise, by arm and time
     pooled: tuple[LevelEstimate, ...]  #: one per arm
-    broken: tuple[Unused, ...]  #: archives, and campaigns (by folder), that could not be used
-    skipped: tuple[Unused, ...]  #: archives that are not meant to be fitted, and why
+    broken: tuple[Unused, ...]  #: archives and campaigns (by folder) that could not be used
+    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting
     read: int  #: archives whose factor was computed
-    cached: int  #: archives whose factor was known
+    cached: int  #: archives whose factor was cached
     code: str  #: digest of the programs

@@ -1,7 +1,7 @@
-"""Work on archives in child processes.
+"""Child processes that work on archives.
 
-An archive that crashes or hangs its process costs itself. Linear algebra has one thread there, so
-the bits do not depend on how many tasks are done at once.
+A crash or a hang costs one archive only. Linear algebra has one thread in a child, so the bits do
+not depend on the number of parallel tasks.
 """
 
 from __future__ import annotations
@@ -26,28 +26,28 @@ Done = Callable[[int], None]
 TIMEOUT: Final = 300.0
 """Longest time for one bundle of archives [s]."""
 _START: Final = 60.0
-"""s that a new process may take to import what it needs, on a busy machine."""
+"""Longest time in which a new process imports its modules on a busy machine, s."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArchiveTask(Generic[T_co]):
-    """Work on archives."""
+    """A task on archives."""
 
-    path: str  #: file or URL, by which the task is named where it fails
-    function: Callable[..., T_co]  #: importable where it runs
-    #: of the function; they travel with each task, so they should be small
+    path: str  #: file or URL that names the task in errors
+    function: Callable[..., T_co]  #: importable in the child
+    #: of the function; they are pickled with each task, so they should be small
     arguments: tuple[Any, ...]
 
 
 class WorkerSoftwareError(HilError):
-    """A worker that runs other software than the one who asked it."""
+    """A worker has other software than the client."""
 
 
 class Workers(ABC):
-    """Who does the work on archives."""
+    """Interface of workers."""
 
-    local: bool  #: whether files they write can be read here under the same names
-    count: int  #: how many tasks are done at once
+    local: bool  #: whether files they write are readable here under the same names
+    count: int  #: number of parallel tasks
 
     def __enter__(self) -> Self:
         return self
@@ -56,24 +56,23 @@ class Workers(ABC):
         self.close()
 
     def close(self) -> None:  # noqa: B027
-        """End or leave those who work, if they are others than this process."""
+        """End the workers."""
 
     @abstractmethod
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
     ) -> Iterator[T | Unused]:
-        """What comes of tasks, in their order; later ones are worked on meanwhile.
+        """Yield the results of tasks in their order; later ones are computed meanwhile.
 
-        A task that fails, ends its process or takes too long has a `Unused` in its place.
-
-        `done` is called with a number of tasks whenever so many more are finished.
+        A task that fails, ends its process or takes too long gives an `Unused`. `done` is called
+        with the number of tasks that were finished since the last call.
         """
 
 
 class LocalWorkers(Workers):
-    """Child processes of this one; they are started when there is something to do.
+    """Child processes of this one, started on demand.
 
-    By default one for each core that this process may use; a task may last for `timeout` [s].
+    The default is one for each core that this process may use; a task may last for `timeout` [s].
     """
 
     local = True
@@ -135,10 +134,10 @@ class LocalWorkers(Workers):
 
 
 def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Unused]:
-    """In a child: what comes of each task; one that takes too long ends the process."""
+    """Run tasks in a child; one that takes too long ends the process."""
     found = []
     for task in tasks:
-        # From here: what a new process takes to import is no fault of the archive.
+        # Started here: imports of a new process do not count.
         # `planner.worker` switches the alarm off when this returns.
         signal.setitimer(signal.ITIMER_REAL, timeout)
         found.append(run_task(task))
@@ -146,11 +145,11 @@ def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Unus
 
 
 def run_task(task: ArchiveTask[T]) -> T | Unused:
-    """What comes of a task, or why nothing does.
+    """Return the result of a task, or why there is none.
 
     Raises:
-        CacheError: the cache cannot be written; the next task would meet it as well.
-        WorkerSoftwareError: other software runs here.
+        CacheError: the cache cannot be written, which affects every task.
+        WorkerSoftwareError: the worker has other software.
     """
     try:
         return task.function(*task.arguments)
@@ -158,5 +157,5 @@ def run_task(task: ArchiveTask[T]) -> T | Unused:
         raise
     except HilError as error:
         return Unused(task.path, str(error))
-    except Exception as error:  # a fault of ours: it costs this archive, not the batch
+    except Exception as error:  # an internal error costs this archive, not the batch
         return Unused(task.path, f"{type(error).__name__}: {error}")

@@ -49,7 +49,7 @@ def records(count: int, seed: int = 0, first: int = 12_000) -> NDArray[np.void]:
 
 
 def same(a: NDArray[np.void], b: NDArray[np.void]) -> bool:
-    """Whether two sets of records are equal to the bit in every field (padding is no field)."""
+    """Whether two sets of records are equal to the bit in every field (padding is ignored)."""
     return a.dtype == b.dtype and all(
         a[name].tobytes() == b[name].tobytes() for name in a.dtype.names or ()
     )
@@ -95,12 +95,12 @@ class TestNames:
     @pytest.mark.parametrize(
         "name", ["excitation.mcap", "dance_001_a1.mcap", "move_1_a1.mcap", "move_001_a0.mcap", "x"]
     )
-    def test_another_name_is_none_of_ours(self, name):
+    def test_other_names_are_refused(self, name):
         assert ArchiveName.parse(name) is None
 
 
 class TestRoundTrip:
-    def test_records_and_what_describes_them_come_back(self, tmp_path):
+    def test_records_and_metadata_are_read_back(self, tmp_path):
         rows = records(257)
         path = write(tmp_path / NAME, rows)
         archive = open_archive(path)
@@ -118,7 +118,7 @@ class TestRoundTrip:
         with pytest.raises(ArchiveError, match="no column"):
             some.cycles()
 
-    def test_the_cycle_message_has_a_place_for_every_field_of_a_record(self):
+    def test_cycle_message_has_every_field_of_a_record(self):
         message = fixed_layout(schema.profile(4)[schema.CYCLE].definition).dtype
         recorded = cycle_dtype(4)
         for name in recorded.names or ():
@@ -142,7 +142,7 @@ class TestRoundTrip:
         }
 
     def test_cycles_or_torques_may_be_missing(self, tmp_path):
-        """A torque that is not known is NaN; an outcome that nobody states is unknown."""
+        """An unknown torque is NaN; the default outcome is ``unknown``."""
         archive = open_archive(write(tmp_path / NAME, records(0)))
         assert archive.complete and archive.n_samples == 0
         with writer(tmp_path / "excitation_008_a1.mcap") as bare:
@@ -151,8 +151,8 @@ class TestRoundTrip:
         assert np.isnan(archive.columns["torque"]).all()
         assert archive.outcome.outcome == "unknown"
 
-    def test_events_come_back_with_text_and_data(self, tmp_path):
-        """Data that JSON cannot hold are written as well as it can."""
+    def test_events_are_read_back_with_text_and_data(self, tmp_path):
+        """Data that JSON cannot represent are converted."""
         data = {"value": np.nan, "last": np.arange(3.0), "pair": (1, np.int64(2)), 5: Path("x")}
         with writer(tmp_path / NAME) as archive:
             archive.event(500, "Refused", "too\nfast", level=Level.ERROR, data=data)  # type: ignore[arg-type]
@@ -168,7 +168,7 @@ class TestRoundTrip:
 
 class TestChunks:
     @given(st.lists(st.integers(1, 260), min_size=1, max_size=12))
-    def test_bytes_do_not_depend_on_how_the_cycles_arrived(self, tmp_path_factory, batches):
+    def test_bytes_do_not_depend_on_the_batches(self, tmp_path_factory, batches):
         folder = tmp_path_factory.mktemp("bytes")
         rows = records(600)
         whole = write(folder / NAME, rows).read_bytes()
@@ -182,7 +182,7 @@ class TestChunks:
         gapped = np.delete(records(300), slice(150, 250))
         assert chunks(write(tmp_path / "move_000_a1.mcap", gapped)) == 3
 
-    def test_reach_the_file_without_waiting_for_the_end(self, tmp_path):
+    def test_are_written_while_recording(self, tmp_path):
         archive = writer(tmp_path / NAME)
         seen = []
         for start in range(0, 400, 50):
@@ -206,7 +206,7 @@ class TestBadInput:
             ("x.mcap", {}, "None is not a kind of archive; use standstill"),
         ],
     )
-    def test_what_cannot_begin_leaves_no_file(self, tmp_path, name, metadata, sentence):
+    def test_invalid_archive_leaves_no_file(self, tmp_path, name, metadata, sentence):
         """And an existing file is never overwritten."""
         with pytest.raises(ArchiveWriteError, match=sentence):
             writer(tmp_path / name, metadata=metadata)
@@ -217,7 +217,7 @@ class TestBadInput:
         assert (tmp_path / NAME).read_bytes() == b"precious"
 
     @pytest.mark.parametrize("first", [12000, 12099, 0])
-    def test_another_arm_or_session_needs_another_archive(self, tmp_path, first):
+    def test_records_of_another_arm_or_session_are_refused(self, tmp_path, first):
         rows = records(100)
         with writer(tmp_path / NAME) as archive:
             with pytest.raises(ValueError, match="expected"):
@@ -232,7 +232,7 @@ class TestBadInput:
         assert back.complete
         assert same(back.cycles(), rows)
 
-    def test_cycles_that_fall_within_a_batch_are_refused(self, tmp_path):
+    def test_decreasing_cycles_are_refused(self, tmp_path):
         rows = records(100)
         rows["cycle"][60:] -= 30
         with writer(tmp_path / NAME) as archive:
@@ -241,7 +241,7 @@ class TestBadInput:
             archive.close("void")
         assert open_archive(tmp_path / NAME).n_samples == 0
 
-    def test_a_full_disk_is_our_error_and_leaves_what_was_flushed(self, tmp_path, monkeypatch):
+    def test_full_disk_leaves_what_was_flushed(self, tmp_path, monkeypatch):
         rows = records(500)
         archive = writer(tmp_path / NAME)
         archive.write(rows[:250], torques(rows[:250]))
@@ -258,7 +258,7 @@ class TestBadInput:
         assert same(back.cycles(), rows[:200])
         assert back.damage is not None
 
-    def test_an_exception_closes_the_archive_and_is_its_outcome(self, tmp_path):
+    def test_exception_closes_the_archive_and_is_its_reason(self, tmp_path):
         with pytest.raises(RuntimeError), writer(tmp_path / NAME) as archive:
             archive.write(records(30))
             raise RuntimeError("cable pulled")
@@ -266,7 +266,7 @@ class TestBadInput:
         assert (outcome.outcome, outcome.samples) == ("interrupted", 30)
         assert outcome.reason == "RuntimeError: cable pulled"
 
-    def test_what_is_no_archive_of_this_version_is_named(self, tmp_path, monkeypatch):
+    def test_other_files_and_versions_are_refused(self, tmp_path, monkeypatch):
         with pytest.raises(ArchiveError, match=r"gone\.mcap: cannot be read: No such file"):
             open_archive(tmp_path / "gone.mcap")
         with (tmp_path / "a.mcap").open("wb") as stream:
@@ -283,9 +283,7 @@ class TestBadInput:
             open_archive(tmp_path / NAME)
 
 
-def test_an_archive_from_before_ages_were_known_is_still_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_archive_without_ages_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = records(300)
     whole = schema._CYCLE
     monkeypatch.setattr(schema, "_CYCLE", whole[: whole.index("uint16[8] age")])
@@ -300,7 +298,7 @@ def test_an_archive_from_before_ages_were_known_is_still_read(
     assert same(archive.cycles(), rows)
 
 
-def test_the_documentation_shows_the_messages_as_they_are() -> None:
+def test_documentation_shows_the_messages() -> None:
     page = Path(__file__).parents[2] / "docs" / "archive-format.md"
     text = page.read_text(encoding="utf-8")
     profile = schema.profile(6)

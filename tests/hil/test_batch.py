@@ -503,7 +503,7 @@ class TestWarnings:
         assert stated == {None, 3.0}
         (pooled,) = found.pooled
         assert (pooled.repetitions, pooled.setup, pooled.payload) == (2, "", None)
-        assert "cells state different things" in pooled.warnings[0]
+        assert "cells state different payloads" in pooled.warnings[0]
         command = ["reidentify", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         ran = CliRunner().invoke(app, command)
         (arm,) = json.loads(ran.stdout)["arms"].values()
@@ -528,7 +528,7 @@ class TestWarnings:
             [warned(f"{k}", f"the clock falls back {k} times") for k in range(100)]
         )
         assert len(many) < 20
-        assert "more warnings stand with the repetitions" in many[-1]
+        assert "more warnings are listed with the repetitions" in many[-1]
 
 
 # Which archives there are
@@ -594,7 +594,7 @@ class TestPlaces:
         (one,) = result.broken
         assert one.path == closed.as_posix()
         assert "Permission denied" in one.reason
-        with pytest.raises(InputError, match="closed cannot be looked into: Permission denied"):
+        with pytest.raises(InputError, match="closed cannot be read: Permission denied"):
             found_in(closed)
 
     def test_that_are_no_files_are_reported(self, tmp_path: Path, arm: Cell) -> None:
@@ -644,7 +644,7 @@ class TestGroups:
         shutil.copy(recording(tmp_path / "a.mcap", arm), tmp_path / "copy" / "b.mcap")
         result = found_in(tmp_path)
         assert [Path(ref.location).name for ref in result.refs] == ["a.mcap"]
-        assert "holds the same as" in reasons_of(result.skipped)["b.mcap"]
+        assert "is a copy of" in reasons_of(result.skipped)["b.mcap"]
 
     def test_what_is_made_beside_a_campaign_is_left_alone(self, tmp_path: Path, arm: Cell) -> None:
         """Runs with a payload that no cell states, and copies for viewers."""
@@ -658,7 +658,7 @@ class TestGroups:
         assert not result.broken
         reasons = {Path(one.path).parent.name: one.reason for one in result.skipped}
         assert reasons["annotated"] == "is a copy for viewers"
-        assert any("carries a payload" in one.reason for one in result.skipped)
+        assert any("recorded with a payload" in one.reason for one in result.skipped)
 
     def test_delays_of_one_folder_are_each_applied(
         self, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -709,7 +709,7 @@ class TestGroups:
         reasons = {Path(one.path).name: one.reason for one in result.skipped}
         assert reasons == {
             rejected.name: "ended rejected",
-            earlier.name: "attempt 2 took its place",
+            earlier.name: "was replaced by attempt 2",
         }
 
     def test_a_torn_attempt_counts_only_without_a_later_one(
@@ -734,8 +734,8 @@ class TestGroups:
         assert names_of(found.broken) == [paths[1, 2].name]
         reasons = {Path(one.path).name: one.reason for one in found.skipped}
         assert reasons == {
-            paths[0, 1].name: "attempt 2 took the place of this unusable one",
-            paths[2, 1].name: "attempt 2 took the place of this unusable one",
+            paths[0, 1].name: "was replaced by attempt 2",
+            paths[2, 1].name: "was replaced by attempt 2",
             move.name: "is a move",
         }
 

@@ -235,7 +235,7 @@ class TestWorkers:
     def test_that_all_go_away_are_an_error_and_no_wait(self, tmp_path: Path) -> None:
         with running(tmp_path, workers=1) as cluster:
             workers = connected(cluster, patience=5.0)
-            with workers, pytest.raises(ClusterError, match=r"all workers .* went away"):
+            with workers, pytest.raises(ClusterError, match=r"all workers .* disappeared"):
                 for _ in workers.results(tasks_of(work.slow_number, 50)):
                     cluster.workers[0].kill()
 

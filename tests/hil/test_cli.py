@@ -170,7 +170,7 @@ def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict
             "m.toml",
         ),
         (["identify", "x.mcap", "--torque-bandwidth", "wide"], "not a bandwidth"),
-        (["identify", "x.mcap", "--output", str(CELL_PATH)], "cannot be made a folder"),
+        (["identify", "x.mcap", "--output", str(CELL_PATH)], "cannot be created"),
         (["identify", "x.mcap", "--delay", "nan"], "--delay"),
         (["demo", "--output", str(CELL_PATH)], "is not a folder"),
     ],

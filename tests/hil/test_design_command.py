@@ -305,7 +305,7 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         (["NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--earlier", "NOWHERE"], "nowhere"),
-        ([CELL_PATH, "-o", "SETTINGS"], "cannot be made a folder"),
+        ([CELL_PATH, "-o", "SETTINGS"], "cannot be created"),
         ([CELL_PATH, "-o", ""], "--output: is empty; name a folder"),
     ],
 )

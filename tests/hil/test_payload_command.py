@@ -181,9 +181,9 @@ class TestRefusals:
             (("empty.mcap",), "give both: hil payload BARE"),
             (
                 ("empty.mcap", "--loaded", "full.mcap", "--check", "mass"),
-                "'mass' is no NAME=NUMBER",
+                "'mass' is not NAME=NUMBER",
             ),
-            (("empty.mcap", "--shape", "ball", "1", "1", "1"), "ball 1 1 1 is no shape"),
+            (("empty.mcap", "--shape", "ball", "1", "1", "1"), "ball 1 1 1 is not a shape"),
         ],
     )
     def test_what_cannot_be_used_is_named(
@@ -269,11 +269,11 @@ class TestRun:
         weighed = weighing.weigh(designed, "x", run=run, mount=mount, reporter=Silent())
         assert done == ["bare 1", "loaded 1", "loaded 2", "bare 2"]
         assert asked == [False, True, False]
-        assert "another pair is worth it" in weighed.sentence
+        assert "another pair is recommended" in weighed.sentence
         monkeypatch.setattr(weighing, "ENOUGH", 0.5)
         weighed = weighing.weigh(designed, "y", run=run, mount=mount, reporter=Silent())
         assert weighed.pairs == 1
-        assert "another pair is not worth it" in weighed.sentence
+        assert "another pair is not needed" in weighed.sentence
 
     def test_nobody_who_mounts_it_ends_the_recording(self, designed: Campaign) -> None:
         with pytest.raises(OperatorStopError, match="nothing was recorded"):
@@ -284,7 +284,7 @@ class TestRun:
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
-            (("--payload", "../x"), "no name of a payload"),
+            (("--payload", "../x"), "is not a valid name of a payload"),
             (("--payload", "x", "--dry-run"), "includes dry run"),
         ],
     )

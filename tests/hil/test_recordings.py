@@ -119,9 +119,9 @@ def test_a_part_of_the_time_is_that_part_of_the_whole(tmp_path: Path) -> None:
     assert part.provenance["part"] == "2.1 s to 2.3 s"
     assert np.array_equal(open_recording(path, start=2.7).position, whole.position[350:])
     assert np.array_equal(open_recording(path, stop=2.01).position, whole.position[:5])
-    with pytest.raises(ArchiveError, match="holds no sample from 90 s to its end"):
+    with pytest.raises(ArchiveError, match="has no sample from 90 s to its end"):
         open_recording(path, start=90.0)
-    with pytest.raises(ArchiveError, match="holds no sample; record it again"):
+    with pytest.raises(ArchiveError, match="has no sample; record it again"):
         open_recording(archive(tmp_path / "move_000_a1.mcap", records(0)))
 
 

@@ -1,7 +1,7 @@
-"""Whether a file keeps the profile: each rule of docs/archive-format.md, broken one at a time.
+"""Conformance check: each rule of docs/archive-format.md, violated one at a time.
 
-The files are written by the mcap library, so what is checked is the file and not our writer.
-At the end `hil archive` at the command line: words, JSON and exit statuses.
+The files are written by the mcap library, not by the own writer. Also the commands of `hil
+archive`: text, JSON and exit statuses.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def data_of(content: Content, topic: str, nth: int) -> bytearray:
     return bytearray([m for m in content.messages if m.topic == topic][nth].data)
 
 
-def test_the_library_writes_it_as_we_do(content, written, tmp_path):
+def test_file_written_by_the_library_conforms(content, written, tmp_path):
     path = content.write(tmp_path / written.path.name)
     check = check_archive(path)
     assert check.conforms, check.faults
@@ -129,7 +129,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("what", BROKEN)
-def test_a_broken_rule_is_named(what, content, written, tmp_path):
+def test_violated_rule_is_named(what, content, written, tmp_path):
     """Each aspect by one at least."""
     change, aspect = BROKEN[what]
     change(content)
@@ -159,7 +159,7 @@ def test_a_damaged_description_is_a_fault_of_an_archive(written, tmp_path):
 
 
 class TestAnotherFile:
-    def test_a_foreign_mcap_file_is_named_as_such(self, tmp_path):
+    def test_other_mcap_file_is_refused(self, tmp_path):
         path = tmp_path / "x.mcap"
         with path.open("wb") as stream:
             writer = Writer(stream)
@@ -171,13 +171,13 @@ class TestAnotherFile:
     @pytest.mark.parametrize(
         ("data", "sentence"), [(b"hello" * 9, "is not an MCAP file"), (b"", "is empty")]
     )
-    def test_anything_else_is_no_mcap_file(self, tmp_path, data, sentence):
+    def test_other_file_is_refused(self, tmp_path, data, sentence):
         (tmp_path / "x").write_bytes(data)
         for read in (check_archive, open_archive):
             with pytest.raises(NotAnArchiveError, match=sentence):
                 read(tmp_path / "x")
 
-    def test_a_file_that_is_not_there_comes_with_a_remedy(self, tmp_path):
+    def test_missing_file_is_refused_with_a_remedy(self, tmp_path):
         for read in (check_archive, open_archive, repair):
             with pytest.raises(ArchiveError, match="No such file or directory; check whether"):
                 read(tmp_path / "nowhere.mcap")
@@ -201,12 +201,12 @@ def text_file(tmp_path) -> Path:
 
 
 class TestCheck:
-    def test_an_archive_that_keeps_the_profile(self, written):
+    def test_conforming_archive(self, written):
         done = run("check", written.path)
         assert done.exit_code == 0
         assert "conforms to profile 1, 43 samples" in done.stdout
 
-    def test_one_that_does_not_names_the_repair(self, torn, written, text_file):
+    def test_damaged_archive_names_the_repair(self, torn, written, text_file):
         done = run("check", torn)
         assert done.exit_code == 5
         assert "the outcome is missing" in done.stdout
@@ -236,7 +236,7 @@ class TestRepair:
         assert f"wrote {repaired}: 43 samples, none lost" in done.stdout
         assert repaired.read_bytes() == written.data
 
-    def test_loss_is_said_and_is_the_exit_status(self, torn, tmp_path):
+    def test_loss_is_printed_and_sets_the_exit_status(self, torn, tmp_path):
         output = tmp_path / "out.mcap"
         done = run("repair", torn, "-o", output)
         assert done.exit_code == 3
@@ -258,7 +258,7 @@ class TestRepair:
 
 
 class TestInfo:
-    def test_says_what_a_person_wants(self, written, torn, text_file):
+    def test_prints_the_content(self, written, torn, text_file):
         done = run("info", written.path)
         assert done.exit_code == 0
         for words in (

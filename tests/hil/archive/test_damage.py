@@ -1,7 +1,6 @@
-"""Archives that were cut off or damaged: what is read is what was written, or it is said.
+"""Truncated and damaged archives, and archives with intact chunks of another one.
 
-Or that hold whole chunks of another archive, each sound by itself: never read, and repaired around.
-A repair invents nothing and names what is lost.
+Only what was written is read, and a repair reports what is lost.
 """
 
 from __future__ import annotations
@@ -53,19 +52,19 @@ def read(written: Written, path: Path, data: bytes) -> Archive | None:
 
 
 class TestDamage:
-    def test_what_is_missing_is_said_in_a_sentence(self, written, path):
+    def test_message_states_what_is_missing(self, written, path):
         path.write_bytes(written.data[: written.chunks[2].end - 17])
         sentence = str(open_archive(path).missing)
         assert sentence.startswith(str(path))
         assert "is cut off, or its length is corrupt" in sentence
         assert "20 samples (0.19 s) could be read; the outcome is missing" in sentence
-        # Where no column was asked for, nobody has counted them.
+        # Without columns, samples are not counted.
         uncounted = str(open_archive(path, fields=()).damage)
         assert "samples" not in uncounted
         assert uncounted.endswith("are unused); the outcome is missing")
 
-    def test_the_opcode_of_every_record_is_guarded(self, written, path):
-        """A reader passes over records of unknown kind; what it then misses must be noticed."""
+    def test_changed_opcode_of_any_record_is_detected(self, written, path):
+        """Readers skip records of unknown kind; the missing content must be detected."""
         matters = (container.CHUNK, container.METADATA, container.ATTACHMENT, container.DATA_END)
         for record in written.records:
             changed = bytearray(written.data)
@@ -78,13 +77,13 @@ class TestDamage:
                 assert part.n_samples == 20 or not part.complete
 
     @pytest.mark.parametrize("place", range(5))
-    def test_a_chunk_that_was_cut_out_is_noticed(self, written, path, place):
+    def test_removed_chunk_is_detected(self, written, path, place):
         chunk = written.chunks[place]
         archive = read(written, path, written.data[: chunk.offset] + written.data[chunk.end :])
         assert archive.n_samples == 10 * place
         assert not archive.complete
 
-    def test_a_chunk_without_checksum_is_not_believed(self, written, path):
+    def test_chunk_without_checksum_is_refused(self, written, path):
         changed = bytearray(written.data)
         at = written.chunks[0].offset + container.RECORD.size + 24
         changed[at : at + 4] = bytes(4)
@@ -92,7 +91,7 @@ class TestDamage:
         assert archive.n_samples == 0
         assert "(chunk) has no checksum" in str(archive.missing)
 
-    def test_metadata_are_guarded_by_their_own_checksum(self, written, path):
+    def test_changed_metadata_fail_their_checksum(self, written, path):
         """MCAP has no checksum for metadata, and a wrong period makes wrong times."""
         assert written.data.count(b"0.01") == 1
         assert read(written, path, written.data.replace(b"0.01", b"0.02")) is None
@@ -100,11 +99,11 @@ class TestDamage:
         assert header.checksum({"a": "1"}) != header.checksum({"a": "2"})
 
 
-# Whole chunks of another archive: by the checksums in the outcome, or else by the cycles
+# Intact chunks of another archive: detected by the checksums in the outcome, or else by the cycles
 
 
 def recorded(path: Path, first: int = FIRST) -> bytes:
-    """An archive of the same description as the small one, of other cycles and positions."""
+    """Return an archive with the same header as the small one and other cycles and positions."""
     rows = np.zeros(43, cycle_dtype(2))
     rows["cycle"] = first + np.arange(43)
     rows["number"] = np.arange(43)
@@ -113,13 +112,13 @@ def recorded(path: Path, first: int = FIRST) -> bytes:
 
 
 def mixed(data: bytes, other: bytes, place: int) -> bytes:
-    """The file with a chunk of the other in the place of one of its own."""
+    """Return the file with one chunk replaced by that of the other."""
     begin, end = chunks(data)[place]
     return data[:begin] + other[slice(*chunks(other)[place])] + data[end:]
 
 
 def earlier(data: bytes, path: Path) -> bytes:
-    """The archive as versions wrote it that had no list of chunks."""
+    """Return the archive as older versions wrote it, without list of chunks."""
     at = data.index(b"\x0b\x00\x00\x00hil.outcome") - container.RECORD.size
     _, end = container.record_bounds(data, at, 0)
     record = container.Record(at, container.METADATA, data[at + container.RECORD.size : end])
@@ -128,14 +127,14 @@ def earlier(data: bytes, path: Path) -> bytes:
         del entries[key]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data[:at] + mcap_bytes.metadata(name, header.with_checksum(entries)))
-    done = repair(path, in_place=True)  # makes the index anew
+    done = repair(path, in_place=True)  # regenerates the index
     assert done.losses == ()
     assert header.CHUNKS.encode() + b"\x28" not in path.read_bytes()
     return path.read_bytes()
 
 
 def assert_saved(path: Path, written: Written, sound: list[int]) -> None:
-    """A repair saves these chunks; the check counts the same samples, and so does the reader."""
+    """Repair, check and reader find exactly these chunks."""
     cycles = [FIRST + c for k in sound for c in range(10 * k, min(10 * k + 10, 43))]
     check = check_archive(path)
     assert not check.conforms
@@ -152,7 +151,7 @@ def assert_saved(path: Path, written: Written, sound: list[int]) -> None:
 
 class TestChunksOfAnotherArchive:
     @pytest.mark.parametrize("has_list", [True, False])
-    def test_one_without_a_list_of_chunks_opens_as_well(self, has_list, written, path):
+    def test_archive_opens_with_and_without_list_of_chunks(self, has_list, written, path):
         path.write_bytes(written.data if has_list else earlier(written.data, path))
         archive = open_archive(path)
         assert archive.complete
@@ -162,7 +161,7 @@ class TestChunksOfAnotherArchive:
         assert repair(path).intact
 
     @pytest.mark.parametrize("place", [0, 1, 4])
-    def test_one_with_cycles_of_another_time_costs_itself(self, written, path, place):
+    def test_chunk_with_other_cycles_is_left_out(self, written, path, place):
         path.write_bytes(mixed(written.data, recorded(path, 9000), place))
         archive = open_archive(path)
         assert not archive.complete
@@ -171,7 +170,7 @@ class TestChunksOfAnotherArchive:
         assert_saved(path, written, [k for k in range(5) if k != place])
 
     def test_cycles_that_do_not_follow_those_before_are_damage(self, written, path):
-        """5013 to 5022 between 5009 and 5020: without a list of chunks what follows is lost."""
+        """5013 to 5022 between 5009 and 5020: without a list of chunks the next chunk is lost."""
         other = recorded(path, 5003)
         for ours, n_read in ((earlier(written.data, path), 20), (written.data, 10)):
             path.write_bytes(mixed(ours, other, 1))
@@ -185,7 +184,7 @@ class TestChunksOfAnotherArchive:
         assert_saved(path, written, [0, 2, 3, 4])
 
     @pytest.mark.parametrize("place", range(5))
-    def test_one_with_the_same_cycles_is_known_by_its_checksum(self, written, path, place):
+    def test_chunk_with_the_same_cycles_is_detected(self, written, path, place):
         path.write_bytes(mixed(written.data, recorded(path), place))
         archive = open_archive(path)
         assert "is of another recording" in str(archive.missing)
@@ -202,7 +201,7 @@ class TestChunksOfAnotherArchive:
         assert_saved(path, written, [k for k in range(5) if k != place])
 
     @pytest.mark.parametrize("cut", [9, 60])
-    def test_the_list_is_found_where_the_end_is_lost(self, written, path, cut):
+    def test_list_of_chunks_is_found_without_footer(self, written, path, cut):
         data = mixed(written.data, recorded(path), 2)
         end = data.index(b"\x0b\x00\x00\x00hil.outcome")
         _, length = container.RECORD.unpack_from(data, end - container.RECORD.size)
@@ -211,7 +210,7 @@ class TestChunksOfAnotherArchive:
         written.assert_true(archive)
         assert archive.n_samples == 20
 
-    def test_damage_behind_it_hides_none(self, written, path):
+    def test_other_damage_does_not_hide_the_chunk(self, written, path):
         data = bytearray(mixed(written.data, recorded(path), 1))
         data[chunks(bytes(data))[3][1] - 5] ^= 0xFF
         path.write_bytes(data)
@@ -219,7 +218,7 @@ class TestChunksOfAnotherArchive:
         assert_saved(path, written, [0, 2, 4])
 
     @pytest.mark.parametrize("change", ["amended", "repaired"])
-    def test_what_was_written_anew_knows_its_chunks_as_well(self, written, path, change):
+    def test_rewritten_archive_lists_its_chunks(self, written, path, change):
         made = []
         for data in (recorded(path), written.data):
             path.write_bytes(data)
@@ -237,8 +236,8 @@ class TestChunksOfAnotherArchive:
         assert "is of another recording" in str(archive.missing)
         written.assert_true(archive)
 
-    def test_another_program_may_cut_the_chunks_anew(self, written, path):
-        """It names itself in the header; a repair makes the file ours again, list and all."""
+    def test_copy_with_other_chunks_by_another_program_is_read(self, written, path):
+        """Its name is in the header; a repair regenerates the list of chunks."""
         content = mcap_bytes.Content.of(written.path)
         replace(content, library="mcap", cycles_per_chunk=7).write(path)
         assert open_archive(path).complete
@@ -250,22 +249,22 @@ class TestChunksOfAnotherArchive:
         assert archive.n_samples == 43
 
 
-def mended(path: Path, data: bytes) -> tuple[Repair, bytes]:
-    """Repair bytes, and once more what comes of it."""
+def repaired_twice(path: Path, data: bytes) -> tuple[Repair, bytes]:
+    """Repair bytes, and repair the result."""
     output, again = path.with_name("once.mcap"), path.with_name("twice.mcap")
     for one in (output, again):
         one.unlink(missing_ok=True)
     path.write_bytes(data)
     done = repair(path, output)
     second = repair(output, again)
-    assert path.read_bytes() == data, "the original stays as it is"
+    assert path.read_bytes() == data, "the original is unchanged"
     assert second.intact, "a repaired archive has no fault"
     assert again.read_bytes() == output.read_bytes(), "repairing twice changes nothing"
     return done, output.read_bytes()
 
 
-def assert_sound(done: Repair, written: Written) -> Archive:
-    """The repaired file is complete, true and says what it lost."""
+def assert_valid(done: Repair, written: Written) -> Archive:
+    """Check that the repaired file is complete, correct, and states its losses."""
     assert done.output is not None
     archive = open_archive(done.output)
     assert archive.complete, archive.missing
@@ -304,7 +303,7 @@ def cuts(data: bytes, count: int) -> Iterator[bytes]:
 
 
 class TestAnyDamage:
-    """No wrong sample is read, in whole or in part, and a repair is true and says what is lost."""
+    """No wrong sample is read or repaired, and losses are reported."""
 
     @pytest.mark.parametrize(
         ("kind", "count", "whole", "lost"),
@@ -316,17 +315,17 @@ class TestAnyDamage:
             pytest.param(cuts, 14_000, 1, 5, marks=pytest.mark.slow),
         ],
     )
-    def test_is_noticed(self, written, path, monkeypatch, kind, count, whole, lost):
+    def test_is_detected(self, written, path, monkeypatch, kind, count, whole, lost):
         monkeypatch.setattr("os.fsync", lambda descriptor: None)
         ends = [chunk.end for chunk in written.chunks]
         variants = kind(written.data, count)
-        counts = Counter(self.judged(written, path, data, ends) for data in variants)
+        counts = Counter(self.outcome_of(written, path, data, ends) for data in variants)
         assert counts["whole"] >= whole
         assert counts["lost"] >= lost
         assert counts["refused"] < 0.6 * count
 
     @staticmethod
-    def judged(written: Written, path: Path, data: bytes, ends: list[int]) -> str:
+    def outcome_of(written: Written, path: Path, data: bytes, ends: list[int]) -> str:
         archive = read(written, path, data)
         if archive is not None:
             if archive.damage is not None:
@@ -344,34 +343,34 @@ class TestAnyDamage:
             position = alone.columns.get("position", np.zeros((0, 2)))
             assert np.array_equal(position, written.rows["position"][: len(position)])
         try:
-            done, _ = mended(path, data)
+            done, _ = repaired_twice(path, data)
         except ArchiveError:
             return "refused"
-        assert_sound(done, written)
+        assert_valid(done, written)
         return "lost" if done.losses else "whole"
 
 
 class TestNothingLost:
-    def test_a_file_that_lost_its_index_becomes_what_it_was(self, path, written):
-        """Cut anywhere behind the outcome: what follows from the rest is made anew."""
+    def test_lost_index_is_restored_to_the_byte(self, path, written):
+        """Truncated anywhere behind the outcome."""
         for length in range(written.records[-1].offset, len(written.data), 97):
-            done, output = mended(path, written.data[:length])
+            done, output = repaired_twice(path, written.data[:length])
             assert output == written.data
             assert done.losses == ()
             assert done.samples_lost == 0
 
     @pytest.mark.parametrize("what", ["message indexes", "times of a chunk", "nothing"])
-    def test_what_follows_from_the_rest_is_set_right(self, path, written, what):
+    def test_damaged_index_is_restored_to_the_byte(self, path, written, what):
         data = {
             "message indexes": written.changed(written.first(container.MESSAGE_INDEX), 20),
             "times of a chunk": written.changed(written.chunks[2], 3),
             "nothing": written.data,
         }[what]
-        done, output = mended(path, data)
+        done, output = repaired_twice(path, data)
         assert done.intact == (what == "nothing")
         assert not done.losses
         assert output == written.data
-        if done.intact:  # a whole archive is left alone
+        if done.intact:  # an intact archive is not rewritten
             again = repair(path)
             assert again.intact and again.output is None
 
@@ -381,14 +380,14 @@ class TestLoss:
         ("damage", "sound", "lost", "outcome"),
         [
             ("torn", range(20), None, "unknown"),
-            # Behind a damaged chunk cycles show the hole as they show lost packets.
+            # Behind a damaged chunk, cycles show the gap as they show lost packets.
             ("hole", [*range(10), *range(20, 43)], 10, "completed"),
             # Channels are found in the index.
             ("first chunk lost", range(10, 43), 10, "completed"),
             ("length of a chunk", [*range(10), *range(20, 43)], 10, "completed"),
         ],
     )
-    def test_sound_chunks_are_saved(self, path, written, damage, sound, lost, outcome):
+    def test_intact_chunks_are_saved(self, path, written, damage, sound, lost, outcome):
         data = {
             "torn": written.data[: written.chunks[2].end - 17],
             "hole": written.changed(written.chunks[1], -5),
@@ -397,8 +396,8 @@ class TestLoss:
         }[damage]
         if damage == "length of a chunk":
             data[written.chunks[1].offset + 6] ^= 0x40
-        done, output = mended(path, bytes(data))
-        archive = assert_sound(done, written)
+        done, output = repaired_twice(path, bytes(data))
+        archive = assert_valid(done, written)
         assert archive.columns["cycle"].tolist() == [FIRST + index for index in sound]
         assert done.samples_lost == lost
         assert archive.outcome.entries["outcome"] == outcome
@@ -411,7 +410,7 @@ class TestLoss:
 
     @staticmethod
     def assert_others_read(path: Path, archive: Archive) -> None:
-        """mcap reads a repaired file as it reads a whole one."""
+        """The mcap library reads the repaired file."""
         with path.open("rb") as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
             found = [
@@ -427,8 +426,8 @@ class TestLoss:
             assert values.tobytes() == column.tobytes(), name
         assert statistics.message_count == 3 * len(found) + len(archive.events)
 
-    def test_samples_of_a_foreign_recording_end_at_the_first_hole(self, tmp_path):
-        """Nothing in them would show it."""
+    def test_imported_recording_ends_at_the_first_gap(self, tmp_path):
+        """It has no cycle numbers that show the gap."""
         position = np.random.default_rng(1).normal(size=(3500, 2))
         stamp = np.arange(3500, dtype=np.int64) * 1_000_000
         path = write_samples(
@@ -442,17 +441,17 @@ class TestLoss:
         assert done.samples_lost == 2500
         assert np.array_equal(open_archive(done.output).columns["position"], position[:1000])
 
-    def test_a_lost_attachment_is_no_longer_named(self, path, written):
-        done, _ = mended(path, written.changed(written.first(container.ATTACHMENT), -8))
-        archive = assert_sound(done, written)
+    def test_lost_attachment_is_no_longer_listed(self, path, written):
+        done, _ = repaired_twice(path, written.changed(written.first(container.ATTACHMENT), -8))
+        archive = assert_valid(done, written)
         assert list(archive.attachments) == ["robot.urdf"]
         assert "cell.toml" in archive.outcome.entries["repaired.losses"]
 
-    def test_damage_after_a_repair_adds_to_what_was_lost(self, path, written):
-        _, first = mended(path, written.changed(written.chunks[1], -5))
+    def test_losses_of_several_repairs_add_up(self, path, written):
+        _, first = repaired_twice(path, written.changed(written.chunks[1], -5))
         data = bytearray(first)
         data[chunks(first)[1][1] - 5] ^= 0xFF
-        done, _ = mended(path, bytes(data))
+        done, _ = repaired_twice(path, bytes(data))
         outcome = open_archive(done.output).outcome.entries
         assert outcome["samples"] == "23"
         assert outcome["repaired.samples_lost"] == "20"
@@ -475,19 +474,19 @@ class TestRefused:
         assert (path.parent / "x.mcap").read_bytes() == b"precious"
 
     @pytest.mark.parametrize("sentence", ["fails its checksum", "is not an MCAP file"])
-    def test_a_file_without_description_cannot_be_repaired(self, path, written, sentence):
+    def test_file_without_header_cannot_be_repaired(self, path, written, sentence):
         damaged = written.changed(written.first(container.METADATA), -3, mask=1)
         path.write_bytes(damaged if "checksum" in sentence else b"hello" * 100)
         with pytest.raises(NotAnArchiveError, match=sentence):
             repair(path)
 
-    def test_what_does_not_read_back_is_thrown_away_with_a_remedy(self, path, monkeypatch):
+    def test_output_that_cannot_be_read_back_is_removed(self, path, monkeypatch):
         torn = open_archive(path)
         monkeypatch.setattr(repairing, "open_archive", lambda *_, **__: torn)
         with pytest.raises(ArchiveError, match=r"cannot be rewritten.*restore it from a copy"):
             repair(path)
 
-    def test_a_full_disk_is_our_error(self, path, monkeypatch):
+    def test_full_disk_is_an_archive_write_error(self, path, monkeypatch):
         def full(descriptor: int) -> None:
             raise OSError(28, "No space left on device")
 
@@ -497,7 +496,7 @@ class TestRefused:
 
 
 class TestFiles:
-    """What a repair does to names, links and modes; each begins with an archive without footer."""
+    """Names, links and modes of repaired files, of an archive without footer."""
 
     @pytest.fixture(autouse=True)
     def torn(self, path: Path, written) -> None:
@@ -521,7 +520,7 @@ class TestFiles:
         repair(path)
         assert steps == ["file", "name", "folder"]
 
-    def test_a_link_under_a_name_of_ours_is_not_followed(self, path):
+    def test_link_in_place_of_a_temporary_file_is_not_followed(self, path):
         victim = path.parent / "victim"
         victim.write_bytes(b"precious")
         for name in (path.name, f"{path.stem}_repaired.mcap"):
@@ -529,7 +528,7 @@ class TestFiles:
         repair(path)
         assert victim.read_bytes() == b"precious"
 
-    def test_repairs_of_one_archive_at_once_do_not_meet(self, path, written, monkeypatch):
+    def test_concurrent_repairs_do_not_interfere(self, path, written, monkeypatch):
         """The second runs from beginning to end while the first reads back what it wrote."""
         second: list[Repair] = []
 

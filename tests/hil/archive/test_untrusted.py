@@ -1,7 +1,7 @@
-"""Archives that somebody else wrote: sound by their checksums, and odd or hostile all the same.
+"""Invalid or hostile archives with valid checksums.
 
-Whoever opens one gets an error of ours that names file and field, or an archive that says what it
-lost; in memory that the file itself does not choose.
+Opening one raises an `ArchiveError` with file and field, or reports what is lost, in bounded
+memory.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def forged(
     attachments: Mapping[str, bytes] | None = None,
     chunk: Callable[[bytes], bytes] = bytes,
 ) -> Path:
-    """The small archive with other content, all checksums and the index fitting it."""
+    """Write the small archive with other content, valid checksums and index."""
     made, described = mcap_bytes.Indexed(), ""
     given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
     for record in written.records:
@@ -86,34 +86,34 @@ def forged(
 
 
 def in_turn(*changes: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """A change for each of the first chunks, none of the others."""
+    """Return a change for each of the first chunks, none of the others."""
     left = iter(changes)
     return lambda chunk: next(left, bytes)(chunk)
 
 
 def outcomes(path: Path) -> dict[str, str]:
-    """What each way into a file says of it; other errors than ours pass through and fail."""
-    said = {}
+    """Return the error text of each reader, "" without error; other exceptions are raised."""
+    messages = {}
     for name, read in READERS.items():
         try:
             read(path)
         except ArchiveError as error:
             assert error.path is not None
-            said[name] = str(error)
+            messages[name] = str(error)
         else:
-            said[name] = ""
+            messages[name] = ""
         path.with_name("repaired.mcap").unlink(missing_ok=True)
-    return said
+    return messages
 
 
-def test_the_same_content_written_by_others_is_as_good(written, path):
+def test_same_content_of_another_writer_is_valid(written, path):
     path = forged(written, path)
     assert check_archive(path).conforms
     assert set(outcomes(path).values()) == {""}
 
 
 DEEP = "[" * 100_000
-ODD = {
+INVALID = {
     "joint_names": ["", "null", "{}", "[]", "[1, 2]", '["a"', '["a", "a"]', '["a", ""]', DEEP,
                     '["\\ud800", "b"]', '["a\\u001b[31m", "b"]',
                     json.dumps([str(i) for i in range(300)])],
@@ -125,12 +125,12 @@ ODD = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("field", "text"), [(f, t) for f, texts in ODD.items() for t in texts])
-def test_an_entry_that_cannot_be_used_is_named(field, text, written, tmp_path):
+@pytest.mark.parametrize(("field", "text"), [(f, t) for f, texts in INVALID.items() for t in texts])
+def test_invalid_entry_is_named(field, text, written, tmp_path):
     path = forged(written, tmp_path / NAME, metadata={field: text})
-    said = outcomes(path)
+    messages = outcomes(path)
     for way in READERS.keys() - {"check"}:
-        assert f"{NAME}: {field}: " in said[way], way
+        assert f"{NAME}: {field}: " in messages[way], way
     faults = check_archive(path).faults["metadata"]
     assert len(faults) == 1
     assert faults[0].startswith(f"{field} ")
@@ -144,7 +144,7 @@ def test_a_missing_period_is_a_fault_of_a_recorded_archive_alone():
         ArchiveHeader.of({**entries, "period": "soon"})
 
 
-def test_the_command_line_says_it_in_a_sentence(written, path):
+def test_commands_report_an_invalid_entry(written, path):
     path = forged(written, path, metadata={"joint_names": DEEP})
     for command, status in (("info", 2), ("check", 5), ("repair", 1)):
         result = CliRunner().invoke(app, ["archive", command, str(path)])
@@ -154,25 +154,25 @@ def test_the_command_line_says_it_in_a_sentence(written, path):
 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "\N{SUPERSCRIPT TWO}", "-1", "1e3", ""])
-def test_what_is_written_for_a_number_stops_no_reader(number, written, path):
+def test_invalid_counts_do_not_stop_readers(number, written, path):
     path = forged(
         written,
         path,
         metadata=dict.fromkeys(("index", "attempt"), number),
         outcome=dict.fromkeys(("first_cycle", "last_cycle", "late_answers"), number),
     )
-    said = outcomes(path)
-    assert set(said.values()) == {""}, said
+    messages = outcomes(path)
+    assert set(messages.values()) == {""}, messages
     assert "validation" in read_overview(path).title
 
 
-def test_a_count_that_is_no_number_is_a_fault(written, path):
+def test_invalid_count_is_a_fault(written, path):
     for count in ("samples", "events", "lost_packets"):
         assert "outcome" in check_archive(forged(written, path, outcome={count: "many"})).faults
 
 
 @pytest.mark.parametrize("name", ["cell.toml", "robot.urdf"])
-def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
+def test_cell_that_is_not_text_is_named(name, written, tmp_path):
     path = forged(written, tmp_path / NAME, attachments={name: b"\xff\xfe"})
     with pytest.raises(ArchiveError, match=f"{name}: is not UTF-8 text"):
         cell_of(open_archive(path))
@@ -182,10 +182,10 @@ def test_a_cell_that_is_no_text_is_named(name, written, tmp_path):
         gather_sources([path], 0.3, in_sample=True)
 
 
-def test_joints_or_a_description_that_do_not_belong_are_damage(written, path):
+def test_wrong_joints_or_a_second_header_are_damage(written, path):
     path = forged(written, path, metadata={"joint_names": '["a", "b", "c"]'})
     assert "not that of 3 joints" in str(open_archive(path).damage)
-    assert "holds no sample" in outcomes(path)["open_recording"]
+    assert "has no sample" in outcomes(path)["open_recording"]
     assert not check_archive(path).conforms
     entries = {"kind": "move", "joint_names": '["x"]', "attachments": "[]", "format_version": "1"}
     second = mcap_bytes.metadata("hil", {**entries, "checksum": header.checksum(entries)})
@@ -197,7 +197,7 @@ def test_joints_or_a_description_that_do_not_belong_are_damage(written, path):
 
 
 @pytest.mark.parametrize("losses", ["no", "[1]", DEEP])
-def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, path):
+def test_invalid_counts_and_losses_do_not_stop_repairs(losses, written, path):
     path = forged(
         written,
         path,
@@ -213,8 +213,8 @@ def test_counts_and_losses_that_are_none_stop_no_repair(losses, written, path):
 
 
 class TestEvents:
-    def test_texts_are_no_commands_and_data_nested_stay_text(self, written, path):
-        """Data nested without end stay text; no text steers the terminal."""
+    def test_texts_are_escaped_and_nested_data_stay_text(self, written, path):
+        """Deeply nested data stay text; control characters are not printed."""
 
         def nested(plain: bytes) -> bytes:
             return plain.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
@@ -231,7 +231,7 @@ class TestEvents:
         assert not {"\x1b", "\x07", "\r"} & set(shown)
 
 
-CYCLE, ELSEWHERE = 1, 9  # numbers of channels; the second is nobody's
+CYCLE, ELSEWHERE = 1, 9  # numbers of channels; the second is unused
 
 
 def channel(number: int, topic: str, *, schema_id: int = 1) -> bytes:
@@ -249,14 +249,14 @@ def another_schema(chunk: bytes) -> bytes:
 
 
 def without_cycles(chunk: bytes) -> bytes:
-    """A chunk whose cycles are announced, and counted, as something that nobody knows."""
+    """Return a chunk whose cycles are of an unknown topic."""
     announced = channel(CYCLE, schema.CYCLE)
     assert announced in chunk
     return chunk.replace(announced, channel(CYCLE, "/elsewhere"))
 
 
 def with_cycles(chunk: bytes) -> bytes:
-    """A chunk whose cycles are of another channel, announced only here, that counts from 0."""
+    """Return a chunk whose cycles are of another channel, defined only here, numbered from 0."""
     changed, number = bytearray(chunk), 0
     for message in mcap_bytes.heads(chunk):
         if message.channel == CYCLE:
@@ -266,7 +266,7 @@ def with_cycles(chunk: bytes) -> bytes:
 
 
 class TestDefinitions:
-    """What a number or a topic means is said once: else samples of one were taken for another's."""
+    """A number or topic that is redefined would mix samples of two channels."""
 
     @pytest.mark.parametrize(
         ("second", "why"),
@@ -293,7 +293,7 @@ class TestDefinitions:
     def assert_first_alone(
         written, folder: Path, changes: list[Callable[[bytes], bytes]], why: str, *, repaired: int
     ) -> None:
-        """Nothing behind the first chunk counts, and no column is longer than another."""
+        """Check that nothing behind the first chunk is read, and columns have equal length."""
         path = forged(written, folder / NAME, chunk=in_turn(*changes))
         archive = open_archive(path)
         assert why in str(archive.damage)
@@ -334,7 +334,7 @@ class Imported(NamedTuple):
 
 
 class TestImported:
-    """Two channels make the samples: each at the time of the other, or not at all."""
+    """Samples of two channels must have the same times."""
 
     def test_as_it_was(self, imported, tmp_path):
         path = forged(imported, tmp_path / IMPORTED)
@@ -401,7 +401,7 @@ class TestSizes:
         path.write_bytes(data)
         self.assert_small(path, "claims 4294967296 bytes")
 
-    def test_a_chunk_of_zeros_that_is_as_large_as_it_says(self, written, path):
+    def test_a_chunk_of_zeros_that_is_as_large_as_stated(self, written, path):
         bomb = mcap_bytes.chunk(bytes(1 << 26), level=19)
         assert len(bomb) < 10_000
         path.write_bytes(self.before_the_chunks(written, bomb * 50))
@@ -438,7 +438,7 @@ class TestSizes:
         assert set(outcomes(path).values()) == {""}
 
     @pytest.mark.parametrize("place", [(8, 1 << 62), (1 << 63, 100), ((1 << 64) - 1, 9)])
-    def test_an_index_that_points_beyond_the_world(self, place, written, tmp_path):
+    def test_an_index_that_points_behind_the_file(self, place, written, tmp_path):
         def elsewhere(entry: bytes) -> list[bytes]:
             changed = bytearray(entry)
             struct.pack_into("<QQ", changed, container.RECORD.size + 16, *place)
@@ -450,7 +450,7 @@ class TestSizes:
 
     @pytest.mark.parametrize("line", ["float64[999999999] x", "uint8[99999999999999999999] x",
                                       "float64 x\nfloat64 x"])  # fmt: skip
-    def test_a_message_that_nobody_could_send(self, line):
+    def test_a_message_that_is_too_large(self, line):
         with pytest.raises(LayoutError):
             assert peak(lambda: fixed_layout(line)) < MEMORY
 
@@ -478,8 +478,8 @@ class TestSizes:
 
     @staticmethod
     def assert_small(path: Path, reason: str) -> None:
-        said: dict[str, str] = {}
-        assert peak(lambda: said.update(outcomes(path))) < MEMORY
-        assert reason in said["open_recording"]
+        messages: dict[str, str] = {}
+        assert peak(lambda: messages.update(outcomes(path))) < MEMORY
+        assert reason in messages["open_recording"]
         assert any(reason in fault for faults in check_archive(path).faults.values()
                    for fault in faults)  # fmt: skip
