@@ -1,8 +1,8 @@
-"""The circle is not closed on itself: an error planted on one side only turns the verdict red.
+"""Errors on one side only, simulated arm or PC, make the verdict wrong.
 
-"Physical" errors are in the simulated robot, which then differs from what its controller
-announces and the cell file says; the others are in what the PC makes of honest archives.
-The planted truth itself: friction laws, and what the URDF is wrong by.
+The simulated arm differs from what its controller reports and the cell file states, or the PC
+misinterprets correct archives. Also the true parameters of the simulation: friction laws and errors
+of the URDF.
 """
 
 from __future__ import annotations
@@ -32,29 +32,28 @@ Run = Callable[..., Campaign]
 
 @pytest.fixture(scope="module")
 def short(cell: Cell) -> Cell:
-    """No more motion, and no more cycles of it, than a verdict needs."""
     return cell.with_link(cycle_ms=2).with_campaign(repetitions=2, validation_runs=1)
 
 
 @pytest.fixture(scope="module")
 def motions(plan: CampaignPlan) -> CampaignPlan:
-    """One of each kind."""
+    """Return one motion of each kind."""
     return CampaignPlan(plan.excitation, plan.validation[:1])
 
 
 @pytest.fixture(scope="module")
-def honest(
+def correct_campaign(
     tmp_path_factory: pytest.TempPathFactory, short: Cell, motions: CampaignPlan, run: Run
 ) -> Campaign:
-    """A campaign of the robot that the cell describes; tests only read it."""
-    return run(tmp_path_factory.mktemp("honest") / "campaign", short, motions)
+    """Return a campaign of the robot that the cell describes; read only."""
+    return run(tmp_path_factory.mktemp("correct_campaign") / "campaign", short, motions)
 
 
 def verdict(campaign: Campaign) -> VerdictResult:
     return identify_campaign(campaign.folder.root, Silent()).results.verdict
 
 
-def gear_4_turned(drive: SimulatedDrive) -> SimulatedDrive:
+def gear_4_negated(drive: SimulatedDrive) -> SimulatedDrive:
     ratios = list(drive.gear_ratio)
     ratios[3] = -ratios[3]
     return replace(drive, gear_ratio=tuple(ratios))
@@ -70,13 +69,13 @@ def torque_constants_of_2_and_3_swapped(drive: SimulatedDrive) -> SimulatedDrive
     return replace(drive, torque_constant=tuple(constants))
 
 
-def test_the_honest_cell_is_green(honest: Campaign) -> None:
-    found = verdict(honest)
+def test_a_correct_cell_is_good(correct_campaign: Campaign) -> None:
+    found = verdict(correct_campaign)
     assert found.good, found.line
 
 
 @pytest.mark.slow
-def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
+def test_usual_unmodelled_effects_stay_good(
     tmp_path: Path, short: Cell, motions: CampaignPlan, run: Run
 ) -> None:
     found = verdict(run(tmp_path / "effects", short, motions, effects=True))
@@ -86,13 +85,13 @@ def test_effects_that_the_model_leaves_out_stay_green_at_their_usual_size(
 @pytest.mark.parametrize(
     "error",
     [
-        pytest.param(gear_4_turned, marks=pytest.mark.slow),
+        pytest.param(gear_4_negated, marks=pytest.mark.slow),
         pytest.param(coupling_of_5_into_6_turned, marks=pytest.mark.slow),
         torque_constants_of_2_and_3_swapped,
     ],
     ids=lambda error: error.__name__,
 )
-def test_a_robot_that_is_not_what_the_cell_says_is_red(
+def test_a_robot_other_than_the_cell_is_wrong(
     tmp_path: Path,
     short: Cell,
     motions: CampaignPlan,
@@ -107,8 +106,8 @@ def test_a_robot_that_is_not_what_the_cell_says_is_red(
 @pytest.mark.parametrize(
     "joint", [0, *(pytest.param(joint, marks=pytest.mark.slow) for joint in range(1, 6))]
 )
-def test_one_torque_constant_of_the_wrong_sign_is_red(
-    honest: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
+def test_a_negative_torque_constant_is_wrong(
+    correct_campaign: Campaign, monkeypatch: pytest.MonkeyPatch, joint: int
 ) -> None:
     def turned(archive: hil.identify.sources.Archive) -> object:
         recording = recording_of(archive)
@@ -117,22 +116,22 @@ def test_one_torque_constant_of_the_wrong_sign_is_red(
         return replace(recording, torque=recording.torque * signs)
 
     monkeypatch.setattr(hil.identify.sources, "recording_of", turned)
-    found = verdict(honest)
+    found = verdict(correct_campaign)
     assert not found.good, found.line
 
 
-def test_friction_columns_of_the_wrong_sign_are_red(
-    honest: Campaign, monkeypatch: pytest.MonkeyPatch
+def test_negated_friction_columns_are_wrong(
+    correct_campaign: Campaign, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The prediction stays as good, but friction that drives a joint is impossible."""
+    """The prediction is equal, but negative friction is impossible."""
     monkeypatch.setitem(vars(COULOMB), "value", lambda v, s, _: -s)
-    found = verdict(honest)
+    found = verdict(correct_campaign)
     assert not found.good, found.line
     assert any("Coulomb friction of" in reason for reason in found.reasons)
 
 
 def cell_with(third: str, overrides: dict[str, str], planted: str) -> Cell:
-    """The NS 16 with these third laws, and these planted coefficients of them."""
+    """Return the NS 16 with these third laws and true coefficients."""
     base = Cell.load(CELL_PATH).with_values({"simulation.third": json.loads(planted)})
     lines = [f'[robot.friction.joints.{name}]\nthird = "{law}"' for name, law in overrides.items()]
     text = base.text.replace('third = "quadratic"', f'third = "{third}"', 1)
@@ -147,10 +146,8 @@ def cell_with(third: str, overrides: dict[str, str], planted: str) -> Cell:
         ({"joint_1": "quadratic", "joint_2": "cubic"}, "cubic"),
     ],
 )
-def test_the_law_is_that_of_the_joints_planted_with_a_third_term(
-    laws: dict[str, str], found: str
-) -> None:
-    """Joints without a planted term do not count; two laws in one arm are refused."""
+def test_the_law_follows_the_simulated_third_term(laws: dict[str, str], found: str) -> None:
+    """Joints without a third term do not count; two laws in one arm raise."""
     assert planted_truth(cell_with("none", laws, "[0, 1.5, 0, 0, 0, 0]")).third_law == found
     cell = cell_with("none", {"joint_1": "quadratic", "joint_2": "cubic"}, "[1, 1.5, 0, 0, 0, 0]")
     with pytest.raises(CellError, match=r"robot\.friction\.joints.*joint_1, joint_2.*same third"):
@@ -158,27 +155,27 @@ def test_the_law_is_that_of_the_joints_planted_with_a_third_term(
 
 
 class TestInertiaScale:
-    """Law: the arm has the scaled links, the PC knows those of the URDF; the first are true."""
+    """The arm has scaled links, the PC those of the URDF."""
 
-    def test_the_demo_has_table_2_and_knows_it_wrongly(self) -> None:
+    def test_the_demo_has_table_2_and_other_nominal_values(self) -> None:
         cell = Cell.load(CELL_PATH)
         table = base_from_standard(standard_parameters())
         planted, known = planted_values(cell), cell.nominal_values()
         b = cell.model.base.rank
         large = np.abs(planted) > 1e-6
-        # Table 2 turns the signs of some and orders them otherwise.
+        # Table 2 has other signs and another order.
         found, printed = np.sort(np.abs(planted[:b])), np.sort(np.abs(table))
         np.testing.assert_allclose(found, printed, rtol=1e-9, atol=1e-12)
         errors = np.abs(known[large] / planted[large] - 1.0)
         assert errors.max() < 0.25
         assert np.median(errors) > 0.1
 
-    def test_the_controller_moves_what_is_planted(self) -> None:
+    def test_the_controller_moves_the_simulated_arm(self) -> None:
         moved = simulated_controller(Cell.load(CELL_PATH)).standard_parameters()
         for name, value in standard_parameters().items():
             assert moved[name] == pytest.approx(value, rel=1e-11, abs=1e-11), name
 
-    def test_without_it_the_urdf_is_right(self) -> None:
+    def test_without_it_the_urdf_is_true(self) -> None:
         cell = Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": []})
         b = cell.model.base.rank
         np.testing.assert_array_equal(planted_truth(cell).inertia_scale, np.ones(6))

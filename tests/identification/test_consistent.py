@@ -1,4 +1,4 @@
-"""Physically consistent estimates: laws of what comes out, and of the method that finds it."""
+"""Physically consistent estimates: properties of the result and of the solver."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ from tests.identification.two_link import (
     sine_motion,
     truth,
 )
-from tests.identification.two_link import a_motion as lively_motion
+from tests.identification.two_link import a_motion as two_link_motion
 
 Array = NDArray[np.float64]
 
 
 def with_friction(*friction: float) -> Array:
-    """The planted parameters of the two links with other friction."""
+    """Return the true parameters of the two links with other friction."""
     return np.concatenate([truth()[: MODEL.base.rank], friction])
 
 
 def a_motion(model: RobotModel, seed: int, samples: int = 2000) -> Motion:
-    """Five sines per joint; another seed is another motion, about as far and as fast."""
+    """Return five sines per joint, similar for all seeds."""
     rng = np.random.default_rng(seed)
     shape = (5, model.n_joints)
     time = np.arange(samples) * 4e-3
@@ -62,7 +62,7 @@ def a_motion(model: RobotModel, seed: int, samples: int = 2000) -> Motion:
 
 
 def measured(model: RobotModel, motion: Motion, values: Array, noise: float, seed: int) -> Array:
-    """Torque with noise, a share of each joint's RMS."""
+    """Return torque with noise, a share of each joint's RMS."""
     torque = model.torque(values, *motion[1:])
     rms = np.sqrt((torque**2).mean(axis=0))
     return torque + noise * rms * np.random.default_rng(seed).standard_normal(torque.shape)
@@ -72,21 +72,21 @@ def fitted(model: RobotModel, motion: Motion, torque: Array, **options: Any) -> 
     return consistent_estimate(model, Factor.from_samples(model, motion, torque), **options)
 
 
-def planted(
+def simulated(
     values: Array, noise: float, seed: int, *, model: RobotModel = MODEL, samples: int = 2000
 ) -> ConsistentEstimate:
-    """Estimate of an arm with these parameters."""
+    """Return the estimate of an arm with these parameters."""
     motion = a_motion(model, seed, samples)
     return fitted(model, motion, measured(model, motion, values, noise, seed))
 
 
-def cost(found: ConsistentEstimate) -> float:
-    """Rise of the relative error on the fitted rows."""
+def error_rise(found: ConsistentEstimate) -> float:
+    """Return the rise of the relative error on the fitted rows."""
     return found.relative_error - found.unconstrained_relative_error
 
 
-def assert_possible(model: RobotModel, found: ConsistentEstimate) -> None:
-    """Eigenvalues of what the definition says, nothing of ours in between."""
+def assert_consistent(model: RobotModel, found: ConsistentEstimate) -> None:
+    """Check the definition of consistency by eigenvalues."""
     rows = found.standard.reshape(model.n_joints, -1)
     for xx, xy, xz, yy, yz, zz, hx, hy, hz, m, *rotor in rows:
         tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -101,16 +101,15 @@ def assert_possible(model: RobotModel, found: ConsistentEstimate) -> None:
         assert value >= 0.0 or not name.startswith(("f0", "f1"))
 
 
-LARGE = 1e2  # as many times the nominal bodies, kg m² of rotor, or N·m of friction
+LARGE = 1e2  # times the nominal bodies, kg m² of rotor, or N·m of friction
 
 
 def largest_gain(gradient: Array, at: Array, nominal: Array) -> float:
-    """How much less than at `at` a convex function can be for any possible machine, at most.
+    """Return a bound on how much consistent parameters can decrease a convex function.
 
-    The function stays above its tangent, and of a machine the tangent is easily bounded: what
-    the gradient says of a link is a matrix Z with <Z, J(x)> = gradient x. If Z is positive
-    semidefinite, that is never negative, and so is the rest if its gradient is not. Where either
-    is so but for a little, the little is multiplied with LARGE.
+    The function stays above its tangent. The gradient of a link is a matrix Z with <Z, J(x)> =
+    gradient x, not negative if Z is positive semidefinite. Small violations are multiplied by
+    LARGE.
     """
     upper = np.triu_indices(4)
     basis = np.zeros((10, 4, 4))
@@ -130,21 +129,21 @@ def largest_gain(gradient: Array, at: Array, nominal: Array) -> float:
 
 
 def nearest_consistent(column: str) -> tuple[float, float]:
-    """Distance of a column of Table 2 from the possible machines, and a lower bound of it."""
+    """Return the distance of a column of Table 2 from consistent parameters, and its bound."""
     model = RobotModel.from_urdf(
         urdf_text(), friction=FrictionLaw(coulomb=False, viscous=False, third=None)
     )
     rows = {row.pivot: row for row in table2()[:40]}
     values = np.array([rows[n].sign * getattr(rows[n], column) for n in model.base.names])
-    # Forty "measurements", each of one base parameter.
+    # One row per base parameter.
     gram = np.zeros((6, 41, 41))
     gram[0] = np.eye(41)
     gram[0, :40, 40] = gram[0, 40, :40] = values
     gram[0, 40, 40] = values @ values
     factor = Factor(gram, np.array([40, 0, 0, 0, 0, 0]), model.parameter_names)
     found = consistent_estimate(model, factor, weights=np.ones(6), prior_weight=1e-6)
-    assert_possible(model, found)
-    # From here on Table 2's own grouping.
+    assert_consistent(model, found)
+    # With Table 2's own grouping.
     names = model.standard_names
     grouping = np.zeros((40, len(names)))
     for i, row in enumerate(table2()[:40]):
@@ -157,45 +156,45 @@ def nearest_consistent(column: str) -> tuple[float, float]:
 
 
 class TestConsistentEstimate:
-    def test_from_poor_data_comes_a_possible_machine(self) -> None:
-        found = planted(truth(), 0.5, 1, samples=150)
-        assert_possible(MODEL, found)
+    def test_poor_data_give_consistent_parameters(self) -> None:
+        found = simulated(truth(), 0.5, 1, samples=150)
+        assert_consistent(MODEL, found)
         assert found.status == "optimal"
         assert np.all(found.margin > 0.0)
 
-    def test_base_parameters_are_those_of_the_standard_ones(self) -> None:
-        found, rank = planted(truth(), 0.3, 1, samples=300), MODEL.base.rank
+    def test_base_parameters_follow_from_standard_ones(self) -> None:
+        found, rank = simulated(truth(), 0.3, 1, samples=300), MODEL.base.rank
         expected = MODEL.base.grouping @ found.standard
         np.testing.assert_allclose(found.estimate.values[:rank], expected, atol=1e-12)
         np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
 
-    def test_where_least_squares_is_possible_it_is_hardly_moved(self) -> None:
-        found = planted(truth(), 0.02, 2)
+    def test_a_consistent_estimate_is_hardly_changed(self) -> None:
+        found = simulated(truth(), 0.02, 2)
         assert np.abs(found.shift).max() < 0.1
-        assert cost(found) < 1e-5
+        assert error_rise(found) < 1e-5
 
-    def test_exact_data_of_the_nominal_give_every_parameter_back(self) -> None:
-        """Also those that no torque depends on: they are the nominal's."""
+    def test_exact_nominal_data_return_all_parameters(self) -> None:
+        """Parameters without effect on the torque are nominal."""
         values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
-        np.testing.assert_allclose(planted(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
+        np.testing.assert_allclose(simulated(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
 
-    def test_friction_that_would_drive_is_none(self) -> None:
-        found = planted(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
+    def test_negative_friction_becomes_zero(self) -> None:
+        found = simulated(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
         for name in ("f0_1", "f1_2"):
             assert found.unconstrained.value(name) < 0.0
             assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
-        assert_possible(MODEL, found)
+        assert_consistent(MODEL, found)
 
     def test_the_third_friction_term_may_have_either_sign(self) -> None:
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
         friction = np.array([4, 4, 2, 2, -0.1, 0.1, -1, 1])
         values = np.concatenate([model.base.grouping @ model.nominal, friction])
-        found = planted(values, 0.001, 5, model=model)
+        found = simulated(values, 0.001, 5, model=model)
         np.testing.assert_allclose(found.friction, friction, rtol=0.05)
 
-    def test_no_other_possible_machine_fits_better(self) -> None:
+    def test_no_other_consistent_parameters_fit_better(self) -> None:
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
-        values[MODEL.parameter_names.index("I2yy")] = -0.1  # no machine: the constraints bind
+        values[MODEL.parameter_names.index("I2yy")] = -0.1  # active constraints
         motion = a_motion(MODEL, 6)
         torque = measured(MODEL, motion, values, 0.4, 6)
         found = fitted(MODEL, motion, torque, prior_weight=1e-4)
@@ -215,16 +214,16 @@ class TestConsistentEstimate:
         assert largest_gain(gradient, x, MODEL.chain.inertial) < 1e-2 * excess
 
     @pytest.mark.parametrize("noise", [0.1, 0.01, 0.0])
-    def test_of_impossible_data_is_the_closest_machine(self, noise: float) -> None:
-        """As after a wrong sign of one torque, however exact the data are."""
+    def test_inconsistent_data_give_the_closest_parameters(self, noise: float) -> None:
+        """As after a wrong sign of one torque, for any noise."""
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
         values[MODEL.parameter_names.index("I2yy")] = -0.3
-        found = planted(values, noise, 6)
-        assert_possible(MODEL, found)
+        found = simulated(values, noise, 6)
+        assert_consistent(MODEL, found)
         assert "no consistent parameters fit" in found.status
-        assert cost(found) > 0.02
+        assert error_rise(found) > 0.02
 
-    def test_errors_and_covariance_are_those_it_says(self) -> None:
+    def test_errors_and_covariance_are_correct(self) -> None:
         motion = a_motion(MODEL, 7, samples=300)
         torque = measured(MODEL, motion, truth(), 0.3, 7)
         found = fitted(MODEL, motion, torque)
@@ -236,7 +235,7 @@ class TestConsistentEstimate:
         assert "covariance of the unconstrained estimate" in found.estimate.method
         np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
 
-    def test_a_joint_that_never_moved_keeps_its_nominal_link(self) -> None:
+    def test_a_resting_joint_keeps_its_nominal_link(self) -> None:
         law = FrictionLaw(third=None)
         model = RobotModel.from_urdf(URDF, friction=law, gravity=(0, 0, 0))
         motion = a_motion(model, 10)
@@ -247,12 +246,12 @@ class TestConsistentEstimate:
         mask = np.zeros(torque.shape, dtype=np.bool_)
         mask[:, 0] = True
         found = consistent_estimate(model, Factor.from_samples(model, motion, torque, mask))
-        assert_possible(model, found)
+        assert_consistent(model, found)
         assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
         assert np.all(np.isfinite(found.standard))
         np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
 
-    def test_without_nominal_inertia_bodies_are_assumed(self) -> None:
+    def test_missing_nominal_bodies_are_assumed(self) -> None:
         bare = URDF
         while "<inertial>" in bare:
             start, end = bare.index("<inertial>"), bare.index("</inertial>") + len("</inertial>")
@@ -261,12 +260,12 @@ class TestConsistentEstimate:
         motion = a_motion(MODEL, 12)
         found = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
         assert all(words.startswith("assumed") for words in found.reference)
-        assert_possible(empty, found)
-        assert cost(found) < 1e-3
+        assert_consistent(empty, found)
+        assert error_rise(found) < 1e-3
 
     @pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
-    def test_ns16_predicts_unseen_motion_as_well(self, noise: float) -> None:
-        """With a nominal that is 5 to 20 % wrong and knows no rotors."""
+    def test_ns16_predicts_unseen_motion_equally_well(self, noise: float) -> None:
+        """The nominal bodies are 5 to 20 % wrong, without rotors."""
         model, planted_rotors = RobotModel.from_urdf(urdf_text()), load_truth()
         named = standard_parameters()
         standard = np.array([named[name] for name in model.standard_names]).reshape(6, 11)
@@ -275,8 +274,8 @@ class TestConsistentEstimate:
         friction = (planted_rotors.coulomb, planted_rotors.viscous, planted_rotors.third)
         values = np.concatenate([model.base.grouping @ standard.reshape(-1), *friction])
         other = a_motion(model, 2)
-        found = planted(values, noise, 1, model=model)
-        assert_possible(model, found)
+        found = simulated(values, noise, 1, model=model)
+        assert_consistent(model, found)
         unseen = measured(model, other, values, noise, 4)
 
         def error(values: Array) -> float:
@@ -285,10 +284,10 @@ class TestConsistentEstimate:
 
         assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
 
-    def test_the_makers_parameters_are_possible(self) -> None:
+    def test_nominal_parameters_of_the_paper_are_consistent(self) -> None:
         assert nearest_consistent("pi_c")[0] < 1e-3
 
-    def test_the_papers_method_b_is_not_possible(self) -> None:
+    def test_method_b_of_the_paper_is_inconsistent(self) -> None:
         distance, at_least = nearest_consistent("pi_b")
         assert 1.4 < at_least <= distance < 1.43
 
@@ -296,17 +295,17 @@ class TestConsistentEstimate:
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
     )
     def test_other_robots(self, path: str) -> None:
-        """Their nominal parameters are partly no bodies."""
+        """With partly inconsistent nominal parameters."""
         model = RobotModel.from_urdf(robot_text(path))
         friction = np.repeat([2.0, 1.0, 0.0], model.n_joints)
         standard = model.nominal.reshape(model.n_joints, -1).copy()
         standard[:, 10] = 0.5
         values = np.concatenate([model.base.grouping @ standard.reshape(-1), friction])
-        found = planted(values, 0.1, 1, model=model)
-        assert_possible(model, found)
-        assert cost(found) < 1e-3
+        found = simulated(values, 0.1, 1, model=model)
+        assert_consistent(model, found)
+        assert error_rise(found) < 1e-3
 
-    def test_an_estimate_of_other_parameters_is_refused(self) -> None:
+    def test_an_estimate_with_other_parameters_raises(self) -> None:
         other = RobotModel.from_urdf(URDF)
         motion = a_motion(MODEL, 1, samples=200)
         torque = measured(MODEL, motion, truth(), 0.1, 1)
@@ -329,15 +328,15 @@ class TestDrives:
         return model, standard
 
     @pytest.mark.parametrize("inertia", [0.12, 0.6, -0.6])
-    def test_the_rotors_matrix_is_possible(self, inertia: float) -> None:
-        """And where the planted one is, it costs nothing."""
+    def test_the_rotor_matrix_is_positive(self, inertia: float) -> None:
+        """At no cost if the true one is."""
         model, standard = self.coupled(inertia)
         friction = np.full(len(model.friction.terms), 0.8)
         values = np.concatenate([model.base.grouping @ standard, friction])
-        found = planted(values, 0.01, 1, model=model)
+        found = simulated(values, 0.01, 1, model=model)
         assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
         assert np.all(found.margin > 0.0)
-        assert (cost(found) < 1e-4) == (inertia == 0.12)
+        assert (error_rise(found) < 1e-4) == (inertia == 0.12)
 
     def test_the_coupled_ns16_is_written_as_a_urdf(self) -> None:
         wrist = np.eye(6)
@@ -349,23 +348,23 @@ class TestDrives:
         standard[model.layout.couplings] = -0.03, 0.01, -0.02
         friction = np.random.default_rng(0).uniform(1.0, 9.0, len(model.friction.terms))
         values = np.concatenate([model.base.grouping @ standard, friction])
-        found = planted(values, 0.02, 1, model=model)
+        found = simulated(values, 0.02, 1, model=model)
         assert found.status == "optimal"
         assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
-        assert cost(found) < 1e-3
+        assert error_rise(found) < 1e-3
         assert np.all(found.friction > 0.0)
         write_urdf(urdf_text(), model, found.standard, found.friction)
         assert not_in_urdf(model) == (
             "rotor inertias", "coupling inertias", "friction of coupled motors",
         )  # fmt: skip
 
-    def test_impossible_coupling_inertias_are_not_written(self) -> None:
+    def test_inconsistent_coupling_inertias_raise(self) -> None:
         model, standard = self.coupled(0.3)
         with pytest.raises(NotConsistentError, match="coupling"):
             write_urdf(URDF, model, standard)
 
-    def test_friction_by_direction_and_at_low_speed_takes_energy(self) -> None:
-        """Planted against nature: more viscous difference than viscosity, less friction at rest."""
+    def test_all_friction_terms_dissipate(self) -> None:
+        """True friction: larger viscous difference than viscosity, smaller friction at rest."""
         law = FrictionLaw(third=None, asymmetric=True, stribeck=0.3)
         model = RobotModel.from_urdf(URDF, friction=law)
         terms = {"f0": 1.0, "f1": 0.3, "fd": 0.6, "fs": -2.0, "fo": 0.2}
@@ -374,19 +373,19 @@ class TestDrives:
         def friction() -> Array:
             return np.array([terms[term.symbol] for term in model.friction.terms])
 
-        found = planted(np.append(base, friction()), 0.01, 1, model=model)
+        found = simulated(np.append(base, friction()), 0.01, 1, model=model)
         for own in model.friction.table(found.friction):
             assert own["f0"] >= 0.0
             assert own["f0"] + own["fs"] >= -1e-12
             assert abs(own["fd"]) <= own["f1"] + 1e-12
-        # And what nature makes comes back.
+        # Consistent parameters are recovered.
         terms |= {"f1": 0.9, "fs": 0.7}
-        found = planted(np.append(base, friction()), 0.0, 1, model=model)
+        found = simulated(np.append(base, friction()), 0.0, 1, model=model)
         np.testing.assert_allclose(found.friction, friction(), rtol=0.02)
 
 
 def a_problem(seed: int) -> Smooth:
-    """Two links, three further variables of which two may not be negative; few data."""
+    """Two links, three further variables of which two are not negative; few data."""
     rng = np.random.default_rng(seed)
     rows, columns = np.triu_indices(4)
     entries = np.zeros((10, 4, 4))
@@ -422,7 +421,7 @@ class TestNewton:
 
     @given(st.integers(0, 2**16))
     @settings(max_examples=20)
-    def test_every_start_and_the_path_end_at_the_same_minimum(self, seed: int) -> None:
+    def test_all_starts_reach_the_same_minimum(self, seed: int) -> None:
         problem = a_problem(seed)
         found = [
             polish(problem, start()),
@@ -437,7 +436,7 @@ class TestNewton:
 
     @given(st.integers(0, 2**16))
     @settings(max_examples=20)
-    def test_at_the_minimum_no_allowed_direction_leads_down(self, seed: int) -> None:
+    def test_no_feasible_direction_decreases_at_the_minimum(self, seed: int) -> None:
         problem = a_problem(seed)
         found = polish(problem, start())
         assert found.converged
@@ -454,7 +453,7 @@ class TestNewton:
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    motion = lively_motion()
+    motion = two_link_motion()
     return recording(gaussian(np.random.default_rng(3), motion), motion)
 
 

@@ -11,14 +11,11 @@ from identification.estimators.covariance import (
     left_out,
     leverage_corrected,
     spread,
-    with_block_covariance,
 )
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import (
     Factor,
     NormalEquations,
-    estimate,
-    joint_weights,
     solve,
 )
 from identification.factor.phases import PhaseFactor
@@ -36,7 +33,7 @@ Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1])
-def test_95_percent_intervals_cover_90_to_99_percent_whatever_the_colour_of_the_noise(
+def test_95_percent_intervals_cover_90_to_99_percent(
     correlation: float,
 ) -> None:
     motion = a_motion()
@@ -52,7 +49,7 @@ def test_95_percent_intervals_cover_90_to_99_percent_whatever_the_colour_of_the_
         assert np.mean(classical) < 0.75
 
 
-def test_an_error_that_repeats_in_every_repetition_is_not_averaged_away() -> None:
+def test_a_repeated_error_is_not_averaged() -> None:
     motion = a_motion()
     rng = np.random.default_rng(3)
     repeated = coloured(rng, len(motion.time), 5e-3, 0.05)
@@ -61,9 +58,8 @@ def test_an_error_that_repeats_in_every_repetition_is_not_averaged_away() -> Non
         for _ in range(16)
     ]
     one, many = estimate_repetitions(MODEL, runs[:1]), estimate_repetitions(MODEL, runs)
-    # Sixteen repetitions of the same error say as much as one ...
+    # Sixteen repetitions of one error count as one, unlike their scatter or independence.
     np.testing.assert_allclose(many.pooled.std, one.pooled.std, rtol=0.35)
-    # ... which neither the scatter over repetitions nor their independence would tell.
     assert np.median(many.scatter_std / many.pooled.std) < 0.1
     assert np.median(many.independent_std / many.pooled.std) < 0.35
     error = np.abs(many.pooled.values - truth())
@@ -75,14 +71,14 @@ def test_independent_noise_averages_over_repetitions() -> None:
     rng = np.random.default_rng(4)
     runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.02), motion) for _ in range(16)]
     result = estimate_repetitions(MODEL, runs)
-    # All three honest routes agree when repetitions really are independent.
+    # All three estimates agree for independent repetitions.
     assert np.median(result.scatter_std / result.pooled.std) == pytest.approx(1.0, abs=0.35)
     assert np.median(result.independent_std / result.pooled.std) == pytest.approx(1.0, abs=0.35)
     assert np.median(result.classical_std / result.pooled.std) < 0.75
 
 
 def test_leverage_correction_is_leaving_out_one_block() -> None:
-    # CR3: the corrected score is what the estimate moves by, times A, when a block goes.
+    # CR3: corrected score is A times the change without the block.
     motion = a_motion(4.0)
     noise = coloured(np.random.default_rng(9), len(motion.time), 5e-3, 0.02)
     phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
@@ -99,9 +95,9 @@ def test_leverage_correction_is_leaving_out_one_block() -> None:
         np.testing.assert_allclose(moved[block], values - without, atol=1e-9)
 
 
-def test_what_few_blocks_determine_has_an_honest_variance_too() -> None:
-    # The elbow moves for a fifth of a second only: its friction and rotor rest on two blocks, of
-    # whose residuals the fit leaves next to nothing.
+def test_variance_determined_by_few_blocks_is_correct() -> None:
+    # The elbow moves for 0.2 s only: two blocks with almost no residual determine its friction and
+    # rotor.
     motion = a_motion()
     at = np.clip((motion.time - 5.0) / 0.2, 0.0, 1.0)
     for array, own in zip(
@@ -130,7 +126,7 @@ def test_what_few_blocks_determine_has_an_honest_variance_too() -> None:
     assert np.all(np.median(np.array(alone) / classical, axis=0)[elbow] > 1.0)
 
 
-def test_a_direction_of_one_block_takes_the_variance_of_the_others() -> None:
+def test_a_direction_of_one_block_uses_other_blocks() -> None:
     rng = np.random.default_rng(0)
     blocks, k = 30, 3
     shares = np.zeros((blocks, k, k))
@@ -138,19 +134,19 @@ def test_a_direction_of_one_block_takes_the_variance_of_the_others() -> None:
     shares[4, 2, 2] = 1.0
     effect = 7.0
     scores = np.sqrt(effect / blocks) * rng.standard_normal((blocks, k))
-    scores[:, 2] = 0.0  # whatever the noise is: the fit goes through it
+    scores[:, 2] = 0.0  # exactly fitted
     rows = leverage_corrected(shares, scores)
     covariance = rows.T @ rows
     usual = leverage_corrected(shares[:, :2, :2], scores[:, :2])
     assert len(usual) == blocks
     np.testing.assert_allclose(covariance[:2, :2], usual.T @ usual)
     assert covariance[2, 2] == pytest.approx(np.diag(usual.T @ usual).mean(), rel=0.1)
-    # Never less than white noise would leave.
+    # At least the variance of white noise.
     quiet = leverage_corrected(shares, 1e-3 * scores)
     assert (quiet.T @ quiet)[2, 2] == pytest.approx(1.0)
 
 
-def test_the_spread_is_that_of_leaving_out_one_block_where_none_stands_alone() -> None:
+def test_the_spread_is_that_of_leaving_out_one_block() -> None:
     motion = a_motion(4.0)
     noise = coloured(np.random.default_rng(9), len(motion.time), 5e-3, 0.02)
     phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
@@ -164,8 +160,8 @@ def test_the_spread_is_that_of_leaving_out_one_block_where_none_stands_alone() -
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.09])
-def test_what_neighbouring_blocks_share_is_in_the_variance(shared: float) -> None:
-    """Estimates of a mean from blocks that correlate with the next one alone."""
+def test_correlation_of_neighbouring_blocks_counts(shared: float) -> None:
+    """Mean of blocks that are correlated with the next one."""
     rng = np.random.default_rng(3)
     blocks, k = 300, 40
     weight = (1.0 - np.sqrt(1.0 - 4.0 * shared**2)) / (2.0 * shared) if shared else 0.0
@@ -184,7 +180,7 @@ def test_blocks_grow_with_the_correlation_of_the_scores() -> None:
     slow = lfilter([1.0], [1.0, -0.8], white, axis=0)
     assert block_length(white) == 2
     assert 4 <= block_length(slow) <= 20
-    assert block_length(white[:25]) == 1  # never so long that hardly any block is left
+    assert block_length(white[:25]) == 1  # enough blocks remain
 
 
 def test_the_factor_of_all_blocks_is_the_factor_of_the_samples() -> None:
@@ -199,7 +195,7 @@ def test_repetitions_are_added_at_equal_times_of_the_motion() -> None:
     motion = a_motion(4.0)
     error = np.zeros((len(motion.time), 2))
     early = recording(error, motion)
-    # The same motion in a recording whose clock stands elsewhere.
+    # The same motion with another clock.
     late = Samples(
         motion=motion._replace(time=motion.time + 7.3),
         torque=early.torque,
@@ -211,13 +207,3 @@ def test_repetitions_are_added_at_equal_times_of_the_motion() -> None:
     one, two = (PhaseFactor.from_samples(MODEL, samples) for samples in (early, late))
     for both, own in zip((one + two).gram, one.gram, strict=True):
         np.testing.assert_allclose(both, 2.0 * own, rtol=1e-9, atol=1e-8)
-
-
-def test_the_method_says_what_was_done() -> None:
-    motion = a_motion()
-    noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
-    phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
-    weights = joint_weights(phase.total)
-    result = with_block_covariance(estimate(MODEL, phase.total, weights), phase, weights)
-    assert "40 blocks of 0.25 s" in result.method
-    assert result.interval_factor == pytest.approx(2.02, abs=0.01)  # Student's t, 39

@@ -1,4 +1,4 @@
-"""A recording of the simulated NS 16, made by the smallest PC that can play targets to it."""
+"""Delay of the torque, of two links and of the simulated NS 16."""
 
 from __future__ import annotations
 
@@ -133,8 +133,8 @@ class TestCommonDelay:
         recording = a_recording(MODEL, TRUTH, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
         assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=5e-6)
 
-    def test_noise_does_not_bias_it_and_its_interval_is_honest(self) -> None:
-        """Mean within its standard error, scatter over seeds as claimed."""
+    def test_noise_does_not_bias_it_and_the_interval_covers(self) -> None:
+        """Mean within its standard error, scatter over seeds as estimated."""
         found = [
             estimate_delays(a_recording(MODEL, TRUTH, 1.6e-3, seed=seed), MODEL)
             for seed in range(12)
@@ -143,7 +143,7 @@ class TestCommonDelay:
         claimed = np.sqrt(np.mean([one.common_std**2 for one in found]))
         scatter = error.std(ddof=1)
         assert abs(error.mean()) < 3.0 * scatter / np.sqrt(len(found)) + 5e-6
-        # A standard deviation of 12 draws is itself known to 21 %.
+        # The standard deviation of 12 samples has an error of 21 %.
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
         assert all(one.agree and one.significant for one in found)
 
@@ -153,7 +153,7 @@ class TestCommonDelay:
         assert found.common == pytest.approx(planted, abs=3e-4)
         np.testing.assert_array_equal(found.applied, found.common)
 
-    def test_a_longer_one_than_was_sought_is_not_determined(self) -> None:
+    def test_a_delay_beyond_the_range_is_undetermined(self) -> None:
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
         assert found.reason == "the residual decreases up to the longest delay tested"
         np.testing.assert_array_equal(found.applied, 0.0)
@@ -163,7 +163,7 @@ class TestCommonDelay:
         recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
         assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
 
-    def test_the_torque_may_have_come_through_a_low_pass(self) -> None:
+    def test_it_is_found_in_a_filtered_torque(self) -> None:
         time = np.arange(0.0, 8.0, 0.004)
         recording = a_recording(MODEL, TRUTH, 0.003, time=time, torque_noise=0.3)
         assert recording.torque is not None
@@ -171,14 +171,14 @@ class TestCommonDelay:
         found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
         assert found.common == pytest.approx(0.003, abs=4e-4)
 
-    def test_the_known_torque_of_a_payload_is_late_as_well(self) -> None:
-        """It is taken off where the samples were prepared, at another delay."""
+    def test_known_payload_torque_is_delayed_equally(self) -> None:
+        """It was subtracted with another delay."""
         load = Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None), payload=load)
         found = estimate_delays(a_recording(model, TRUTH, 0.01, torque_noise=0.1), model)
         assert found.common == pytest.approx(0.01, abs=1e-4)
 
-    def test_it_is_found_beyond_the_one_assumed(self) -> None:
+    def test_it_is_found_beside_an_assumed_delay(self) -> None:
         recording = a_recording(MODEL, TRUTH, 0.004)
         found = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.003))
         assert found.common == pytest.approx(0.004, abs=3e-4)
@@ -202,7 +202,7 @@ class TestCommonDelay:
     def test_encoder_noise_in_a_servo_loop_biases_it_little(
         self, simulated: tuple[Recording, float]
     ) -> None:
-        """The simulated cell in closed loop: within 0.05 ms of the planted 0.2 ms."""
+        """Simulated cell in closed loop: within 0.05 ms of the true 0.2 ms."""
         recording, planted = simulated
         found = estimate_delays(recording, ns16_model())
         assert found.agree
@@ -221,31 +221,31 @@ class TestUndeterminedDelay:
         assert np.isinf(slow.std).all()
         np.testing.assert_array_equal(slow.applied, 0.0)
 
-    def test_the_words_say_why(self, slow: DelayEstimate) -> None:
+    def test_the_reason_is_given(self, slow: DelayEstimate) -> None:
         (line,) = slow.describe()
         assert line.startswith("all axes: not determined; 95 % interval of ± ")
         assert line.endswith("the torques change too slowly, or are too noisy")
 
-    def test_its_variance_is_at_most_that_of_any_delay(self, slow: DelayEstimate) -> None:
+    def test_its_variance_is_bounded(self, slow: DelayEstimate) -> None:
         unknown = replace(slow, common_std=np.inf)
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
 
-    def test_a_wide_one_is_applied_where_it_is_significant(self) -> None:
+    def test_an_uncertain_significant_delay_is_applied(self) -> None:
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.045, speed=0.2, seed=2), MODEL)
         assert found.reason is not None and found.significant
         np.testing.assert_array_equal(found.applied, found.common)
         (line,) = found.describe()
         assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
-    def test_without_motion_there_is_no_row(self) -> None:
+    def test_a_recording_without_motion_raises(self) -> None:
         still = a_recording(MODEL, TRUTH, 0.0, speed=0.0)
         with pytest.raises(IdentificationError, match="not one usable sample"):
             estimate_delays(still, MODEL)
 
     @pytest.mark.slow
-    def test_a_torque_through_a_low_pass_does_not_tell_it(self, shared_data: Path) -> None:
-        """A real UR10's effort has come through 2 Hz; a number here would be an invention."""
+    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data: Path) -> None:
+        """The effort of a real UR10 is filtered at 2 Hz."""
         model, recording = ur10(shared_data)
         found = estimate_delays(recording, model)
         assert not found.determined.any()
@@ -260,7 +260,7 @@ class TestDeviatingAxes:
         assert found.applied == pytest.approx(planted, abs=3e-4)
         assert any("predicts better than the common delay" in s for s in found.describe())
 
-    def test_one_of_six_leaves_the_common_delay_as_it_is(
+    def test_one_axis_of_six_leaves_the_common_delay(
         self, simulated: tuple[Recording, float]
     ) -> None:
         recording, planted = simulated
@@ -272,7 +272,7 @@ class TestDeviatingAxes:
         assert found.deviations[2] == pytest.approx(0.006, abs=1e-4)
         assert found.common == pytest.approx(planted, abs=5e-5)
 
-    def test_an_axis_that_stands_takes_the_delay_of_the_others(self) -> None:
+    def test_a_resting_axis_has_the_common_delay(self) -> None:
         time = np.arange(6000) * STEP
         keep = np.array([1.0, 0.0])
         rng = np.random.default_rng(1)
@@ -291,7 +291,7 @@ PLANTED = np.array([0.37e-3, -1.3e-3])  # s
 
 
 class TestCompensation:
-    def test_torques_belong_to_their_positions(self) -> None:
+    def test_torques_are_shifted_to_their_positions(self) -> None:
         late = a_recording(MODEL, TRUTH, PLANTED, torque_noise=0.0, position_noise=0.0)
         time = late.time
         gap = np.zeros(len(time), dtype=np.bool_)
@@ -303,17 +303,17 @@ class TestCompensation:
         clear = np.abs(motion(there.time)[1]) > 0.1  # Coulomb friction jumps between samples
         assert np.abs(there.torque - exact)[clear].max() < 2e-3
         assert len(there.segments()) == 2
-        # Nothing was read across the gap: the samples beside it that would need it are gone.
+        # No interpolation across the gap: samples beside it are dropped.
         assert there.n_samples == torn.n_samples - 2 * 3
 
-    def test_by_nothing_it_changes_nothing(self) -> None:
+    def test_zero_delays_change_nothing(self) -> None:
         recording = a_recording(MODEL, TRUTH, 0.0)
         same = compensate(recording, [0.0, 0.0])
         assert recording.torque is not None
         np.testing.assert_array_equal(same.torque, recording.torque)
         np.testing.assert_array_equal(same.time, recording.time)
 
-    def test_what_cannot_be_compensated_is_refused(self) -> None:
+    def test_a_delay_longer_than_the_recording_raises(self) -> None:
         recording = a_recording(MODEL, TRUTH, 0.0)
         with pytest.raises(IdentificationError, match="shorter than the delay"):
             compensate(recording, [100.0, 0.0])
@@ -323,8 +323,8 @@ class TestDelayUncertainty:
     def fit(self, model: RobotModel, samples: Samples) -> Estimate:
         return estimate(model, Factor.of(model, samples), np.array([1.0, 25.0]))
 
-    def test_the_sensitivity_is_the_slope_of_the_estimate(self) -> None:
-        """Against fits with a delay half a millisecond shorter and longer."""
+    def test_the_sensitivity_is_the_derivative_of_the_estimate(self) -> None:
+        """Compared with fits at delays half a millisecond shorter and longer."""
         recording = a_recording(MODEL, TRUTH, 0.004, torque_noise=0.0, position_noise=1e-8)
 
         def samples(delay: float) -> Samples:
@@ -341,7 +341,7 @@ class TestDelayUncertainty:
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)
 
-    def test_what_is_undetermined_stays_so(self) -> None:
+    def test_undetermined_parameters_stay_undetermined(self) -> None:
         samples = prepare(a_recording(MODEL, TRUTH, 0.0), MODEL)
         fitted, products = self.fit(MODEL, samples), rate_products(MODEL, samples)
         covariance = fitted.covariance.copy()

@@ -52,13 +52,13 @@ def samples_of(
 
 
 def factors(model: RobotModel, values: Array, seed: int = 0) -> tuple[PhaseFactor, PhaseFactor]:
-    """Factors of a motion to fit and of another one."""
+    """Return factors of a fitted and of another motion."""
     runs = (samples_of(model, values, a_motion(k), NOISE, seed + k) for k in (1, 2))
     fitted, unseen = (PhaseFactor.from_samples(model, run) for run in runs)
     return fitted, unseen
 
 
-def test_parameters_that_are_nothing_go_and_those_that_matter_stay() -> None:
+def test_zero_parameters_are_removed() -> None:
     nothing = {"f2_1", "f2_2", "fo_1", "fo_2"}
     gone: list[str] = []
     for seed in range(0, 40, 2):
@@ -96,7 +96,7 @@ def test_a_step_is_the_least_squares_fit_of_the_columns_left() -> None:
     assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
 
 
-def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter() -> None:
+def test_the_path_removes_the_most_uncertain_parameter() -> None:
     training, unseen = factors(MODEL, TRUTH)
     result = eliminate(MODEL, training, unseen)
     full = estimate(MODEL, training.total)
@@ -107,13 +107,13 @@ def test_the_worst_known_goes_first_and_the_path_leads_to_one_parameter() -> Non
     assert result.steps[0].largest_relative_std == pytest.approx(relative.max(), rel=1e-9)
     assert [step.left for step in result.steps] == list(range(MODEL.n_parameters, 0, -1))
     errors = [step.in_sample for step in result.steps]
-    # Weighted they must rise; unweighted, with joints of different noise, they nearly do.
+    # Monotonic with weights; nearly so without.
     assert errors[-1] > 5.0 * errors[0]
     removed = [step.removed for step in result.steps[1:]]
     assert len(set(removed)) == len(removed)
 
 
-def test_a_parameter_that_unseen_motion_needs_stays_whatever_the_rule_of_thumb_says() -> None:
+def test_a_parameter_needed_by_unseen_motion_stays() -> None:
     values = TRUTH.copy()
     values[MODEL.parameter_names.index("fo_2")] = 1.0
     training, unseen = factors(MODEL, values)
@@ -127,7 +127,7 @@ def test_a_parameter_that_unseen_motion_needs_stays_whatever_the_rule_of_thumb_s
 
 @settings(max_examples=15)
 @given(st.integers(0, 2**16))
-def test_no_removal_up_to_the_cut_costs_more_than_the_rule_gives_away(seed: int) -> None:
+def test_removals_up_to_the_cut_satisfy_the_rule(seed: int) -> None:
     model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
     values = np.random.default_rng(seed).normal(0.0, 2.0, model.n_parameters)
     result = eliminate(model, *factors(model, values, seed))
@@ -140,7 +140,7 @@ def test_no_removal_up_to_the_cut_costs_more_than_the_rule_gives_away(seed: int)
         assert result.chosen.spread < rule.spread
 
 
-def test_what_the_motion_does_not_determine_goes_first() -> None:
+def test_undetermined_parameters_are_removed_first() -> None:
     motion = a_motion(1)
     held = Motion(
         motion.time,
@@ -156,12 +156,12 @@ def test_what_the_motion_does_not_determine_goes_first() -> None:
         after for before, after in pairwise(result.steps) if np.isinf(before.largest_relative_std)
     ]
     assert {"f0_2", "f1_2", "f2_2", "fo_2"} <= {step.removed for step in lost}
-    assert len(lost) < len(full.undetermined)  # of a combination one parameter can stay
+    assert len(lost) < len(full.undetermined)  # one parameter of a combination can stay
     assert result.estimate.undetermined == ()
     assert np.all(np.isfinite(result.estimate.std))
 
 
-def test_the_estimate_that_is_left_is_one_like_every_other() -> None:
+def test_the_remaining_estimate_is_least_squares() -> None:
     covered = []
     for seed in range(0, 60, 2):
         result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
@@ -174,14 +174,14 @@ def test_the_estimate_that_is_left_is_one_like_every_other() -> None:
     assert "cluster-robust" in one.method
 
 
-def test_empty_factors_are_refused() -> None:
+def test_empty_factors_raise() -> None:
     _, unseen = factors(MODEL, TRUTH)
     empty = PhaseFactor.zero(MODEL)
     with pytest.raises(IdentificationError, match="no usable fitted"):
         eliminate(MODEL, empty, unseen)
 
 
-def test_the_ns16_loses_parameters_and_predicts_no_worse() -> None:
+def test_the_ns16_predicts_equally_with_fewer_parameters() -> None:
     model = RobotModel.from_urdf(urdf_text())
     standard = model.nominal.reshape(6, -1).copy()
     standard[:, -1] = [7.6465, 24.5955, 10.48, 0.253, 0.298, 0.12]
@@ -221,10 +221,10 @@ def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data: Path) -> None:
     assert model.n_parameters == 58
     assert 20 <= result.chosen.left <= 30
     assert result.chosen.held_out < result.steps[0].held_out + 0.001
-    # On no axis is the model worse than with all parameters, ...
+    # The error of each axis stays, unlike by relative standard deviations, which remove the offset
+    # of joint 6.
     error = unseen.total.relative_errors
     assert np.all(error(result.values) < error(estimate(model, training.total).values) + 0.005)
-    # ... which the rule of relative standard deviations does not see to: joint 6 needs its offset.
     blind = eliminate(model, training, unseen, rule=CutRule(overall=9.0, axis=9.0))
     assert blind.chosen.left < result.chosen.left
     assert error(blind.values)[5] > 2.0 * error(result.values)[5]
@@ -241,8 +241,8 @@ def factors_of(model: RobotModel, runs: list[Samples]) -> list[PhaseFactor]:
 
 @settings(max_examples=8)
 @given(st.integers(0, 1000))
-def test_a_blind_choice_never_sees_the_held_out_motion(seed: int) -> None:
-    """Recomputed from rows: chosen on the end of what is fitted, fitted to all, then tried."""
+def test_a_blind_choice_ignores_the_held_out_motion(seed: int) -> None:
+    """Recomputed from rows: chosen on the end of the fitted part, fitted to all of it."""
     arm = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
     values = np.random.default_rng(seed).normal(1.0, 1.0, arm.n_parameters)
     fitted, *unseen = runs_of(arm, values, seed, 3)
@@ -281,13 +281,13 @@ def part_of(run: Samples, rows: slice) -> Samples:
     )
 
 
-def test_too_short_a_motion_has_no_part_to_choose_on() -> None:
+def test_a_short_motion_has_no_blind_choice() -> None:
     training, unseen = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 2))
     assert choose_essential(MODEL, training, [unseen]).blind is not None
     assert choose_essential(MODEL, training.blocks(slice(0, 20)), [unseen]).blind is None
 
 
-def test_the_rule_of_thumb_is_the_path_that_no_held_out_error_stops() -> None:
+def test_the_choice_by_spread_ignores_held_out_errors() -> None:
     training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 3))
     found = choose_essential(MODEL, training, held_out)
     assert found.by_spread.spread < CutRule().spread
@@ -295,8 +295,8 @@ def test_the_rule_of_thumb_is_the_path_that_no_held_out_error_stops() -> None:
     assert found.elimination.chosen.held_out <= found.by_spread.held_out + 2 * CutRule().overall
 
 
-def test_many_recordings_cost_no_more_than_few() -> None:
-    """Blocks are merged; the error over all of them is the same sum."""
+def test_many_recordings_are_merged() -> None:
+    """The error over merged blocks is the same sum."""
     training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
     found = choose_essential(MODEL, training, held_out)
     total = sum(held_out, PhaseFactor.zero(MODEL)).total
@@ -305,7 +305,7 @@ def test_many_recordings_cost_no_more_than_few() -> None:
     )
 
 
-def test_without_held_out_motion_nothing_is_chosen() -> None:
+def test_missing_held_out_motion_raises() -> None:
     (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
     with pytest.raises(IdentificationError, match="no held-out motion"):
         choose_essential(MODEL, training, [])

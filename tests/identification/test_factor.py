@@ -70,7 +70,7 @@ def a_motion(samples: int = 3000, *, step: float = 2e-3, held_elbow: bool = Fals
 
 
 def ill() -> Samples:
-    """A scaled condition of some 1e7: the elbow turns one way, at very nearly one speed."""
+    """Motion of scaled condition 1e7: the elbow turns one way at nearly constant speed."""
     time = np.arange(400) * 2e-3
     motion = one_sine(time, (0.9, 1e-5))
     motion.position[:, 1] += time
@@ -92,7 +92,7 @@ def summed(kind: Kind, parts: list[Samples]) -> Any:
 
 
 def exact_solution(samples: Samples) -> Array:
-    """Ordinary least squares in rational arithmetic, from the float rows as they are."""
+    """Solve least squares in rational arithmetic from the float rows."""
     blocks = MODEL.regressor(*samples.motion[1:]).dense(P)
     table = np.concatenate([blocks, samples.torque[:, :, None]], axis=2)[samples.usable]
     rows = [[Fraction(float(x)) for x in row] for row in table]
@@ -109,8 +109,8 @@ def exact_solution(samples: Samples) -> Array:
 
 
 class TestFactor:
-    def test_the_gram_is_that_of_the_dense_rows_that_count(self) -> None:
-        """Masked rows may hold anything, and the arrays that go in stay as they are."""
+    def test_the_gram_is_that_of_the_usable_rows(self) -> None:
+        """Masked rows may hold any values; input arrays are unchanged."""
         model, (motion, torque) = ns16(), some_samples(200)
         mask = np.ones((200, 6), dtype=bool)
         mask[40:80, 2] = False
@@ -155,7 +155,7 @@ class TestFactor:
         assert equations.yy == pytest.approx(right @ right, rel=1e-13)
         assert equations.n == 900
 
-    def test_the_dense_regressor_is_never_made(self) -> None:
+    def test_the_dense_regressor_is_not_allocated(self) -> None:
         model, (motion, torque) = ns16(), some_samples(30_000)
         tracemalloc.start()
         Factor.from_samples(model, motion, torque)
@@ -164,7 +164,7 @@ class TestFactor:
         assert peak < 0.2 * 30_000 * 6 * 58 * 8
 
     @both
-    def test_what_does_not_belong_together_is_refused(self, kind: Kind) -> None:
+    def test_factors_of_other_models_raise(self, kind: Kind) -> None:
         samples = noisy(a_motion(50))
         one = kind.of(MODEL, samples)
         with pytest.raises(IdentificationError, match="cannot be added"):
@@ -177,7 +177,7 @@ class TestFactor:
                 kind.of(MODEL, replace(samples, **{name: short}))
 
     @pytest.mark.parametrize("bandwidth", [None, np.array([60.0, 80.0])])
-    def test_rows_are_regressor_and_torque_of_what_counts(self, bandwidth: Array | None) -> None:
+    def test_rows_are_regressor_and_torque(self, bandwidth: Array | None) -> None:
         samples = replace(noisy(a_motion(3000), NOISE), torque_bandwidth=bandwidth)
         samples.torque[~samples.usable] = np.nan
         blocks, columns = samples.regressor(MODEL)
@@ -192,7 +192,7 @@ class TestFactor:
         assert (chunks[0][0].start, chunks[-1][0].stop) == (0, 3000)
 
     @pytest.mark.parametrize("weights", [None, np.array([0.3, 20.0])])
-    def test_both_kinds_agree_to_nine_digits(self, weights: Array | None) -> None:
+    def test_gram_and_qr_agree_to_nine_digits(self, weights: Array | None) -> None:
         samples = noisy(a_motion(), NOISE)
         gram, factor = Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)
         expected, found = estimate(MODEL, gram, weights), estimate(MODEL, factor, weights)
@@ -206,7 +206,7 @@ class TestFactor:
 
 
 class TestConditioning:
-    def test_triangles_keep_digits_that_gram_matrices_lose(self) -> None:
+    def test_qr_is_more_accurate_than_gram(self) -> None:
         samples, ordinary = ill(), np.ones(2)
         exact, found = exact_solution(samples), QRFactor.of(MODEL, samples).solve(ordinary)
         assert 3e6 < found.condition < 1e8
@@ -214,11 +214,11 @@ class TestConditioning:
         np.testing.assert_allclose(found.values, exact, rtol=1e-7)
         equations = Factor.of(MODEL, samples).weighted(ordinary)
         assert np.abs(np.linalg.solve(equations.A, equations.b) / exact - 1.0).max() > 1e-2
-        # And the estimate on Gram matrices says so instead of printing those.
+        # The estimate on Gram matrices reports this.
         assert not solve(equations).determined.all()
 
-    def test_the_residual_does_not_drown_in_the_torque(self) -> None:
-        """A residual 1e-9 of the torque: its square is below what a Gram matrix can hold."""
+    def test_qr_resolves_small_residuals(self) -> None:
+        """A residual of 1e-9 of the torque, below the resolution of a Gram matrix."""
         samples, ordinary = noisy(a_motion(), 1e-9 * NOISE), np.ones(2)
         errors = []
         for kind in (QRFactor, Factor):
@@ -229,7 +229,7 @@ class TestConditioning:
         assert errors[0] < 0.05
         assert errors[1] > 1.0
 
-    def test_the_condition_decides_the_kind_of_factor(self) -> None:
+    def test_the_condition_selects_gram_or_qr(self) -> None:
         good, bad = noisy(a_motion(), NOISE), ill()
         assert not isinstance(reduced(MODEL, [good], Factor.of(MODEL, good)), QRFactor)
         factor = reduced(MODEL, [bad, bad], summed(Factor, [bad, bad]))
@@ -242,24 +242,24 @@ class TestConditioning:
         assert "by QR" in robust_estimate(MODEL, [bad]).estimate.method
 
     @both
-    def test_what_the_motion_does_not_determine_is_named(self, kind: Kind) -> None:
+    def test_undetermined_parameters_are_named(self, kind: Kind) -> None:
         motion = a_motion(held_elbow=True)
         samples = replace(noisy(motion), usable=np.ones((3000, 2), dtype=bool))
         result = estimate(MODEL, kind.of(MODEL, samples))
-        # The elbow stands: its friction has no column, its inertia no acceleration of its own.
+        # The elbow rests: no friction column, no own acceleration.
         assert {"f0_2", "f1_2", "I2m"} <= set(result.undetermined)
         assert {"f0_1", "f1_1"}.isdisjoint(result.undetermined)
         known = np.array([name not in result.undetermined for name in result.names])
         assert np.isinf(result.std[~known]).all()
         assert np.isfinite(result.std[known]).all()
         np.testing.assert_allclose(result.values[known], truth()[known], rtol=1e-3)
-        # Even so it predicts what it was fitted to.
+        # It still predicts the fitted motion.
         predicted = MODEL.torque(result.values, *motion[1:])
         np.testing.assert_allclose(predicted, samples.torque, atol=1e-4)
 
-    def test_parameters_that_move_together_are_both_named(self) -> None:
+    def test_dependent_parameters_are_both_named(self) -> None:
         factor = Factor.of(MODEL, noisy(a_motion(), NOISE))
-        # Viscous friction made a multiple of Coulomb's, as if the joint had one speed only.
+        # Viscous friction proportional to Coulomb friction, as at one speed.
         i, j = (MODEL.parameter_names.index(name) for name in ("f0_1", "f1_1"))
         gram = factor.gram.copy()
         gram[:, j, :] = 2.0 * gram[:, i, :]
@@ -307,7 +307,7 @@ class TestEstimate:
     def trial(self, seed: int, noise: Array = NOISE) -> Factor:
         return Factor.of(MODEL, noisy(a_motion(), noise, seed))
 
-    def test_without_noise_the_truth_comes_back(self) -> None:
+    def test_without_noise_the_true_values_are_found(self) -> None:
         result = estimate(MODEL, self.trial(0, np.zeros(2)))
         np.testing.assert_allclose(result.values, truth(), rtol=1e-6, atol=1e-7)
         assert result.undetermined == ()
@@ -331,8 +331,8 @@ class TestEstimate:
             ordinary = fit_least_squares(MODEL, [samples], "ordinary")
             np.testing.assert_allclose(ordinary.values, expected, rtol=1e-8)
 
-    def test_parameters_take_degrees_of_freedom(self) -> None:
-        """So few rows that the parameters take half of them."""
+    def test_parameters_reduce_degrees_of_freedom(self) -> None:
+        """With half as many parameters as rows."""
         found, weights = [], np.ones(2)
         motion = a_motion(11, step=0.4)
         for seed in range(300):

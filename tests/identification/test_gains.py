@@ -1,4 +1,4 @@
-"""Torque constants from a known payload, and from the masses of the description."""
+"""Torque constants from a known payload, and from the nominal masses."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PLANTED = np.array([12.0, 5.0])  # N m / A
 NOISE = np.array([0.3, 0.1])  # A
 SEEDS = 100
 
-# Lifts along gravity, then turns about it: an axis on which no payload weighs.
+# Lifts along gravity, then turns about it: no payload loads the second axis.
 LIFT_AND_TURN = """<robot name="lift"><link name="base"/>
 <joint name="lift" type="prismatic"><parent link="base"/><child link="column"/>
 <axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="500" velocity="3"/></joint>
@@ -69,7 +69,7 @@ def factor_of(
     motion: Motion | None = None,
     transmission: Array | None = None,
 ) -> PhaseFactor:
-    """A recording without payload and one with it; currents are what carries the noise."""
+    """Reduce a recording without payload and one with it; noise is on the currents."""
     motion = lively(model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
     rng = np.random.default_rng(seed)
@@ -91,7 +91,7 @@ def gains_of(factor: PhaseFactor, model: RobotModel = MODEL) -> Gains:
 
 
 def lifted(payload: Payload) -> Gains:
-    """Gains of an arm that lifts along gravity and turns about it."""
+    """Return gains of an arm that lifts along gravity and turns about it."""
     model = RobotModel.from_urdf(LIFT_AND_TURN, friction=FrictionLaw(third=None))
     standard = model.nominal.copy()
     standard[[10, 21]] = 2.0, 0.05
@@ -108,7 +108,7 @@ NS16_LOAD = Payload(16.0, (0.10, 0.05, 0.25), (0.1, 0.0, 0.0, 0.1, 0.0, 0.05))
 
 
 def ns16(motion: Motion | None = None) -> Gains:
-    """Gains of the coupled NS 16."""
+    """Return gains of the coupled NS 16."""
     model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None))
     planted, named = load_truth(), standard_parameters()
     # The named figures are of the DH frames; the URDF holds the same bodies.
@@ -131,7 +131,7 @@ GAINS = np.array([12.0, 3.0])  # N·m/A
 
 
 def scale(signs: tuple[float, float]) -> CurrentScale:
-    """Gains from currents of the nominal arm with rotors and friction, times signs."""
+    """Return gains from currents of the nominal arm with rotors and friction, times signs."""
     motion = a_motion()
     values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
     noise = 0.1 * coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
@@ -145,25 +145,25 @@ def many() -> list[Gains]:
 
 
 class TestGains:
-    def test_without_noise_the_planted_gains_come_back(self) -> None:
+    def test_without_noise_the_true_gains_are_found(self) -> None:
         assert gains_of(factor_of(np.zeros(2))).values == pytest.approx(PLANTED, rel=1e-6)
 
-    def test_95_percent_intervals_hold_the_truth(self, many: list[Gains]) -> None:
+    def test_95_percent_intervals_cover(self, many: list[Gains]) -> None:
         inside = [np.abs(one.values - PLANTED) <= one.interval_factor * one.std for one in many]
-        # Of 100 draws with 95 %, fewer than 89 come once in two hundred times.
+        # Fewer than 89 of 100 have a probability of 0.5 %.
         assert np.all(np.sum(inside, axis=0) >= 89)
         scatter = np.std([one.values for one in many], axis=0, ddof=1)
         claimed = np.sqrt(np.mean([one.std**2 for one in many], axis=0))
-        # A standard deviation from 100 draws is itself known to 7 %.
+        # The standard deviation of 100 samples has an error of 7 %.
         assert np.all(np.abs(np.log(claimed / scatter)) < 3 * 0.07)
 
-    def test_noise_of_the_currents_does_not_shrink_gains(self, many: list[Gains]) -> None:
-        """As least squares of the equation that is linear in gains and parameters does."""
+    def test_current_noise_does_not_bias_gains(self, many: list[Gains]) -> None:
+        """Unlike least squares of the equation linear in gains and parameters."""
         values = np.array([one.values for one in many])
         error = values.std(axis=0, ddof=1) / np.sqrt(SEEDS)
         assert np.all(np.abs(values.mean(axis=0) - PLANTED) < 3.0 * error)
 
-    def test_an_axis_that_the_payload_does_not_load_is_named(self) -> None:
+    def test_an_unloaded_axis_is_undetermined(self) -> None:
         gains = lifted(Payload(4.0, (0.0, 0.0, 0.1)))
         assert gains.values[0] == pytest.approx(PLANTED[0], abs=4.0 * gains.std[0])
         assert gains.determined.tolist() == [True, False]
@@ -172,7 +172,7 @@ class TestGains:
         reason = "the payload does not load it"
         assert gains.reasons == (None, reason)
 
-    def test_a_payload_beside_that_axis_determines_it(self) -> None:
+    def test_an_eccentric_payload_determines_it(self) -> None:
         gains = lifted(Payload(4.0, (0.2, 0.0, 0.1)))
         assert np.all(np.abs(gains.values - PLANTED) < 4.0 * gains.std)
 
@@ -194,14 +194,14 @@ class TestGains:
         assert there.values == pytest.approx(back.values, rel=1e-9)
         assert np.all(there.std < gains_of(one).std)
 
-    def test_without_a_known_payload_it_refuses(self) -> None:
+    def test_missing_payload_raises(self) -> None:
         with pytest.raises(IdentificationError, match="no recording has a known payload"):
             gains_of(factor_of(load=None))
 
 
 class TestCurrentScale:
     @pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
-    def test_a_current_of_the_wrong_sign_is_named(self, signs: tuple[float, float]) -> None:
+    def test_a_current_of_the_wrong_sign_is_reported(self, signs: tuple[float, float]) -> None:
         found, names = scale(signs), MODEL.joint_names
         np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
         np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
@@ -210,6 +210,6 @@ class TestCurrentScale:
         for name, turned in zip(names, found.turned, strict=True):
             assert any(name in text for text in negative) == turned
 
-    def test_a_gain_that_is_not_known_is_not_turned(self) -> None:
+    def test_an_undetermined_gain_has_no_wrong_sign(self) -> None:
         std, inertial = np.array([np.inf, 0.1]), np.zeros(2, dtype=np.bool_)
         assert not CurrentScale(np.array([-1.0, 2.0]), std, inertial).turned.any()

@@ -1,4 +1,4 @@
-"""Settings are chosen by predicting parts of what is fitted from the rest of it."""
+"""Settings are chosen by predicting parts of the fitted data from the rest."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CUT = 1400  # of 2000 rows: what is fitted
 
 
 def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> Recording:
-    """A motion of the planted arm with noise on torque and position."""
+    """Simulate a motion of the arm with noise on torque and position."""
     motion = a_motion()
     direction = model.friction.direction(*motion[:3])
     rng = np.random.default_rng(5)
@@ -49,7 +49,7 @@ def chosen(
     ripple: Sequence[TorqueRipple] = (),
     low_passes: Sequence[Preprocessing] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
-    """Settings chosen on the rows before CUT; on all of them where those behind it leak."""
+    """Choose settings on the rows before CUT, or on all of them with a leak."""
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         samples = prepare(recording, model, options=how)
@@ -61,21 +61,21 @@ def chosen(
 
 class TestChosenSettings:
     @pytest.mark.parametrize("distance", [1e-4, 1e-3])
-    def test_the_planted_presliding_is_found(self, distance: float) -> None:
+    def test_the_true_presliding_is_found(self, distance: float) -> None:
         recording = a_recording(MODEL.with_friction(presliding=distance))
         settings, _ = chosen(recording, {"presliding", "bandwidth"})
         assert settings.model.friction.laws[0].presliding == distance
 
-    def test_the_planted_friction_term_is_found(self) -> None:
+    def test_the_true_friction_term_is_found(self) -> None:
         cubic = MODEL.with_friction(third="cubic")
         settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
         assert settings.model.friction.laws[0].third == "cubic"
 
-    def test_a_term_that_is_not_there_is_not_claimed(self) -> None:
+    def test_no_friction_term_is_added_without_cause(self) -> None:
         settings, _ = chosen(a_recording(), {"friction"})
         assert settings.model.friction.laws[0].third is None
 
-    def test_torque_ripple_is_estimated_only_where_it_is(self) -> None:
+    def test_torque_ripple_is_estimated_only_if_present(self) -> None:
         ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
         rippled = MODEL.with_elements(ripple)
         strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
@@ -85,10 +85,8 @@ class TestChosenSettings:
         assert settings.model.parameter_names == MODEL.parameter_names
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
-    def test_a_late_torque_is_not_called_a_low_pass(
-        self, shape: LowPassShape | None, name: str
-    ) -> None:
-        """A delay and a low-pass of that lag each predict best where they are the cause."""
+    def test_a_delay_is_not_called_a_low_pass(self, shape: LowPassShape | None, name: str) -> None:
+        """Delay and low-pass of equal lag each predict best where they are the cause."""
         recording = a_recording()
         time, torque = recording.time, recording.torque
         assert torque is not None
@@ -102,13 +100,13 @@ class TestChosenSettings:
         assert name in [one.name for one in choices if one.chosen]
         assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
 
-    def test_least_squares_stays_where_it_predicts_as_well(self) -> None:
+    def test_least_squares_stays_if_it_predicts_equally(self) -> None:
         settings, choices = chosen(a_recording(), {"estimator"})
         assert settings.shrinkage.strength == 0.0
         assert choices[-1].candidates[choices[-1].chosen] == "least squares"
 
-    def test_a_joint_that_rests_for_a_stretch_is_no_reason_not_to_choose(self) -> None:
-        """Joints that move one after the other have stretches without a row of their own."""
+    def test_a_joint_may_rest_in_some_segments(self) -> None:
+        """Joints that move one after the other have segments without rows."""
         recording = a_recording()
         position = recording.position.copy()
         position[: CUT // 4, 0] = position[CUT // 4, 0]
@@ -117,7 +115,7 @@ class TestChosenSettings:
         assert [one.name for one in choices][-1] == "estimator"
         assert all(np.isfinite(one.errors).all() for one in choices)
 
-    def test_what_is_not_asked_stays(self) -> None:
+    def test_other_settings_stay(self) -> None:
         start = Settings(MODEL, Preprocessing(rigid_bandwidth=33.0))
         settings, choices = choose_settings(lambda *_: [], start, set(), lambda *_: 1.0)
         assert settings == start
@@ -125,12 +123,12 @@ class TestChosenSettings:
 
 
 class TestHeldOutRows:
-    """The torque of rows that are held out has no part in any choice."""
+    """The torque of held-out rows has no effect on any choice."""
 
     QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "friction", "estimator"})
 
     @staticmethod
-    def spoiled(recording: Recording) -> Recording:
+    def corrupted(recording: Recording) -> Recording:
         assert recording.torque is not None
         torque = recording.torque.copy()
         torque[CUT:] += 40.0 * np.sign(np.sin(7.0 * recording.time[CUT:, None]))
@@ -139,12 +137,12 @@ class TestHeldOutRows:
     def errors(self, recording: Recording, *, leaks: bool) -> list[tuple[float, ...]]:
         return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
 
-    def test_spoiling_them_changes_nothing(self) -> None:
+    def test_changing_them_has_no_effect(self) -> None:
         recording = a_recording()
         sound = self.errors(recording, leaks=False)
-        assert sound == self.errors(self.spoiled(recording), leaks=False)
+        assert sound == self.errors(self.corrupted(recording), leaks=False)
 
-    def test_a_leak_would_be_noticed(self) -> None:
+    def test_a_leak_would_be_detected(self) -> None:
         recording = a_recording()
         sound = self.errors(recording, leaks=True)
-        assert sound != self.errors(self.spoiled(recording), leaks=True)
+        assert sound != self.errors(self.corrupted(recording), leaks=True)

@@ -55,7 +55,7 @@ def executed(
     correlation: float = 0.02,
     noise: float = 1.0,
 ) -> Samples:
-    """The plan, followed within 2 %, seen through noisy encoders and a 40 Hz smoother."""
+    """Return the plan followed within 2 %, with noisy encoders and a 40 Hz smoother."""
     rng = np.random.default_rng(seed)
     true = Motion(
         TIME, *(a + b for a, b in zip(PLAN[1:4], sines(13 + seed, 0.02)[1:4], strict=True))
@@ -70,7 +70,7 @@ def executed(
 
 
 def smoothed(position: Array) -> Motion:
-    """Positions (m, n) through a spline of 40 Hz, however noisy they are."""
+    """Smooth positions (m, n) by a spline of 40 Hz."""
     tolerance = np.full(position.shape[1], 1e-14)
     spline = fit_smoothing_spline(TIME, position, tolerance, widest=40.0)
     return Motion(TIME, *(spline(TIME, order) for order in range(3)))
@@ -93,7 +93,7 @@ def examine(samples: Samples) -> EndogeneityTest:
 
 
 def dense(samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
-    """Z and W (m, n, p) and y (m, n) of the rows that count, zero elsewhere."""
+    """Return Z and W (m, n, p) and y (m, n), zero in unusable rows."""
     rows = samples.usable & MODEL.moving(plan.velocity)
     p = MODEL.n_parameters
     z, w = (MODEL.regressor(*one[1:]).dense(p) for one in (plan, samples.motion))
@@ -104,17 +104,14 @@ def dense(samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
     )
 
 
-# The estimate
-
-
-def test_without_noise_the_truth_comes_back() -> None:
+def test_without_noise_the_true_values_are_found() -> None:
     _, result = fit(executed(0, noise=0.0))
     np.testing.assert_allclose(result.estimate.values, TRUTH, rtol=1e-6, atol=1e-7)
     assert result.estimate.undetermined == ()
     assert result.weak == ()
 
 
-def test_it_solves_the_stacked_weighted_instrumental_equations() -> None:
+def test_it_solves_the_weighted_instrumental_equations() -> None:
     samples = executed(1, position_noise=LARGE)
     z, w, y = dense(samples)
     weights = np.array([0.3, 20.0])
@@ -130,10 +127,10 @@ def test_where_position_noise_is_large_it_beats_least_squares() -> None:
     instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
     least = np.array([run.least_squares.values for run in runs]) - TRUTH
     inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
-    # Least squares shrinks what stands in front of the acceleration, instruments do not, ...
+    # Least squares shrinks the coefficients of the acceleration, instruments do not, and their
+    # total error is far smaller.
     assert np.all(np.abs(least.mean(axis=0))[inertias] > 0.2 * TRUTH[inertias])
     assert np.all(np.abs(instrumental.mean(axis=0))[inertias] < 0.02 * TRUTH[inertias])
-    # ... and the error as a whole is smaller by far.
     errors = [np.sqrt((e**2).mean(axis=0)) for e in (instrumental, least)]
     assert np.median(errors[0] / errors[1]) < 0.3
 
@@ -148,7 +145,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_the_part_without_instruments_is_what_least_squares_reads() -> None:
+def test_the_measured_part_is_the_least_squares_factor() -> None:
     samples = executed(1)
     factor = instrument_factor(MODEL, samples, PLAN)
     same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
@@ -157,9 +154,6 @@ def test_the_part_without_instruments_is_what_least_squares_reads() -> None:
         measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
     )
     np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
-
-
-# Strength of the instruments
 
 
 def test_strength_is_sheas_partial_r2() -> None:
@@ -179,14 +173,14 @@ def test_strength_is_sheas_partial_r2() -> None:
         assert strength[k] == pytest.approx((apart[1] @ apart[1]) / (apart[0] @ apart[0]), rel=1e-5)
 
 
-def test_instruments_that_have_nothing_to_do_with_the_motion_are_called_weak() -> None:
+def test_unrelated_instruments_are_weak() -> None:
     samples = executed(1)
     factor, result = fit(samples, sines(99))
     assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
     assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
 
-def test_a_joint_whose_instrument_stands_still_is_not_determined() -> None:
+def test_a_resting_instrument_determines_nothing() -> None:
     still = PLAN._replace(
         velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
     )
@@ -196,16 +190,13 @@ def test_a_joint_whose_instrument_stands_still_is_not_determined() -> None:
     assert {"f0_2", "f1_2"} <= set(result.weak)
 
 
-# Was least squares biased?
-
-
-def test_without_noise_in_the_regressor_a_5_percent_test_rejects_3_to_8_percent() -> None:
+def test_without_noise_a_5_percent_test_rejects_3_to_8() -> None:
     runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
     assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
     assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
 
 
-def test_with_much_noise_it_says_that_least_squares_was_biased_and_where() -> None:
+def test_large_noise_is_reported_as_bias() -> None:
     for seed in range(5):
         test = examine(executed(seed, position_noise=LARGE))
         assert test.biased
@@ -213,11 +204,11 @@ def test_with_much_noise_it_says_that_least_squares_was_biased_and_where() -> No
         assert "Least squares is biased by noise in the regressor" in test.words
         assert "I1yy" in test.words
         assert test.predicted.max() > 0.05
-        # Nearly all that the plan does not explain is noise of the encoders.
+        # Mostly encoder noise.
         np.testing.assert_allclose(test.coefficient, -1.0, atol=0.05)
 
 
-def test_a_disturbance_that_moves_the_arm_is_not_taken_for_noise() -> None:
+def test_a_disturbance_is_distinguished_from_noise() -> None:
     samples = executed(0)
     explained = MODEL.torque(TRUTH, *PLAN[1:])
     disturbed = samples.torque + 0.8 * (samples.torque - explained)
@@ -235,7 +226,7 @@ def test_a_disturbance_that_moves_the_arm_is_not_taken_for_noise() -> None:
         (LARGE, True, True, "Use the instrumental variables"),
     ],
 )
-def test_it_says_whether_there_is_a_bias_that_matters(
+def test_the_size_of_the_bias_is_reported(
     noise: float, biased: bool, matters: bool, words: str
 ) -> None:
     test = examine(executed(0, position_noise=noise))
@@ -244,7 +235,7 @@ def test_it_says_whether_there_is_a_bias_that_matters(
     assert words in test.words
 
 
-def test_instruments_that_are_the_measured_motion_leave_nothing_to_test() -> None:
+def test_instruments_equal_to_the_motion_are_untested() -> None:
     samples = executed(0, position_noise=SMALL)
     factor, result = fit(samples, samples.motion)
     test = endogeneity_test(MODEL, factor, result)
@@ -256,7 +247,7 @@ def test_instruments_that_are_the_measured_motion_leave_nothing_to_test() -> Non
     )
 
 
-def test_the_statistic_is_that_of_the_auxiliary_regression_refitted_without_each_block() -> None:
+def test_the_statistic_is_that_of_the_refitted_regression() -> None:
     samples = executed(3, position_noise=1e-4)
     factor, result = fit(samples)
     test = endogeneity_test(MODEL, factor, result)
@@ -288,14 +279,9 @@ def test_the_statistic_is_that_of_the_auxiliary_regression_refitted_without_each
     assert test.statistic == pytest.approx(expected, rel=1e-5)
 
 
-# Where instruments come from
-
-
 @settings(max_examples=10)
 @given(st.floats(0.002, 0.2), st.floats(0.002, 0.2))
-def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
-    shoulder: float, elbow: float
-) -> None:
+def test_the_plan_is_shifted_by_the_lag_of_each_axis(shoulder: float, elbow: float) -> None:
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
     late = [
         np.column_stack(
@@ -315,7 +301,7 @@ def test_the_lag_of_each_axis_is_found_and_the_plan_shifted_by_it(
     assert instruments.usable[inside].all()
 
 
-def test_a_lag_that_is_known_is_not_sought_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_lag_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = executed(0)
     found = planned_motion(samples, PLAN.position)
     monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
@@ -324,7 +310,7 @@ def test_a_lag_that_is_known_is_not_sought_again(monkeypatch: pytest.MonkeyPatch
     np.testing.assert_array_equal(again.usable, found.usable)
 
 
-def test_repetitions_share_a_plan_whatever_their_clocks_and_other_motions_do_not() -> None:
+def test_repetitions_share_a_plan_for_any_clock() -> None:
     plan = TIME, PLAN.position
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
     later = TIME[20:-20] + 0.3 * STEP
@@ -338,7 +324,7 @@ def test_repetitions_share_a_plan_whatever_their_clocks_and_other_motions_do_not
     assert not same_plan(plan, (TIME, np.full_like(PLAN.position, np.nan)))
 
 
-def test_rows_without_a_command_and_recordings_without_any() -> None:
+def test_missing_commands() -> None:
     samples = executed(0)
     command = PLAN.position.copy()
     command[300:340, 1] = np.nan

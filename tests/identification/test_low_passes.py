@@ -1,4 +1,4 @@
-"""A low-pass that a recorded torque has come through is found, whatever its shape."""
+"""A low-pass in the recorded torque is found for each shape."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
 
 
 def a_recording(shape: LowPassShape | None, *, seed: int = 0) -> Recording:
-    """A motion of the planted arm, its torque with noise through a Butterworth low-pass."""
+    """Simulate a motion with noisy torque through a Butterworth low-pass."""
     motion, rng = a_motion(4000 / RATE), np.random.default_rng(seed)
     torque = MODEL.torque(truth(), *motion[1:4])
     torque += 0.5 * NOISE * rng.standard_normal(torque.shape)
@@ -37,7 +37,7 @@ def a_recording(shape: LowPassShape | None, *, seed: int = 0) -> Recording:
 
 
 def chosen(recording: Recording) -> Settings:
-    """Settings chosen on the rows before CUT."""
+    """Choose settings on the rows before CUT."""
     fitted = recording.between(0, CUT)
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
@@ -50,7 +50,7 @@ def chosen(recording: Recording) -> Settings:
 
 
 def held_out_error(recording: Recording, settings: Settings) -> float:
-    """||tau - tau_hat|| / ||tau|| behind CUT."""
+    """Return ||tau - tau_hat|| / ||tau|| after CUT."""
     model = settings.model
     fitted, rest = (
         prepare(recording.between(*part), model, options=settings.preprocessing)
@@ -68,7 +68,7 @@ def unfiltered_error() -> float:
 
 
 class TestPlantedLowPass:
-    """Its bandwidth is found within 20 %, and it costs no more than 30 % of the accuracy."""
+    """The bandwidth is found within 20 %; the error rises by at most 30 %."""
 
     @pytest.mark.parametrize("causal", [False, True])
     @pytest.mark.parametrize("order", [1, 2, 4])
@@ -81,15 +81,15 @@ class TestPlantedLowPass:
 
 
 class TestNoLowPass:
-    """Torque that has come through none is read as it is."""
+    """Unfiltered torque is used as it is."""
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_none_is_claimed(self, seed: int) -> None:
+    def test_none_is_found(self, seed: int) -> None:
         assert chosen(a_recording(None, seed=seed)).preprocessing.torque_bandwidth is None
 
 
 class TestLowPassShape:
-    """At its bandwidth a sine keeps one half without phase, and 1/sqrt(2) if it runs forwards."""
+    """Gain at the bandwidth: 1/2 without phase, 1/sqrt(2) if causal."""
 
     @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
     def test_gain_at_the_bandwidth(self, shape: LowPassShape) -> None:
@@ -99,7 +99,7 @@ class TestLowPassShape:
         gain = inner.std() / sine[1000:3000].std()
         assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
 
-    def test_uneven_times_are_read_at_their_own(self) -> None:
+    def test_uneven_times_are_interpolated(self) -> None:
         time = np.arange(4000) / RATE
         uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
         shape = LowPassShape(order=2, causal=True)

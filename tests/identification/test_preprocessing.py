@@ -56,7 +56,7 @@ def a_recording(
 QUANTISATION = np.full(2, RESOLUTION**2 / 12.0)
 
 
-def test_smoothed_motion_is_the_true_motion_where_rows_count() -> None:
+def test_smoothed_motion_is_accurate_in_usable_rows() -> None:
     recording = a_recording(MODEL, TRUTH)
     samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
     for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
@@ -75,25 +75,25 @@ def test_no_derivative_is_taken_across_a_gap() -> None:
     assert whole.torque is not None
     gap = np.zeros(len(keep), dtype=bool)
     gap[2000] = True
-    # Time that counts on through a gap, as a PC's clock would: only the flag tells.
-    torn = Recording(
+    # Time that continues through a gap: only the flag reports it.
+    gapped = Recording(
         time=whole.time[: len(keep)],
         position=whole.position[keep],
         joint_names=whole.joint_names,
         torque=whole.torque[keep],
         gap_before=gap,
     )
-    samples = prepare(torn, MODEL, noise_variance=QUANTISATION)
+    samples = prepare(gapped, MODEL, noise_variance=QUANTISATION)
     exact = [part[keep] for part in motion(whole.time)]
     rows = samples.usable.all(axis=1)
     assert not samples.usable[1995:2005].any()
     assert np.abs(samples.motion.velocity - exact[1])[rows].max() < 0.02
-    unflagged = prepare(replace(torn, gap_before=None), MODEL, noise_variance=QUANTISATION)
+    unflagged = prepare(replace(gapped, gap_before=None), MODEL, noise_variance=QUANTISATION)
     assert np.abs(unflagged.motion.velocity - exact[1])[1995:2005].max() > 1.0
 
 
 @pytest.mark.parametrize("delay", [0.004, -0.0025])
-def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
+def test_a_known_torque_delay_is_compensated(delay: float) -> None:
     recording = a_recording(MODEL, TRUTH, delay=delay)
 
     def worst(assumed: float) -> float:
@@ -104,7 +104,7 @@ def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
             options=Preprocessing(torque_delay=assumed),
         )
         error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
-        moving = np.abs(samples.motion.velocity) > 0.1  # clear of the step at a reversal
+        moving = np.abs(samples.motion.velocity) > 0.1  # away from reversals
         return float(np.abs(error[samples.usable & moving]).max())
 
     assert worst(delay) < 0.1
@@ -113,16 +113,14 @@ def test_a_known_delay_of_the_torque_is_taken_out(delay: float) -> None:
 
 @settings(max_examples=30)
 @given(sigma=st.floats(1e-6, 1e-2), seed=st.integers(0, 2**16))
-def test_the_noise_of_a_smooth_signal_is_found_from_its_differences(
-    sigma: float, seed: int
-) -> None:
+def test_differences_measure_noise(sigma: float, seed: int) -> None:
     time = np.arange(3000) * 1e-3
     noise = sigma * np.random.default_rng(seed).standard_normal((3000, 2))
     found = difference_variance(time, motion(time)[0] + noise)
     np.testing.assert_allclose(np.sqrt(found), sigma, rtol=0.1)
 
 
-def test_differences_do_not_take_jitter_of_the_clock_for_noise() -> None:
+def test_clock_jitter_is_not_noise() -> None:
     rng = np.random.default_rng(4)
     time = np.arange(5000) * 1e-3 + rng.uniform(-3e-4, 3e-4, 5000)
     found = difference_variance(time, motion(time)[0] + 1e-5 * rng.standard_normal((5000, 2)))
@@ -137,7 +135,7 @@ def test_variance_at_standstill_is_that_of_the_noise() -> None:
     np.testing.assert_allclose(np.sqrt(found), [1e-5, 1e-3], rtol=0.05)
 
 
-def test_an_arm_that_creeps_and_slips_at_rest_is_not_noisy() -> None:
+def test_creep_at_rest_is_not_noise() -> None:
     rng = np.random.default_rng(6)
     time = np.arange(5000) * 1e-3
     slip = 3e-4 * (time > 3.0) * (1.0 - np.exp(-(time - 3.0) / 0.2))
@@ -145,16 +143,16 @@ def test_an_arm_that_creeps_and_slips_at_rest_is_not_noisy() -> None:
     np.testing.assert_allclose(np.sqrt(standstill_variance(time, values)), 1e-6, rtol=0.1)
 
 
-def test_a_reading_that_never_changes_has_no_variance_of_its_own() -> None:
+def test_a_constant_reading_has_no_variance() -> None:
     assert standstill_variance(np.arange(500) * 1e-3, np.full((500, 1), 0.4))[0] < 1e-40
     with pytest.raises(RecordingError, match="20 samples"):
         standstill_variance(np.arange(19) * 1e-3, np.zeros((19, 2)))
 
 
-def test_a_low_pass_in_the_torque_channel_cancels_when_the_regressor_goes_through_it_too() -> None:
+def test_a_torque_low_pass_cancels_with_the_regressor() -> None:
     recording = a_recording(MODEL, TRUTH)
     assert recording.torque is not None
-    # Recorded through a low-pass that is not the smoother itself: Butterworth, both ways.
+    # Filtered by a Butterworth filter both ways, not by the smoother.
     logged = sosfiltfilt(butter(3, 4.0, fs=1000.0, output="sos"), recording.torque, axis=0)
 
     def misfit(options: Preprocessing) -> float:
@@ -167,7 +165,7 @@ def test_a_low_pass_in_the_torque_channel_cancels_when_the_regressor_goes_throug
     assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
 
 
-def test_the_papers_way_smooths_torque_and_regressor_alike() -> None:
+def test_smooth_torque_filters_the_regressor_equally() -> None:
     recording = a_recording(MODEL, TRUTH, noise=0.5)
     options = Preprocessing(smooth_torque=True)
     samples = prepare(
@@ -180,24 +178,23 @@ def test_the_papers_way_smooths_torque_and_regressor_alike() -> None:
     assert recording.torque is not None
     removed = recording.torque - samples.torque
     np.testing.assert_allclose(np.mean(removed**2, axis=0), 0.25, rtol=0.1)
-    # What is left of the noise in the fit's residual is what the smoother lets through; the
-    # linear relation itself has not suffered.
+    # The residual contains the noise that the smoother passes.
     error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
     assert np.sqrt(np.mean(error**2)) < 0.2
 
 
-def test_a_recording_without_torque_is_refused() -> None:
+def test_a_recording_without_torque_raises() -> None:
     with pytest.raises(RecordingError, match="no joint torque"):
         prepare(replace(a_recording(MODEL, TRUTH), torque=None), MODEL)
 
 
-def test_a_recording_that_fails_its_checks_is_refused() -> None:
+def test_an_invalid_recording_raises() -> None:
     wrong = replace(a_recording(MODEL, TRUTH), joint_names=("elbow", "shoulder"))
     with pytest.raises(RecordingError, match="order"):
         prepare(wrong, MODEL)
 
 
-def test_a_bandwidth_that_is_none_is_refused() -> None:
+def test_an_invalid_bandwidth_raises() -> None:
     with pytest.raises(ValueError, match="positive"):
         Preprocessing(torque_bandwidth=0.0)
 
@@ -223,7 +220,7 @@ def motion_and_recording(model: RobotModel, clip: float = np.inf) -> tuple[Motio
     )
 
 
-def test_a_clipped_torque_is_found_where_it_was_clipped(model: RobotModel) -> None:
+def test_clipped_torque_is_found(model: RobotModel) -> None:
     _, whole = motion_and_recording(model)
     _, clipped = motion_and_recording(model, clip=15.0)
     assert whole.torque is not None
@@ -231,7 +228,7 @@ def test_a_clipped_torque_is_found_where_it_was_clipped(model: RobotModel) -> No
     true = np.abs(whole.torque) > 15.0
     found = flat_topped(clipped.torque, EVERYWHERE)
     assert not np.any(found & ~true)
-    # Noise lets the torque out of the limit for a sample now and then; short runs are let pass.
+    # Noise interrupts the limit; short runs are not detected.
     assert np.count_nonzero(found) > 0.9 * np.count_nonzero(true)
     assert not flat_topped(whole.torque, EVERYWHERE).any()
 
@@ -241,21 +238,19 @@ def test_a_clipped_torque_is_found_where_it_was_clipped(model: RobotModel) -> No
     rate=st.floats(0.5, 20.0),
     phase=st.floats(0.0, 6.0),
 )
-def test_a_smooth_peak_read_with_a_coarse_resolution_is_not_clipped(
-    resolution: float, rate: float, phase: float
-) -> None:
+def test_a_coarse_smooth_peak_is_not_clipped(resolution: float, rate: float, phase: float) -> None:
     smooth = np.round(20.0 * np.sin(rate * TIME + phase) / resolution) * resolution
     assert not flat_topped(smooth[:, None], EVERYWHERE).any()
 
 
-def test_a_channel_that_stays_the_same_at_rest_is_not_clipped() -> None:
+def test_a_constant_channel_at_rest_is_not_clipped() -> None:
     channel = np.concatenate([np.full(500, 12.0), 12.0 * np.cos(TIME[:2000] * 4.0)])[:, None]
     moving = np.arange(len(channel))[:, None] > 500
     assert not flat_topped(channel, moving).any()
     assert not flat_topped(np.full((100, 1), 3.0), EVERYWHERE).any()
 
 
-def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) -> None:
+def test_every_excluded_row_has_a_reason(model: RobotModel) -> None:
     motion, recording = motion_and_recording(model, clip=15.0)
     mask = mask_rows(recording, model, motion, np.full(2, 40.0))
     reasons = np.any(list(mask.reasons.values()), axis=0)
@@ -266,7 +261,7 @@ def test_every_row_left_out_has_a_reason_and_counts_add_up(model: RobotModel) ->
         assert np.all(mask.counts[reason] > 0)
 
 
-def test_where_only_rests_are_left_out_so_are_the_two_rows_of_a_reversal(
+def test_rests_exclude_two_rows_at_a_reversal(
     model: RobotModel,
 ) -> None:
     motion, recording = motion_and_recording(model)
@@ -280,7 +275,7 @@ def test_where_only_rests_are_left_out_so_are_the_two_rows_of_a_reversal(
 
 
 @pytest.mark.parametrize("friction", [True, False])
-def test_rows_beside_a_reversal_of_a_coupled_motor_are_left_out(friction: bool) -> None:
+def test_reversals_of_coupled_motors_are_excluded(friction: bool) -> None:
     turns = np.array([[1.0, 0.0], [-0.8, 1.0]])
     model = RobotModel.from_urdf(
         URDF,
@@ -297,20 +292,20 @@ def test_rows_beside_a_reversal_of_a_coupled_motor_are_left_out(friction: bool) 
         assert len(at)
         return np.asarray(np.abs(TIME[:, None] - at).min(axis=1) <= reach)
 
-    # As far as the slower of its joints is smoothed; the joints' own reversals as ever.
+    # By the bandwidth of the slower joint; the joints' own reversals as usual.
     for joint, reach in enumerate((1.0 / 40.0, 1.0 / 20.0)):
         own = beside(motion.velocity[:, joint], reach)
         expected = own | beside(motor, 1.0 / 20.0) if friction else own
         apart = np.flatnonzero(expected != reversals[:, joint])
-        # But for the sample at the edge.
+        # Except the sample at the edge.
         assert len(apart) <= 2 * np.count_nonzero(np.diff(expected))
         assert np.count_nonzero(expected) > 10 * len(apart)
         assert (np.count_nonzero(expected & ~own) > 50) == friction
 
 
 @pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
-def test_a_row_read_earlier_is_torn_where_it_is_read(model: RobotModel, delay: float) -> None:
-    """Its motion comes from `delay` before; there has to be some, and not at an end."""
+def test_delayed_rows_near_an_edge_are_excluded(model: RobotModel, delay: float) -> None:
+    """The motion `delay` earlier must be known and away from an end."""
     _, recording = motion_and_recording(model)
     samples = prepare(recording, model, options=Preprocessing(torque_delay=delay))
     assert samples.mask is not None
@@ -321,7 +316,7 @@ def test_a_row_read_earlier_is_torn_where_it_is_read(model: RobotModel, delay: f
     assert not samples.usable[~inside].any()
 
 
-def test_ends_of_a_low_passed_torque_are_torn_as_far_as_the_low_pass_reaches(
+def test_edges_of_a_low_passed_torque_are_excluded(
     model: RobotModel,
 ) -> None:
     _, recording = motion_and_recording(model)
@@ -331,20 +326,20 @@ def test_ends_of_a_low_passed_torque_are_torn_as_far_as_the_low_pass_reaches(
     assert samples.usable[recording.time > recording.time[0] + LONGEST_END][:100].any()
 
 
-def test_rows_beside_a_gap_and_short_stretches_are_torn(model: RobotModel) -> None:
+def test_edges_of_gaps_and_short_segments_are_excluded(model: RobotModel) -> None:
     motion, recording = motion_and_recording(model)
     gap = np.zeros(len(TIME), dtype=np.bool_)
     gap[[2000, 2040]] = True
-    torn = Recording(
+    gapped = Recording(
         time=TIME, position=recording.position, joint_names=model.joint_names, gap_before=gap
     )
-    rows = mask_rows(torn, model, motion, np.full(2, 40.0)).reasons[EDGE][:, 0]
+    rows = mask_rows(gapped, model, motion, np.full(2, 40.0)).reasons[EDGE][:, 0]
     assert rows[1950:2090].all()
     assert not rows[100:1940].any()
     assert not rows[2100:3900].any()
 
 
-def test_the_limit_of_the_current_counts(model: RobotModel) -> None:
+def test_rows_at_the_current_limit_are_excluded(model: RobotModel) -> None:
     motion, recording = motion_and_recording(model)
     driven = replace(recording, motor_current=recording.torque, torque=None)
     limit = np.array([18.0, 100.0])

@@ -65,7 +65,7 @@ def independent(mean: Array, std: Array) -> GaussianPrior:
 
 
 @given(seed=st.integers(0, 999), size=st.floats(1e-6, 1e6))
-def test_a_covariance_is_what_its_root_undoes(seed: int, size: float) -> None:
+def test_the_root_inverts_the_covariance(seed: int, size: float) -> None:
     covariance = some_covariance(seed, size)
     prior = prior_of(np.zeros(P), covariance)
     np.testing.assert_allclose(prior.root @ covariance @ prior.root.T, np.eye(P), atol=1e-8)
@@ -73,7 +73,7 @@ def test_a_covariance_is_what_its_root_undoes(seed: int, size: float) -> None:
 
 
 @given(seed=st.integers(0, 999), flat=st.integers(0, 3))
-def test_an_infinite_deviation_is_the_limit_of_a_large_one(seed: int, flat: int) -> None:
+def test_infinite_is_the_limit_of_large_deviations(seed: int, flat: int) -> None:
     random = np.random.default_rng(seed)
     combinations = np.hstack([np.eye(4), random.standard_normal((4, 3))])
     std = random.uniform(0.5, 2.0, 7)
@@ -90,7 +90,7 @@ def test_an_infinite_deviation_is_the_limit_of_a_large_one(seed: int, flat: int)
 
 
 @pytest.mark.parametrize("std", [[1.0, 0.0], [1.0, -1.0], [1.0, np.nan]])
-def test_a_deviation_that_is_none_is_refused(std: list[float]) -> None:
+def test_an_invalid_deviation_raises(std: list[float]) -> None:
     with pytest.raises(IdentificationError, match="must be positive"):
         independent(np.zeros(2), np.array(std))
 
@@ -140,7 +140,7 @@ def test_without_data_it_is_the_prior(kind: type[Factor]) -> None:
     assert found.estimate.undetermined == ()
 
 
-def test_what_the_data_do_not_determine_keeps_the_prior_and_what_they_do_does_not() -> None:
+def test_undetermined_parameters_keep_the_prior() -> None:
     prior = nominal_prior(MODEL, known=KNOWN)
     found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     at = {name: index for index, name in enumerate(found.estimate.names)}
@@ -152,11 +152,11 @@ def test_what_the_data_do_not_determine_keeps_the_prior_and_what_they_do_does_no
     assert found.learned[at["f0_1"]]
     assert found.estimate.undetermined == ()
     assert np.isfinite(found.estimate.std).all()
-    # No parameter is known worse than before.
+    # No parameter is less certain than before.
     assert (found.ratio <= 1.0 + 1e-9).all()
 
 
-def test_what_neither_says_stays_at_the_prior_mean_and_is_named() -> None:
+def test_unknown_parameters_stay_at_the_prior_mean() -> None:
     prior = nominal_prior(MODEL, known=ROTORS)
     found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
@@ -168,8 +168,8 @@ def test_what_neither_says_stays_at_the_prior_mean_and_is_named() -> None:
 
 @given(seed=st.integers(0, 999))
 @settings(max_examples=20)
-def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
-    # Yesterday's posterior is today's prior: the law that makes it one.
+def test_two_updates_equal_one(seed: int) -> None:
+    # The posterior is the prior of the next update.
     samples, weights = noisy(), 1.0 / NOISE**2
     half = len(samples.torque) // 2
     ends = ((0, half), (half, len(samples.torque)))
@@ -183,7 +183,7 @@ def test_data_in_two_steps_are_data_at_once(seed: int) -> None:
     np.testing.assert_allclose(second.std, once.std, rtol=1e-5)
 
 
-def test_too_few_rows_to_know_the_noise_need_weights() -> None:
+def test_few_rows_require_weights() -> None:
     samples = noisy()
     few = replace(
         samples, usable=samples.usable & (np.arange(len(samples.torque)) % 200 == 7)[:, None]
@@ -196,11 +196,11 @@ def test_too_few_rows_to_know_the_noise_need_weights() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_percent(
+def test_95_percent_intervals_cover_90_to_99_percent(
     correlation: float,
 ) -> None:
     prior = nominal_prior(MODEL, known=KNOWN)
-    spread = np.linalg.inv(prior.root)  # as many directions as parameters: nothing is flat
+    spread = np.linalg.inv(prior.root)  # no flat direction
     motion = a_motion()
     inside, surprise, naive = [], [], []
     for seed in range(80):
@@ -215,7 +215,7 @@ def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_per
         naive.append(np.abs(white.values - values) < 1.96 * white.std)
         surprise.append(result.normalized_change[np.isfinite(result.normalized_change)])
     assert 0.90 <= np.mean(inside) <= 0.99
-    # What the data changed is as much as the prior allowed.
+    # The change by the data is what the prior allows.
     assert 0.85 < np.std(np.concatenate(surprise)) < 1.15
     if correlation:
         assert np.mean(naive) < 0.85
@@ -224,7 +224,7 @@ def test_if_prior_and_noise_are_as_stated_95_percent_intervals_hold_90_to_99_per
         assert result.design_effect < 2.0
 
 
-def test_a_prior_that_is_wrong_is_seen_to_be() -> None:
+def test_a_wrong_prior_is_detected() -> None:
     wrong = KNOWN | {"f0_1": (20.0, 1.0)}
     result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=wrong))
     at = result.estimate.names.index("f0_1")
@@ -234,7 +234,7 @@ def test_a_prior_that_is_wrong_is_seen_to_be() -> None:
     assert np.nanmax(np.abs(others)) < 4.0
 
 
-def test_the_method_says_where_the_prior_comes_from() -> None:
+def test_the_method_names_the_prior() -> None:
     result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=ROTORS))
     assert "Gaussian prior (nominal parameters to 10 %, 2 given)" in result.estimate.method
     empty = replace(noisy(), usable=np.zeros_like(noisy().usable))
@@ -245,7 +245,7 @@ def test_the_method_says_where_the_prior_comes_from() -> None:
 # The prior from a URDF ----------------------------------------------------------------------
 
 
-def test_the_nominal_prior_is_that_of_many_arms_built_with_its_spread() -> None:
+def test_the_nominal_prior_is_that_of_sampled_arms() -> None:
     prior = nominal_prior(MODEL, 0.1, known=KNOWN)
     nominal = MODEL.nominal.reshape(2, 11)
     rng = np.random.default_rng(3)
@@ -269,11 +269,11 @@ def test_the_nominal_prior_is_that_of_many_arms_built_with_its_spread() -> None:
     np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
 
 
-def test_of_rotors_and_friction_a_urdf_says_nothing() -> None:
+def test_rotors_and_friction_have_no_nominal_prior() -> None:
     model = RobotModel.from_urdf(urdf_text())
     std = dict(zip(model.parameter_names, nominal_prior(model).std, strict=True))
     flat = {name for name, value in std.items() if np.isinf(value)}
-    # A flat rotor makes flat the group it is part of, and no other.
+    # A flat rotor makes only its own group flat.
     groups = {
         name
         for name, row in zip(model.base.names, model.base.grouping, strict=True)
@@ -284,7 +284,7 @@ def test_of_rotors_and_friction_a_urdf_says_nothing() -> None:
     assert all(value > 0.0 for value in std.values())
 
 
-def test_a_urdf_without_inertia_a_name_unknown_or_no_share_are_errors() -> None:
+def test_invalid_nominal_priors_raise() -> None:
     bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
     with pytest.raises(IdentificationError, match="no inertia"):
         nominal_prior(bare)
@@ -294,7 +294,7 @@ def test_a_urdf_without_inertia_a_name_unknown_or_no_share_are_errors() -> None:
         nominal_prior(MODEL, 0.0)
 
 
-def test_links_without_moments_or_mass_borrow_a_scale() -> None:
+def test_missing_moments_or_mass_are_scaled() -> None:
     inertial = MODEL.chain.inertial.copy()
     inertial[0, 6:9], inertial[1] = 0.0, 0.0
     model = replace(MODEL, chain=replace(MODEL.chain, inertial=inertial))

@@ -1,4 +1,4 @@
-"""Repetitions are recognised from positions, whatever their clocks say."""
+"""Recordings: checks, clock statistics, and repetitions recognised from positions."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def a_recording(samples: int = 200, *, commanded: bool = True) -> Recording:
 
 
 def changed(name: str, rows: slice | int, joint: int, value: object) -> Recording:
-    """A sound recording with other readings of a joint."""
+    """Return a valid recording with other readings of a joint."""
     recording = a_recording()
     values = getattr(recording, name).copy()
     values[rows, joint] = values[0, joint] if value is None else value
@@ -43,7 +43,7 @@ def changed(name: str, rows: slice | int, joint: int, value: object) -> Recordin
 
 
 def leaping(sample: int, step: float) -> Recording:
-    """A recording whose clock goes on after another step than the usual one [s]."""
+    """Return a recording with another time step at a sample [s]."""
     time = a_recording().time.copy()
     time[sample:] += time[sample - 1] + step - time[sample]
     return replace(a_recording(), time=time)
@@ -53,7 +53,7 @@ RESTING = changed("commanded_position", slice(None), 1, 0.3).commanded_position
 
 
 class TestChecks:
-    def test_a_sound_recording_passes_unchanged(self) -> None:
+    def test_a_valid_recording_is_unchanged(self) -> None:
         recording = a_recording()
         assert recording.checked(NAMES) is recording
 
@@ -63,7 +63,7 @@ class TestChecks:
         joint=st.integers(0, 2),
         value=st.sampled_from([np.nan, np.inf, -np.inf]),
     )
-    def test_a_number_that_is_none_is_refused_where_it_is(
+    def test_nan_and_infinity_raise(
         self, channel: str, sample: int, joint: int, value: float
     ) -> None:
         where = f"{channel} of joint {NAMES[joint]} is {value} at sample {sample} "
@@ -83,7 +83,7 @@ class TestChecks:
             (a_recording(1), "has 1 samples"),
         ],
     )
-    def test_what_no_motion_can_be_is_refused(self, recording: Recording, words: str) -> None:
+    def test_invalid_recordings_raise(self, recording: Recording, words: str) -> None:
         with pytest.raises(RecordingError, match=words):
             recording.checked()
 
@@ -97,10 +97,10 @@ class TestChecks:
         ],
         ids=["cycles without a set-point", "commanded to rest", "a long pause", "standstill"],
     )
-    def test_what_is_legal_passes(self, recording: Recording) -> None:
+    def test_valid_recordings_pass(self, recording: Recording) -> None:
         assert recording.checked() is recording
 
-    def test_without_a_command_a_dead_reading_must_be_declared(self) -> None:
+    def test_a_constant_reading_must_be_declared(self) -> None:
         recording = replace(changed("position", slice(None), 0, 0.3), commanded_position=None)
         with pytest.raises(RecordingError, match=r"shoulder is stuck.*declare it as held"):
             recording.checked()
@@ -119,12 +119,12 @@ class TestChecks:
             ("shoulder", "elbow"),
         ],
     )
-    def test_joints_that_are_not_the_models_are_refused(self, expected: tuple[str, ...]) -> None:
+    def test_other_joints_than_the_model_raise(self, expected: tuple[str, ...]) -> None:
         with pytest.raises(RecordingError, match=f"the model's are {', '.join(expected)}"):
             a_recording().checked(expected)
 
 
-def test_reported_gaps_and_jumps_of_the_clock_split_a_recording() -> None:
+def test_gaps_split_a_recording() -> None:
     recording = a_recording()
     gap = np.zeros(200, dtype=bool)
     gap[30] = True
@@ -137,13 +137,13 @@ def test_reported_gaps_and_jumps_of_the_clock_split_a_recording() -> None:
     ]
 
 
-def test_a_jittering_clock_is_not_a_gap() -> None:
+def test_clock_jitter_is_not_a_gap() -> None:
     jitter = np.random.default_rng(1).uniform(-4e-4, 4e-4, 200)
     recording = a_recording()
     assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
 
 
-def test_arrays_that_do_not_fit_each_other_are_refused() -> None:
+def test_arrays_of_other_shapes_raise() -> None:
     recording = a_recording()
     assert recording.torque is not None
     with pytest.raises(ShapeError, match="torque"):
@@ -152,7 +152,7 @@ def test_arrays_that_do_not_fit_each_other_are_refused() -> None:
         replace(recording, gap_before=np.zeros(3, dtype=bool))
 
 
-def test_a_motion_starts_where_the_command_begins_to_move() -> None:
+def test_a_motion_starts_with_its_command() -> None:
     recording = a_recording()
     assert recording.commanded_position is not None
     command = recording.commanded_position.copy()
@@ -172,7 +172,7 @@ STEP = 2e-3
 def recorded(
     seed: int, *, start: float = 0.0, clock: float = 0.0, pace: float = 1.0, noise: int = 0
 ) -> Recording:
-    """Eight seconds of a motion from `start` on, by a clock that is fast by `clock` [s]."""
+    """Return eight seconds of a motion from `start`, with a clock offset [s]."""
     rng = np.random.default_rng(seed)
     amplitude, rate = rng.uniform(0.2, 1.0, (3, 2)), rng.uniform(0.5, 3.0, (3, 2))
     time = start + STEP * np.arange(4000)
@@ -183,8 +183,6 @@ def recorded(
 
 
 class TestRepetitions:
-    """One motion, several times."""
-
     @settings(max_examples=20, deadline=None)
     @given(
         seed=st.integers(0, 50),
@@ -207,12 +205,12 @@ class TestRepetitions:
             [recorded(1), recorded(1, noise=1), recorded(2)],
         ],
     )
-    def test_one_alone_and_other_motions_repeat_nothing(self, runs: list[Recording]) -> None:
+    def test_other_motions_are_no_repetitions(self, runs: list[Recording]) -> None:
         assert offsets_of_repetitions(runs) is None
 
 
 @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
-def test_an_even_clock_is_uniform_and_needs_nothing(rate: float) -> None:
+def test_an_even_clock_is_uniform(rate: float) -> None:
     base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
     assert base.uniform
     assert base.rate == pytest.approx(rate, rel=1e-4)
@@ -231,7 +229,7 @@ def test_jitter_is_measured_against_the_usual_step() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_stamps_that_come_late_are_not_taken_for_missing_samples(seed: int) -> None:
+def test_late_stamps_are_not_missing_samples(seed: int) -> None:
     random = np.random.default_rng(seed)
     late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
     lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
@@ -244,7 +242,7 @@ def test_stamps_that_come_late_are_not_taken_for_missing_samples(seed: int) -> N
     assert torn.rate == pytest.approx(100.0, rel=1e-3)
 
 
-def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
+def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
     index = np.arange(1000.0)
     index[100] = index[99]  # repeats
     index[200] = index[199] - 0.5  # falls back
@@ -252,7 +250,7 @@ def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
     index[600:] += 50.0  # a gap
     base = time_base(index * 1e-3)
     assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
-    # The long steps after the repeat and the fall make up for the short ones: nothing is missing.
+    # Long steps after the repeat and the fall compensate the short ones.
     assert base.dropped == 3
     assert not base.uniform
     words = " ".join(base.describe())
@@ -260,18 +258,18 @@ def test_repeats_falls_drops_and_gaps_are_counted_apart() -> None:
         assert part in words
 
 
-def test_a_reported_gap_counts_although_the_clock_runs_on() -> None:
+def test_a_reported_gap_counts_without_a_time_step() -> None:
     gap = np.zeros(100, dtype=np.bool_)
     gap[50] = True
     assert time_base(np.arange(100) * 1e-3, gap).gaps == 1
 
 
-def test_a_clock_that_stands_still_is_refused() -> None:
+def test_constant_time_stamps_raise() -> None:
     with pytest.raises(RecordingError, match="same time stamp"):
         time_base(np.full(5, 3.0))
 
 
-def test_samples_of_one_stamp_become_their_mean() -> None:
+def test_samples_of_one_stamp_are_averaged() -> None:
     time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
     torque = np.arange(14.0).reshape(7, 2)
     merged = without_repeats(
@@ -283,6 +281,6 @@ def test_samples_of_one_stamp_become_their_mean() -> None:
     assert without_repeats(even) is even
 
 
-def test_a_clock_that_falls_back_is_not_put_in_order() -> None:
+def test_samples_are_not_reordered() -> None:
     with pytest.raises(RecordingError, match="falls back at sample 2"):
         without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))

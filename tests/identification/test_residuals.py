@@ -1,4 +1,4 @@
-"""Checks of the residual speak up for what was planted, and keep still for coloured noise."""
+"""Checks of the residual find injected patterns, and none in coloured noise."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def values_of() -> Array:
 
 
 def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float = MEMORY) -> Array:
-    """First-order noise of unit variance that is correlated over `memory` seconds."""
+    """Return first-order noise of unit variance, correlated over `memory` seconds."""
     decay = np.exp(-STEP / memory)
     white = np.sqrt(1.0 - decay**2) * rng.standard_normal(shape)
     return np.asarray(lfilter([1.0], [1.0, -decay], white, axis=0))
@@ -78,7 +78,7 @@ def checked(
     return check_residuals(MODEL, values_of(), runs[:5], runs[5:], motor_from_joint=GEAR)
 
 
-def test_coloured_noise_alone_raises_no_alarm() -> None:
+def test_coloured_noise_is_not_reported() -> None:
     alarms = np.zeros(4)
     campaigns = 25
     for campaign in range(campaigns):
@@ -86,11 +86,11 @@ def test_coloured_noise_alone_raises_no_alarm() -> None:
         assert checks.ripple is not None and checks.drift is not None
         for k, check in enumerate((checks.speed, checks.position, checks.ripple, checks.drift)):
             alarms[k] += np.count_nonzero(check.significant)
-    # 50 joints at a chance of 0.001 each; two alarms would have a chance of 0.1 %.
+    # 50 joints at 0.001 each: two findings have a probability of 0.1 %.
     assert (alarms <= 1).all(), alarms
 
 
-def test_friction_of_another_form_shows_over_speed_of_its_joint_only() -> None:
+def test_wrong_friction_shows_over_speed() -> None:
     def stribeck(motion: Motion, _: int) -> Array:
         extra = 1.0 * np.sign(motion.velocity) * np.exp(-((motion.velocity / 0.5) ** 2))
         return np.asarray(extra * np.array([0.0, 1.0]))
@@ -101,10 +101,10 @@ def test_friction_of_another_form_shows_over_speed_of_its_joint_only() -> None:
     assert abs(at) < 0.6 and np.sign(size) == np.sign(at)
 
 
-def test_a_pull_that_depends_on_posture_shows_over_position() -> None:
+def test_a_position_dependent_torque_shows_over_position() -> None:
     checks = checked(lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
     assert checks.position.significant.tolist() == [True, False]
-    # RMS of the planted wave, to within what binning and its own noise take off.
+    # RMS of the true wave, within binning and noise.
     assert checks.position.rms[0] == pytest.approx(0.6 / np.sqrt(2.0), rel=0.25)
 
 
@@ -124,11 +124,11 @@ def test_ripple_is_found_with_its_harmonic_and_amplitude(harmonic: int) -> None:
     assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
 
 
-def test_without_a_gear_ratio_there_is_no_ripple_to_look_for() -> None:
+def test_ripple_needs_gear_ratios() -> None:
     assert check_residuals(MODEL, values_of(), [a_run(1)]).ripple is None
 
 
-def test_friction_that_falls_from_run_to_run_is_found_with_its_size() -> None:
+def test_friction_drift_is_measured() -> None:
     friction = np.where(MODEL.friction_columns, values_of(), 0.0)
 
     def cooling(motion: Motion, seed: int) -> Array:
@@ -143,20 +143,20 @@ def test_friction_that_falls_from_run_to_run_is_found_with_its_size() -> None:
     assert drift.change_std[1] < 0.02
 
 
-def test_one_recording_is_cut_so_that_drift_can_be_seen() -> None:
+def test_drift_is_measured_within_one_recording() -> None:
     drift = check_residuals(MODEL, values_of(), [a_run(1, duration=30.0)]).drift
     assert drift is not None and len(drift.share) >= 4
 
 
 @pytest.mark.parametrize("memory", [0.01, 0.05])
-def test_the_memory_of_coloured_noise_is_that_of_theory(memory: float) -> None:
+def test_the_correlation_time_is_that_of_theory(memory: float) -> None:
     rng = np.random.default_rng(2)
     residual = coloured(rng, (200_000, 2), memory)
     found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
     decay = np.exp(-STEP / memory)
     expected = 0.5 * STEP * (1.0 + decay) / (1.0 - decay)
     np.testing.assert_allclose(found.time, expected, rtol=0.15)
-    # White noise has a memory of half a step: each sample counts.
+    # White noise: half a step, all samples independent.
     rows = 0.5 * STEP * len(residual) / expected
     np.testing.assert_allclose(found.effective_rows, rows, rtol=0.15)
 
@@ -178,7 +178,7 @@ def test_the_autocorrelation_is_that_of_counting_pairs(rows: int, seed: int, run
         )
 
 
-def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not() -> None:
+def test_block_means_cover_unlike_independent_samples() -> None:
     blocks, per_block, seeds = 60, 125, 400
     inside, naive = 0, 0
     for seed in range(seeds):
@@ -191,7 +191,7 @@ def test_block_means_cover_the_truth_where_samples_taken_as_independent_do_not()
     assert naive / seeds < 0.6
 
 
-def test_repetitions_of_one_motion_do_not_make_its_errors_more_certain() -> None:
+def test_repeated_errors_are_not_more_certain() -> None:
     rng = np.random.default_rng(3)
     motion = np.array([rng.standard_normal((40, 1)), np.ones((40, 1))])
     once, thrice = block_mean([motion]), block_mean([motion] * 3, repeated=3)
@@ -205,14 +205,14 @@ def test_too_few_blocks_give_no_mean() -> None:
     assert np.isnan(block_mean([np.ones((2, FEWEST_BLOCKS - 1, 1))]).mean).all()
 
 
-def test_planted_spikes_are_counted_and_taken_off() -> None:
+def test_outliers_are_counted_and_removed() -> None:
     random = np.random.default_rng(5)
     torque, residual = 10.0 * random.standard_normal((2, 5000, 2))
     residual *= 0.01
     hit = random.permutation(5000)[:25]
     residual[hit, 1] += 20.0
     usable = np.ones((5000, 2), dtype=np.bool_)
-    usable[hit[:5], 1] = False  # what does not count is no outlier
+    usable[hit[:5], 1] = False  # unusable rows are no outliers
     found = find_outliers(torque, residual, usable)
     np.testing.assert_allclose(found.share, [0.0, 20 / 4995])
     assert found.power[0] == 0.0 and found.power[1] > 0.9
@@ -220,7 +220,7 @@ def test_planted_spikes_are_counted_and_taken_off() -> None:
     assert found.without.rows.tolist() == [5000, 4975]
 
 
-def test_noise_of_any_size_has_none() -> None:
+def test_noise_has_no_outliers() -> None:
     noise = np.random.default_rng(6).standard_normal((20000, 3)) * [1e-6, 1.0, 1e6]
     found = find_outliers(noise, noise, np.ones(noise.shape, dtype=np.bool_))
     np.testing.assert_array_equal(found.share, 0.0)
@@ -231,7 +231,6 @@ LIMIT = Thresholds()
 
 
 def ripple(size: float) -> Ripple:
-    """Of the elbow [N·m], four times per motor turn."""
     mean = np.zeros((2, len(HARMONICS), 2))
     mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
     std = np.full_like(mean, 1e-6)
@@ -239,34 +238,34 @@ def ripple(size: float) -> Ripple:
 
 
 def drift(*change: float) -> FrictionDrift:
-    """From the first of ten pieces to the last; the scatter is small."""
+    """Return a drift over ten parts with small scatter."""
     total = np.array(change)
     return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
 
 
 @pytest.fixture(scope="module")
-def sound() -> ResidualChecks:
+def valid() -> ResidualChecks:
     return replace(checked(), ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
 class TestPatterns:
-    """What a verdict says of them."""
+    """Findings of a verdict on patterns."""
 
-    def found(self, sound: ResidualChecks, check: str, **changes: object) -> Finding:
-        return finding_of(check, NAMES, residuals=replace(sound, **changes))
+    def found(self, valid: ResidualChecks, check: str, **changes: object) -> Finding:
+        return finding_of(check, NAMES, residuals=replace(valid, **changes))
 
-    def test_what_was_not_looked_at_is_not_spoken_of(self, sound: ResidualChecks) -> None:
-        checks = {one.check for one in judged(NAMES, residuals=sound).findings}
+    def test_untested_patterns_have_no_finding(self, valid: ResidualChecks) -> None:
+        checks = {one.check for one in judged(NAMES, residuals=valid).findings}
         assert "whiteness" in checks and not {"torque ripple", "friction over time"} & checks
 
     @pytest.mark.parametrize(
         ("share", "level"),
         [(0.0, "good"), (0.9 * LIMIT.ripple, "information"), (1.1 * LIMIT.ripple, "doubtful")],
     )
-    def test_ripple_beyond_that_of_sound_drives_is_doubtful(
-        self, sound: ResidualChecks, share: float, level: str
+    def test_large_ripple_is_doubtful(
+        self, valid: ResidualChecks, share: float, level: str
     ) -> None:
-        found = self.found(sound, "torque ripple", ripple=ripple(share * sound.torque_rms[1]))
+        found = self.found(valid, "torque ripple", ripple=ripple(share * valid.torque_rms[1]))
         assert found.level == level and "shoulder" not in found.words
         expected = f"elbow (4 per motor turn, {share:.1%} of its torque)"
         assert (expected in found.words) == (level != "good")
@@ -280,9 +279,9 @@ class TestPatterns:
             ((0.02, -0.2), 1.0, "doubtful", "during the recordings: elbow by -20.0%"),
         ],
     )
-    def test_drift_matters_as_far_as_it_makes_torque(
+    def test_drift_is_judged_by_its_torque(
         self,
-        sound: ResidualChecks,
+        valid: ResidualChecks,
         change: tuple[float, float],
         share: float,
         level: str,
@@ -290,7 +289,7 @@ class TestPatterns:
     ) -> None:
         friction = np.array([share, 1.0])
         found = self.found(
-            sound, "friction over time", drift=drift(*change), friction_share=friction
+            valid, "friction over time", drift=drift(*change), friction_share=friction
         )
         assert found.level == level and words in found.words
         assert (found.role == "cause") == (level == "doubtful")

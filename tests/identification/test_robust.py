@@ -32,14 +32,14 @@ Array = NDArray[np.float64]
 LOSSES = [Huber(), Tukey()]
 
 
-def spoiled(rng: np.random.Generator, error: Array, share: float, size: float) -> Array:
-    """Errors of `size` standard deviations, all of one sign, in a share of the rows."""
+def with_outliers(rng: np.random.Generator, error: Array, share: float, size: float) -> Array:
+    """Add errors of `size` standard deviations and one sign to a share of the rows."""
     bad = rng.random(error.shape) < share
     return np.where(bad, size * NOISE * rng.uniform(0.5, 1.5, error.shape), error)
 
 
 def distance(values: Array, samples: Samples) -> float:
-    """Distance from the truth in standard deviations of a fit to good rows, rms."""
+    """Return the rms error in standard deviations of a fit to good rows."""
     information = Factor.of(MODEL, samples).weighted(1.0 / NOISE**2).A
     off = values - truth()
     return float(np.sqrt(off @ information @ off / P))
@@ -50,7 +50,7 @@ def distance(values: Array, samples: Samples) -> float:
 
 @pytest.mark.parametrize("loss", [Loss(), *LOSSES, Huber(0.7), Tukey(3.0)])
 @given(x=st.floats(-1e6, 1e6))
-def test_weights_lie_between_zero_and_one_and_fall_with_the_residual(loss: Loss, x: float) -> None:
+def test_weights_decrease_from_one_to_zero(loss: Loss, x: float) -> None:
     one, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
     assert 0.0 <= further[0] <= one[0] <= 1.0
     assert loss.weight(np.array([-x])) == one
@@ -66,7 +66,7 @@ def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> Non
     np.testing.assert_allclose(loss.slope(x), numeric, atol=1e-4)
 
 
-def test_an_infinite_residual_of_tukeys_counts_nothing() -> None:
+def test_infinite_residuals_have_no_weight() -> None:
     assert Tukey().weight(np.array([np.inf])) == 0.0
 
 
@@ -76,9 +76,7 @@ def test_an_infinite_residual_of_tukeys_counts_nothing() -> None:
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=8)
-def test_on_gaussian_noise_it_is_within_sampling_error_of_weighted_least_squares(
-    loss: Loss, seed: int
-) -> None:
+def test_gaussian_noise_gives_nearly_least_squares(loss: Loss, seed: int) -> None:
     motion = a_motion(5.0)
     samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
     robust = robust_estimate(MODEL, [samples], loss)
@@ -93,11 +91,9 @@ def test_on_gaussian_noise_it_is_within_sampling_error_of_weighted_least_squares
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @given(seed=st.integers(0, 2**16), size=st.floats(20.0, 300.0))
 @settings(max_examples=8)
-def test_with_5_percent_of_gross_errors_it_is_far_better_than_least_squares(
-    loss: Loss, seed: int, size: float
-) -> None:
+def test_outliers_have_little_effect(loss: Loss, seed: int, size: float) -> None:
     motion, rng = a_motion(5.0), np.random.default_rng(seed)
-    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, size), motion)
+    samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, size), motion)
     robust = robust_estimate(MODEL, [samples], loss)
     plain = estimate(MODEL, Factor.of(MODEL, samples))
     error = distance(robust.estimate.values, samples)
@@ -107,10 +103,10 @@ def test_with_5_percent_of_gross_errors_it_is_far_better_than_least_squares(
     np.testing.assert_allclose(robust.outlying, 0.05, atol=0.025)
 
 
-def test_tukeys_loss_leaves_no_trace_of_gross_errors_of_one_sign() -> None:
+def test_tukey_ignores_outliers_of_one_sign() -> None:
     motion, rng = a_motion(), np.random.default_rng(2)
     clean = gaussian(rng, motion)
-    bad = recording(spoiled(rng, clean, 0.10, 40.0), motion)
+    bad = recording(with_outliers(rng, clean, 0.10, 40.0), motion)
     plain, huber, tukey = (
         distance(values, bad)
         for values in (
@@ -124,9 +120,9 @@ def test_tukeys_loss_leaves_no_trace_of_gross_errors_of_one_sign() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
-def test_it_is_the_minimum_of_the_loss_with_the_scales_it_found(loss: Loss) -> None:
+def test_it_minimises_the_loss(loss: Loss) -> None:
     motion, rng = a_motion(2.0), np.random.default_rng(3)
-    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, 15.0), motion)
+    samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 15.0), motion)
     result = robust_estimate(MODEL, [samples], loss)
     rows = MODEL.regressor(*motion[1:]).dense(P)
     scale, usable = result.estimate.noise_std, samples.usable
@@ -156,9 +152,7 @@ def test_it_is_the_minimum_of_the_loss_with_the_scales_it_found(loss: Loss) -> N
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent_with_gross_errors_and_coloured_noise(
-    loss: Loss, correlation: float
-) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(loss: Loss, correlation: float) -> None:
     motion = a_motion()
     inside = []
     for seed in range(40):
@@ -171,7 +165,7 @@ def test_95_percent_intervals_cover_90_to_99_percent_with_gross_errors_and_colou
     assert 0.90 <= np.mean(inside) <= 0.99
 
 
-def test_exact_data_come_back_and_do_not_divide_by_zero() -> None:
+def test_exact_data_are_recovered() -> None:
     motion = a_motion(3.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
     samples.torque[::40] += 500.0
@@ -179,7 +173,7 @@ def test_exact_data_come_back_and_do_not_divide_by_zero() -> None:
     np.testing.assert_allclose(result.estimate.values, truth(), rtol=1e-6)
 
 
-def test_a_joint_that_never_moves_has_no_scale_and_is_named() -> None:
+def test_a_resting_joint_has_no_scale() -> None:
     motion = a_motion(4.0)
     samples = recording(gaussian(np.random.default_rng(6), motion), motion)
     samples.usable[:, 1] = False
@@ -191,16 +185,16 @@ def test_a_joint_that_never_moves_has_no_scale_and_is_named() -> None:
     assert "f0_1" not in result.estimate.undetermined
 
 
-def test_what_does_not_converge_says_so() -> None:
+def test_missing_convergence_is_reported() -> None:
     motion, rng = a_motion(3.0), np.random.default_rng(7)
-    samples = recording(spoiled(rng, gaussian(rng, motion), 0.05, 30.0), motion)
+    samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 30.0), motion)
     result = robust_estimate(MODEL, [samples], most_iterations=1)
     assert not result.converged
     assert "NOT converged" in result.estimate.method
     assert "Huber" in result.estimate.method
 
 
-def test_where_a_model_leaves_much_out_the_outlying_rows_say_so() -> None:
+def test_many_outliers_mean_a_wrong_model() -> None:
     motion, rng = a_motion(5.0), np.random.default_rng(11)
     error = gaussian(rng, motion)
     # The elbow's friction in one direction of some poses is not in the model.
@@ -209,7 +203,7 @@ def test_where_a_model_leaves_much_out_the_outlying_rows_say_so() -> None:
     assert result.doubtful.tolist() == [False, True]
 
 
-def test_no_rows_are_an_error() -> None:
+def test_no_rows_raise() -> None:
     motion = a_motion(1.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
     empty = replace(samples, usable=np.zeros_like(samples.usable))
@@ -217,7 +211,7 @@ def test_no_rows_are_an_error() -> None:
         robust_estimate(MODEL, [empty])
 
 
-def test_on_a_real_arm_5_percent_of_gross_errors_hardly_cost_anything(shared_data: Path) -> None:
+def test_outliers_on_a_real_arm_have_little_effect(shared_data: Path) -> None:
     model, recorded = ur10(shared_data)
     cut = round(0.7 * recorded.n_samples)
     first = prepare(recorded.between(0, cut), model)

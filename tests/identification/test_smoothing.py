@@ -36,10 +36,8 @@ def sines(time: Array, derivative: int = 0) -> Array:
     tolerance=st.floats(1e-12, 1e-2),
     seed=st.integers(0, 2**16),
 )
-def test_parabolas_pass_unchanged_whatever_the_tolerance(
-    coefficients: list[float], tolerance: float, seed: int
-) -> None:
-    # The roughness of a parabola is zero, so no penalty can move it.
+def test_parabolas_pass_unchanged(coefficients: list[float], tolerance: float, seed: int) -> None:
+    # The roughness of a parabola is zero.
     time = np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 300))
     polynomial = np.polynomial.Polynomial(coefficients)
     spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([tolerance]))
@@ -48,11 +46,11 @@ def test_parabolas_pass_unchanged_whatever_the_tolerance(
     np.testing.assert_allclose(spline(time, 2)[:, 0], polynomial.deriv(2)(time), atol=1e-3)
 
 
-def test_quintics_are_reproduced_when_hardly_anything_may_be_smoothed() -> None:
+def test_quintics_are_reproduced_with_small_tolerance() -> None:
     time = np.linspace(0.0, 1.0, 400)
     polynomial = np.polynomial.Polynomial([0.2, -1.0, 3.0, 2.0, -4.0, 1.5])
     spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([1e-24]))
-    # What is left is rounding, divided by the knot spacing once per derivative.
+    # Rounding, divided by the knot spacing once per derivative.
     for derivative, tolerance in ((0, 1e-12), (1, 1e-8), (2, 1e-4)):
         expected = polynomial.deriv(derivative)(time) if derivative else polynomial(time)
         np.testing.assert_allclose(spline(time, derivative)[:, 0], expected, atol=tolerance)
@@ -66,7 +64,7 @@ def test_the_mean_squared_residual_is_the_tolerance(sigma: float) -> None:
     np.testing.assert_allclose(measured, sigma**2, rtol=1e-3)
 
 
-def test_derivatives_of_noisy_sines_are_far_better_than_differences() -> None:
+def test_derivatives_are_better_than_differences() -> None:
     sigma = 1e-5
     time, values = noisy_sines(sigma)
     spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
@@ -88,10 +86,8 @@ def test_derivatives_are_those_of_the_spline_itself() -> None:
         np.testing.assert_allclose(spline(at, derivative + 1), slope, rtol=1e-5, atol=1e-4)
 
 
-def test_it_minimises_squares_plus_penalty_times_the_integral_of_the_squared_third_derivative() -> (
-    None
-):
-    # Small enough for a dense solution built from SciPy's splines and adaptive quadrature.
+def test_it_minimises_squares_plus_roughness() -> None:
+    # Small enough for a dense solution by SciPy splines and quadrature.
     rng = np.random.default_rng(5)
     time = np.sort(rng.uniform(0.0, 1.0, 40))
     values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
@@ -115,7 +111,7 @@ def test_it_minimises_squares_plus_penalty_times_the_integral_of_the_squared_thi
     np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
 
 
-def test_the_fixed_low_pass_is_a_third_order_butterworth_run_both_ways() -> None:
+def test_the_low_pass_is_a_butterworth_both_ways() -> None:
     # |H|^2 of a third-order Butterworth is 1 / (1 + (w/w_c)^6), the smoother's own gain.
     time, values = noisy_sines(0.1)
     sections = butter(3, 6.0, fs=1000.0, output="sos")
@@ -135,7 +131,7 @@ def test_the_low_pass_is_linear_and_keeps_constants(bandwidth: float, seed: int)
     np.testing.assert_allclose(low_pass(time, np.ones((400, 1)), bandwidth), 1.0, atol=1e-9)
 
 
-def test_a_jittering_time_base_costs_no_accuracy() -> None:
+def test_clock_jitter_has_no_effect() -> None:
     rng = np.random.default_rng(11)
     sigma = 1e-4
     time = np.arange(8000) * 1e-3 + rng.uniform(-4e-4, 4e-4, 8000)
@@ -146,7 +142,7 @@ def test_a_jittering_time_base_costs_no_accuracy() -> None:
     assert np.std(error) < 0.01 * np.std(sines(time, 2))
 
 
-def test_knots_are_refined_where_the_tolerance_asks_for_it() -> None:
+def test_knots_are_refined_to_the_tolerance() -> None:
     # 120 Hz at 1 kHz: one knot per four samples cannot follow, one per sample can.
     time = np.arange(2000) * 1e-3
     values = np.sin(2.0 * np.pi * 120.0 * time)[:, None]
@@ -163,7 +159,7 @@ TORQUE_NOISE = np.array([3.0, 0.5])
 def repetition(
     seed: int, *, start: float = 0.0, drift: float = 0.0, gap: int | None = None
 ) -> Recording:
-    """Half a second of rest, then the motion; what is commanded says when."""
+    """Return 0.5 s of rest, then the motion, with commands."""
     rng = np.random.default_rng(seed)
     time = start + np.arange(5000) * STEP
     since = np.maximum(np.arange(5000) * STEP - 0.5, 0.0)[:, None]
@@ -184,12 +180,12 @@ def repetition(
 
 
 def within(variance: Array, expected: Array, freedom: float) -> bool:
-    """Whether a chi-squared estimate lies within four of its standard deviations."""
+    """Return whether a chi-squared estimate lies within four standard deviations."""
     return bool(np.all(np.abs(variance / expected - 1.0) < 4.0 * np.sqrt(2.0 / freedom)))
 
 
 @pytest.mark.parametrize("count", [2, 5])
-def test_the_planted_noise_is_found_under_motion(count: int) -> None:
+def test_noise_is_measured_during_motion(count: int) -> None:
     noise = repetition_noise([repetition(seed, start=7.0 * seed) for seed in range(count)])
     freedom = 4500.0 * (count - 1)
     assert noise.torque is not None
@@ -198,8 +194,8 @@ def test_the_planted_noise_is_found_under_motion(count: int) -> None:
     assert within(noise.torque, TORQUE_NOISE**2, freedom / 3.0)
 
 
-def test_noise_that_standstill_does_not_show_is_found() -> None:
-    """A reading of coarse resolution says nothing at rest, and everything in motion."""
+def test_noise_absent_at_standstill_is_found() -> None:
+    """A coarse reading is constant at rest."""
     resolution = 1e-3
 
     def read(seed: int) -> Recording:
@@ -218,24 +214,24 @@ def test_noise_that_standstill_does_not_show_is_found() -> None:
     assert np.all(moving.position > 1e-3 * resolution**2)
 
 
-def test_friction_that_drifts_is_no_white_noise() -> None:
+def test_friction_drift_is_not_noise() -> None:
     noise = repetition_noise([repetition(1), repetition(2, drift=0.1)])
     assert noise.torque is not None
     assert within(noise.torque, TORQUE_NOISE**2, 1500.0)
 
 
-def test_repetitions_are_aligned_where_their_motion_begins() -> None:
+def test_repetitions_are_aligned_at_their_start() -> None:
     late = repetition(2, start=3.0).between(200, 5000)
     noise = repetition_noise([repetition(1), late])
     assert within(noise.position, POSITION_NOISE**2, 1500.0)
 
 
-def test_a_gap_in_one_of_them_is_not_bridged() -> None:
+def test_gaps_are_not_bridged() -> None:
     noise = repetition_noise([repetition(1), repetition(2, gap=2000)])
     assert within(noise.position, POSITION_NOISE**2, 1500.0)
 
 
-def test_what_are_no_repetitions_is_refused() -> None:
+def test_other_recordings_raise() -> None:
     one = repetition(1)
     with pytest.raises(IdentificationError, match="requires two"):
         repetition_noise([one])

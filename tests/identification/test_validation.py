@@ -1,4 +1,4 @@
-"""Intervals of predicted torque hold what is measured on motion that was not fitted."""
+"""Prediction errors, and coverage of intervals of held-out torque."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
 
 
 def samples_with(error: Array, *, origin: float = 0.0) -> Samples:
-    """A motion whose torque is that of parameters 1, 1, 1, ... plus an error (m, 2)."""
+    """Return a motion with the torque of unit parameters plus an error (m, 2)."""
     time = np.arange(len(error)) * 2e-3
     motion = one_sine(time)._replace(time=time + origin)
     torque = MODEL.torque(np.ones(MODEL.n_parameters), *motion[1:]) + error
     return as_samples(MODEL, motion, torque, origin=origin)
 
 
-def test_the_measures_are_those_of_their_definitions() -> None:
+def test_error_measures_are_correct() -> None:
     measured = np.array([[3.0, 1.0], [-4.0, 2.0]])
     error = PredictionError.between(measured, np.array([[2.0, 1.0], [-2.0, 2.0]]))
     np.testing.assert_allclose(error.mean_absolute, [1.5, 0.0])
@@ -61,7 +61,7 @@ def test_the_measures_are_those_of_their_definitions() -> None:
 
 
 @given(torques, torques, arrays(np.bool_, (20, 2)))
-def test_rows_that_do_not_count_change_nothing(
+def test_unusable_rows_have_no_effect(
     measured: Array, predicted: Array, usable: NDArray[np.bool_]
 ) -> None:
     spoilt = np.where(usable, measured, np.nan)
@@ -73,22 +73,14 @@ def test_rows_that_do_not_count_change_nothing(
 
 
 @given(torques, torques, torques, torques)
-def test_the_error_over_two_runs_is_that_of_the_runs_put_together(
-    m1: Array, p1: Array, m2: Array, p2: Array
-) -> None:
+def test_errors_of_two_recordings_add(m1: Array, p1: Array, m2: Array, p2: Array) -> None:
     both = pooled_error([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
     joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
     np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
     assert both.overall == pytest.approx(joined.overall, rel=1e-12, nan_ok=True)
 
 
-def test_an_error_is_printed_as_a_person_reads_it() -> None:
-    measured = np.array([[3.0, 0.0], [4.0, 2.0]])
-    error = PredictionError.between(measured, 0.9 * measured)
-    assert str(error) == "10.0 % of the torque (10.0, 10.0 % by joint; 2 to 2 rows of a joint)"
-
-
-def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for() -> None:
+def test_prediction_error_of_usable_or_all_rows() -> None:
     values = np.ones(MODEL.n_parameters)
     samples = samples_with(np.zeros((2000, 2)))
     torque = samples.torque.copy()
@@ -100,8 +92,8 @@ def test_prediction_error_is_of_the_usable_rows_unless_all_are_asked_for() -> No
     assert error.overall > 0.05
 
 
-def test_a_change_of_friction_is_apart_from_other_slow_errors() -> None:
-    """Measured in full, and forgiven up to a tenth."""
+def test_friction_change_is_separated() -> None:
+    """Measured without limit, compensated up to a tenth."""
     values = np.ones(MODEL.n_parameters)
     motion = samples_with(np.zeros((5000, 2))).motion
     friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), *motion[1:])
@@ -117,15 +109,15 @@ def test_a_change_of_friction_is_apart_from_other_slow_errors() -> None:
     assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
 
 
-def test_no_runs_and_other_shapes_are_errors() -> None:
+def test_no_recordings_and_other_shapes_raise() -> None:
     with pytest.raises(IdentificationError, match="no recording"):
         pooled_error([])
     with pytest.raises(ShapeError):
         PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
 
 
-def test_noise_is_what_differs_between_repetitions() -> None:
-    """Their clocks start at different times, as recordings' clocks do."""
+def test_noise_is_measured_between_repetitions() -> None:
+    """With different clock offsets."""
     rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
     common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
     values = np.ones(MODEL.n_parameters)
@@ -166,13 +158,13 @@ def calibrated(fitted: Samples, held_out: Samples) -> Calibration:
 
 
 def split(error: Array) -> Calibration:
-    """The beginning of the planted arm's motion fitted, the rest held out."""
+    """Fit the beginning of a motion, hold out the rest."""
     samples = recording(error, MOTION)
     return calibrated(samples.between(0, CUT), samples.between(CUT, LENGTH))
 
 
 def shares(correlation: float, model_error: float = 0.0, seeds: int = 50) -> tuple[float, ...]:
-    """Share inside, share inside if residuals were white, and mean half width over noise."""
+    """Return share inside, with white residuals, and half width over noise."""
     systematic = model_error * NOISE * np.sin(6.0 * MOTION.position)
     found = []
     for seed in range(seeds):
@@ -183,25 +175,25 @@ def shares(correlation: float, model_error: float = 0.0, seeds: int = 50) -> tup
 
 
 class TestIntervals:
-    """Of held-out means of torque 95 % lie inside their 95 % intervals."""
+    """Held-out mean torques are inside their 95 % intervals."""
 
     @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1, 0.2])
-    def test_they_are_honest_for_noise_of_any_colour(self, correlation: float) -> None:
-        """Between 93 and 98 % inside; those of white residuals fail wherever there is colour."""
+    def test_they_cover_for_white_and_coloured_noise(self, correlation: float) -> None:
+        """93 to 98 % inside; intervals of white residuals fail for coloured noise."""
         inside, white, _ = shares(correlation)
         assert 0.93 <= inside <= 0.98
         assert (white < 0.7) == (correlation > 0.0)
 
-    def test_they_grow_with_an_error_of_the_model_and_hold(self) -> None:
-        """A torque that the model has no term for, as large as the noise, at 93 to 98 % inside."""
+    def test_they_cover_with_a_model_error(self) -> None:
+        """Unmodelled torque as large as the noise: 93 to 98 % inside."""
         _, _, without = shares(0.02)
         inside, white, half_width = shares(0.02, model_error=1.0)
         assert 0.93 <= inside <= 0.98
         assert half_width > 1.3 * without
         assert white < 0.7
 
-    def test_they_do_not_shrink_with_repetitions_of_one_error(self) -> None:
-        """An error that is the same in each repetition is no less of one for being repeated."""
+    def test_repeated_errors_do_not_shrink_them(self) -> None:
+        """An error equal in all repetitions counts once."""
         noise = coloured(np.random.default_rng(1), LENGTH, 5e-3, 0.05)
         one = recording(noise, MOTION).between(0, CUT)
         rest = TorqueMeans.of(MODEL, [recording(noise, MOTION).between(CUT, LENGTH)])
@@ -216,9 +208,7 @@ class TestIntervals:
 
 
 class TestHeldOutTorque:
-    """It is compared with intervals, and has no part in them."""
-
-    def test_it_does_not_widen_its_own_intervals(self) -> None:
+    def test_it_does_not_change_the_intervals(self) -> None:
         noise = coloured(np.random.default_rng(2), LENGTH, 5e-3, 0.05)
         spoiled = noise.copy()
         spoiled[CUT:] += 20.0 * NOISE
@@ -226,7 +216,7 @@ class TestHeldOutTorque:
         np.testing.assert_array_equal(off.half_width, sound.half_width)
         assert off.overall == 0.0 < 0.8 < sound.overall
 
-    def test_none_is_no_share(self) -> None:
+    def test_without_means_the_share_is_nan(self) -> None:
         samples = recording(coloured(np.random.default_rng(3), LENGTH, 5e-3, 0.05), MOTION)
         found = calibrated(samples, samples.between(0, 0))
         assert np.isnan(found.overall)
@@ -234,8 +224,8 @@ class TestHeldOutTorque:
 
 
 class TestInnerFolds:
-    def test_each_stretch_is_predicted_from_the_others(self) -> None:
-        """Leaving out by hand gives the errors of the first fifth."""
+    def test_each_fold_is_predicted_from_the_others(self) -> None:
+        """Equal to leaving out the first fold by hand."""
         noise = coloured(np.random.default_rng(4), LENGTH, 5e-3, 0.05)
         samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
         phase, means = PhaseFactor.from_samples(MODEL, samples), TorqueMeans.of(MODEL, [samples])
@@ -244,7 +234,7 @@ class TestInnerFolds:
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
         np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
 
-    def test_a_joint_that_moves_in_one_stretch_only_has_no_interval(self) -> None:
+    def test_a_joint_moving_in_one_fold_has_no_interval(self) -> None:
         samples = recording(coloured(np.random.default_rng(5), LENGTH, 5e-3, 0.05), MOTION)
         usable = samples.usable.copy()
         usable[200:, 1] = False
@@ -259,8 +249,8 @@ class TestInnerFolds:
         with pytest.raises(IdentificationError, match="too short"):
             calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
 
-    def test_rest_behind_the_last_row_belongs_to_the_last_stretch(self) -> None:
-        """Rows that are not fitted are predicted all the same."""
+    def test_final_rest_belongs_to_the_last_fold(self) -> None:
+        """Unfitted rows are predicted."""
         samples = recording(coloured(np.random.default_rng(6), LENGTH, 5e-3, 0.05), MOTION)
         usable = samples.usable.copy()
         usable[2400:] = False
@@ -270,15 +260,15 @@ class TestInnerFolds:
 
 
 class TestTorqueMeans:
-    def test_a_block_less_than_half_full_has_no_mean(self) -> None:
+    def test_a_half_empty_block_has_no_mean(self) -> None:
         samples = recording(np.zeros((LENGTH, 2)), MOTION)
         for length, known in ((1040, 10), (1060, 11)):
             errors = TorqueMeans.of(MODEL, [samples.between(0, length)]).errors(truth())
             assert len(errors) == 11
             np.testing.assert_array_equal(np.isfinite(errors).sum(axis=0), known)
 
-    def test_rows_beside_an_end_are_left_out_and_those_at_rest_are_not(self) -> None:
-        """Where motion or torque are not known no model can be right; at rest it has to be."""
+    def test_edges_are_excluded_and_rest_included(self) -> None:
+        """Motion or torque are unknown at edges."""
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
         ends[:20], slow[40:60] = True, True
         reasons = {EDGE: ends, SATURATED: np.zeros_like(ends), STANDSTILL: slow}

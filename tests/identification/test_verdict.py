@@ -1,4 +1,4 @@
-"""Verdicts on recordings of the NS 16 with one planted fault: named, and none named without."""
+"""Verdicts on recordings of the NS 16 with one injected fault, and without."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MODEL = RobotModel.from_urdf(urdf_text())
 
 @dataclass(frozen=True)
 class Drive:
-    """Gear ratios, wrist coupling and torque constants, as one side believes them to be."""
+    """Gear ratios, wrist coupling and torque constants of one side."""
 
     gear: tuple[float, ...] = (-116.0, 116.0, -106.0, -50.0, 51.5, -33.0)
     k54: float = 0.03
@@ -54,7 +54,7 @@ class Drive:
         coupling[5, 3:5] = self.k65 * self.k54 - self.k64, -self.k65
         return np.array(self.gear)[:, None] * coupling
 
-    def with_turned(self, what: str, axis: int = 0) -> Drive:
+    def with_wrong_sign(self, what: str, axis: int = 0) -> Drive:
         if what.startswith("k"):
             return replace(self, **{what: -getattr(self, what)})
         values = list(getattr(self, what))
@@ -82,16 +82,16 @@ def a_motion(seed: int, *, duration: float = 8.0, step: float = 0.01) -> Motion:
 
 
 def executed(
-    model: RobotModel, truth: Array, motion: Motion, seed: int, believed: Drive, other: Disturbance
+    model: RobotModel, truth: Array, motion: Motion, seed: int, assumed: Drive, other: Disturbance
 ) -> Samples:
-    """What a PC that believes in its drive train makes of the currents of the real arm."""
+    """Return the samples of a PC that assumes another drive train than the arm has."""
     real, torque = Drive(), model.torque(truth, *motion[1:])
     torque = torque + other(motion, torque)
     current = np.linalg.solve(real.motor_from_joint.T, torque.T).T / np.array(real.constant)
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
-    seen = np.linalg.solve(believed.motor_from_joint, real.motor_from_joint).T
+    seen = np.linalg.solve(assumed.motor_from_joint, real.motor_from_joint).T
     motion = Motion(motion.time, *(part @ seen for part in motion[1:4]))
-    torque = (current * np.array(believed.constant)) @ believed.motor_from_joint
+    torque = (current * np.array(assumed.constant)) @ assumed.motor_from_joint
     return as_samples(model, motion, torque)
 
 
@@ -101,7 +101,7 @@ def nothing(motion: Motion, torque: Array) -> Array:
 
 def campaign(
     *,
-    believed: Drive = Drive(),
+    assumed: Drive = Drive(),
     truth: Array | None = None,
     disturbance: Disturbance = nothing,
     unseen_disturbance: Disturbance | None = None,
@@ -109,15 +109,15 @@ def campaign(
 ) -> tuple[Verdict, Evidence]:
     truth = parameters(model=real) if truth is None else truth
     training, unseen = a_motion(17, duration=12.0), unseen_disturbance or disturbance
-    fitted = [executed(real, truth, training, k, believed, disturbance) for k in range(2)]
-    held_out = [executed(real, truth, a_motion(k), 10 + k, believed, unseen) for k in range(2)]
+    fitted = [executed(real, truth, training, k, assumed, disturbance) for k in range(2)]
+    held_out = [executed(real, truth, a_motion(k), 10 + k, assumed, unseen) for k in range(2)]
     result = estimate_repetitions(MODEL, fitted)
     evidence = gather(MODEL, result, fitted, held_out, nominal=parameters())
     return judge(MODEL.joint_names, evidence), evidence
 
 
-class TestSoundCampaign:
-    def test_it_is_good_and_nothing_is_blamed(self) -> None:
+class TestValidCampaign:
+    def test_it_is_good_without_causes(self) -> None:
         verdict, evidence = campaign()
         assert verdict.good, verdict.reasons
         assert "predicts unseen motion well" in verdict.line
@@ -128,7 +128,7 @@ class TestSoundCampaign:
         assert evidence.gravity is not None and np.degrees(evidence.gravity.angle) < 0.5
         np.testing.assert_array_equal(evidence.loaded, [False, *[True] * 5])
 
-    def test_effects_that_no_model_has_do_not_spoil_it(self) -> None:
+    def test_unmodelled_effects_stay_good(self) -> None:
         def effects(motion: Motion, torque: Array) -> Array:
             motor = motion.position @ Drive().motor_from_joint.T
             ripple = 0.10 * COULOMB * np.sin(2.0 * motor + np.arange(6))
@@ -142,7 +142,7 @@ class TestSoundCampaign:
 
 
 class TestOneSidedErrors:
-    """A sign of the drive train that is wrong on one side only."""
+    """Wrong sign in the drive train of one side."""
 
     @pytest.mark.parametrize(
         ("what", "axis"),
@@ -151,9 +151,9 @@ class TestOneSidedErrors:
             *((coupling, 4) for coupling in ("k54", "k64", "k65")),
         ],
     )
-    def test_a_turned_one_is_found_and_nothing_else_blamed(self, what: str, axis: int) -> None:
-        """Neither gravity nor a load; of the large axes by name."""
-        verdict, evidence = campaign(believed=Drive().with_turned(what, axis))
+    def test_a_wrong_sign_is_the_only_cause(self, what: str, axis: int) -> None:
+        """Neither gravity nor a load; large axes are named."""
+        verdict, evidence = campaign(assumed=Drive().with_wrong_sign(what, axis))
         assert not verdict.good and "must not be relied on" in verdict.line
         assert evidence.load is not None and evidence.causes is not None
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
@@ -169,7 +169,7 @@ class TestOneSidedErrors:
         ("term", "axis"),
         [*(("coulomb", axis) for axis in (0, 2, 4)), *(("viscous", axis) for axis in (1, 3, 5))],
     )
-    def test_friction_that_drives_is_named(self, term: str, axis: int) -> None:
+    def test_negative_friction_is_named(self, term: str, axis: int) -> None:
         values = {"coulomb": COULOMB, "viscous": VISCOUS}[term].copy()
         values[axis] *= -1.0
         verdict, _ = campaign(truth=parameters(**{term: values}))
@@ -178,16 +178,14 @@ class TestOneSidedErrors:
 
 
 class TestUnseenMotion:
-    """What was another one where the model was tested."""
+    """Changes between fitted and unseen motion."""
 
     @pytest.mark.parametrize(
         "mounted",
         [(1.703, 0.0, -9.661), (0.0, 0.0, 9.81), (9.81, 0.0, 0.0), (0.0, -9.81, 0.0)],
         ids=["tilted by 10 degrees", "upside down", "on a wall", "on another wall"],
     )
-    def test_gravity_that_pulls_elsewhere_is_named_first(
-        self, mounted: tuple[float, float, float]
-    ) -> None:
+    def test_wrong_gravity_is_named_first(self, mounted: tuple[float, float, float]) -> None:
         verdict, evidence = campaign(real=RobotModel.from_urdf(urdf_text(), gravity=mounted))
         assert not verdict.good
         assert "with gravity (" in verdict.reasons[0]
@@ -197,7 +195,7 @@ class TestUnseenMotion:
         assert not any("gear ratio" in step or "jog" in step for step in verdict.next_steps)
 
     @pytest.mark.parametrize("mass", [4.0, 1.0])
-    def test_a_load_is_named_and_weighed(self, mass: float) -> None:
+    def test_a_load_is_named_with_its_mass(self, mass: float) -> None:
         carrying = RobotModel.from_urdf(urdf_text(), payload=Payload(mass, (0.0, 0.09, 0.12)))
 
         def load(motion: Motion, _: Array) -> Array:
@@ -211,7 +209,7 @@ class TestUnseenMotion:
         (step,) = verdict.next_steps
         assert step.startswith("record both with the same tool and payload")
 
-    def test_changed_friction_is_given_in_full(self) -> None:
+    def test_changed_friction_is_measured(self) -> None:
         def warmer(motion: Motion, _: Array) -> Array:
             return 0.2 * (COULOMB * np.sign(motion.velocity) + VISCOUS * motion.velocity)
 
@@ -221,7 +219,7 @@ class TestUnseenMotion:
         assert verdict.next_steps == ("warm the arm up by moving it before recording",)
 
     @pytest.mark.parametrize("share", [0.01, 0.001])
-    def test_spikes_are_named_and_no_gear_ratio(self, share: float) -> None:
+    def test_outliers_are_named(self, share: float) -> None:
         random = np.random.default_rng(3)
 
         def spikes(_: Motion, torque: Array) -> Array:
@@ -235,7 +233,7 @@ class TestUnseenMotion:
         assert "--estimator tukey" in verdict.next_steps[0]
 
 
-# What a verdict makes of evidence
+# Verdicts on given evidence
 
 AXES = ("one", "two")
 
@@ -256,7 +254,7 @@ def an_estimate(**changes: Any) -> Estimate:
 
 
 def judged(names: Sequence[str] = AXES, **changes: Any) -> Verdict:
-    """On evidence that is good but for changes; those of the context by name."""
+    """Return the verdict on good evidence with changes; those of the context by name."""
     own = CellContext.__dataclass_fields__.keys() & changes.keys()
     around = {name: changes.pop(name) for name in own}
     evidence = Evidence(an_estimate(), held_out=an_error(0.05), training=an_error(0.04))
@@ -264,7 +262,7 @@ def judged(names: Sequence[str] = AXES, **changes: Any) -> Verdict:
 
 
 def finding_of(check: str, names: Sequence[str] = AXES, **changes: Any) -> Finding:
-    """The one finding of a check."""
+    """Return the only finding of a check."""
     (found,) = (one for one in judged(names, **changes).findings if one.check == check)
     return found
 
@@ -278,7 +276,7 @@ LATE = DelayEstimate(
     deviation_std=np.zeros(2), assumed=0.0, cycle=0.001, interval_factor=2.0, reason=None,
     significant=True,
 )  # fmt: skip
-# Torque 10 ± 0.3 (gravity that hardly varies), error 0.5: 5 % of the torque, and useless.
+# Torque 10 ± 0.3 (constant gravity), error 0.5: 5 % of the torque, no variance explained.
 HEAVY = replace(an_error(0.05), torque_sum=np.array([1000 * np.sqrt(100.0 - 0.09), 0.0]))
 MANY = tuple(f"p{k}" for k in range(12))
 
@@ -314,7 +312,7 @@ class TestJudgement:
             ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
         ],
     )
-    def test_each_fault_turns_it_and_is_said(self, changes: dict[str, Any], words: str) -> None:
+    def test_wrong_findings_are_reasons(self, changes: dict[str, Any], words: str) -> None:
         verdict = judged(**changes)
         assert not verdict.good
         assert any(words in reason for reason in verdict.reasons)
@@ -333,37 +331,35 @@ class TestJudgement:
             ({}, "cannot be distinguished from noise"),
         ],
     )
-    def test_what_is_doubtful_is_said_and_turns_nothing(
-        self, changes: dict[str, Any], words: str
-    ) -> None:
+    def test_doubtful_findings_are_warnings(self, changes: dict[str, Any], words: str) -> None:
         verdict = judged(**changes)
         assert verdict.good and any(words in one for one in verdict.warnings)
 
     @pytest.mark.parametrize("kind", get_args(Kind))
-    def test_each_kind_of_cause_has_words_and_a_step(self, kind: Kind) -> None:
+    def test_each_kind_of_cause_has_a_message_and_a_step(self, kind: Kind) -> None:
         (found,) = (
             one for one in judged(causes=caused(kind, 0, 1)).findings if one.role == "cause"
         )
         assert not {"{", "}"} & {*found.words, *found.next_step} and found.next_step
 
     @pytest.mark.parametrize("error", [0.05, 0.5])
-    def test_what_is_wrong_comes_before_what_is_doubtful(self, error: float) -> None:
+    def test_steps_of_wrong_findings_replace_doubtful_ones(self, error: float) -> None:
         verdict = judged(held_out=an_error(error), estimate=an_estimate(condition=450.0))
         level = "doubtful" if verdict.good else "wrong"
         expected = {finding.next_step for finding in verdict.findings if finding.level == level}
         assert expected == set(verdict.next_steps) and "" not in expected
 
-    def test_a_worse_model_of_the_controller_is_no_warning(self) -> None:
+    def test_a_worse_controller_model_is_good(self) -> None:
         found = finding_of("against the controller's model", controller=an_error(0.09))
         assert found.level == "good" and "is 9.0%, of the identified model 5.0%" in found.words
 
-    def test_payloads_are_asked_for_where_gravity_loads_the_axis(self) -> None:
+    def test_payloads_are_proposed_for_loaded_axes(self) -> None:
         verdict = judged(systematic=np.array([0.025, 0.025]), loaded=np.array([False, True]))
         (step,) = (step for step in verdict.next_steps if "torque constant" in step)
         assert "of two with a known payload" in step
         assert "of one with the drive's data sheet" in step
 
-    def test_what_sound_models_reach_is_no_warning(self) -> None:
+    def test_small_systematic_errors_are_good(self) -> None:
         verdict = judged(systematic=np.array([0.019, 0.0]))
         assert not any("beyond noise" in one for one in verdict.warnings)
         assert "beyond noise 1.9% at worst" in verdict.line
@@ -375,17 +371,17 @@ class TestJudgement:
         assert "--delay auto" in verdict.next_steps[0]
         assert "torque constant of one, two" in verdict.next_steps[1]
 
-    def test_repetitions_of_a_poor_motion_are_not_compared(self) -> None:
+    def test_undetermined_repetitions_are_not_compared(self) -> None:
         changes = {"estimate": an_estimate(undetermined=MANY), "disagreement": np.array([0.8, 0.1])}
         assert len(judged(**changes).reasons) == 1
 
-    def test_names_with_braces_are_names(self) -> None:
+    def test_joint_names_may_contain_braces(self) -> None:
         verdict = judged(("{one}", "<two>"), held_out=an_error(0.4), training=an_error(0.4))
         assert "{one} 40%, <two> 40%" in " ".join(verdict.reasons)
         assert any("torque constant of {one}, <two>," in one for one in verdict.next_steps)
 
 
-# Faults found by mending them
+# Causes
 
 NOISE = 0.02  # of each joint's torque
 LOAD = 6.0  # kg
@@ -394,7 +390,7 @@ SLOW = 0.2  # rad/s; rows near a reversal are left out
 
 
 def recorded(seed: int, load: Array | None = None) -> Samples:
-    """A motion with the torques of the paper's arm, a load (m,) [kg] on its flange, and noise."""
+    """Return a motion with the paper's arm, a load (m,) [kg] on its flange, and noise."""
     motion = a_motion(seed, duration=10.0, step=8e-3)
     torque = MODEL.torque(parameters(), *motion[1:])
     if load is not None:
@@ -405,7 +401,7 @@ def recorded(seed: int, load: Array | None = None) -> Samples:
 
 
 def of_one_kilogram(motion: Motion) -> Array:
-    """Torque by pinocchio of a sphere of 1 kg, 10 cm in front of the last joint."""
+    """Return the torque (pinocchio) of a sphere of 1 kg, 10 cm from the last joint."""
     bare = pin.buildModelFromXML(urdf_text())
     loaded = bare.copy()
     body = pin.Inertia.FromSphere(1.0, 0.05)
@@ -465,15 +461,15 @@ FAULTS: dict[str, tuple[tuple[int, ...], Callable[[Samples], Samples]]] = {
 
 
 class TestCausesOfWholeRecordings:
-    """What is wrong throughout."""
+    """Faults of all recordings."""
 
     @pytest.mark.parametrize("seed", range(8))
-    def test_sound_recordings_have_none(self, seed: int) -> None:
+    def test_valid_recordings_have_none(self, seed: int) -> None:
         assert causes([recorded(seed)]) == ()
 
     @pytest.mark.parametrize("kind", FAULTS)
     @pytest.mark.parametrize("seed", [1, 2])
-    def test_a_fault_is_named_and_nothing_else(self, kind: str, seed: int) -> None:
+    def test_a_single_fault_is_named(self, kind: str, seed: int) -> None:
         joints, spoil = FAULTS[kind]
         found = causes([spoil(recorded(seed))])
         assert [(one.fault.kind, one.fault.joints) for one in found] == [(kind, joints)]
@@ -483,20 +479,22 @@ class TestCausesOfWholeRecordings:
             (cause,) = causes([FAULTS[kind][1](recorded(1))])
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
-    def test_two_faults_are_found_one_after_the_other(self) -> None:
+    def test_two_faults_are_found_in_sequence(self) -> None:
         both = FAULTS["torque sign"][1](late(recorded(1)))
         found = causes([both])
         assert {one.fault.kind for one in found} == {"torque sign", "delay"}
 
 
 class TestCausesOfParts:
-    """What is wrong in some of the recordings only."""
+    """Faults of some recordings."""
 
     @pytest.mark.parametrize(
         ("seeds", "loaded", "words"),
         [((1,), 0.5, "0.mcap from 5 s on"), (range(4), (1, 3), "1.mcap, 3.mcap")],
     )
-    def test_a_load_is_weighed(self, seeds: Sequence[int], loaded: Any, words: str) -> None:
+    def test_a_changed_load_is_measured(
+        self, seeds: Sequence[int], loaded: Any, words: str
+    ) -> None:
         """In the second half of one recording, or in two of four."""
         if loaded == 0.5:
             runs = [recorded(1, LOAD * (np.arange(1250) >= 625))]

@@ -1,7 +1,7 @@
-"""A simulated arm written without the project's code: pinocchio, numpy and scipy only.
+"""Simulated arm without code of the project: pinocchio, numpy and scipy only.
 
-Trajectories, friction, noise and delay are its own; of the project it reads the NS 16's URDF file
-only, so that an error of the project's model, smoothing or sampling has no counterpart here.
+Only the NS 16's URDF is shared, so that errors of the project's model, smoothing or sampling are
+not reproduced.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class SimulatedArm:
 
 
 def ns16() -> SimulatedArm:
-    """A COMAU NS 16: its wrist has more friction than inertia."""
+    """Return a COMAU NS 16, with more friction than inertia in the wrist."""
     urdf = (ROOT / "sim_fixtures" / "ns16" / "ns16.urdf").read_text(encoding="utf-8")
     model = pin.buildModelFromXML(urdf)
     model.armature = np.array([7.6, 24.6, 10.5, 0.25, 0.30, 0.12])
@@ -75,7 +75,7 @@ def ns16() -> SimulatedArm:
 
 
 def panda() -> SimulatedArm:
-    """A Franka Emika Panda without its fingers; skips where its description is not installed."""
+    """Return a Franka Emika Panda without fingers; skips without its description."""
     try:
         package = distribution("example-robot-data")
     except PackageNotFoundError:
@@ -117,7 +117,7 @@ class Sines:
 
 
 def motion(arm: SimulatedArm, seed: int, pace: float) -> Sines:
-    """Five sines a joint between 0.1 and 1 Hz at pace 1, at up to 60 % of the largest speeds."""
+    """Return five sines per joint, 0.1 to 1 Hz at pace 1, up to 60 % of the largest speeds."""
     rng = np.random.default_rng([seed, 1])
     shape = (5, len(arm.centre))
     rate = 2.0 * np.pi * rng.uniform(0.1, 1.0, shape)
@@ -131,7 +131,7 @@ def motion(arm: SimulatedArm, seed: int, pace: float) -> Sines:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """What a logger would have written: time (m,), position and torque (m, n)."""
+    """Logged time (m,), position and torque (m, n)."""
 
     time: Array
     position: Array

@@ -1,4 +1,4 @@
-"""A torque that is logged late, by recordings that no code of the project has made."""
+"""Delayed torque, on recordings made without code of the project."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ def recorded(arm: SimulatedArm, seed: int, noise: Noise, delay: float, pace: flo
 def coverage(
     arm: SimulatedArm, model: RobotModel, recording: Recording, found: DelayEstimate
 ) -> float:
-    """Share of the parameters whose 95 % interval holds the truth, the delay compensated."""
+    """Return the share of parameters in their 95 % intervals, with the delay compensated."""
     standard = model.nominal
     standard[10::11] = arm.model.armature
     truth = np.concatenate([model.base.grouping @ standard, arm.coulomb, arm.viscous])
-    # Rows at a reversal depend on how friction turns round, which is another question.
+    # Rows at a reversal depend on presliding.
     options = Preprocessing(torque_delay=float(found.applied[0]), left_out="slow")
     samples = prepare(recording, model, options=options)
     phase = PhaseFactor.from_samples(model, samples)
@@ -81,9 +81,7 @@ class TestDelayOfABriskMotion:
     @pytest.mark.parametrize("name", ARMS)
     @pytest.mark.parametrize("noise", ["white", "coloured"])
     @pytest.mark.parametrize("delay", DELAYS)
-    def test_it_is_found_and_intervals_hold_the_truth(
-        self, name: str, noise: Noise, delay: float
-    ) -> None:
+    def test_it_is_found_and_intervals_cover(self, name: str, noise: Noise, delay: float) -> None:
         """Within 0.3 ms in 19 of 20 runs; 95 % intervals of parameters cover 93 to 98 %."""
         arm = ARMS[name]()
         model = model_of(arm)
@@ -93,7 +91,7 @@ class TestDelayOfABriskMotion:
             found = estimate_delays(recording, model)
             near += found.determined.all() and abs(found.common - delay) < NEAR
             shares.append(coverage(arm, model, recording, found))
-        # Of so many runs the share is known to two of its standard errors.
+        # Within two standard errors of the share.
         share, unsure = np.mean(shares), 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
         assert near >= 0.95 * SEEDS
         assert 0.93 - unsure < share < 0.98 + unsure
@@ -103,7 +101,7 @@ class TestDelayBesideOtherSettings:
     @pytest.mark.slow
     @pytest.mark.parametrize("seed", [2, 3, 4])
     def test_a_presliding_displacement_does_not_replace_it(self, seed: int) -> None:
-        """On all rows 1e-5 rad without a delay predict better than 1e-6 rad with the true one."""
+        """On all rows 1e-5 rad without delay predicts better than 1e-6 rad with the true one."""
         arm = ns16()
         model, recording = model_of(arm), recorded(arm, seed, "coloured", 0.0013, BRISK)
         found = estimate_delays(recording, model)
