@@ -1,4 +1,4 @@
-"""Files and texts of a folder: written whole or not at all, read within bounds."""
+"""Atomic writing of files, and bounded reading of texts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hil.files import write_files
 from hil.reading import parse_count, parse_port, parse_time
 
 
-def test_files_are_written_replaced_and_taken_away(tmp_path: Path) -> None:
+def test_files_are_written_replaced_and_removed(tmp_path: Path) -> None:
     (tmp_path / "old").write_text("old")
     (tmp_path / "gone").write_text("gone")
     write_files(tmp_path, {"old": "new", "bytes": b"\x00\x01", "gone": None, "never": None})
@@ -49,7 +49,7 @@ def no_file_above(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("failing", ["a", "b", "c"])
-def test_if_the_disk_takes_one_of_them_no_more_none_is_written(folder: Path, failing: str) -> None:
+def test_no_file_is_written_if_the_disk_fails_at_one(folder: Path, failing: str) -> None:
     contents = {"a": "new", "b": "new", "c": "new", "d": None, failing: b"0" * 3_000_000}
     with (
         no_file_above(2_000_000),
@@ -60,7 +60,7 @@ def test_if_the_disk_takes_one_of_them_no_more_none_is_written(folder: Path, fai
 
 
 @pytest.mark.parametrize("taken", ["new", None])
-def test_a_folder_in_the_way_is_named_and_left(folder: Path, taken: str | None) -> None:
+def test_folder_in_place_of_a_file_is_named_and_left(folder: Path, taken: str | None) -> None:
     (folder / "c").mkdir()
     (folder / "c" / "mine").touch()
     with pytest.raises(OutputError, match="c is a folder"):
@@ -71,7 +71,7 @@ def test_a_folder_in_the_way_is_named_and_left(folder: Path, taken: str | None) 
 
 @pytest.mark.parametrize("links", [True, False])
 @pytest.mark.parametrize("failing", ["a", "b", "c"])
-def test_if_one_cannot_get_to_its_place_the_others_are_put_back(
+def test_files_are_restored_if_one_cannot_be_replaced(
     folder: Path, failing: str, links: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also on file systems where a file has one name only."""
@@ -93,7 +93,7 @@ def test_if_one_cannot_get_to_its_place_the_others_are_put_back(
     assert unchanged(folder)
 
 
-def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path) -> None:
+def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file") as caught:
         write_files(tmp_path / "gone", {"a": "new"})
     assert caught.value.exit_code == 1
@@ -106,14 +106,14 @@ def test_a_folder_that_is_gone_is_one_sentence(tmp_path: Path) -> None:
     st.datetimes(datetime(1971, 1, 1), datetime(2199, 1, 1)),
     st.integers(-14 * 60, 14 * 60),
 )
-def test_a_moment_is_read_whatever_its_zone(at: datetime, minutes: int) -> None:
+def test_time_is_read_in_any_zone(at: datetime, minutes: int) -> None:
     zoned = at.replace(tzinfo=timezone(timedelta(minutes=minutes)))
     assert parse_time(zoned.isoformat()) == zoned
     assert parse_time(at.isoformat()) == at.replace(tzinfo=UTC)
 
 
 @given(st.one_of(st.text(), st.datetimes().map(datetime.isoformat)))
-def test_any_text_is_a_moment_of_some_robot_or_none(text: str) -> None:
+def test_any_text_is_a_time_in_range_or_none(text: str) -> None:
     found = parse_time(text)
     assert found is None or 1970 <= found.year < 2200
 
@@ -121,7 +121,7 @@ def test_any_text_is_a_moment_of_some_robot_or_none(text: str) -> None:
 @pytest.mark.parametrize(
     "text", ["", "soon", "0001-01-01T00:00:00+23:59", "9999-12-31T23:59:59-23:59", "1969-12-31"]
 )
-def test_what_is_no_moment(text: str) -> None:
+def test_invalid_times(text: str) -> None:
     assert parse_time(text) is None
 
 
@@ -129,17 +129,17 @@ def test_what_is_no_moment(text: str) -> None:
 
 
 @given(st.integers(0, 10**18 - 1))
-def test_a_number_is_read_as_it_was_written(number: int) -> None:
+def test_count_is_read(number: int) -> None:
     assert parse_count(str(number)) == number
 
 
 @given(st.one_of(st.text(), st.text("0123456789²٣-+_ ."), st.integers(4000, 6000).map("7".__mul__)))
-def test_any_text_is_a_number_of_some_size_or_none(text: str) -> None:
+def test_any_text_is_a_count_or_none(text: str) -> None:
     found = parse_count(text)
     assert found is None or (0 <= found < 2**63 and text.lstrip("0") in (str(found), ""))
 
 
-def test_ports_and_numbers_that_are_none() -> None:
+def test_invalid_ports_and_counts() -> None:
     assert parse_count(None) is None
     assert parse_count("") is None
     assert [parse_port(text) for text in ("1", "1000", "65535")] == [1, 1000, 65535]

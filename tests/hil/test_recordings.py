@@ -1,4 +1,4 @@
-"""From archives to what identification reads."""
+"""Conversion of archives to recordings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def archive(path: Path, rows: NDArray[np.void], *, torque: bool = True, lost: in
     return path
 
 
-def test_holds_what_was_archived_and_where_it_comes_from(tmp_path: Path) -> None:
+def test_recording_has_columns_and_provenance(tmp_path: Path) -> None:
     """Time is counted in cycles, not in arrivals."""
     rows = records()
     rows["arrival"] = 1e9 + np.random.default_rng(0).normal(size=len(rows))
@@ -60,7 +60,7 @@ def test_holds_what_was_archived_and_where_it_comes_from(tmp_path: Path) -> None
     assert "missing" not in recording.provenance
 
 
-def test_lost_packets_leave_a_gap_where_they_were_lost(tmp_path: Path) -> None:
+def test_lost_packets_are_gaps(tmp_path: Path) -> None:
     rows = records()
     rows["gap"][120] = 2
     rows = np.delete(rows, [118, 119, 300, 301])  # the second hole was never reported
@@ -70,14 +70,14 @@ def test_lost_packets_leave_a_gap_where_they_were_lost(tmp_path: Path) -> None:
     assert recording.time[118] == pytest.approx(0.240)
 
 
-def test_a_motion_is_not_smooth_where_an_answer_was_not_taken(tmp_path: Path) -> None:
+def test_replies_not_accepted_are_gaps(tmp_path: Path) -> None:
     rows = records()
     path = archive(tmp_path / NAME, rows, lost=int(rows["cycle"][150]))
     segments = open_recording(path).segments()
     assert [(s.start, s.stop) for s in segments] == [(0, 150), (150, 400)]
 
 
-def test_a_torn_archive_gives_what_is_whole_and_says_so(tmp_path: Path) -> None:
+def test_truncated_archive_gives_its_intact_part(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records())
     path.write_bytes(path.read_bytes()[:-9000])
     recording = open_recording(path)
@@ -89,9 +89,7 @@ def test_a_torn_archive_gives_what_is_whole_and_says_so(tmp_path: Path) -> None:
     assert "outcome" not in recording.provenance
 
 
-def test_cycles_that_begin_anew_within_an_archive_are_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_restarted_cycles_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody knows how two sessions lie in time: the first counts, and the rest is missing."""
     monkeypatch.setattr(ArchiveWriter, "_check_growth", lambda *_: None)  # as earlier versions
     rows = np.concatenate([records(100), records(100, first=0)])
@@ -100,7 +98,7 @@ def test_cycles_that_begin_anew_within_an_archive_are_not_read(
     assert "cycles that do not follow those before" in recording.provenance["missing"]
 
 
-def test_imported_stamps_become_seconds_from_the_first_on(tmp_path: Path) -> None:
+def test_imported_stamps_are_converted_to_seconds(tmp_path: Path) -> None:
     stamp = np.array([0, 8_000_001, 15_999_999], np.int64) + 1_700_000_000 * 10**9
     samples = Samples(stamp, np.arange(6.0).reshape(3, 2))
     path = write_samples(tmp_path / "x.mcap", samples, joint_names=JOINTS, metadata={})
@@ -109,7 +107,7 @@ def test_imported_stamps_become_seconds_from_the_first_on(tmp_path: Path) -> Non
     assert recording.gap_before is None
 
 
-def test_a_part_of_the_time_is_that_part_of_the_whole(tmp_path: Path) -> None:
+def test_part_of_the_time_equals_that_part_of_the_recording(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records(first=1000))
     whole = open_recording(path)
     part = open_recording(path, start=2.1, stop=2.3)  # s; the first cycle is at 2 s
@@ -125,7 +123,7 @@ def test_a_part_of_the_time_is_that_part_of_the_whole(tmp_path: Path) -> None:
         open_recording(archive(tmp_path / "move_000_a1.mcap", records(0)))
 
 
-def test_what_is_not_known_or_not_wanted_is_none(tmp_path: Path) -> None:
+def test_unknown_or_unwanted_channels_are_none(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records())
     recording = open_recording(path, channels=["torque"])
     assert recording.torque is not None

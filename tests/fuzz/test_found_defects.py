@@ -1,4 +1,4 @@
-"""What fuzzing found, each as the shortest file that a person might really have."""
+"""Defects found by fuzzing, each by the shortest realistic file."""
 
 from __future__ import annotations
 
@@ -49,20 +49,20 @@ def archive(path: Path, samples: Samples | None = None, /, **attachments: bytes)
     "table", [b"{", b"[1]", b"\xff", b'{"current_limit": "ab"}', b'{"current_limit": [null, 1]}',
               b'{"current_limit": [NaN, 1]}', b"[" * 9999]
 )  # fmt: skip
-def test_limits_in_an_archive_that_are_none_are_not_shown(tmp_path: Path, table: bytes) -> None:
+def test_invalid_limits_in_an_archive_are_not_shown(tmp_path: Path, table: bytes) -> None:
     view = view_of(archive(tmp_path / "imported.mcap", drive_train_json=table))
     assert view.quantities
     assert all(not trace.limits for one in view.quantities for trace in one.traces)
 
 
-def test_a_clock_that_jumps_by_a_lifetime_costs_no_time(tmp_path: Path) -> None:
+def test_jump_of_the_clock_by_years_is_fast(tmp_path: Path) -> None:
     far = Samples(np.array([0, 2**60]), position=np.ones((2, 2)), torque=np.ones((2, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", far))
     assert view.stop == pytest.approx(2**60 * 1e-9)
     assert np.count_nonzero(np.isfinite(view.quantities[0].traces[0].value)) == 2
 
 
-def test_a_position_too_large_for_degrees_is_missing_in_the_picture(tmp_path: Path) -> None:
+def test_position_too_large_for_degrees_is_not_drawn(tmp_path: Path) -> None:
     position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
     large = Samples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", large))
@@ -81,7 +81,7 @@ def test_a_position_too_large_for_degrees_is_missing_in_the_picture(tmp_path: Pa
         ("init_packet_bin", b"short", "is not an init packet"),
     ],
 )
-def test_a_cell_is_not_begun_from_what_an_archive_cannot_say(
+def test_cell_from_an_invalid_archive_is_refused(
     tmp_path: Path, name: str, content: bytes, problem: str
 ) -> None:
     with pytest.raises(ArchiveError, match=problem) as raised:
@@ -100,7 +100,7 @@ def test_a_cell_is_not_begun_from_what_an_archive_cannot_say(
         ("", r"controller\.cycle_ms: is missing; add it"),
     ],
 )
-def test_a_cell_whose_link_cannot_be_changed_says_how_to_write_it(
+def test_cell_whose_link_cannot_be_changed_is_refused(
     tmp_path: Path, written: str, remedy: str
 ) -> None:
     begin, _, rest = CELL.partition("[controller]")
@@ -196,14 +196,14 @@ REFUSED: list[tuple[str, Callable[[Path], object], type[Exception], str]] = [
 
 
 @pytest.mark.parametrize(("name", "read", "error", "why"), REFUSED)
-def test_what_is_beyond_all_bounds_is_refused_by_name(
+def test_number_out_of_range_is_refused(
     name: str, read: Callable[[Path], object], error: type[Exception], why: str, tmp_path: Path
 ) -> None:
     with pytest.raises(error, match=why):
         read(tmp_path / name)
 
 
-def test_a_signalling_nan_goes_over_can_as_any_other() -> None:
+def test_signalling_nan_is_sent_over_can() -> None:
     end = ControllerEnd(BusRates("classic"))
     end.packet(InitPacket.build(1, 2, {}).encode())
     packet = CyclicPacket.zeros(11, 1)
@@ -211,6 +211,6 @@ def test_a_signalling_nan_goes_over_can_as_any_other() -> None:
     assert len(end.packet(packet.encode())) == 2
 
 
-def test_an_archive_in_a_state_that_nobody_knows_is_shown() -> None:
+def test_archive_with_an_unknown_state_is_shown() -> None:
     assert _state_name(State.OPEN) == "open"
     assert _state_name(105) == "state 105"
