@@ -95,7 +95,7 @@ def test_cell_from_an_invalid_archive_is_refused(
     [
         (
             'controller = { transport = "simulated", cycle_ms = 2 }',
-            r"write \[controller\] in a line of its own",
+            r"write \[controller\] on a line of its own",
         ),
         ("", r"controller\.cycle_ms: is missing; add it"),
     ],
