@@ -1,4 +1,4 @@
-"""What a person types, what he gets, and the exit status a script sees."""
+"""Commands as typed: output, exit status and help."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def hil(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_help_says_where_to_start() -> None:
+def test_help_lists_every_command() -> None:
     done = hil("--help")
     assert done.returncode == 0
     assert "hil demo" in done.stdout
@@ -55,7 +55,7 @@ def leaves(command: Any) -> Iterator[Any]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_option_is_explained(command: str) -> None:
-    """By its own text or in the docstring of the command, of which nothing else is left over."""
+    """By its help text or in the docstring of the command."""
     for leaf in leaves(COMMANDS[command]):
         assert all(option.help for option in leaf.params), leaf.name
         assert "Options:" not in leaf.help
@@ -63,7 +63,7 @@ def test_each_option_is_explained(command: str) -> None:
         assert {*entries} <= {option.name for option in leaf.params}
 
 
-def test_the_package_says_what_its_names_are_for() -> None:
+def test_the_package_documents_its_names() -> None:
     assert hil_package.__doc__ is not None
     for name in hil_package.__all__:
         assert f"`{name}`" in hil_package.__doc__
@@ -83,10 +83,10 @@ def test_help_imports_no_numerics() -> None:
 
 @pytest.mark.parametrize("arguments", [[], ["run"], ["import", "log"], ["archive", "check"]])
 def test_a_flag_has_no_type_in_the_help(arguments: list[str]) -> None:
-    """Nothing is to be typed behind it."""
-    told = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
-    assert "--" in told.stdout
-    assert "<bool>" not in told.stdout
+    """A flag has no value."""
+    result = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
+    assert "--" in result.stdout
+    assert "<bool>" not in result.stdout
 
 
 @pytest.mark.parametrize(
@@ -109,14 +109,14 @@ def test_an_extra_is_installed_from_where_hil_itself_came(
     assert install_command("live") == command
 
 
-def test_the_version_is_that_of_the_package_and_of_what_its_numbers_depend_on() -> None:
-    told = CliRunner().invoke(app, ["--version"])
-    assert told.exit_code == 0
-    assert told.stdout.startswith(f"hil {version('hil')} (numpy {np.__version__}, ")
+def test_the_version_names_package_and_numerical_libraries() -> None:
+    result = CliRunner().invoke(app, ["--version"])
+    assert result.exit_code == 0
+    assert result.stdout.startswith(f"hil {version('hil')} (numpy {np.__version__}, ")
 
 
 @pytest.mark.parametrize("command", ["status", "run"])
-def test_a_command_does_not_wait_for_libraries_that_it_does_not_use(command: str) -> None:
+def test_a_command_imports_only_what_it_uses(command: str) -> None:
     look = f"import sys; from hil.cli import COMMANDS; COMMANDS['{command}']; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)
     loaded = set(done.stdout.split())
@@ -128,7 +128,7 @@ def test_a_command_does_not_wait_for_libraries_that_it_does_not_use(command: str
 
 @pytest.mark.slow
 def test_status_takes_at_most_0_8_s_of_processor(campaign: Campaign) -> None:
-    """The least of some runs: other programs on this computer make it longer."""
+    """The minimum of several runs, as other programs slow it down."""
     spent = []
     for _ in range(8):
         before = os.times()
@@ -182,7 +182,7 @@ def test_bad_input_gets_one_sentence_and_status_2(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """What the program does when it is started; anything but its own end would get out here."""
+    """Any other exception would propagate."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["hil", *arguments])
     with pytest.raises(SystemExit) as end:
@@ -192,18 +192,18 @@ def test_bad_input_gets_one_sentence_and_status_2(
 
 
 @pytest.mark.slow
-def test_a_stopped_demo_goes_on_where_it_was(campaign: Campaign, tmp_path: Path) -> None:
+def test_a_stopped_demo_is_resumed(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)
     (folder / "archives" / "validation_001_a1.mcap").unlink()
     done = hil("demo", "--output", folder, "--resume")
     assert done.returncode == 0, done.stderr
-    # A number that was given away is not given twice.
+    # Attempt numbers are not reused.
     assert (folder / "archives" / "validation_001_a2.mcap").exists()
     assert (folder / "report.html").exists()
 
 
-def test_force_removes_nothing_but_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
+def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(campaign.folder.root, folder)
     (folder / "my_notes.txt").write_text("mine")
@@ -225,7 +225,7 @@ def test_an_archive_that_went_missing_is_named(campaign: Campaign, tmp_path: Pat
     assert "excitation_001_a1.mcap is missing" in done.stderr
 
 
-def test_ctrl_c_stops_the_arm_on_its_path_and_leaves_whole_archives(tmp_path: Path) -> None:
+def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     command = [sys.executable, "-m", "hil", "demo", "--output", str(folder)]
     with subprocess.Popen(

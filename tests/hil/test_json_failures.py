@@ -1,4 +1,4 @@
-"""`--json`: one JSON object on stdout also where a command fails, in one form for all of them."""
+"""`--json` prints one JSON object to stdout also if a command fails."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ FAILING = {
     "archive": ("archive", "info", NOWHERE),
     "demo": ("demo", "--nonsense"),
 }
-"""A call of each command that cannot succeed."""
+"""A failing call of each command."""
 
 
 def called(*arguments: str) -> Result:
     return CliRunner().invoke(app, [*arguments, "--json"])
 
 
-def test_what_was_typed_wrong_is_told_likewise() -> None:
+def test_usage_errors_are_json_too() -> None:
     assert {*FAILING} == {*COMMANDS}
     for arguments in (("status",), ("bla",), ("plot", "--no-such-option")):
         result = called(*arguments)
@@ -69,17 +69,17 @@ def test_a_command_that_fails_prints_one_object(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     result = called(*FAILING[command])
-    told = json.loads(result.stdout)
-    assert told["error"]
-    if command != "archive":  # which says it of each of several files
-        assert told["exit_code"] == 2
-        assert told["kind"].isidentifier()
+    document = json.loads(result.stdout)
+    assert document["error"]
+    if command != "archive":  # which has one object per file
+        assert document["exit_code"] == 2
+        assert document["kind"].isidentifier()
     assert [path.name for path in tmp_path.iterdir()] == []
 
 
-def test_an_error_tells_its_parts_and_its_status() -> None:
-    told = as_json(InputError("a.toml", "is empty", field="cell", remedy="fill it"))
-    assert told == {
+def test_json_of_an_error_has_its_parts_and_status() -> None:
+    document = as_json(InputError("a.toml", "is empty", field="cell", remedy="fill it"))
+    assert document == {
         "error": "a.toml: cell: is empty; fill it",
         "kind": "InputError",
         "exit_code": 2,
@@ -93,7 +93,7 @@ def test_an_error_tells_its_parts_and_its_status() -> None:
 
 
 class TestDisk:
-    """What a disk refuses is no bad input: exit status 1, as the docs say, whoever was writing."""
+    """Errors of a disk are not bad input: exit status 1."""
 
     @pytest.fixture(params=[errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG])
     def refusal(self, request: pytest.FixtureRequest) -> OSError:
@@ -129,15 +129,15 @@ class TestDisk:
 
 
 @pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt(), 130), (MemoryError(), 1)])
-def test_ctrl_c_and_what_nobody_foresaw_are_told_too(
+def test_ctrl_c_and_unexpected_errors_are_json_too(
     raised: BaseException, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise raised
 
     monkeypatch.setattr(Campaign, "open", fail)
-    told = json.loads(called("status", NOWHERE).stdout)
-    assert told["exit_code"] == code and told["error"]
+    document = json.loads(called("status", NOWHERE).stdout)
+    assert document["exit_code"] == code and document["error"]
     silent = CliRunner().invoke(app, ["status", NOWHERE])
     assert silent.stdout == ""
 

@@ -1,4 +1,4 @@
-"""The command line only asks, calls the Python face, and tells: it computes and decodes nothing."""
+"""The command line computes, decodes and connects nothing itself."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvx
            "jinja2", "foxglove", "distributed", "fsspec", "pyarrow")  # fmt: skip
 WIRE = ("socket", "struct", "multiprocessing", "ctypes", "mmap")
 OF_NUMPY = {"array", "asarray", "isfinite", "degrees", "max", "abs", "argmax", "float64"}
-"""What it takes to say a number: nothing here estimates, solves, draws lots or integrates."""
+"""Functions of numpy for output: no estimation, solution, sampling or integration."""
 LOOPS = (ast.For, ast.While, ast.ListComp, ast.SetComp, ast.GeneratorExp, ast.DictComp)
 MATHS = (ast.Mult, ast.MatMult, ast.Pow, ast.Div, ast.FloorDiv)
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Full names of what a module imports, wherever in it."""
+    """Yield the full names of all imports of a module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -30,8 +30,8 @@ def imported(tree: ast.AST) -> Iterator[str]:
             yield from (f"{'.' * node.level}{node.module or ''}.{a.name}" for a in node.names)
 
 
-def doings(source: str) -> list[str]:
-    """What a module of the command line does that is not its to do."""
+def violations(source: str) -> list[str]:
+    """Return operations that a module of the command line must not contain."""
     tree, found = ast.parse(source), []
     for name in imported(tree):
         top = name.lstrip(".").split(".")[0]
@@ -53,7 +53,7 @@ def doings(source: str) -> list[str]:
 
 
 def computed(loop: ast.AST) -> Iterator[str]:
-    """Products and quotients of two things that are not known beforehand: no change of units."""
+    """Yield products and quotients of two variables; changes of units are allowed."""
     for node in ast.walk(loop):
         if (
             isinstance(node, ast.BinOp)
@@ -69,12 +69,12 @@ FIGURES = {
     "gains.py": {"computes gains.interval_factor * std in a loop"},
     "plan.py": {"computes getattr(extrema, q) / getattr(plan.limits, q) in a loop"},
 }  # fmt: skip
-"""Figures that are made while they are told: an interval of a spread, a share of a limit."""
+"""Exceptions: values computed for output only."""
 
 
 @pytest.mark.parametrize("path", SHELL, ids=lambda path: path.stem)
 def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> None:
-    assert set(doings(path.read_text("utf-8"))) == FIGURES.get(path.name, set())
+    assert set(violations(path.read_text("utf-8"))) == FIGURES.get(path.name, set())
 
 
 @pytest.mark.parametrize(
@@ -89,11 +89,11 @@ def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> N
         "def f():\n    for k in range(n):\n        torque += regressor[k] @ values",
     ],
 )
-def test_what_would_be_too_much_is_seen(source: str) -> None:
-    assert doings(source)
+def test_violations_are_detected(source: str) -> None:
+    assert violations(source)
 
 
-def test_nothing_that_a_script_uses_knows_the_command_line() -> None:
+def test_no_other_module_imports_the_command_line() -> None:
     for package in OURS:
         for path in (ROOT / package).rglob("*.py"):
             if path in SHELL or path == ROOT / "hil" / "__main__.py":
