@@ -240,8 +240,8 @@ class FourierSeries:
             InvalidTrajectory: a field is missing or invalid.
         """
         try:
-            if data["type"] != "fourier_series":
-                raise InvalidTrajectory("the type is not 'fourier_series'")
+            if (kind := data["type"]) != "fourier_series":
+                raise InvalidTrajectory(f"type is {kind!r:.80}; expected 'fourier_series'")
             return cls(
                 offset=numbers(data["offset"], 1),
                 amplitude=numbers(data["amplitude"], 2),

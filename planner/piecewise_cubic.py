@@ -162,8 +162,8 @@ class PiecewiseCubic:
             InvalidTrajectory: a field is missing or invalid.
         """
         try:
-            if data["type"] != "piecewise_cubic":
-                raise InvalidTrajectory("the type is not 'piecewise_cubic'")
+            if (kind := data["type"]) != "piecewise_cubic":
+                raise InvalidTrajectory(f"type is {kind!r:.80}; expected 'piecewise_cubic'")
             knots = tuple(numbers(row, 1) for row in data["knots"])
             coefficients = tuple(numbers(row, 2) for row in data["coefficients"])
             _check_table(knots, coefficients)
@@ -182,8 +182,10 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
         )
     for joint, (times, pieces) in enumerate(zip(knots, coefficients, strict=True)):
         if len(times) < 2 or pieces.shape != (len(times) - 1, 4):
-            shapes = f"knots {times.shape} and coefficients {pieces.shape}"
-            raise InvalidTrajectory(f"joint {joint}: {shapes}; expected (m + 1,) and (m, 4)")
+            shapes = f"knots {times.shape}, coefficients {pieces.shape}"
+            raise InvalidTrajectory(
+                f"joint {joint}: {shapes}; expected (m + 1,) and (m, 4), m >= 1"
+            )
         if not (np.all(np.isfinite(times)) and np.all(np.isfinite(pieces))):
             raise InvalidTrajectory(f"joint {joint}: knots and coefficients must be finite")
         if times[0] != 0.0 or np.any(np.diff(times) < 0.0) or times[-1] != knots[0][-1]:

@@ -68,12 +68,13 @@ def describe(event: ExchangeEvent) -> str:
         case HoldChanged():
             return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
         case PacketRejected(kind="answered late"):
-            return f"{_replies(event.count)} sent more than a cycle late"
+            packet = "its packet" if event.count == 1 else "their packets"
+            return f"{_replies(event.count)} sent more than a cycle after {packet}"
         case PacketRejected():
             reason = f" ({event.reason})" if event.reason else ""
             return f"{plural(event.count, f'{event.kind} packet')} got no reply{reason}"
         case LinkLost(stale=stale):
-            stale_only = f"only {plural(stale, 'packet')} older than the last one"
+            stale_only = f"only {plural(stale, 'packet')} that cannot follow the last one"
             received = stale_only if stale else "no packet"
             return f"{received} for {event.silence:.3f} s in state {event.state.name}"
         case InitReceived():

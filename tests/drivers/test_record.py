@@ -263,7 +263,7 @@ EXAMPLES = {
     AxisNotInMode: AxisNotInMode(2, 0, 4, 99),
     ModeRefused: ModeRefused(2, 3, False, 99),
     ExitTimeout: ExitTimeout(5000, 6000),
-    errors.SessionFailed: errors.SessionFailed(ValueError("why"), 7),
+    errors.SessionFailed: errors.SessionFailed("why", 7),
     errors.TargetNotFinite: errors.TargetNotFinite(2, 6, float("inf"), 8),
 }
 

@@ -15,7 +15,15 @@ from numpy.typing import NDArray
 
 from drivers import CyclicPacket
 from drivers.drive_train import DriveTrain
-from drivers.events import InitReceived, LinkLost, MotionEnded, MotionStarted, StateChanged
+from drivers.events import (
+    Event,
+    InitReceived,
+    LinkLost,
+    MotionEnded,
+    MotionStarted,
+    PacketRejected,
+    StateChanged,
+)
 from drivers.packets import INIT_LENGTH, InitPacket, is_init, next_number
 from drivers.record import LONGEST_PACKET, PACKET_DTYPE, PacketRing, cycle_dtype
 from drivers.states import State
@@ -24,6 +32,7 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.check import check_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
+from hil.archive.recorder import describe
 from hil.archive.repair import repair
 from hil.archive.schema import CYCLE, PACKETS
 from hil.campaign import Link, Stop
@@ -137,6 +146,23 @@ class TestRecorder:
         assert "no packet for 1.200 s" in silent
         assert lost == "7 records overwritten"
         assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        (PacketRejected("answered late", 1), "1 reply sent more than a cycle after its packet"),
+        (
+            PacketRejected("answered late", 3),
+            "3 replies sent more than a cycle after their packets",
+        ),
+        (PacketRejected("stale", 2, "number 9 does not follow 11"), "2 stale packets got no reply"),
+        (LinkLost(1.2, State.OPEN, 30), "only 30 packets that cannot follow the last one for 1.2"),
+        (LinkLost(1.2, State.OPEN), "no packet for 1.200 s in state OPEN"),
+    ],
+)
+def test_event_texts(event: Event, text: str) -> None:
+    assert text in describe(event)
 
 
 def at(*numbers: int) -> NDArray[np.void]:

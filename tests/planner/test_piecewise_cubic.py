@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.interpolate import PPoly
 
-from planner import InvalidLimits, InvalidTrajectory, JointLimits, NotSmooth, PiecewiseCubic, plan
+from planner import (
+    FourierSeries,
+    InvalidLimits,
+    InvalidTrajectory,
+    JointLimits,
+    NotSmooth,
+    PiecewiseCubic,
+    plan,
+)
 from planner.piecewise_cubic import Block
 from planner.verify import check_rest, check_smooth
 from tests.planner.six_axes import SIX_AXES, random_points
@@ -122,6 +130,18 @@ def test_refuses_stored_data_that_are_no_trajectory(damage):
     PiecewiseCubic.from_dict(good)
     with pytest.raises(InvalidTrajectory):
         PiecewiseCubic.from_dict({**good, **damage})
+
+
+@pytest.mark.parametrize("kind", [PiecewiseCubic, FourierSeries])
+def test_refusal_of_another_type_names_both(kind):
+    with pytest.raises(InvalidTrajectory, match=r"type is 'spline'; expected '(piece|fourier)"):
+        kind.from_dict({"type": "spline"})
+
+
+def test_refusal_of_a_trajectory_without_pieces_states_how_many_are_needed():
+    stored = {"type": "piecewise_cubic", "knots": [[0.0]], "coefficients": [[]]}
+    with pytest.raises(InvalidTrajectory, match="m >= 1"):
+        PiecewiseCubic.from_dict(stored)
 
 
 def test_tables_are_read_only():

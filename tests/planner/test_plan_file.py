@@ -278,7 +278,7 @@ def test_a_damaged_file_is_an_invalid_one_whatever_the_damage(damage):
 
 @pytest.mark.parametrize("data", [[], None, 5, "plan"])
 def test_what_is_no_table_is_no_plan(data):
-    with pytest.raises(InvalidPlanFile):
+    with pytest.raises(InvalidPlanFile, match=r"not a plan: top level: .* dictionary"):
         PlanFile.from_dict(data)
 
 
