@@ -495,7 +495,7 @@ def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
         current = f"{100.0 * share:.0f} % of its limit"
         weight = agree.get(name, Text("agree"))
         table.add_row(Text(printable(name)), f"{math.degrees(error):.3f}°", current, weight)
-    link = f"{plural(found.missed, 'packet')} missed, {found.late} replies late"
+    link = f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'reply')} late"
     table.caption = Text(printable(f"{link}; {', '.join(found.archives)}"))
     console.print(table)
     for warning in found.warnings:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 
 def plural(number: int, noun: str) -> str:
-    """Number and noun: 1 packet, 2 packets; the noun is one that takes an s."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+    """Return number and noun: 1 packet, 2 packets, 2 replies."""
+    several = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else several}"
 
 
 def printable(text: str, *, keep: str = "\n") -> str:

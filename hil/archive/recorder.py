@@ -60,16 +60,15 @@ def describe(event: ExchangeEvent) -> str:
         case GapSeen():
             return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
         case AnswersLost():
-            return (
-                f"{_replies(event.count)} not accepted by the controller, until cycle {event.cycle}"
-            )
+            replies = plural(event.count, "reply")
+            return f"{replies} not accepted by the controller, until cycle {event.cycle}"
         case OverrideChanged():
             return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
         case HoldChanged():
             return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
         case PacketRejected(kind="answered late"):
             packet = "its packet" if event.count == 1 else "their packets"
-            return f"{_replies(event.count)} sent more than a cycle after {packet}"
+            return f"{plural(event.count, 'reply')} sent more than a cycle after {packet}"
         case PacketRejected():
             reason = f" ({event.reason})" if event.reason else ""
             return f"{plural(event.count, f'{event.kind} packet')} got no reply{reason}"
@@ -85,10 +84,6 @@ def describe(event: ExchangeEvent) -> str:
         case ExchangeStarted():
             return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
     return _SENTENCES[type(event)].format(event)
-
-
-def _replies(count: int) -> str:
-    return f"{count} {'reply' if count == 1 else 'replies'}"
 
 
 _ERRORS: Final = (Refused, LinkLost, ExchangeFailed, EventsLost)

@@ -185,7 +185,7 @@ def _accepted(found: DryRun | None) -> Step:
         details=(
             f"largest current, of its limit: {currents}",
             f"{plural(len(found.archives), 'motion')} at {found.override:.0%} of their speed",
-            f"{plural(found.missed, 'packet')} missed, {found.late} replies late",
+            f"{plural(found.missed, 'packet')} missed, {plural(found.late, 'reply')} late",
             *(f"{warning}; it was accepted by name" for warning in found.warnings),
         ),
     )

@@ -70,7 +70,7 @@ def move(
     """
     if (to is None) == (joint is None) or (joint is None) != (by is None):
         remedy = "give either --to, or --joint and --by"
-        raise InputError(None, "no target", remedy=remedy)
+        raise InputError(None, "one target is needed", remedy=remedy)
     campaign = Campaign.open(where) if where.is_dir() else None
     cell = Cell.load(where) if campaign is None else campaign.cell
     axis = axis_alone(cell, joint) if only_axis else None

@@ -158,6 +158,8 @@ def test_one_target_of_six_angles_is_asked_for(arguments: list[str]) -> None:
     assert isinstance(result.exception, InputError)
     if len(arguments) == 2 and arguments[1] != "1":
         assert "6 angles in degrees" in str(result.exception)
+    if arguments in ([], ["--to", "home", "--joint", "1"]):
+        assert "one target is needed" in str(result.exception)
 
 
 def test_a_real_controller_is_not_driven_unless_a_person_confirms(

@@ -207,9 +207,9 @@ def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
 
 
 def until_heard(recorder: subprocess.Popen[str]) -> str:
-    """The line that says what was heard; notes on what the system refused come before it."""
+    """The line on the packets received; notes on what the system refused come before it."""
     assert recorder.stdout is not None
-    return next(line for line in recorder.stdout if "heard" in line)
+    return next(line for line in recorder.stdout if "packets from" in line)
 
 
 def recorder_of(cell: Path, *options: object) -> Any:

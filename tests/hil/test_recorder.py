@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from drivers import CyclicPacket
 from drivers.drive_train import DriveTrain
 from drivers.events import (
+    AnswersLost,
     Event,
     InitReceived,
     LinkLost,
@@ -326,3 +327,9 @@ class TestRawPackets:
         (returned,) = ring.drain()
         assert returned["length"] == 1536
         assert returned["data"].tobytes() == (bytes(range(256)) * 6)[:LONGEST_PACKET]
+
+
+@pytest.mark.parametrize(("count", "replies"), [(1, "1 reply"), (2, "2 replies")])
+def test_events_count_replies(count: int, replies: str) -> None:
+    assert describe(AnswersLost(count, 7)).startswith(f"{replies} not accepted by the controller")
+    assert describe(PacketRejected("answered late", count)).startswith(f"{replies} sent more than")
