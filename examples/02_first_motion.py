@@ -1,7 +1,7 @@
 """A first motion: the simulated NS 16 goes home, and every cycle of it is archived.
 
-One sees where the arm stood, how long the way takes, how it ended, and in the picture what the
-archive holds: position, speed, currents against their limits, following error, events.
+Prints the initial posture, the duration and the outcome; the picture shows the archive: position,
+speed, currents and their limits, following error, events.
 """
 
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 from hil import Cell
 from hil.campaign import stop_on_interrupt
 from hil.cell_link import cell_link
-from hil.move import send, straight_way
+from hil.move import plan_move, send
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
 
@@ -25,10 +25,10 @@ def main() -> None:
     with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
         here = link.connect(stop)  # a controller that does not fit the cell file is refused here
         print("the arm stands at", np.degrees(here).round(1), "degrees (URDF)")
-        way = straight_way(cell, here, cell.home)  # limits, contacts, currents: checked
-        print(f"home is {way.duration:.2f} s away")
+        move = plan_move(cell, here, cell.home)  # limits, contacts, currents: checked
+        print(f"home is {move.duration:.2f} s away")
         archive = Path(folder) / "move_000_a1.mcap"
-        ended = send(way, cell, link, archive, stop=stop)
+        ended = send(move, cell, link, archive, stop=stop)
         print(f"{ended.outcome}; {archive.stat().st_size / 1e3:.0f} kB archived")
         PICTURE.parent.mkdir(parents=True, exist_ok=True)
         save(draw_archive(view_of(archive)), PICTURE)

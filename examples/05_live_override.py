@@ -1,6 +1,6 @@
 """Overriding a motion while it runs: slower, then on at full speed, on the path all the time.
 
-One sees how far the commanded positions are from the straight way that was planned: rounding. The
+One sees how far the commanded positions are from the planned straight motion: rounding. The
 picture shows what was wished, the speed along the path that followed within the limits of
 `[bounds]`, and that of the joints. On a real arm the keys of `hil run` do this; any object with
 `show` and `request` can.
@@ -17,13 +17,13 @@ from hil.archive import open_archive
 from hil.campaign import stop_on_interrupt
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell_link import cell_link
-from hil.move import send, straight_way
+from hil.move import plan_move, send
 
 PICTURE = Path("runs/examples/05_live_override.png")
 
 
 class Person:
-    """Slows the motion down from a quarter to half of the way."""
+    """Slows the motion down from a quarter to half of the motion."""
 
     def __init__(self) -> None:
         self.wishes, self.seen = OperatorRequest(), []
@@ -41,14 +41,14 @@ class Person:
 
 cell, person = Cell.load("sim_fixtures/ns16/cell.toml"), Person()
 with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
-    way = straight_way(cell, link.connect(stop), cell.home, speed=0.02)
+    move = plan_move(cell, link.connect(stop), cell.home, speed=0.02)
     archive = Path(folder) / "move_000_a1.mcap"
-    print(send(way, cell, link, archive, stop=stop, watch=person).outcome)
+    print(send(move, cell, link, archive, stop=stop, watch=person).outcome)
     q = open_archive(archive).columns["commanded_position"]
     q = q[np.isfinite(q).all(axis=1)]
-along = (way.target - way.start) / np.linalg.norm(way.target - way.start)
-beside = (q - way.start) - np.outer((q - way.start) @ along, along)
-print(f"{way.duration:.2f} s planned, {len(q) * cell.period:.2f} s executed")
+along = (move.target - move.start) / np.linalg.norm(move.target - move.start)
+beside = (q - move.start) - np.outer((q - move.start) @ along, along)
+print(f"{move.duration:.2f} s planned, {len(q) * cell.period:.2f} s executed")
 print(f"largest distance from the planned path: {np.abs(beside).max():.1e} rad")
 figure, rows = plt.subplots(2, sharex=True, figsize=(8, 4.5), layout="constrained")
 cycles, wished, rate = np.array(person.seen).T

@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from drivers import CycleRing, Guard, Session, TransportClosed
 from hil import Cell
 from hil.campaign import Link, stop_on_interrupt
-from hil.move import send, straight_way
+from hil.move import plan_move, send
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
 from hil.simulation import simulated_controller
@@ -84,8 +84,8 @@ def main() -> None:
     link = Link(PipeTransport(near, cell.period), session, ring, guard, cell)
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
-        way = straight_way(cell, link.connect(stop), cell.home)
-        print(send(way, cell, link, archive, stop=stop).outcome, link.transport.packets, "packets")
+        move = plan_move(cell, link.connect(stop), cell.home)
+        print(send(move, cell, link, archive, stop=stop).outcome, link.transport.packets, "packets")
         PICTURE.parent.mkdir(parents=True, exist_ok=True)
         save(draw_archive(view_of(archive, joints=("1",))), PICTURE)
 

@@ -5,7 +5,7 @@ Campaigns:
 - `Cell`: robot, drive train, controller and limits of a cell file.
 - `Campaign`: a folder with one plan for one cell: rehearse, run, identify, report.
 - `simulated_controller`: a simulated controller with the arm of a cell.
-- `straight_way`, `send`: plan a straight motion in joint space; send a motion and archive it.
+- `plan_move`, `send`: plan a straight motion in joint space; send a motion and archive it.
 - `Stop`, `stop_on_interrupt`: stop the arm on its path, also on Ctrl-C.
 - `reporter`, `Silent`: progress bars, or none.
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from hil.exporting import export_model
     from hil.identify import Options, identify_archives, identify_campaign
     from hil.importers import ColumnMap, Robot, import_log, import_rosbag2
-    from hil.move import send, straight_way
+    from hil.move import plan_move, send
     from hil.progress import Silent, reporter
     from hil.recordings import open_recording
     from hil.replaying import replay_motions
@@ -53,7 +53,7 @@ _HOME = {
     **dict.fromkeys(("Campaign", "Stop", "stop_on_interrupt"), "campaign"),
     **dict.fromkeys(("Options", "identify_archives", "identify_campaign"), "identify"),
     **dict.fromkeys(("ColumnMap", "Robot", "import_log", "import_rosbag2"), "importers"),
-    **dict.fromkeys(("send", "straight_way"), "move"),
+    **dict.fromkeys(("send", "plan_move"), "move"),
     **dict.fromkeys(("Silent", "reporter"), "progress"),
     "Cell": "cell",
     "Results": "results",
@@ -90,7 +90,7 @@ __all__ = [
     "send",
     "simulated_controller",
     "stop_on_interrupt",
-    "straight_way",
+    "plan_move",
 ]
 
 

@@ -1,7 +1,7 @@
 """`python -m hil`, and the console script.
 
-One thread of linear algebra unless the environment says otherwise: the matrices are small, more
-threads only get into each other's way, and sums would depend on how many there are.
+Linear algebra uses one thread unless the environment sets another number: the matrices are small,
+and the rounding of sums would depend on the number of threads.
 """
 
 from __future__ import annotations

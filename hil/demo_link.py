@@ -1,4 +1,4 @@
-"""A simulated controller in a process of its own, and a real link to it on this computer."""
+"""Simulated controller in another process, with a real link to it over the loopback device."""
 
 from __future__ import annotations
 
@@ -25,65 +25,61 @@ from hil.errors import ControllerFault
 
 LOOPBACK = "127.0.0.1"
 CAN = CanTable(interface="udp_multicast", channel="239.74.163.31")
-"""A CAN bus within this computer: python-can's, without an adapter."""
+"""Virtual CAN bus of python-can, without an adapter."""
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 END_TIMEOUT = 20.0
-"""s a simulated controller may take to end its session."""
+"""Time limit for a simulated controller to end its session, s."""
 
 
 @dataclass(eq=False)
 class SimulatorProcess:
-    """`hil simulate`, running.
-
-    Attributes:
-        process: the child; `terminate` lets it end its session properly.
-    """
+    """A child process that runs `hil simulate`."""
 
     process: subprocess.Popen[bytes]
-    _words: IO[bytes] = field(repr=False)
-    _figures: IO[bytes] = field(repr=False)
+    _stderr: IO[bytes] = field(repr=False)
+    _stdout: IO[bytes] = field(repr=False)
 
     @classmethod
     def start(cls, cell: Path, *options: str) -> SimulatorProcess:
         """Start a controller for a cell file."""
-        words, figures = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - for its life
+        stderr, stdout = (tempfile.TemporaryFile() for _ in range(2))  # noqa: SIM115 - closed in end
         process = subprocess.Popen(
             [*SIMULATE, str(cell), "--json", *options],
             stdin=subprocess.DEVNULL,
-            stdout=figures,
-            stderr=words,
+            stdout=stdout,
+            stderr=stderr,
             start_new_session=True,
         )
-        return cls(process, words, figures)
+        return cls(process, stderr, stdout)
 
     @property
     def running(self) -> bool:
-        """Whether its session goes on, or has yet to begin."""
+        """Whether the process runs."""
         return self.process.poll() is None
 
     def finish(self) -> None:
-        """Ask it to end the session: the arm stands, the drive goes off, then mode 504."""
+        """Request the end of the session: arm at rest, drive off, then mode 504."""
         if self.running:
             self.process.send_signal(signal.SIGTERM)
 
     def failure(self) -> str | None:
-        """What it said before it failed; None while it runs, or if it ended properly."""
+        """Return its last error message; None while it runs, or if it succeeded."""
         if not self.process.poll():
             return None
-        said = [line for line in _lines(self._words) if any(letter.isalpha() for letter in line)]
-        errors = [line for line in said if line.startswith("error:")]
-        return (errors or said or [f"exit status {self.process.returncode}"])[-1]
+        lines = [line for line in _lines(self._stderr) if any(letter.isalpha() for letter in line)]
+        errors = [line for line in lines if line.startswith("error:")]
+        return (errors or lines or [f"exit status {self.process.returncode}"])[-1]
 
     def end(self) -> dict[str, Any]:
-        """Wait for its end, or kill it; what it counted (`docs/simulate.md`), nothing if killed."""
+        """Wait for the end, or kill it; return its summary (`docs/simulate.md`), {} if killed."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(END_TIMEOUT)
         if self.running:
             self.process.kill()
             self.process.wait()
-        lines = _lines(self._figures)
-        self._words.close()
-        self._figures.close()
+        lines = _lines(self._stdout)
+        self._stderr.close()
+        self._stdout.close()
         return json.loads(lines[-1]) if lines else {}
 
 
@@ -100,22 +96,25 @@ def loopback_link(
     options: tuple[str, ...] = (),
     live: LiveView | None = None,
 ) -> Iterator[LiveLink]:
-    """A `LiveLink` to a simulated controller of `cell` that runs beside this program.
+    """Start a simulated controller in another process and connect a `LiveLink` to it.
 
-    Over the cell's own transport, "udp" or "can", but always within this computer: UDP takes a
-    free port of the loopback device, CAN the bus that the cell names. `simulated_by` is a cell
-    file for the controller, if not the cell's own, `options` are further ones of `hil simulate`.
+    Args:
+        cell: its transport, "udp" or "can", is used: a free UDP port of the loopback device, or
+            the CAN bus of the cell.
+        simulated_by: cell file of the controller, by default that of `cell`.
+        options: further options of `hil simulate`.
+        live: settings of the live view.
     """
     spec: TransportSpec
     if cell.controller.can is not None and cell.controller.transport == "can":
         table = cell.controller.can
         spec = cell.transport_spec()
-        far = ("--can", f"{table.interface}:{table.channel}:{table.profile}")
+        address = ("--can", f"{table.interface}:{table.channel}:{table.profile}")
     else:
         port = free_port()
         spec = UdpSpec(peer_host=LOOPBACK, port=port, bind=LOOPBACK)
-        far = ("--udp", f"{LOOPBACK}:{port}")
-    simulator = SimulatorProcess.start(simulated_by or cell.path, *far, *options)
+        address = ("--udp", f"{LOOPBACK}:{port}")
+    simulator = SimulatorProcess.start(simulated_by or cell.path, *address, *options)
     try:
         with LiveLink.open(cell, transport=spec, finish=simulator.finish, live=live) as link:
             yield link
@@ -129,7 +128,7 @@ def loopback_link(
 
 
 def free_port() -> int:
-    """A UDP port of the loopback device that nobody uses now."""
+    """Return a free UDP port of the loopback device."""
     with socket(AF_INET, SOCK_DGRAM) as probe:
         probe.bind((LOOPBACK, 0))
         port: int = probe.getsockname()[1]

@@ -6,22 +6,22 @@ HilError                   exit status 1
 │   ├── MotionRefusedError      limits, current, collision, or too long
 │   ├── NoExcitationError       every motion of a design would be refused
 │   ├── NotRehearsedError       the plan did not pass its rehearsal
-│   └── DryRunError             nobody has accepted the plan's slow dry run
+│   └── DryRunError             the slow dry run of the plan was not accepted
 ├── ControllerFault        4: the controller, the link or the guard ended a motion
-│   └── MotionFailedError       and what was recorded of it is archived
-├── RepetitionsRejectedError   5: a motion failed its quality check again and again
-├── OperatorStopError         130: a person stopped the work
-├── OutputError            1: what was found cannot be written: disk full, no permission
-└── InputError             2: something the user gave cannot be used: file, field, problem, remedy
-                           (1 on the command line, where a disk refused: `DISK_REFUSES`)
+│   └── MotionFailedError       with the archive of what was recorded
+├── RepetitionsRejectedError   5: a motion failed its quality check repeatedly
+├── OperatorStopError         130: stopped by the operator
+├── OutputError            1: results cannot be written: disk full, no permission
+└── InputError             2: invalid input of the user: file, field, problem, remedy
+                           (1 on the command line for errors of a disk: `DISK_REFUSES`)
     ├── ArchiveError       an archive that cannot be read or written
-    │   ├── NotAnArchiveError       not ours: other format, empty, torn at its head
+    │   ├── NotAnArchiveError       another format, empty, or truncated in its header
     │   ├── ArchiveVersionError     written by a newer version of the archive profile
-    │   └── ArchiveWriteError       the file cannot be created or the disk refuses
+    │   └── ArchiveWriteError       the file cannot be created or written
     ├── CellError          the cell file
     ├── SettingsError      the settings of a design
     ├── CampaignFolderError     the campaign folder
-    ├── WrongObjectError   an argument of another type than it has to be (a TypeError too)
+    ├── WrongObjectError   an argument of the wrong type (also a TypeError)
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
 ```
 """
@@ -38,34 +38,34 @@ from typing import ClassVar, Final, Self
 from hil.terminal_text import printable
 
 DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG})
-"""Numbers of an OSError that nothing typed or given can mend: full, over quota, broken."""
+"""Numbers of an OSError that are not caused by input: disk full, over quota, failed."""
 
 
 class HilError(Exception):
-    """Anything `hil` refuses to do; the message is a sentence for the person at the keyboard.
+    """Base class of the errors of `hil`; the message is for the operator.
 
     Attributes:
-        exit_code: exit status of the command line when this error ends it.
-        figures: what a script receives beside the sentence, of work that was done until then.
+        exit_code: exit status of the command line.
+        figures: JSON data about the work done before the error.
     """
 
     exit_code: ClassVar[int] = 1
     figures: Mapping[str, object] = MappingProxyType({})
 
     def beside(self, figures: Mapping[str, object]) -> Self:
-        """This error with figures."""
+        """Return this error with figures."""
         self.figures = dict(figures)
         return self
 
 
 class InputError(HilError):
-    """Something given by the user that cannot be used.
+    """Invalid input of the user.
 
     Attributes:
-        path: the file to blame, None when it is not a file.
-        field: the part of it (table and key, column, topic, record), "" for the whole.
-        problem: what is wrong with it, with the value found.
-        remedy: what would be right, "" when nothing can be advised.
+        path: of the file, None if it is not a file.
+        field: part of it (table and key, column, topic, record), "" for all of it.
+        problem: what is wrong, with the value.
+        remedy: "" for none.
     """
 
     exit_code: ClassVar[int] = 2
@@ -92,15 +92,15 @@ class ArchiveError(InputError):
 
 
 class NotAnArchiveError(ArchiveError):
-    """A file that is not an archive of ours, or was torn before it held anything."""
+    """A file that is not an archive of `hil`, or is truncated in its header."""
 
 
 class ArchiveVersionError(ArchiveError):
-    """An archive written with a profile version this software does not know."""
+    """An archive of an unknown profile version."""
 
 
 class ArchiveWriteError(ArchiveError):
-    """An archive that cannot be created, or whose disk refuses to take more."""
+    """An archive that cannot be created or written."""
 
 
 class SourceError(InputError):
@@ -108,18 +108,18 @@ class SourceError(InputError):
 
 
 class OutputError(HilError):
-    """A folder that does not take what was found; nothing in it was changed.
+    """A folder that cannot be written to; nothing in it was changed.
 
     Attributes:
-        path: the folder.
-        problem: what is wrong with it.
+        path: of the folder.
+        problem: what is wrong.
     """
 
     def __init__(self, path: Path, problem: str) -> None:
         self.path = path
         self.problem = problem
         super().__init__(
-            f"{path}: {problem}; nothing there was changed: make room, or name another folder"
+            f"{path}: {problem}; nothing was changed: free disk space, or use another folder"
         )
 
 
@@ -130,7 +130,7 @@ class UnsafeError(HilError):
 
 
 class OperatorStopError(HilError):
-    """A person stopped the work; what was recorded is whole."""
+    """Stopped by the operator; everything recorded is archived."""
 
     exit_code: ClassVar[int] = 130
 

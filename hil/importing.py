@@ -1,4 +1,4 @@
-"""Ctrl-C while libraries are imported."""
+"""Ctrl-C during imports."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from typing import Any, NoReturn
 
 @contextmanager
 def leave_if_interrupted() -> Iterator[None]:
-    """Leave at once on Ctrl-C: an interrupted import fails in ways of its own, and holds nothing.
+    """Exit on Ctrl-C during an import, which could otherwise fail with any exception.
 
-    Where somebody else heeds the signal, or a shell has it ignored, nothing is changed.
+    Other signal handlers are not changed.
     """
     before: Any = signal.getsignal(signal.SIGINT)
-    ours = (
+    is_default = (
         before is signal.default_int_handler
         and threading.current_thread() is threading.main_thread()
     )
-    if ours:
+    if is_default:
         signal.signal(signal.SIGINT, _leave)
     try:
         yield
     finally:
-        if ours:
+        if is_default:
             signal.signal(signal.SIGINT, before)
 
 

@@ -1,4 +1,4 @@
-"""One straight way to a posture: planned from where the arm stands, checked, sent, archived."""
+"""Straight motion in joint space to a posture: planned, checked, executed and archived."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.events import MotionEnded
 from hil.campaign.errors import MotionRefusedError
-from hil.campaign.intervals import Interval, player_of, way
+from hil.campaign.intervals import Interval, player_of, straight_move
 from hil.campaign.motion_link import MotionLink, active_checks
 from hil.campaign.operator import MotionWatch, Stop, unwatched_motion
 from hil.campaign.plan import moves_to_dict
@@ -24,19 +24,19 @@ from planner import FourierSeries, PiecewiseCubic
 Array = NDArray[np.float64]
 
 _ROUND: Final = 0.1
-"""deg; via points drawn at random are as round as those a person teaches."""
+"""Resolution of random via points, deg."""
 THERE = 1e-4
-"""rad; an arm that is so near to a posture is there."""
+"""Distance below which an arm is at a posture, rad."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A way that passed every check.
+class CheckedMove:
+    """A straight motion that passed all checks.
 
     Attributes:
-        start: (n,) rad, where the arm stood when it was planned.
+        start: (n,) rad.
         target: (n,) rad.
-        interval: the motion, and what it was planned from.
+        interval: the motion with its plan.
         speed: fraction of the joints' speeds.
         checks: that it passed.
     """
@@ -54,23 +54,23 @@ class Way:
 
     @property
     def duration(self) -> float:
-        """How long it takes at full speed [s]."""
+        """Duration at full speed [s]."""
         return self.trajectory.duration
 
     @property
     def not_checked(self) -> str:
-        """What the check of contacts leaves out, in words; "" for nothing."""
+        """Contacts that were not checked, "" for none."""
         return self.checks.not_checked or ""
 
 
 def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
-    """The home posture, or the middle of the limits, and points within the limits (1 + m, n) [rad].
+    """Return home (or the middle of the limits) and random points in the limits (1 + m, n) [rad].
 
     Args:
-        cell: whose limits.
-        frame: angles in which they are round.
-        count: points m.
-        seed: the same gives the same points.
+        cell: with the limits.
+        frame: angles in which the points are rounded.
+        count: number m of points.
+        seed: of the random numbers.
     """
     limits = cell.joint_limits
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
@@ -82,16 +82,16 @@ def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> A
 
 
 def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Array:
-    """The posture (n,) [rad, URDF angles] that a word or a list of degrees names.
+    """Parse a posture (n,) [rad, URDF angles].
 
     Args:
-        cell: whose arm.
-        text: "home"; "start": where the excitation begins, home without one; or degrees in the
-            frame of the cell's [limits], apart by commas or blanks.
+        cell: of the arm.
+        text: "home"; "start" (start of the excitation, home without one); or degrees in the frame
+            of the cell's [limits], separated by commas or blanks.
         excitation_start: (n,) rad, of a campaign.
 
     Raises:
-        InputError: it names no posture.
+        InputError: the text is not a posture.
     """
     if text == "home" or (text == "start" and excitation_start is None):
         return cell.home
@@ -106,24 +106,18 @@ def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Arr
     if len(degrees) != n or not np.isfinite(degrees).all():
         raise InputError(
             None,
-            f"{text!r} is no posture",
+            f"{text!r} is not a posture",
             field="--to",
-            remedy=f"give start, home, or {n} angles in degrees apart by commas",
+            remedy=f"give start, home, or {n} angles in degrees separated by commas",
         )
     return AngleFrame.of(cell).urdf(degrees)
 
 
 def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
-    """`start` (n,) [rad] with one joint further by `degrees` of the frame of [limits].
-
-    Args:
-        cell: whose arm.
-        start: where it stands.
-        joint: its name, or its number from 1.
-        degrees: how far.
+    """Return `start` (n,) [rad] with one joint turned by `degrees` in the frame of [limits].
 
     Raises:
-        InputError: there is no such joint.
+        InputError: `joint` is neither a name nor a number from 1.
     """
     target = start.copy()
     index = joint_index(cell, joint, "--joint")
@@ -132,7 +126,7 @@ def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
 
 
 def joint_index(cell: Cell, joint: str, field: str) -> int:
-    """Index, from 0, of a joint given by its name, or its number from 1.
+    """Return the index of a joint given by name, or by number from 1.
 
     Raises:
         InputError: there is no such joint.
@@ -143,66 +137,64 @@ def joint_index(cell: Cell, joint: str, field: str) -> int:
     if index is None:
         raise InputError(
             None,
-            f"{joint!r} is no joint",
+            f"{joint!r} is not a joint",
             field=field,
-            remedy=f"name one of {', '.join(names)}",
+            remedy=f"use one of {', '.join(names)}",
         )
     return index
 
 
 def axis_alone(cell: Cell, joint: str | None) -> int:
-    """Number, from 1, of the axis that moves a joint by itself.
+    """Return the number, from 1, of the only axis that moves a joint.
 
     Raises:
-        InputError: no joint is named, or a wrist coupling turns further motors with it.
+        InputError: no joint is given, or several motors move it.
     """
     if joint is None:
-        raise InputError(
-            None, "which axis is open?", field="--only-axis", remedy="give --joint and --by"
-        )
+        raise InputError(None, "needs a joint", field="--only-axis", remedy="give --joint and --by")
     index = joint_index(cell, joint, "--joint")
     motors = np.flatnonzero(cell.drive_train.motor_from_joint[:, index]) + 1
     if motors.tolist() != [index + 1]:
         raise InputError(
             None,
-            f"joint {index + 1} moves by the motors of axes {', '.join(map(str, motors))}",
+            f"joint {index + 1} is moved by the motors of axes {', '.join(map(str, motors))}",
             field="--only-axis",
             remedy="move another joint first, or open all axes",
         )
     return index + 1
 
 
-def straight_way(
+def plan_move(
     cell: Cell,
     start: Array,
     target: Array,
     *,
     speed: float | None = None,
     checks: MotionChecks | None = None,
-) -> Way:
-    """Plan the straight way in joint space between two postures, and check it.
+) -> CheckedMove:
+    """Plan and check a straight motion in joint space between two postures.
 
     Args:
         cell: limits, workspace and nominal model.
         start: (n,) rad.
         target: (n,) rad.
-        speed: fraction of the joints' speeds; the cell's `approach_speed` if left out.
-        checks: the cell's if left out; `active_checks` has those with a connected controller's
-            own limits, which `send` asks for again.
+        speed: fraction of the joints' speeds; by default the cell's `approach_speed`.
+        checks: by default the cell's; `active_checks` are those with the limits of a connected
+            controller, which `send` applies again.
 
     Raises:
-        MotionRefusedError: it breaks a limit, touches something or needs too much current.
-        PlannerError: the solver crashed, or found no way.
+        MotionRefusedError: it violates a limit, collides or needs too much current.
+        PlannerError: the solver crashed, or found no motion.
     """
     checks = checks or MotionChecks.of(cell)
     speed = cell.campaign.approach_speed if speed is None else speed
-    planned = way(cell, start, target, speed)
+    planned = straight_move(cell, start, target, speed)
     _require(checks, planned.trajectory)
-    return Way(start, target, planned, speed, checks)
+    return CheckedMove(start, target, planned, speed, checks)
 
 
 def send(
-    planned: Way,
+    planned: CheckedMove,
     cell: Cell,
     link: MotionLink,
     path: Path,
@@ -211,21 +203,20 @@ def send(
     watch: MotionWatch = unwatched_motion,
     durable: bool = True,
 ) -> MotionEnded:
-    """Run a way on a connected link and archive every cycle of it.
+    """Execute a motion on a connected link and archive every cycle.
 
     Args:
-        planned: what passed its checks.
-        cell: travels in the archive.
+        planned: the motion.
+        cell: stored in the archive.
         link: connected.
         path: of the archive, which must not exist.
-        stop: brings the arm to rest on the way.
-        watch: sees the motion, and may slow and hold it.
-        durable: wait at each flush until the disk has the data.
+        stop: stops the arm on its path.
+        watch: shows the motion, and may slow and hold it.
+        durable: whether each flush waits for the disk.
 
     Raises:
-        MotionRefusedError: the controller announces a current limit below the cell's, and the way
-            needs more.
-        ControllerFault: it was not accepted (nothing moved), or the link broke.
+        MotionRefusedError: the motion needs more current than the controller's limit.
+        ControllerFault: it was not accepted (nothing moved), or the link failed.
         ArchiveWriteError: the archive cannot be written; the arm was stopped.
     """
     checks = active_checks(cell, link.connection, planned.checks)
@@ -243,5 +234,5 @@ def send(
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:
     if (problem := checks.refusal(trajectory)) is not None:
-        remedy = "go slower or by way of another posture, or jog the arm"
-        raise MotionRefusedError("the way", problem, remedy)
+        remedy = "reduce the speed, move via another posture, or jog the arm"
+        raise MotionRefusedError("the motion", problem, remedy)

@@ -1,4 +1,4 @@
-"""What an identification leaves in a folder: exports, results, the report and its series."""
+"""Output files of an identification: exports, results, report and its series."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from identification.export.urdf import write_urdf
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
 _WORDS: Final = ("example_archive", "replay_words")
 _LARGEST: Final = 1 << 30
-"""Bytes of series that are read; those of a campaign of 30 repetitions have a hundredth of it."""
+"""Maximum size of series in bytes, a hundred times that of a campaign of 30 repetitions."""
 
 
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
-    """Write files for other tools, `results.json` and the page, or nothing; say where they are.
+    """Write exports, `results.json` and report together, and report their names.
 
     Raises:
         OutputError: the folder cannot be written to; nothing in it was changed.
@@ -53,18 +53,18 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         REPORT: report_bytes(results, found.series),
     }
     write_files(folder, files)
-    for name, why in exports.withheld.items():
-        reporter.say(f"{name} was not written: {why}")
+    for name, reason in exports.withheld.items():
+        reporter.say(f"{name} was not written: {reason}")
     reporter.say(f"written to {folder}: {RESULTS}, {', '.join(exports.result.written)}")
     reporter.say(f"report: {folder / REPORT}")
     return results
 
 
 def rewrite_report(folder: Path) -> Results:
-    """Make the page anew from the results and series that lie in a folder.
+    """Create the report again from the results and series in a folder.
 
     Raises:
-        InputError: they are not there, or cannot be read.
+        InputError: they are missing, or cannot be read.
         OutputError: the folder cannot be written to.
     """
     results = Results.load(folder / RESULTS)
@@ -72,8 +72,8 @@ def rewrite_report(folder: Path) -> Results:
     try:
         page = report_bytes(results, series)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        # What was written by us can be drawn; what somebody wrote has lists of any length.
-        problem = f"holds what no page can be drawn from ({error})"
+        # For example lists of unequal length in an edited file.
+        problem = f"contains values that a report cannot show ({error})"
         remedy = "identify again from the archives (`hil identify`)"
         raise InputError(folder / RESULTS, problem, remedy=remedy) from error
     write_files(folder, {REPORT: page})
@@ -92,18 +92,18 @@ def report_replay(
         InputError: results or series cannot be read.
         OutputError: the folder cannot be written to.
     """
-    there = Results.load(folder / RESULTS)
-    if [p.estimate for p in there.parameters] != [p.estimate for p in results.parameters]:
-        reporter.say(f"note: {folder / REPORT} is of another identification; it stays as it is")
+    existing = Results.load(folder / RESULTS)
+    if [p.estimate for p in existing.parameters] != [p.estimate for p in results.parameters]:
+        reporter.say(f"note: {folder / REPORT} is of another identification and was not changed")
         return
-    series = replay(_load_series(folder / SERIES, len(there.joint_names)))
-    pages = {SERIES: _series_bytes(series), REPORT: report_bytes(there, series)}
+    series = replay(_load_series(folder / SERIES, len(existing.joint_names)))
+    pages = {SERIES: _series_bytes(series), REPORT: report_bytes(existing, series)}
     write_files(folder, pages)
     reporter.say(f"report: {folder / REPORT}")
 
 
 def _series_bytes(series: ReportSeries) -> bytes:
-    """The series behind the figures as a `.npz` file."""
+    """Return the series of the figures as a `.npz` file."""
     content = BytesIO()
     np.savez_compressed(content, **asdict(series))
     return content.getvalue()
@@ -122,8 +122,8 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
         words = {name: str(one) for name, one in arrays.items() if name in _WORDS}
         series = ReportSeries(**(arrays | words))
         return series.checked_for(n_joints)
-    except Exception as error:  # a forged archive makes its readers raise anything
-        problem = f"does not hold the series of a report ({error})"
+    except Exception as error:  # readers of a corrupt file may raise anything
+        problem = f"does not contain the series of a report ({error})"
         remedy = "identify again from the archives (`hil identify`)"
         raise InputError(path, problem, remedy=remedy) from error
 
@@ -133,22 +133,19 @@ PARAMETERS_JSON, PARAMETERS_CSV = "parameters.json", "parameters.csv"
 STANDARD_CSV = "standard.csv"
 FRICTION_TEXT, FRICTION_SOURCE = "friction.txt", "friction.py"
 FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_TEXT, FRICTION_SOURCE, STANDARD_CSV, URDF)
-"""All that an identification can leave for other tools."""
+"""Exports of an identification."""
 
 
 @dataclass(frozen=True)
 class Exports:
-    """The files for other tools: text by name, and by name why there is none.
+    """Files for other tools."""
 
-    A text of None is to be removed: what is there would be of other parameters than its neighbours.
-    """
-
-    contents: Mapping[str, str | None]
-    withheld: Mapping[str, str]
+    contents: Mapping[str, str | None]  #: text by name; None: remove a file of other parameters
+    withheld: Mapping[str, str]  #: reason by name of each file that is not written
 
     @property
     def result(self) -> ExportResult:
-        """As it goes into `results.json`."""
+        """Entry of `results.json`."""
         written = [name for name, text in self.contents.items() if text is not None]
         return ExportResult(written=written, withheld=dict(self.withheld))
 
@@ -161,16 +158,16 @@ def exports_of(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> Exports:
-    """The identified model as files for other tools; `provenance` see :func:`provenance_of`.
+    """Return the exports of an identified model; `provenance` see :func:`provenance_of`.
 
-    Without a physically consistent estimate, but the reason, there is no URDF and no full standard
-    parameters.
+    URDF and standard parameters need a physically consistent estimate (else `consistent` is the
+    reason why there is none).
 
     Raises:
         IdentificationError: the estimate is not of the cell's model.
     """
     model = cell.model
-    # Each fit for one line of any of the files: names of archives come from anywhere.
+    # Single printable lines: names of archives may contain anything.
     origin = {
         key: " ".join("".join(c if c.isprintable() else " " for c in value).split())
         for key, value in (provenance or {}).items()
@@ -197,7 +194,7 @@ def exports_of(
 
 
 def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
-    """Where a result comes from: cell, archives with their digests, software and verdict."""
+    """Return the origin of a result: cell, archives with digests, software and verdict."""
     digests = (f"{path.name} sha256 {file_digest(path)}" for path in archives)
     return {
         "robot": results.cell,
@@ -234,14 +231,14 @@ def _friction(
 def _urdf(
     cell: Cell, estimate: Estimate, consistent: ConsistentEstimate, origin: Mapping[str, str]
 ) -> str:
-    """The user's URDF with the consistent parameters, and a comment that says so."""
+    """Return the user's URDF with the consistent parameters and a comment."""
     model = cell.model
     names = model.parameter_names[model.friction_part]
-    # A joint that never moved keeps the friction that its URDF gives it.
+    # A joint that did not move has the friction of its URDF.
     unknown = np.array([name in estimate.undetermined for name in names], dtype=np.bool_)
     friction = np.where(unknown, np.nan, consistent.friction)
-    lines = ["Inertia and joint friction were identified by hil; everything else is as it was."]
+    lines = ["Inertia and joint friction were identified by hil; everything else is unchanged."]
     if undetermined := ", ".join(estimate.undetermined):
-        lines.append(f"Not determined by the data, but nominal: {undetermined}.")
+        lines.append(f"Nominal values, not determined by the data: {undetermined}.")
     lines += [f"{key}: {value}" for key, value in origin.items()]
     return write_urdf(cell.urdf, model, consistent.standard, friction, remarks=lines)

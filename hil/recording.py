@@ -1,4 +1,4 @@
-"""Recording a motion that the controller's own program makes: answered safely, archived whole."""
+"""Recording of motions that the controller's own program executes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hil.campaign.operator import Stop
 
 KINDS = ("excitation", "validation", "standstill")
-"""What a recording can be used for."""
+"""Kinds of recordings."""
 
 
 def record(
@@ -34,15 +34,22 @@ def record(
     watch: Watch = lambda _: None,
     durable: bool = True,
 ) -> Recorded:
-    """Record what the controller does, from its first cycle on. No motion is ever requested.
+    """Record the session of the controller from its first cycle, without requesting any motion.
 
-    The cell travels in the archive, which must not exist and is of a kind of `KINDS`. It lasts for
-    a `duration` of the controller's time [s], or until `stop` or the session's end; the controller
-    is waited for as long as `wait` says [s]. If `durable`, each flush waits for the disk.
+    Args:
+        link: to the controller.
+        cell: stored in the archive.
+        path: of the archive, which must not exist.
+        kind: one of `KINDS`.
+        stop: ends the recording, as does the end of the session.
+        duration: of the controller's time [s]; None for no limit.
+        wait: time limit for the controller to start [s]; None for none.
+        watch: receives the progress.
+        durable: whether each flush waits for the disk.
 
     Raises:
-        ControllerFault: the controller did not come in time, or is not the cell's.
-        OperatorStopError: stopped before it came.
+        ControllerFault: the controller did not start in time, or does not match the cell.
+        OperatorStopError: stopped before it started.
         ArchiveWriteError: the archive cannot be written.
     """
     metadata = {"motion": CONTROLLER_PROGRAM, **kind_entry(path, kind), **origin_of(cell)}
@@ -58,11 +65,14 @@ def archive_spec(
     *,
     durable: bool,
 ) -> ArchiveSpec:
-    """An archive of a cell's arm, which needs nothing else to be identified from.
+    """Return the specification of an archive with cell, URDF, drive train and plan attached.
 
-    The cell travels in it with URDF and drive train, and the plan, None for a motion of the
-    controller's own; metadata stand beside the cell's name. If `durable`, each flush waits for the
-    disk.
+    Args:
+        cell: of the arm.
+        path: of the archive.
+        metadata: added to the name of the cell.
+        plan: of the motion; None for one of the controller's own program.
+        durable: whether each flush waits for the disk.
     """
     attachments = {
         "cell.toml": cell.text.encode(),
@@ -82,10 +92,10 @@ def archive_spec(
 
 
 def archive_path(output: Path, kind: str) -> Path:
-    """Where to record: `output` itself if it is called *.mcap, else the next name in that folder.
+    """Return `output` if it ends in .mcap, else the next file name in that folder.
 
     Raises:
-        InputError: the file exists, or the folder cannot be made.
+        InputError: the file exists, or the folder cannot be created.
     """
     if output.suffix == ".mcap":
         if output.exists():
@@ -105,17 +115,19 @@ def archive_path(output: Path, kind: str) -> Path:
 
 
 def kind_entry(path: Path, kind: str) -> dict[str, str]:
-    """The kind as metadata, where the file's name does not say it."""
+    """Return the kind as metadata, {} if the file name contains it."""
     return {} if ArchiveName.parse(path) is not None else {"kind": kind}
 
 
 def origin_of(
     cell: Cell, *, only_simulated: bool | None = None, virtual: bool | None = None
 ) -> dict[str, str]:
-    """As metadata: where, when and with what it was recorded; virtual time has no date.
+    """Return origin, date (none in virtual time) and software of a recording as metadata.
 
-    Of the link that is really used: whether only a simulated arm can move, and whether time is
-    virtual; what is left out is as the cell's own link says.
+    Args:
+        cell: of the arm.
+        only_simulated: whether only a simulated arm can move; by default by the cell's link.
+        virtual: whether time is virtual; by default by the cell's link.
     """
     if only_simulated is None:
         only_simulated = cell.only_simulated
@@ -129,7 +141,7 @@ def origin_of(
 
 
 def with_present_date(metadata: Mapping[str, str]) -> dict[str, str]:
-    """The same, for an archive that begins now; what has no date gets none."""
+    """Return the metadata with the present date, if it has a date."""
     return {**metadata, **({"recorded_at": _now()} if "recorded_at" in metadata else {})}
 
 

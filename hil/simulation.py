@@ -1,4 +1,4 @@
-"""The simulated cell of a cell file: a controller in virtual time at the other end of the link."""
+"""Simulated controller and arm of a cell file, linked in virtual time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 _LOAD = "hil_simulated_payload"
 _CHECKED = 100
-"""Postures checked on each way of the controller's own motion."""
+"""Postures checked on each path of the controller's own motion."""
 
 
 def simulated_link(
@@ -43,20 +43,20 @@ def simulated_link(
     loaded: bool = False,
     session: int = 0,
 ) -> Link:
-    """A link in virtual time to a simulated controller of this cell; one seed is one run.
+    """Return a link in virtual time to a simulated controller; runs are reproducible by seed.
 
     Args:
-        cell: names the planted truth in `[simulation]`.
-        effects: switch on what the model leaves out, at the sizes the cell names.
-        drive: what the robot really has, where it shall differ from the cell's drive train.
-        truth: what is planted in the plant, where it shall differ from the cell's.
-        instead_of_hardware: simulate a cell that names a real link as well.
-        only_axis: the axis, from 1, that alone is opened and moved; None for all.
-        loaded: the arm carries `[simulation.payload]`, of which controller and PC do not know.
-        session: how often the same controller was powered up before: each has its own noise.
+        cell: with the true parameters in `[simulation]`.
+        effects: whether to simulate unmodelled effects, with the sizes of the cell.
+        drive: true drive train, by default that of the cell.
+        truth: true parameters, by default those of the cell.
+        instead_of_hardware: also simulate a cell with a real link.
+        only_axis: number, from 1, of the only axis that is opened; None for all.
+        loaded: whether the arm carries `[simulation.payload]`, unknown to controller and PC.
+        session: number of earlier sessions of the controller; each has its own noise.
 
     Raises:
-        CellError: the cell is one of real hardware, or names no such payload.
+        CellError: the cell is one of real hardware, or has no such payload.
     """
     if cell.controller.transport != "simulated" and not instead_of_hardware:
         raise CellError(
@@ -64,7 +64,7 @@ def simulated_link(
             "controller.transport",
             cell.controller.transport,
             "a cell of real hardware is not simulated",
-            'write "simulated" to try it without',
+            'set it to "simulated" to run without hardware',
         )
     arm = carrying(cell) if loaded else cell
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
@@ -76,7 +76,7 @@ def simulated_link(
 
 
 def carrying(cell: Cell) -> Cell:
-    """The cell with `[simulation.payload]` as a link of its URDF.
+    """Return the cell with `[simulation.payload]` as a link of its URDF.
 
     Raises:
         CellError: there is no such table, or no such link.
@@ -87,15 +87,15 @@ def carrying(cell: Cell) -> Cell:
             cell.path,
             "simulation.payload",
             None,
-            "the simulated arm has nothing to carry",
-            "write that table: mass in kg, centre in m",
+            "the simulated arm has no payload",
+            "add this table: mass in kg, centre in m",
         )
     root = urdf_tree(cell.urdf)
     last = root.find(f"joint[@name='{cell.joint_names[-1]}']/child")
     frame = payload.frame or ("" if last is None else last.get("link", ""))
     if frame not in {link.get("name") for link in root.findall("link")}:
         raise CellError(
-            cell.path, "simulation.payload.frame", frame, "no link of the URDF", "name one"
+            cell.path, "simulation.payload.frame", frame, "not a link of the URDF", "use a link"
         )
     link = SubElement(root, "link", name=_LOAD)
     inertial = SubElement(link, "inertial")
@@ -120,17 +120,17 @@ def simulated_controller(
     session: int = 0,
     faults: Sequence[ControllerFault] = (),
 ) -> SimulatedController:
-    """The controller and arm of a cell, whatever link the cell names.
+    """Return controller and arm of a cell with any link.
 
     Args:
-        cell: its `[simulation]` says what the arm really is.
-        effects: switch on what the model leaves out.
-        drive: what the robot really has; the init packet announces the cell's drive train.
-        truth: what is planted in the plant, if not the cell's.
-        settings: how the controller behaves; `controller_settings(cell)` if left out.
-        seed: of noise and model errors; the cell's if left out.
-        session: how often the same controller was powered up before.
-        faults: what goes wrong in controller and arm.
+        cell: with the true parameters in `[simulation]`.
+        effects: whether to simulate unmodelled effects.
+        drive: true drive train; the init packet states that of the cell.
+        truth: true parameters, by default those of the cell.
+        settings: of the controller, by default `controller_settings(cell)`.
+        seed: of noise and model errors, by default that of the cell.
+        session: number of earlier sessions of the controller.
+        faults: of controller and arm.
     """
     nominal_drive = simulated_drive(cell)
     return SimulatedController(
@@ -149,12 +149,12 @@ def simulated_controller(
 
 
 def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSettings:
-    """The simulated controller's cycle, mode and noise, from the cell file."""
+    """Return cycle, mode and noise of the simulated controller."""
     return ControllerSettings(
         period=cell.period,
         open_mode=cell.controller.mode,
-        # Springs and a delay of half a cycle need steps shorter than the cycle; rigid gears,
-        # integrated to second order under a current that is constant over it, do not.
+        # Elastic gears and a delay of half a cycle need steps shorter than the cycle; rigid gears
+        # are integrated to second order under a constant current.
         substeps=2 if effects else 1,
         current_noise=cell.simulation.current_noise,
         current_resolution=cell.simulation.current_resolution,
@@ -162,11 +162,10 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
 
 
 def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
-    """Postures (joint angles, rad) that the controller's own program may visit, home at the end.
+    """Return postures (joint angles, rad) of the controller's own program, home at the end.
 
-    Drawn about the home posture within half of each joint's range (and no more than a turn), by
-    the cell's own seed; each straight way from one to the next keeps clear of floor, walls and
-    the arm itself. Where nothing is clear, there are fewer of them.
+    Random within half of each joint's range (at most a turn) around home, by the cell's seed, and
+    connected by collision-free straight motions; there may be fewer than `count`.
     """
     rng = np.random.default_rng(cell.simulation.seed)
     limits, home = cell.joint_limits, cell.home
@@ -192,10 +191,9 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
 
 
 def simulated_drive(cell: Cell) -> SimulatedDrive:
-    """The drive train as the simulated robot has it, by its own formulas.
+    """Return the true drive train, by the formulas of the simulated cell.
 
-    What `[simulation.drive_train]` names is read from there: a mistake in `[drive_train]` then
-    shows, as it would on the robot.
+    `[simulation.drive_train]` has priority, so that errors in `[drive_train]` can be simulated.
     """
     simulation = cell.file.simulation
     known = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
@@ -216,7 +214,7 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
 
 
 def planted_truth(cell: Cell) -> PlantTruth:
-    """Rotor inertias, friction and inertias of links planted in the plant.
+    """Return the true rotor inertias, friction and link inertias.
 
     Raises:
         CellError: joints with a third friction term differ in its law.
@@ -233,7 +231,7 @@ def planted_truth(cell: Cell) -> PlantTruth:
 
 
 def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:
-    """The third friction law of the joints that are planted with one."""
+    """Return the third friction term of the simulated arm."""
     joints = zip(cell.joint_names, cell.model.friction.laws, cell.simulation.third, strict=True)
     planted = {name: law.third for name, law, third in joints if third}
     laws = set(planted.values()) - {None}
@@ -242,14 +240,14 @@ def _third_law(cell: Cell) -> Literal["quadratic", "cubic"]:
             cell.path,
             "robot.friction.joints",
             None,
-            f"quadratic and cubic terms among {', '.join(planted)}; a simulated arm has one law",
+            f"quadratic and cubic terms in {', '.join(planted)}; a simulated arm has only one",
             "give all joints of the simulated arm the same third term",
         )
     return "cubic" if laws == {"cubic"} else "quadratic"
 
 
 def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
-    """What the model leaves out, at the sizes the cell names."""
+    """Return the unmodelled effects with the sizes of the cell."""
     settings = cell.simulation
     return UnmodelledEffects(
         torque_ripple=settings.torque_ripple,
@@ -260,7 +258,7 @@ def unmodelled_effects(cell: Cell) -> UnmodelledEffects:
 
 
 def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
-    """Metadata that marks an archive as simulated, and with what."""
+    """Return the metadata of a simulated archive."""
     sizes = unmodelled_effects(cell) if effects else UnmodelledEffects()
     elasticity = ", ".join(f"{compliance:g}" for compliance in sizes.elasticity)
     described = {
@@ -278,7 +276,7 @@ def simulated_provenance(cell: Cell, effects: bool) -> dict[str, str]:
 
 
 def planted_values(cell: Cell) -> Array:
-    """The planted parameter vector (p,) in the order of the cell's model."""
+    """Return the true parameters (p,) in the order of the cell's model."""
     truth = planted_truth(cell)
     return cell.parameter_values(
         rotor_inertia=truth.rotor_inertia,

@@ -1,4 +1,4 @@
-"""Untrusted texts, for a terminal: names of files, joints, fields, events."""
+"""Text for a terminal, from untrusted names of files, joints, fields and events."""
 
 from __future__ import annotations
 
@@ -10,20 +10,17 @@ def plural(number: int, noun: str) -> str:
 
 
 def printable(text: str, *, keep: str = "\n") -> str:
-    """The text with whatever is not printed written out, as Python writes it in a string.
-
-    A terminal obeys control characters and turns lines round for others; what is no character at
-    all (bytes of a file name that are no UTF-8) cannot even be written.
+    """Return the text with nonprintable characters as Python escapes.
 
     Args:
-        text: anything.
-        keep: characters that stay nevertheless.
+        text: may contain control characters, or surrogates of bytes that are not UTF-8.
+        keep: characters that are not escaped.
     """
     if text.isprintable():
         return text
-    return "".join(c if c.isprintable() or c in keep else written_out(c) for c in text)
+    return "".join(c if c.isprintable() or c in keep else escape(c) for c in text)
 
 
-def written_out(character: str) -> str:
-    """A character as Python writes it in a string."""
+def escape(character: str) -> str:
+    """Return a character as a Python escape."""
     return character.encode("unicode_escape").decode("ascii")

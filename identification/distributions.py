@@ -1,8 +1,4 @@
-"""Limits and tails of the three distributions that intervals and tests are made of.
-
-`scipy.special` has them to the last bit as `scipy.stats` does, which takes a third of a second to
-import: every command of a person would wait for it.
-"""
+"""Quantiles and tails of distributions, without the slow import of `scipy.stats`."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class StraightMoves:
     def between(
         self, start: Array, end: Array, index: int, *, from_arm: bool = False
     ) -> Interval | None:
-        """Return the way from `start` to `end` (n,) [rad]; None where they are the same.
+        """Return the motion from `start` to `end` (n,) [rad]; None where they are the same.
 
         Raises:
             MotionRefusedError: it failed its check.
@@ -143,7 +143,7 @@ class StraightMoves:
             return None
         found = next((one for one in self._known if one.leads(start, end)), None)
         if found is None:
-            found = replace(way(self._cell, start, end), index=index, from_arm=from_arm)
+            found = replace(straight_move(self._cell, start, end), index=index, from_arm=from_arm)
             require_allowed([found], self._checks)
             self._known.append(found)
         return replace(found, index=index)
@@ -224,8 +224,8 @@ def hold(position: Array, duration: float) -> PiecewiseCubic:
     )
 
 
-def way(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Interval:
-    """Return the straight way between two postures (n,) [rad], planned in a child process.
+def straight_move(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Interval:
+    """Return the straight motion between two postures (n,) [rad], planned in a child process.
 
     Args:
         cell: its limits.
@@ -238,9 +238,9 @@ def way(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Int
     """
     limits = cell.joint_limits
     if (problem := beyond(cell, start)) is not None:
-        raise MotionRefusedError("the way", problem, "jog the arm to within [limits]")
+        raise MotionRefusedError("the motion", problem, "jog the arm to within [limits]")
     if (problem := beyond(cell, end, "would go to")) is not None:
-        raise MotionRefusedError("the way", problem, "name a posture within [limits]")
+        raise MotionRefusedError("the motion", problem, "use a posture within [limits]")
     speed = cell.campaign.approach_speed if speed is None else speed
     move = Move(at_limit(end, limits), speed=speed)
     motion = in_child(plan_moves, at_limit(start, limits), (move,), limits)

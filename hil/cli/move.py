@@ -21,7 +21,7 @@ from hil.cell_link import cell_link
 from hil.cli.arguments import AcceptInitOption, JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
-from hil.move import THERE, Way, axis_alone, posture, send, straight_way, turned
+from hil.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
 from hil.progress import Task, say
 from hil.progress import reporter as make_reporter
 from hil.recording import archive_path
@@ -99,7 +99,7 @@ def move(
                 json=json,
             )
             return
-        way = straight_way(
+        move = plan_move(
             cell,
             here,
             target,
@@ -107,7 +107,7 @@ def move(
             checks=active_checks(cell, link.connection),
         )
         if not json:
-            typer.echo(printable(_described(way, cell, link)))
+            typer.echo(printable(_described(move, cell, link)))
         _confirm(cell, link, yes=yes, json=json)
         folder = campaign.folder if campaign is not None and output is None else None
         if folder is None:
@@ -116,8 +116,8 @@ def move(
             make_folder(folder.archives)
             path = folder.archives / folder.next_name("move", 0).filename
         bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
-        with stop_on_interrupt() as stop, bar.task("moving (s)", way.duration) as task:
-            ended = send(way, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
+        with stop_on_interrupt() as stop, bar.task("moving (s)", move.duration) as task:
+            ended = send(move, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
             stopped = stop.requested
         if folder is not None:
             folder.add(path.name, ended.outcome)
@@ -126,8 +126,8 @@ def move(
             "outcome": ended.outcome,
             "reason": ended.reason,
             "simulated": link.only_simulated,
-            "duration": way.duration,
-            "target_deg": AngleFrame.of(cell).shown(way.target).tolist(),
+            "duration": move.duration,
+            "target_deg": AngleFrame.of(cell).shown(move.target).tolist(),
         }
         said = f"{ended.outcome}: {ended.reason or 'the arm has arrived'}; archived in {path}"
         if not json:
@@ -201,11 +201,11 @@ def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
         raise OperatorStopError("not confirmed; nothing was sent.")
 
 
-def _described(way: Way, cell: Cell, link: MotionLink) -> str:
+def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     """Format the path, one line per joint."""
     frame = AngleFrame.of(cell)
-    start, end = frame.shown(way.start), frame.shown(way.target)
-    peaks = np.degrees(way.trajectory.extrema().velocity)
+    start, end = frame.shown(move.start), frame.shown(move.target)
+    peaks = np.degrees(move.trajectory.extrema().velocity)
     width = max(len(name) for name in (*cell.joint_names, "joint"))
     lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]
     lines += [
@@ -214,12 +214,12 @@ def _described(way: Way, cell: Cell, link: MotionLink) -> str:
     ]
     who = "a SIMULATED controller" if link.only_simulated else f"the controller of {cell.name}"
     lines.append(
-        f"{way.duration:.2f} s at {100.0 * way.speed:.3g} % of the joints' speeds, {frame.whose}; "
-        f"checked against limits, motor currents, floor, walls and self-collision; to {who}"
+        f"{move.duration:.2f} s at {100.0 * move.speed:.3g} % of the joints' speeds, {frame.whose};"
+        f" checked against limits, motor currents, floor, walls and self-collision; to {who}"
     )
     below = narrower_limits(cell, link.connection, "following_error")
     lines += [f"the smaller following-error threshold applies, {note}" for note in below]
-    return "\n".join([*lines, way.not_checked] if way.not_checked else lines)
+    return "\n".join([*lines, move.not_checked] if move.not_checked else lines)
 
 
 def _print(text: str, figures: dict[str, object], *, json: bool) -> None:

@@ -13,7 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from hil.report import numbers
-from hil.terminal_text import written_out
+from hil.terminal_text import escape
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
 _STYLE: Final = "report.css"
@@ -54,7 +54,7 @@ def _shown(value: object) -> object:
     """Escape control and direction characters of a text."""
     if isinstance(value, Markup) or not isinstance(value, str):
         return value
-    return _STEERING.sub(lambda found: written_out(found[0]), value)
+    return _STEERING.sub(lambda found: escape(found[0]), value)
 
 
 def policy(script: str) -> str:

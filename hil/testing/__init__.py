@@ -1,7 +1,6 @@
-"""For tests of programs that drive an arm: the simulated cell, its controller, and their faults.
+"""Simulated cell and controller with faults, for tests of programs that drive an arm.
 
-The pytest plugin (`hil.testing.plugin`) is found by pytest itself and imports nothing heavy before
-a fixture is used. The names here are what its fixtures give and are made of.
+The pytest plugin is `hil.testing.plugin`; the names here are those behind its fixtures.
 """
 
 from __future__ import annotations

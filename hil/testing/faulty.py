@@ -1,4 +1,4 @@
-"""The simulated cell of a test with faults that the test works out, here or over loopback UDP."""
+"""Simulated cell with faults, in virtual time or over loopback UDP."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ SHORT: Final = {
     "settle_s": 0.2,
     "warmup_drift": 0,
 }
-"""Of `[campaign]`."""
+"""Values of `[campaign]`."""
 
 
 def shortened(cell: Cell) -> Cell:
-    """The cell with a campaign of seconds instead of minutes, in its text too."""
+    """Return the cell with a campaign of seconds instead of minutes."""
     return cell.with_values({f"campaign.{key}": value for key, value in SHORT.items()})
 
 
 def run_campaign(root: Path, cell: Cell) -> Campaign:
     """Design and run a campaign of a simulated cell in a new folder, in virtual time.
 
-    Its motion is found in a second: no estimate from it is one to rely on.
+    The design takes a second; estimates from it are not accurate.
 
     Raises:
-        CampaignFolderError: the folder holds something already.
-        CellError: the cell is not a simulated one.
+        CampaignFolderError: the folder is not empty.
+        CellError: the cell is not simulated.
     """
     campaign = Campaign.create(root, cell, design(cell, Silent()))
     campaign.run(simulated_link(cell), durable=False, unrehearsed=True)
@@ -51,24 +51,24 @@ def run_campaign(root: Path, cell: Cell) -> Campaign:
 
 
 def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
-    """A fresh simulated controller of a cell with a table [simulation], with faults of its own.
+    """Return a new simulated controller of a cell with a table [simulation].
 
-    `lines` say what goes wrong as `hil simulate --fault` takes it; faults of the link are ignored.
+    `lines` are faults as for `hil simulate --fault`; those of the link are ignored.
 
     Raises:
-        FaultScriptError: a line describes no fault.
+        FaultScriptError: a line is not a fault.
     """
     _, own = split_faults(map(parse_fault, lines))
     return simulated_controller(cell, faults=own)
 
 
 def faulty_link(cell: Cell, *lines: str, controller: SimulatedController | None = None) -> Link:
-    """A link in virtual time to a simulated controller, not yet connected.
+    """Return a link in virtual time to a simulated controller, not yet connected.
 
-    `controller` is `faulty_controller` of the same lines, where it is at hand.
+    `controller` is by default `faulty_controller` of the same lines.
 
     Raises:
-        FaultScriptError: a line describes no fault.
+        FaultScriptError: a line is not a fault.
     """
     controller = controller or faulty_controller(cell, *lines)
     of_link, _ = split_faults(map(parse_fault, lines))
@@ -76,19 +76,18 @@ def faulty_link(cell: Cell, *lines: str, controller: SimulatedController | None 
 
 
 PATIENCE: Final = 0.5
-"""s that the controller waits for an answer, as no real one does: a computer that runs tests need
-not be fit for a robot."""
+"""Time that the controller waits for a reply, s; longer than a real one, for slow computers."""
 
 
 @dataclass(eq=False)
 class UdpController:
-    """`hil simulate`, running; it sends its first packet again every second until it is answered.
+    """`hil simulate` in a child process; repeats its first packet every second until a reply.
 
     Attributes:
-        cell: of its arm, with the link by which it is reached.
-        cell_path: the same as a file.
+        cell: with the link to it.
+        cell_path: file of the cell.
         host: its address.
-        port: the UDP port on which the program under test has to listen.
+        port: UDP port on which the program under test must listen.
     """
 
     cell: Cell
@@ -108,7 +107,7 @@ class UdpController:
         faults: Sequence[str] = (),
         options: Sequence[str] = (),
     ) -> Iterator[UdpController]:
-        """Start one, its cell file in `folder`, with faults and options of `hil simulate`."""
+        """Start a controller with faults and options of `hil simulate`; its cell is in `folder`."""
         port = free_port()
         path = folder / "udp_cell.toml"
         linked = cell.with_link(transport="udp", host=LOOPBACK, port=port, bind=LOOPBACK)
@@ -127,7 +126,7 @@ class UdpController:
 
     @property
     def running(self) -> bool:
-        """Whether its session goes on, or has yet to begin."""
+        """Whether the process runs."""
         return self._simulator.running
 
     def press_drive_on(self) -> None:
@@ -139,10 +138,10 @@ class UdpController:
         self._simulator.process.send_signal(signal.SIGUSR2)
 
     def finish(self) -> dict[str, Any]:
-        """End the session: the arm stands, the drive goes off, then mode 504.
+        """End the session: arm at rest, drive off, then mode 504.
 
         Returns:
-            what it counted, see `docs/simulate.md`; nothing if it had to be killed.
+            its summary, see `docs/simulate.md`; {} if it had to be killed.
         """
         if self._summary is None:
             self._simulator.finish()

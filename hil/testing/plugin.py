@@ -1,7 +1,7 @@
-"""The pytest plugin: fixtures of a simulated cell, down to the bytes of the controller's protocol.
+"""Pytest plugin with fixtures of a simulated cell, down to the bytes of the protocol.
 
-pytest finds it by itself once the package is installed. Nothing but pytest is imported before a
-fixture is used. `docs/testing.md` shows how to test a script of one's own with it.
+pytest loads it once the package is installed; modules are imported when a fixture is used. See
+`docs/testing.md`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ MARKER = "controller_faults"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
+    """Register the marker."""
     config.addinivalue_line(
         "markers",
-        f"{MARKER}(*lines): what goes wrong with the simulated controller or its link, as "
-        '`hil simulate --fault` takes it: "e-stop@4000", "lose@3000x3"',
+        f"{MARKER}(*lines): faults of the simulated controller or its link, as for "
+        '`hil simulate --fault`: "e-stop@4000", "lose@3000x3"',
     )
 
 
@@ -34,8 +34,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def simulated_cell() -> Cell:
     """The simulated COMAU NS 16 with a campaign of seconds.
 
-    Override it in your conftest.py to have all fixtures work with your own cell, which needs a
-    table [simulation].
+    Override it in your conftest.py to use your own cell, which needs a table [simulation].
     """
     from hil.cell import Cell
     from hil.testing.faulty import shortened
@@ -46,7 +45,7 @@ def simulated_cell() -> Cell:
 
 @pytest.fixture
 def controller_faults(request: pytest.FixtureRequest) -> tuple[str, ...]:
-    """What goes wrong, line by line: the test's `controller_faults` markers; nothing without."""
+    """Faults of the test's `controller_faults` markers."""
     return tuple(line for mark in request.node.iter_markers(MARKER) for line in mark.args)
 
 
@@ -54,7 +53,7 @@ def controller_faults(request: pytest.FixtureRequest) -> tuple[str, ...]:
 def simulated_controller(
     simulated_cell: Cell, controller_faults: tuple[str, ...]
 ) -> SimulatedController:
-    """A fresh controller with its arm, in virtual time; one seed is one run."""
+    """A new controller with its arm, in virtual time, reproducible by seed."""
     from hil.testing.faulty import faulty_controller
 
     return faulty_controller(simulated_cell, *controller_faults)
@@ -66,7 +65,7 @@ def simulated_link(
     simulated_controller: SimulatedController,
     controller_faults: tuple[str, ...],
 ) -> Link:
-    """A link to `simulated_controller`, as `Campaign.run` takes it; not yet connected."""
+    """A link to `simulated_controller` for `Campaign.run`, not yet connected."""
     from hil.testing.faulty import faulty_link
 
     return faulty_link(simulated_cell, *controller_faults, controller=simulated_controller)
@@ -74,7 +73,7 @@ def simulated_link(
 
 @pytest.fixture(scope="session")
 def short_campaign(tmp_path_factory: pytest.TempPathFactory, simulated_cell: Cell) -> Campaign:
-    """A finished campaign of `simulated_cell`: every archive of it is whole. Only read it."""
+    """A complete campaign of `simulated_cell`. Read-only."""
     from hil.testing.faulty import run_campaign
 
     return run_campaign(tmp_path_factory.mktemp("hil") / "campaign", simulated_cell)
@@ -84,7 +83,7 @@ def short_campaign(tmp_path_factory: pytest.TempPathFactory, simulated_cell: Cel
 def identified_campaign(
     tmp_path_factory: pytest.TempPathFactory, short_campaign: Campaign
 ) -> Campaign:
-    """A copy of `short_campaign` with results, exports and report. Only read it."""
+    """A copy of `short_campaign` with results, exports and report. Read-only."""
     import shutil
 
     from hil.campaign import Campaign
@@ -100,7 +99,7 @@ def identified_campaign(
 def udp_controller(
     tmp_path: Path, simulated_cell: Cell, controller_faults: tuple[str, ...]
 ) -> Iterator[UdpController]:
-    """A simulated controller in a process of its own, over loopback UDP, in real time."""
+    """A simulated controller in another process, over loopback UDP, in real time."""
     from hil.testing.faulty import UdpController
 
     with UdpController.started(simulated_cell, tmp_path, faults=controller_faults) as controller:

@@ -141,10 +141,8 @@ def repetition_noise(
     """Return the standard deviation of the residual between repetitions (n,) [N·m or N].
 
     The residual of parameters (p,), through a low-pass [Hz] if given, is compared at equal times,
-    rounded to the sampling interval. NaN for a joint that never moves twice at the same time.
-
-    Raises:
-        IdentificationError: fewer than two repetitions, or no row that two of them share.
+    rounded to the sampling interval. NaN for a joint that never moves twice at the same time, such
+    as in one normal and one slowed repetition.
     """
     step, parts = 0.0, []
     for samples in recordings:
@@ -159,11 +157,6 @@ def repetition_noise(
         own[index, joints] = left
     count = np.count_nonzero(~np.isnan(table), axis=0)
     shared = count >= 2
-    if not shared.any():
-        raise IdentificationError(
-            "noise is measured on two or more repetitions in which joints move at the same times;"
-            f" {len(parts)} recordings given"
-        )
     mean = np.nansum(table, axis=0) / np.maximum(count, 1)
     spread = np.where(shared, np.nansum((table - mean) ** 2, axis=0), 0.0).sum(axis=0)
     freedom = np.where(shared, count - 1.0, 0.0).sum(axis=0)

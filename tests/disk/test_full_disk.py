@@ -299,5 +299,5 @@ def test_a_run_whose_folder_is_removed_says_so_with_the_arm_at_rest(
     monkeypatch.undo()
     assert raised.value.exit_code in (1, 2)
     assert str(root) in str(raised.value)
-    assert "see whether it was moved or removed" in str(raised.value)
+    assert "check whether it was moved or removed" in str(raised.value)
     assert np.abs(controller.plant.velocity).max() < 1e-3

@@ -26,7 +26,7 @@ from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, Motio
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRun
 from hil.campaign.folder import CampaignFolder
-from hil.campaign.intervals import at_limit, way
+from hil.campaign.intervals import at_limit, straight_move
 from hil.campaign.operator import RunStatus, Unattended
 from hil.campaign.status import conduct_of
 from hil.campaign.warmup import WarmMotion, WarmUp
@@ -35,7 +35,7 @@ from hil.cli import app
 from hil.design import DesignResult
 from hil.identify import identify_campaign
 from hil.motion_checks import MotionChecks
-from hil.move import straight_way
+from hil.move import plan_move
 from hil.progress import Silent
 from hil.recording import origin_of, with_present_date
 from hil.report.page import when
@@ -432,7 +432,7 @@ def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(planned: Campa
     cell, limits = planned.cell, planned.cell.joint_limits
     start = limits.lower - 4e-7 * (limits.upper - limits.lower)
     assert np.array_equal(at_limit(start, limits), limits.lower)
-    motions = [way(cell, start, cell.home).trajectory, straight_way(cell, start, cell.home)]
+    motions = [straight_move(cell, start, cell.home).trajectory, plan_move(cell, start, cell.home)]
     assert MotionChecks.of(cell).refusal(motions[0]) is None  # type: ignore[arg-type]
     player = TrajectoryPlayer(motions[0], cell.period, limits)  # type: ignore[arg-type]
     player.begin(start)
@@ -440,7 +440,7 @@ def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(planned: Campa
     assert np.abs(first - start).max() < 1e-3
 
 
-@pytest.mark.parametrize("plan_way", [way, straight_way])
+@pytest.mark.parametrize("plan_way", [straight_move, plan_move])
 def test_an_arm_beyond_its_limit_is_told_so_in_degrees(
     plan_way: Callable[..., object], planned: Campaign
 ) -> None:

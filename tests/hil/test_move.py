@@ -16,7 +16,7 @@ from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ControllerFault, InputError, UnsafeError
-from hil.move import posture, straight_way, turned
+from hil.move import plan_move, posture, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT, commands
@@ -96,7 +96,7 @@ class TestOnlyAxis:
         way = ["--joint", "4", "--by", "2", "--only-axis"]
         result = CliRunner().invoke(app, ["move", str(CELL_PATH), *way])
         assert isinstance(result.exception, InputError)
-        assert "joint 4 moves by the motors of axes 4, 5, 6" in str(result.exception)
+        assert "joint 4 is moved by the motors of axes 4, 5, 6" in str(result.exception)
 
 
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:
@@ -131,7 +131,7 @@ def test_a_way_that_may_not_be_gone_is_refused_before_anything_is_sent(
     target: str, reason: str, ns16: Cell
 ) -> None:
     with pytest.raises(MotionRefusedError, match=reason):
-        straight_way(ns16, ns16.initial, posture(ns16, target))
+        plan_move(ns16, ns16.initial, posture(ns16, target))
 
 
 def test_the_way_itself_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
@@ -141,11 +141,11 @@ def test_the_way_itself_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
     )
     walled = Cell.from_texts(text, ns16.urdf, ns16.path)
     left, right = posture(walled, "60,20,-80,0,30,0"), posture(walled, "-60,20,-80,0,30,0")
-    straight_way(ns16, left, right)  # free without the wall
+    plan_move(ns16, left, right)  # free without the wall
     for end in (left, right):
-        straight_way(walled, end, turned(walled, end, "6", 10.0))
+        plan_move(walled, end, turned(walled, end, "6", 10.0))
     with pytest.raises(MotionRefusedError, match="and box 0"):
-        straight_way(walled, left, right)
+        plan_move(walled, left, right)
 
 
 @pytest.mark.parametrize(

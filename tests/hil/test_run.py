@@ -60,7 +60,7 @@ from hil.cli import app
 from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
 from hil.motion_checks import MotionChecks
-from hil.move import send, straight_way
+from hil.move import plan_move, send
 from hil.progress import Silent
 from hil.results import Results
 from hil.screen import Pace
@@ -811,9 +811,9 @@ def test_a_narrower_limit_that_is_kept_is_noted(tmp_path: Path, dry: Campaign) -
 def test_a_single_way_keeps_the_controllers_current_limit(tmp_path: Path, dry: Campaign) -> None:
     cell = dry.cell
     link = link_to_controller_with(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
-    way = straight_way(cell, link.connect(Stop()), cell.home)
-    with pytest.raises(MotionRefusedError, match=r"the way .*controller has 0\.5 A"):
-        send(way, cell, link, tmp_path / "move.mcap", stop=Stop())
+    move = plan_move(cell, link.connect(Stop()), cell.home)
+    with pytest.raises(MotionRefusedError, match=r"the motion .*controller has 0\.5 A"):
+        send(move, cell, link, tmp_path / "move.mcap", stop=Stop())
     assert not (tmp_path / "move.mcap").exists()
 
 
@@ -928,7 +928,7 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
     found = discover([str(campaign.folder.root)], CacheLocation(str(tmp_path / "cache")), Here())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
     (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
-    assert "not named in its campaign's manifest.json" in told.reason
+    assert "not listed in its campaign's manifest.json" in told.reason
     good = campaign.folder.completed("excitation")
     doubts = gather_sources([*good, slowed], 0.5).warnings
     assert any(doubt.startswith(f"{slowed.name} is not in its campaign") for doubt in doubts)

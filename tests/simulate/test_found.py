@@ -162,7 +162,7 @@ def short_way(
     )
 
 
-@pytest.mark.parametrize("seed", [1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192])
+@pytest.mark.parametrize("seed", [1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 20738, 21048])
 def test_a_motion_that_a_controller_held_or_led_on_breaks_no_law(seed: int, tmp_path: Path) -> None:
     """In 5326 a motion that had just begun went on as if it had not been held."""
     assert not Stage(tmp_path).verdict(seed, shrink=False).broken

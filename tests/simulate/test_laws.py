@@ -337,7 +337,7 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("rest", lambda o: with_arm(o, velocity=o.arm.velocity + 1.0),
      ("the arm moves at the end", "ends on a moving arm")),
     ("rest", lambda o: with_arm(o, open_axes=np.ones(len(o.arm.phase), bool)),
-     ("axes are open at the end",)),
+     ("axes are open at the end", "ends with open axes, phase ")),
     ("archives", unarchived, ("",)),
     ("resume", lambda o: with_life(o, 0, error=ValueError("what?")),
      ("life 1 ended with ValueError",)),

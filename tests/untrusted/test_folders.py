@@ -179,7 +179,7 @@ def test_a_manifest_names_files_of_its_own_folder_only(away: str, folder: Path) 
     content = json.loads(path.read_text())
     content["archives"] = [{"name": away, "outcome": "completed", "sha256": "0"}]
     path.write_text(json.dumps(content))
-    with pytest.raises(CampaignFolderError, match="is no name of a file in archives/"):
+    with pytest.raises(CampaignFolderError, match="is not the name of a file in archives/"):
         Campaign.open(folder).folder.manifest()
 
 
@@ -343,7 +343,7 @@ def test_the_series_of_a_report_are_numbers_and_not_too_many(
     monkeypatch.setattr("hil.outcome._LARGEST", 1 << 22)
     for data in bombs.values():
         (folder / SERIES).write_bytes(data)
-        with pytest.raises(InputError, match="does not hold the series of a report"):
+        with pytest.raises(InputError, match="does not contain the series of a report"):
             rewrite_report(folder)
     assert not trace.exists()
 

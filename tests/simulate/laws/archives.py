@@ -313,10 +313,11 @@ def _each_interval(observed: Observed, all_placed: tuple[Placed, ...]) -> Iterat
 def _at_risk(life: Life, mine: list[Placed]) -> int:
     """Return the number of last motions of a life that may have no archive.
 
-    A kill or a disk fault concerns the last one; truncation may leave the newest files empty.
+    A kill or a disk fault concerns the last one; truncation may empty any of the newest files.
     """
     with_rows = {p.archived.path.name for p in mine if len(p.rows)}
-    return max(len({*life.torn} - with_rows), int(life.died or bool(life.disk)))
+    truncated = len(life.torn) if {*life.torn} - with_rows else 0
+    return max(truncated, int(life.died or bool(life.disk)))
 
 
 def _motions(talk: Talk) -> list[int]:
