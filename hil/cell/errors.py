@@ -30,8 +30,21 @@ class CellError(InputError):
         self.field = field
 
 
-def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> CellError:
-    """Convert the first error of pydantic."""
+def first_error(
+    path: Path,
+    error: ValidationError,
+    schema: type[BaseModel],
+    *,
+    documentation: str = "docs/cell-file.md",
+) -> CellError:
+    """Convert the first error of pydantic.
+
+    Args:
+        path: the file.
+        error: of pydantic.
+        schema: of the file.
+        documentation: named in the remedy if the schema does not describe the field.
+    """
     detail = error.errors(include_url=False)[0]
     place, value, kind = _place(schema, detail["loc"]), detail["input"], detail["type"]
     if kind.startswith("union_tag"):
@@ -40,18 +53,20 @@ def first_error(path: Path, error: ValidationError, schema: type[BaseModel]) -> 
         remedy = f"the list must be {place.description}"
         return CellError(path, f"{place.name}.kind", given, problem, remedy)
     if kind == "missing":
-        return CellError(path, place.name, None, "is missing", f"add it: {place.description}")
+        remedy = f"add it: {place.description or f'see {documentation}'}"
+        return CellError(path, place.name, None, "is missing", remedy)
     if kind == "extra_forbidden":
         remedy = f"valid fields: {', '.join(place.siblings)}"
         return CellError(path, place.name, value, "is not a field", remedy)
     problem, _, remedy = detail["msg"].removeprefix("Value error, ").partition("; ")
     problem = problem[0].lower() + problem[1:]
-    remedy = remedy or f"it must be {place.description}"
+    remedy = remedy or (f"it must be {place.description}" if place.description else "")
+    remedy = remedy or f"see {documentation}"
     return CellError(path, place.name, None if isinstance(value, dict) else value, problem, remedy)
 
 
 class _Place(NamedTuple):
-    """A field: dotted name, valid values, and the fields of its table."""
+    """A field: dotted name, valid values or "", and the fields of its table."""
 
     name: str
     description: str
@@ -60,7 +75,7 @@ class _Place(NamedTuple):
 
 def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
     """Convert a location of pydantic, without its names of kinds and unions."""
-    name, description = "", "as described in docs/cell-file.md"
+    name, description = "", ""
     models, siblings = [schema], list[str]()
     for part in location:
         of_kind = [model for model in models if part in _kinds(model)]
@@ -71,12 +86,12 @@ def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
         fields = models[0].model_fields if models else {}
         siblings = sorted(fields)
         if isinstance(part, str) and part in fields:
-            description = fields[part].description or f"a table [{part}]"
             models = list(_models_of(fields[part].annotation))
+            description = fields[part].description or (f"a table [{part}]" if models else "")
     return _Place(name, description, siblings)
 
 
-_UNION_TAGS: Final = {"none", "str", "list", "float"}
+_UNION_TAGS: Final = {"none", "str", "list", "float", "constrained-int"}
 
 
 def _kinds(model: type[BaseModel]) -> tuple[object, ...]:

@@ -42,6 +42,7 @@ TIMES = {"s": 0, "ms": 3, "us": 6, "ns": 9}  # decimal places to shift
 Vector = tuple[FiniteFloat, ...]
 Column = Annotated[int, Field(ge=0)] | str
 _Number = Annotated[int, Field(ge=1)]
+_DOCUMENTATION = "the column map in docs/archive-format.md"
 _ONE_OR_EACH = "a number, or a list of one per joint"
 _PerJoint = Annotated[Vector | None, Field(description="a list of numbers, one per joint")]
 
@@ -224,7 +225,7 @@ class ColumnMap(_Table):
         try:
             return cls.model_validate(parse_toml(read_text(path)))
         except ValidationError as error:
-            wrong = first_error(path, error, cls)
+            wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
             raise SourceError(
                 path, wrong.problem, field=wrong.field, remedy=wrong.remedy
             ) from error

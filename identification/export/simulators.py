@@ -260,8 +260,8 @@ def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
     if not difference <= AGREES:
         joint = arm.model.joint_names[int(np.argmax(error))]
         raise WriteBackError(
-            f"read back, the torque of joint {joint!r} differs by a factor of {difference:.2g} of"
-            " its largest torque"
+            f"read back, the torque of joint {joint!r} differs by {difference:.2g} of its"
+            " largest one"
         )
     left = {name: _rms(torque) for name, torque in _left_out(form, arm, motion).items()}
     if form.read is _mujoco_torque:
