@@ -11,8 +11,9 @@ from identification.estimators.covariance import (
     left_out,
     leverage_corrected,
     spread,
+    with_block_covariance,
 )
-from identification.estimators.least_squares import estimate_repetitions
+from identification.estimators.least_squares import estimate, estimate_repetitions, joint_weights
 from identification.factor.factor import (
     Factor,
     NormalEquations,
@@ -207,3 +208,13 @@ def test_repetitions_are_added_at_equal_times_of_the_motion() -> None:
     one, two = (PhaseFactor.from_samples(MODEL, samples) for samples in (early, late))
     for both, own in zip((one + two).gram, one.gram, strict=True):
         np.testing.assert_allclose(both, 2.0 * own, rtol=1e-9, atol=1e-8)
+
+
+def test_the_interval_factor_is_of_the_number_of_blocks() -> None:
+    motion = a_motion()
+    noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
+    phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
+    weights = joint_weights(phase.total)
+    result = with_block_covariance(estimate(MODEL, phase.total, weights), phase, weights)
+    assert "40 blocks of 0.25 s" in result.method
+    assert result.interval_factor == pytest.approx(2.02, abs=0.01)  # Student's t, 39
