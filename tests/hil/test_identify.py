@@ -366,7 +366,7 @@ class TestJudgement:
     ) -> None:
         rows, lines = table(found.results), sentences(found.results)
         assert len(rows) == 1 + len(found.results.joint_names)
-        heading = "joint RMS error relative fitted of limit explains nominal controller"
+        heading = "joint RMS error relative fitted of limit R² nominal controller"
         assert rows[0].split() == heading.split()
         for row, name in zip(rows[1:], found.results.joint_names, strict=True):
             assert row.startswith(name) and row.count("%") == 6

@@ -132,7 +132,7 @@ class TestCopies:
 
     def test_a_folder_is_needed(self, short_campaign: Campaign) -> None:
         archive = str(short_campaign.folder.archives / "excitation_000_a1.mcap")
-        with pytest.raises(InputError, match="--annotate: has no folder"):
+        with pytest.raises(InputError, match="--annotate: needs an output folder"):
             CliRunner().invoke(app, ["identify", archive, "--annotate"], catch_exceptions=False)
 
 
