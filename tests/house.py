@@ -29,20 +29,21 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 79_550,
+    "product lines": 78_150,
     "product files": 324,
-    "test lines": 73_800,
+    "test lines": 73_700,
     "test files": 242,
     "import circles": 0,
     "imports inside functions": 32,
     "files with one importer": 17,
     "banned names": 0,
-    "functions over 60 lines": 30,
+    "functions over 60 lines": 27,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {
     *("kept", "told", "taken", "answers", "announced", "standing", "sight", "wish", "doubts"),
     *("strangers", "plain", "ways", "drawn", "listed", "counted", "settling"),
+    *("anew", "mishap", "mishaps", "hopeless", "mend", "mended", "trouble", "troubles", "suffer"),
 }
 _LONG: Final = 60
 _LINES: Final = ("product lines", "test lines")

@@ -258,7 +258,7 @@ class Evidence:
     disagreement: Array | None = None
     causes: Causes | None = None  #: faults whose correction reduces errors
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
-    load: CarriedLoad | None = None  #: body carried on unseen motion only
+    load: CarriedLoad | None = None  #: body on the last link in unseen motion only
     loaded: NDArray[np.bool_] | None = None  #: joints that gravity can load (n,)
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None

@@ -17,7 +17,8 @@ TEMPLATES = sorted((ROOT / "hil" / "report" / "templates").glob("*.j2"))
 IDIOMS = re.compile(
     r"\b(kept|told|taken|announced|standing|wish|wish(es|ed)|doubts?|strangers?|sight|ways|plain"
     r"|what it carries|against a constant|turning round|hardly told|gone on with"
-    r"|nobody counted|counted alike|taken as read)\b",
+    r"|nobody counted|counted alike|taken as read|anew|mishaps?|hopeless|mended|somebody|far end"
+    r"|go on|goes on|went on|gone on|carried on|gives up|comes to its end)\b",
     re.IGNORECASE,
 )
 NEVER = re.compile(r"\b(told|wish|wish(es|ed)|doubts?|strangers?|sight|announced)\b", re.IGNORECASE)
