@@ -28,7 +28,7 @@ demo: $(STAMP)  ## the whole way on the simulated NS 16; leaves runs/demo/report
 docs: $(STAMP)  ## build the documentation; leaves build/docs/index.html, which opens offline
 	$(BIN)/sphinx-build --quiet --fail-on-warning --jobs auto docs build/docs
 
-pictures: $(STAMP)  ## draw the documentation's pictures anew: every example's, and the screen's
+pictures: $(STAMP)  ## draw the pictures of the documentation: examples and screen
 	for script in examples/0*.py; do $(BIN)/python $$script || exit 1; done
 	cp runs/examples/*.png examples/pictures/
 	$(BIN)/python docs/screen_picture.py
