@@ -119,7 +119,7 @@ class OutputError(HilError):
         self.path = path
         self.problem = problem
         super().__init__(
-            f"{path}: {problem}; nothing was changed: free disk space, or use another folder"
+            f"{path}: {problem}; nothing there was changed: make room, or use another folder"
         )
 
 

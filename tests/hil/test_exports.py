@@ -226,7 +226,7 @@ def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
     exported(arm, tmp_path)
     text = (tmp_path / "identified.urdf").read_text()
     assert '<dynamics damping="0.7" friction="0.3"/>' in text
-    assert "Not determined by the data" in text
+    assert "not determined by the data" in text
     source = (tmp_path / "friction.py").read_text()
     assert "NOT DETERMINED" in source.splitlines()[1]
     assert "f0_2" in source.splitlines()[1]
