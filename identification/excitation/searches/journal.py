@@ -47,7 +47,7 @@ class Journal:
     """Append-only file of the scores of a search, found by their genes.
 
     Records after a damaged or truncated one are dropped and scored again. Records that the disk
-    refuses are kept in memory and written with the next one.
+    refuses are held in memory and written with the next one.
 
     Args:
         file: binary, readable, writable, seekable and unbuffered; empty or an earlier journal of
