@@ -266,9 +266,9 @@ def test_they_are_numbered_from_one() -> None:
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_it_is_short_and_says_what_one_sees(path: Path) -> None:
+def test_it_is_short_and_has_a_picture(path: Path) -> None:
     source = path.read_text("utf-8")
-    assert "One sees" in (ast.get_docstring(ast.parse(source)) or "").replace("\n", " ")
+    assert ast.get_docstring(ast.parse(source))
     assert code_lines(source) <= 60
     assert (PICTURES / f"{path.stem}.png").is_file()
 

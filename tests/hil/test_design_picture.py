@@ -288,7 +288,7 @@ class TestFront:
             assert not legend.overlaps(matrix.get_tightbbox(renderer))
             assert legend.x1 < figure.bbox.x1
 
-    def test_what_earlier_archives_add_is_told_from_the_motion_alone(self, two_link):
+    def test_earlier_archives_are_labelled_apart_from_the_motion(self, two_link):
         front = front_of([100.0, 105.0], [70.0, 95.0])
         figure, axes = self.page(two_link, front, chosen=0, together=True)
         head = figure.texts[0].get_text()
@@ -296,7 +296,7 @@ class TestFront:
         assert "I_c" not in head
         assert "not comparable" in figure.texts[1].get_text()
         assert "including earlier archives, weighted" in axes.get_xlabel()
-        assert "together" in axes.get_ylabel()
+        assert "including earlier archives" in axes.get_ylabel()
         assert "from this motion alone" in " ".join(texts(figure))
 
 

@@ -83,7 +83,7 @@ def test_what_a_urdf_does_not_state_is_unknown_and_all_named(
 def test_one_question_mark_in_any_list_is_found(tmp_path: Path) -> None:
     cell = Cell.load(CELL_PATH)
     text = cell.text.replace("jerk_deg = [5166.67, 5166.67", 'jerk_deg = [5166.67, "?"')
-    with pytest.raises(UnknownFieldsError, match=r"one field still unknown.*\n.*\(entry 2\)"):
+    with pytest.raises(UnknownFieldsError, match=r"one field unknown.*\n.*\(entry 2\)"):
         Cell.from_texts(text, cell.urdf, tmp_path / "cell.toml")
 
 
@@ -131,7 +131,7 @@ def test_joints_that_slide_are_fixed_and_it_is_said(tmp_path: Path) -> None:
     summary = new(urdf, tmp_path / "panda.toml", "--fix", "panda_finger_joint1=0.02")
     assert len(summary["joints"]) == 7
     (note,) = summary["notes"]
-    assert "panda_finger_joint2 slides, and is fixed at 0 m" in note
+    assert "panda_finger_joint2 is prismatic, and fixed at 0 m" in note
     assert (tmp_path / "panda.urdf").exists()
 
 
@@ -173,7 +173,7 @@ def test_an_archive_of_another_arm_is_refused(
     arguments = ["new", "--urdf", str(two_joints), "-o", str(tmp_path / "c.toml")]
     result = CliRunner().invoke(app, [*arguments, "--from-archive", str(archive)])
     assert isinstance(result.exception, ArchiveError)
-    assert "those of the URDF are hip, knee" in str(result.exception)
+    assert "the URDF has hip, knee" in str(result.exception)
     assert not (tmp_path / "c.toml").exists()
 
 
@@ -256,7 +256,7 @@ def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
     ("options", "sentence"),
     [
         (["--fix", "elbow"], "has no moving joint elbow; it has hip, knee"),
-        (["--fix", "hip=high"], "'hip=high' is no NAME=NUMBER"),
+        (["--fix", "hip=high"], "'hip=high' is not NAME=NUMBER"),
         (["--from-controller", "a:b"], "is not HOST or HOST:PORT"),
         (["--from-controller", "a:70000"], "is not HOST or HOST:PORT"),
         (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is not HOST or HOST:PORT"),

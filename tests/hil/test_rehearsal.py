@@ -213,12 +213,12 @@ class StopsAfter:
         yield Stopping()
 
 
-def test_a_stopped_rehearsal_goes_on_and_a_passed_one_stays(
+def test_a_stopped_rehearsal_resumes_and_a_passed_one_stays(
     tmp_path: Path, designed: Campaign
 ) -> None:
     campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
     stop = Stop()
-    with pytest.raises(OperatorStopError, match="rehearse again to go on"):
+    with pytest.raises(OperatorStopError, match="rehearse again to resume it"):
         campaign.rehearse(stop=stop, reporter=StopsAfter(stop))
     assert Rehearsal.load(campaign.folder) is None
     plain = CampaignFolder(campaign.folder.rehearsed / "plain")
