@@ -164,11 +164,7 @@ def _endogeneity(
 
 
 def cad_prior(cell: Cell) -> GaussianPrior | str:
-    """Return the prior from the URDF and `[nominal]`, or the reason why there is none.
-
-    Relative standard deviations are `[nominal] uncertainty` for inertias (10 % without that table)
-    and `FRICTION_SHARE` for friction.
-    """
+    """Return the prior from the URDF and `[nominal]`, or the reason why there is none."""
     model, table = cell.model, cell.file.nominal
     known: dict[str, tuple[float, float]] = {}  # mean and standard deviation
     if table is not None:
@@ -215,12 +211,8 @@ def fit_of(
 ) -> Fit:
     """Return the fit function of an estimator that works on factors.
 
-    Args:
-        model: of the arm.
-        name: of the estimator.
-        shrinkage: towards `centre`.
-        centre: (p,) physically consistent solution of all recordings; None for least squares.
-        prior: of the estimator "prior".
+    `centre` (p,) is the consistent solution to shrink to, None for least squares; `prior` is that
+    of the estimator "prior".
     """
 
     def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:

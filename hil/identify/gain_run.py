@@ -42,11 +42,8 @@ def find_gains(
 ) -> GainsFound:
     """Identify the torque constant of every motor.
 
-    Args:
-        archives: recorded with the payload of their cell, if it has one.
-        loaded: archives with another payload than that of their cell.
-        reporter: of progress.
-        delay: time by which currents lag positions [s]; "stated" uses the cell's.
+    Archives are `loaded` if they have another payload than that of their cell. Currents lag
+    positions by `delay` [s]; "stated" uses the cell's.
 
     Raises:
         InputError: an archive cannot be used, or not with the others; no archive has a payload.

@@ -32,8 +32,7 @@ ESTIMATORS: Final[dict[Estimator, str]] = {
 class Options:
     """Options of an identification.
 
-    Options that are "auto" are chosen by predicting blocks of the fitted data from the other blocks
-    (:mod:`identification.selection.inner_prediction`).
+    Those that are "auto" are chosen by :mod:`identification.selection.inner_prediction`.
 
     Raises:
         InputError: the method or estimator is unknown.
@@ -74,10 +73,7 @@ FRICTION_TERMS: Final = ", ".join(
 
 
 def friction_from(text: str) -> Mapping[str, Any]:
-    """Parse a friction law such as ``coulomb,viscous,offset,presliding=1e-4``.
-
-    Returns:
-        Entries of `[robot.friction]`; terms that are not named are absent from the law.
+    """Return entries of `[robot.friction]` for a law such as ``coulomb,viscous,presliding=1e-4``.
 
     Raises:
         InputError: a term is unknown or excludes another, or its value is not positive.

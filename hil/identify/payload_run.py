@@ -193,15 +193,9 @@ def find_payload(
 ) -> PayloadFound:
     """Identify the payload of the loaded recordings as their difference to the bare ones.
 
-    Settings are chosen on the bare recordings; `[robot.payload]` of the cells is ignored.
-
-    Args:
-        bare: archives, folders of them, or campaign folders.
-        loaded: likewise.
-        reporter: of progress.
-        frame: link in whose frame the payload is; by default that of `flange_of`.
-        box: edges [m] of the reference body along the axes of that frame; None for a point.
-        options: of the identification.
+    Both are archives, folders of them, or campaign folders. Settings are chosen on the bare
+    recordings; `[robot.payload]` of the cells is ignored. The payload is in the frame of a link, by
+    default that of `flange_of`; `box` are the edges [m] of the reference body, None for a point.
 
     Raises:
         InputError: archives cannot be used, are of two arms, have two payloads or none.

@@ -156,15 +156,7 @@ def identify_archives(
     name: str = "",
     warnings: Sequence[str] = (),
 ) -> Identification:
-    """Identify from archives; their kind decides what is fitted and what is held out.
-
-    Args:
-        paths: of the archives.
-        reporter: of progress.
-        options: of the identification.
-        predict: archives that are held out, whatever their kind.
-        name: of the result; by default that of the first archive.
-        warnings: added to those of the result.
+    """Identify from archives; their kind decides what is fitted, `predict` is held out.
 
     Raises:
         InputError: the archives cannot be used, not together, or not by the chosen estimator.

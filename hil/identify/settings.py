@@ -101,11 +101,7 @@ def samples_of(
 ) -> Samples:
     """Return the samples of a source from :func:`signals_of`, for a fit.
 
-    Args:
-        source: the recording.
-        cell: with the friction law of the settings.
-        settings: of the preprocessing.
-        model: in place of the cell's.
+    The friction law is that of the cell; `model` replaces the cell's.
 
     Raises:
         RecordingError: the recording cannot be prepared.

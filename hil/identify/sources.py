@@ -376,10 +376,7 @@ def _split(whole: Source, share: float) -> tuple[tuple[Source, ...], list[Source
 
 
 def position_noise(cell: Cell, rest: Recording) -> Array:
-    """Return the variance of positions at standstill (n,), at least that of their resolution.
-
-    At rest the encoder may show a constant count; rounding is uniform noise over one count.
-    """
+    """Return the variance of positions at standstill (n,), at least that of their resolution."""
     measured = standstill_variance(rest.time, rest.position)
     if cell.file.drive_train is None:
         # Smallest difference between two positions of a joint, 0 if all are equal.

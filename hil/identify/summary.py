@@ -209,10 +209,7 @@ def uncertainty_result(estimation: Estimation) -> results.UncertaintyResult:
 
 
 def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
-    """Return the parameters (p,) of the simulated arm by archive or cell; None if unknown.
-
-    Those of a torque ripple, which has a random phase, are NaN.
-    """
+    """Return the parameters (p,) of the simulated arm, NaN of a torque ripple; None if unknown."""
     model, planted = cell.model, header.planted
     if planted is not None:
         if not planted.keys() >= {*model.parameter_names[: model.element_part.start]}:
@@ -232,10 +229,7 @@ def _period(samples: Samples) -> float:
 
 
 def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
-    """Return the criteria of the executed motion and of its plan, and the information (p, p).
-
-    As in the plan, all samples of the motion count, those of joints at rest included.
-    """
+    """Return the criteria of executed and planned motion, and the information (p, p); all rows."""
     model, lengths = prepared.sources.cell.model, []
     factor = Factor.zero(model)
     for source, samples in zip(prepared.sources.training, prepared.training, strict=True):

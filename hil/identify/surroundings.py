@@ -35,10 +35,7 @@ _TIME_TOLERANCE = 1e-6  # s
 def controller_error(
     cell: Cell, sources: Sequence[Source], samples: Sequence[Samples]
 ) -> PredictionError | None:
-    """Return the torque error of the controller's model on the usable rows of sources.
-
-    None if any of the archives lacks the controller's model current, or has zeros in it.
-    """
+    """Return the torque error of the controller's model; None if an archive lacks its current."""
     if cell.file.drive_train is None:
         return None
     errors = []
@@ -54,10 +51,7 @@ def controller_error(
 def controller_inertia(
     cell: Cell, estimate: Estimate, sources: Sequence[Source]
 ) -> InertiaRatio | None:
-    """Return the ratio of the controller's diagonal inertia to the identified one, per posture.
-
-    None if the controller sent none (zeros), or parameters are undetermined.
-    """
+    """Return the controller's diagonal inertia over the identified one; None if not sent."""
     if cell.file.drive_train is None or estimate.undetermined:
         return None
     found = []
@@ -74,10 +68,7 @@ def controller_inertia(
 
 
 def _column_at(source: Source, field: str, time: Array) -> Array | None:
-    """Return a channel (m, n) of a complete archive at some of its times.
-
-    None for a part of an archive, and for a channel that is absent, zero or not finite.
-    """
+    """Return a channel (m, n) of a complete archive at some times; None if absent or zero."""
     if source.name != source.path.name:
         return None
     archive = open_archive(source.path, fields=("cycle", field))
@@ -230,10 +221,7 @@ def nominal_of(cell: Cell) -> Nominal | None:
 
 
 def torque_limits(cell: Cell) -> Array | None:
-    """Return the maximum torque of each joint (n,) [N·m or N], NaN if unknown; None without any.
-
-    That of its motor and gear at the current limit, or the URDF's effort limit without drive train.
-    """
+    """Return the maximum torque of each joint (n,) [N·m or N], NaN if unknown; None without any."""
     if cell.file.drive_train is not None:
         drives = cell.drive_train
         gear = np.abs(np.diag(drives.motor_from_joint))

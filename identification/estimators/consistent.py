@@ -1,7 +1,6 @@
 r"""Physically consistent estimates: standard parameters that a robot can have.
 
-Over the standard parameters :math:`\pi_s` and the friction f, one convex program on the torque
-objective (not a projection of an estimate link by link):
+Over the standard parameters :math:`\pi_s` and the friction f, one convex program
 
 .. math:: \min\; \|R\,[G\pi_s;\, f] - z\|^2
           + w \left( \sum_i D(J_i \,\|\, J_i^0) + \ldots \right)
@@ -9,22 +8,19 @@ objective (not a projection of an estimate link by link):
 
 R is the square root of the weighted normal equations, G the grouping of the base parameters, J the
 pseudo-inertia of a link (Wensing, Kim and Slotine 2018). D is the log-det divergence from the
-nominal (CAD) bodies (Lee, Wensing and Park 2020); the dots are squares of rotor inertias (minus
-nominal ones) and friction, scaled to be small. The prior weighs as much as `prior_weight` rows of
-data and determines what the data leave open. D is infinite at the boundary, so the solution is
-strictly inside. It is approximated by a conic solver and refined by Newton's method; if no
-consistent parameters fit the data, Newton's method follows a path of falling prior weights.
+nominal bodies (Lee, Wensing and Park 2020); the dots are squares of rotor inertias (minus nominal
+ones) and friction, scaled to be small. The prior weighs as much as `prior_weight` rows of data. D
+is infinite at the boundary, so the solution is strictly inside. A conic solver approximates it,
+Newton's method refines it; if no consistent parameters fit the data, Newton's method follows a path
+of falling prior weights.
 
 Where motors turn with several joints, the rotors' inertia matrix with coupling inertias has to be
-positive definite instead of I_im >= 0. Constraints on friction:
-:mod:`identification.model.friction`.
+positive definite instead of I_im >= 0.
 
-:class:`Shrinkage` shrinks least squares towards this solution :math:`\pi_c`:
+:class:`Shrinkage` shrinks least squares towards this solution :math:`\pi_c`, as a Gaussian prior
+with the share :math:`\lambda` of each column's information:
 
 .. math:: \hat\pi = \pi_c + (A + \lambda D)^{-1}\,(b - A\,\pi_c), \qquad D = \mathrm{diag}(A)
-
-the mean of a Gaussian posterior whose prior has the share :math:`\lambda` of each column's
-information. Well-determined parameters follow the data, others the consistent solution.
 """
 
 from __future__ import annotations
@@ -239,13 +235,7 @@ def _descend(problem: Smooth, u: Array, step: Array, decrement: float) -> Array 
 
 
 def follow_path(problem: Smooth, start: Array, weight: Callable[[Array], float]) -> Minimum:
-    """Minimise from a distant start with falling weight of the prior (barrier method).
-
-    Args:
-        problem: its own weight is ignored.
-        start: feasible (v,), such as the reference.
-        weight: final weight as a function of u.
-    """
+    """Minimise from a feasible start (v,) with the prior's weight, a function of u, falling."""
     found, steps = Minimum(start, converged=False), 0
     now = max(problem.excess(start), weight(start))
     while steps < _PATH_STEPS:
@@ -342,14 +332,10 @@ class Program:
         return self.to_standard @ u, self.to_others @ u
 
     def solve(self, n_rows: int, near: Array | None = None) -> tuple[Array, str]:
-        """Return the solution u and its status.
+        """Return the solution u and its status for `n_rows` rows in the weighted normal equations.
 
-        The prior weighs as many rows as `prior_weight` at the noise of the data. If no consistent
-        parameters fit to the noise, the error of the best ones replaces the noise.
-
-        Args:
-            n_rows: rows in the weighted normal equations.
-            near: similar solution (v,) to start from; the prior's weight is then iterated to 1 %.
+        If no consistent parameters fit to the noise, the error of the best ones replaces the noise.
+        `near` is a similar solution (v,) to start from; the prior's weight is then iterated to 1 %.
 
         Raises:
             SolverError: neither the conic solver nor Newton's method found one.
@@ -465,13 +451,9 @@ def consistent_estimate(
 ) -> ConsistentEstimate:
     """Fit physically consistent standard parameters and friction to the samples.
 
-    Args:
-        model: the robot.
-        factor: the samples.
-        unconstrained: least-squares estimate of the same samples for comparison.
-        weights: per joint (n,); by default the inverse residual variance of an ordinary fit.
-        prior_weight: rows of data (each at its noise) that the nominal parameters count for.
-        near: `solution` of similar samples, see :meth:`Program.solve`.
+    An `unconstrained` estimate of the same samples is for comparison; weights (n,) are by default
+    the inverse residual variances of an ordinary fit; the nominal parameters count for
+    `prior_weight` rows of data; `near` is the `solution` of similar samples.
 
     Raises:
         IdentificationError: no rows, or the unconstrained estimate has other parameters.
@@ -565,17 +547,10 @@ def fit_shrunk(
     centre: Array | None = None,
     phase: PhaseFactor | None = None,
 ) -> Estimate:
-    """Fit recordings with shrinkage; the covariance is that of least squares, cluster-robust.
+    """Fit recordings, shrunk to a centre (p,), by default the consistent solution of the samples.
 
-    The consistent solution is estimated from the same samples and adds no information on what they
-    leave open.
-
-    Args:
-        model: the robot.
-        recordings: the samples.
-        shrinkage: its strength.
-        centre: to shrink to (p,), by default the consistent solution.
-        phase: factor of the recordings if known.
+    The covariance is that of least squares, cluster-robust; `phase` is the recordings' factor if
+    known.
 
     Raises:
         IdentificationError: no usable row, or no consistent parameters were found.
@@ -613,17 +588,11 @@ class Ensemble:
 
 
 def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int) -> Ensemble:
-    r"""Sample consistent parameter sets that scatter as the estimate is uncertain.
+    r"""Sample `count` consistent parameter sets that scatter as the estimate is uncertain.
 
-    Each sample is the consistent solution nearest, in the measure :math:`C^{-1}`, to the estimate
-    plus :math:`\delta \sim N(0, C)` (randomise, then optimise). Samples have the covariance C where
-    constraints are inactive. Undetermined parameters stay at the prior.
-
-    Args:
-        model: the robot.
-        estimate: parameters with covariance.
-        count: number N of samples.
-        seed: of the random numbers.
+    Each is the consistent solution nearest, in the measure :math:`C^{-1}`, to the estimate plus
+    :math:`\delta \sim N(0, C)` (randomise, then optimise): of covariance C where constraints are
+    inactive. Undetermined parameters stay at the prior.
 
     Raises:
         SolverError: no consistent parameters were found for a sample.
@@ -643,10 +612,7 @@ def sample_ensemble(model: RobotModel, estimate: Estimate, count: int, seed: int
 
 
 def _roots(covariance: Array) -> tuple[Array, Array]:
-    """Return L (p, d) with ``L L'`` the covariance, and R (d, p) with ``R' R`` its inverse.
-
-    Both are zero for parameters of infinite variance.
-    """
+    """Return L (p, d), ``L L'`` the covariance, and R (d, p), ``R' R`` its inverse."""
     known = np.isfinite(np.diag(covariance))
     own = covariance[np.ix_(known, known)]
     scale = np.sqrt(np.diag(own))

@@ -5,14 +5,12 @@ The torque of axis j is recorded with delay d_j:
 .. math:: \tau_j(t) = W_j\bigl(q, \dot q, \ddot q\bigr)(t - d_j)\,\pi + e_j(t)
 
 One logger records all torques, so a common delay is estimated first: the minimum of a residual
-profile over common delays is refined by Gauss-Newton steps on parameters and delay together, with
-the column :math:`-d\tau/dt`. An axis gets its own deviation only where that is significant and
-predicts left-out blocks of time better. Parameters and delays are estimated together because they
-correlate: with a single frequency a delayed acceleration is viscous friction.
+profile is refined by Gauss-Newton steps on parameters and delay together, with the column
+:math:`-d\tau/dt`. An axis gets its own deviation only where that is significant and predicts
+left-out blocks of time better.
 
-The motion is interpolated at other times, not the torque, whose noise interpolation would smooth by
-an amount that depends on the delay. Rows near a velocity reversal are left out: presliding friction
-is similar to a delay.
+The motion is interpolated at other times, not the torque, whose noise that would smooth. Rows near
+a velocity reversal are left out: presliding friction is similar to a delay.
 """
 
 from __future__ import annotations
@@ -50,15 +48,11 @@ Array = NDArray[np.float64]
 
 
 def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recording:
-    """Return the recording with torque and current shifted to the time of the positions.
+    """Return the checked recording with torque and current shifted by delays (n,) [s].
 
-    Each channel is interpolated `delays` later by cubics between samples, not across gaps; samples
-    without data at the ends of segments are dropped. For a common delay,
-    :attr:`Preprocessing.torque_delay` leaves the torque unchanged.
-
-    Args:
-        recording: checked.
-        delays: of torque and current (n,) [s].
+    Channels are interpolated by cubics, not across gaps; samples without data at the ends of
+    segments are dropped. For a common delay, :attr:`Preprocessing.torque_delay` leaves the torque
+    unchanged.
 
     Raises:
         IdentificationError: no sample is left.
@@ -101,10 +95,7 @@ def predicted_rate(samples: Samples, torque: Array) -> Array:
 
 
 def rate_products(model: RobotModel, samples: Samples) -> Array:
-    """Return sums ``W' d[W | t]/dt`` over usable rows per joint (n, p, p + 1), which add up.
-
-    The torque t is that of the known payload.
-    """
+    """Return sums ``W' d[W | t]/dt`` per joint (n, p, p + 1); t is of the known payload."""
     products = np.zeros((model.n_joints, model.n_parameters, model.n_parameters + 1))
     load = samples.known_torque(model)
     for joint, (block, columns) in enumerate(zip(*samples.regressor(model), strict=True)):
@@ -118,15 +109,10 @@ def rate_products(model: RobotModel, samples: Samples) -> Array:
 def with_uncertain_delay(
     estimate: Estimate, factor: Factor, products: Array, variance: float
 ) -> Estimate:
-    """Return the estimate with the uncertainty of the delay in its covariance.
+    """Return the estimate with the variance [s²] of its given delay in the covariance.
 
-    The parameters change by the fit of the torque's rate.
-
-    Args:
-        estimate: made with one given delay.
-        factor: of the fitted samples.
-        products: their `rate_products` (n, p, p + 1).
-        variance: of the delay [s²].
+    The parameters change by the fit of the torque's rate; `products` are the `rate_products` of the
+    factor's samples (n, p, p + 1).
     """
     weights = inverse_variance(estimate.noise_std**2)
     rate = np.tensordot(weights, products, axes=1) @ np.append(estimate.values, 1.0)
@@ -255,11 +241,8 @@ def estimate_delays(
 ) -> DelayEstimate:
     """Estimate the delay of a recording's torque relative to its position.
 
-    Args:
-        recording: with torque, joints in the model's order.
-        model: the robot.
-        noise_variance: of the positions (n,), see :func:`identification.signals.samples.smooth`.
-        options: smoothing, torque low-pass, and the assumed delay.
+    `noise_variance` (n,) as for :func:`identification.signals.samples.smooth`; the options are of
+    the smoothing and the torque's low-pass, with the assumed delay.
 
     Raises:
         RecordingError: see :func:`identification.signals.samples.prepare`.
@@ -483,11 +466,7 @@ class _Reader:
         return replace(result, torque=result.torque - result.known_torque(self.model))
 
     def profile(self, shifts: Array) -> tuple[Array, Array]:
-        """Return mean log residual variance at common shifts (K,), and the best parameters.
-
-        Raises:
-            IdentificationError: no usable row.
-        """
+        """Return mean log residual variance at common shifts (K,), and the best parameters."""
         heights, best = np.full(len(shifts), np.inf), np.zeros(self.model.n_parameters)
         for k, shift in enumerate(shifts.tolist()):
             factor = Factor.of(self.model, self.at(shift))
@@ -502,11 +481,7 @@ class _Reader:
         return heights, best
 
     def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
-        """Return normal equations of p parameters and n delay steps, by blocks of time.
-
-        At a shift of each axis (n,) and parameters (p,), weighted (n,) by default by inverse
-        residual variance.
-        """
+        """Return normal equations of p parameters and n delay steps at shifts (n,), by blocks."""
         n, p, model = self.model.n_joints, self.model.n_parameters, self.model
         rows, tables = np.zeros_like(self.clear), [np.empty((0, 0))] * n
         for value in np.unique(shift).tolist():

@@ -217,10 +217,7 @@ def scale_from_nominal(
     currents: Sequence[Array],
     motor_from_joint: Array | None = None,
 ) -> CurrentScale:
-    """Estimate gains of all motors from smoothed motions and currents (m, n) [A].
-
-    `motor_from_joint`: motor angles per joint angle (n, n); identity: gains include the gears.
-    """
+    """Estimate gains from motions and currents (m, n) [A]; without transmission with the gears."""
     n = model.n_joints
     turns = np.eye(n) if motor_from_joint is None else np.asarray(motor_from_joint, np.float64)
     parts = [_columns(model, motion, turns) for motion in motions]

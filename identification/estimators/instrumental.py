@@ -99,11 +99,7 @@ def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = No
 
 
 def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
-    """Return whether two recordings were commanded the same motion.
-
-    Each is its time since the motion's origin (m,) [s] and commanded positions (m, n), NaN without
-    command.
-    """
+    """Return whether two pairs of times (m,) and commanded positions (m, n) are of one motion."""
     (time, one), (other_time, other) = first, second
     if one.shape[1] != other.shape[1]:
         return False
@@ -125,11 +121,7 @@ def same_plan(first: tuple[Array, Array], second: tuple[Array, Array]) -> bool:
 
 
 def tracking_lag(time: Array, measured: Array, command: SmoothingSpline) -> Array:
-    """Return the lag of each axis behind its command (n,) [s], NaN for one not commanded to move.
-
-    The lag minimises the variance of the difference to positions (m, n) [rad or m] measured at
-    times (m,) [s].
-    """
+    """Return the lag of axes (m, n) behind their command (n,) [s], NaN if not commanded."""
     thin = slice(None, None, max(1, len(time) // _ROWS))
     time, measured = time[thin], measured[thin]
     inside = time >= time[0] + LONGEST_LAG

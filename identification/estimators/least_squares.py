@@ -102,11 +102,7 @@ class RepeatedEstimate:
         return cls(pooled, tuple(repetitions), phase, factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
-        """Widen the intervals to the scatter of the repetitions.
-
-        Errors of opposite sign (a payload in every other repetition) cancel in the pooled
-        covariance.
-        """
+        """Widen the intervals to the scatter of repetitions, which can cancel in the covariance."""
         covariance = no_narrower(self.pooled.covariance, self.values)
         return replace(self, pooled=replace(self.pooled, covariance=covariance))
 
@@ -134,19 +130,13 @@ class RepeatedEstimate:
 
     @property
     def independent_std(self) -> Array:
-        """Standard deviation of the pooled estimate for independent repetitions (p,).
-
-        RMS of the standard deviations of the repetitions over sqrt(R).
-        """
+        """RMS of the standard deviations of the repetitions over sqrt(R) (p,)."""
         variances = [np.diag(one.covariance) for one in self.repetitions]
         return np.asarray(np.sqrt(np.mean(variances, axis=0) / len(variances)))
 
 
 def no_narrower(covariance: Array, values: Array) -> Array:
-    """Widen a covariance (p, p) to standard deviations of the mean of R values (R, p).
-
-    Only where these are significantly larger.
-    """
+    """Widen a covariance (p, p) where the mean of R values (R, p) scatters significantly more."""
     freedom = len(values) - 1
     if freedom < 1:
         return covariance

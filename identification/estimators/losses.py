@@ -1,7 +1,6 @@
-r"""Loss functions of robust estimation.
+r"""Loss functions of robust estimation, of residuals x in standard deviations.
 
-For residuals x in standard deviations, a fit uses the weight :math:`u(x) = \psi(x)/x`, a covariance
-the slope :math:`\psi'(x)`.
+A fit uses the weight :math:`u(x) = \psi(x)/x`, a covariance the slope :math:`\psi'(x)`.
 """
 
 from __future__ import annotations
@@ -33,10 +32,7 @@ class Loss:
 
 @dataclass(frozen=True)
 class Huber(Loss):
-    """Square within `tuning` standard deviations, linear beyond (Huber 1964).
-
-    Convex; the influence of an outlier is bounded, not zero.
-    """
+    """Square within `tuning` standard deviations, linear beyond (Huber 1964); convex."""
 
     tuning: float = 1.345  #: 1.345 keeps 95 % of the efficiency on Gaussian noise
 
@@ -56,10 +52,7 @@ class Huber(Loss):
 
 @dataclass(frozen=True)
 class Tukey(Loss):
-    """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974).
-
-    Not convex: start from the solution of Huber's loss.
-    """
+    """Bisquare: rows beyond `tuning` standard deviations do not count (Beaton and Tukey 1974)."""
 
     tuning: float = 4.685  #: 4.685 keeps 95 % of the efficiency on Gaussian noise
 

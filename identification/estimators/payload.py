@@ -104,9 +104,7 @@ class Run:
     def of(
         cls, name: str, model: RobotModel, samples: Samples, frame: str | None, *, loaded: bool
     ) -> Run:
-        """Reduce a recording of an arm without payload; the body is at the frame of a link.
-
-        None is the frame of the last joint.
+        """Reduce a recording of an arm without payload; the body is at a frame or the last joint.
 
         Raises:
             ModelError: the description has no such frame, or it is fixed to the base.
@@ -241,10 +239,11 @@ def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, floa
 
 
 def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None:
-    """Return the recording whose payload differs most from the first of its kind, if any.
+    """Return the recording with the largest difference to the first of its kind, if significant.
 
-    Bare and loaded recordings are compared with the first bare and loaded one by mass and first
-    moment. Arguments and errors as for :func:`mass_difference`.
+    Raises:
+        PayloadError: no bare or no loaded recording.
+        IdentificationError: no usable row.
     """
     first = {kind: next((r for r in runs if r.loaded == kind), None) for kind in (False, True)}
     others = [run for run in runs if run not in first.values()]

@@ -53,16 +53,10 @@ class GaussianPrior:
     def of_combinations(
         cls, combinations: Array, mean: Array, std: Array, words: str = "given"
     ) -> GaussianPrior:
-        """Return the prior on ``combinations @ s`` of independent quantities s.
+        """Return the prior on ``combinations @ s`` of independent s with mean and std (s,).
 
-        With the identity and mean zero this is ridge regression in units of `std`.
-
-        Args:
-            combinations: (p, s), of full rank.
-            mean: of the quantities (s,).
-            std: of the quantities (s,), infinite if unknown: only the direction on which such a
-                quantity acts is then flat, not every parameter that it is part of.
-            words: origin of the prior.
+        An infinite standard deviation makes the direction on which its quantity acts flat. With the
+        identity (p, s) and mean zero this is ridge regression in units of `std`.
 
         Raises:
             IdentificationError: a standard deviation is not positive.
@@ -101,10 +95,7 @@ class PosteriorEstimate:
 
     @property
     def ratio(self) -> Array:
-        """Posterior over prior standard deviation (p,): 0 all from the data, 1 all from the prior.
-
-        Without prior 0, or 1 if undetermined.
-        """
+        """Posterior over prior standard deviation (p,), 1: all from the prior; without prior 0."""
         flat = np.isinf(self.prior_std)
         ratio = self.estimate.std / np.where(flat, 1.0, self.prior_std)
         return np.where(flat, np.isinf(self.estimate.std).astype(np.float64), ratio)
@@ -116,10 +107,7 @@ class PosteriorEstimate:
 
     @property
     def normalized_change(self) -> Array:
-        """Change of parameters by the data, in standard deviations that the prior allows (p,).
-
-        Standard normal if prior and data agree. NaN without prior or where little was learned.
-        """
+        """Change by the data (p,), standard normal if prior and data agree; NaN without prior."""
         tested = self.learned & np.isfinite(self.prior_std)
         allowed = np.where(tested, self.prior_std**2, 1.0) * (
             1.0 - np.where(tested, self.ratio, 0.0) ** 2
@@ -231,13 +219,7 @@ def nominal_prior(
     The standard deviation of a mass is `share` of it, that of first moments and inertias `share` of
     the largest of the link. First moments of zero are replaced by mass times radius of gyration, a
     missing inertia by the largest of the arm. Rotor inertia, friction and springs are unknown
-    unless given.
-
-    Args:
-        model: the robot.
-        share: relative standard deviation.
-        known: mean and standard deviation by name, of standard (replacing nominal) and other
-            parameters: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
+    unless `known` by mean and standard deviation: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
 
     Raises:
         IdentificationError: the URDF has no inertia, a name is unknown, the share not positive.

@@ -1,8 +1,4 @@
-"""Robust estimation by iteratively reweighted least squares (Holland and Welsch 1977).
-
-The noise scale of each joint is estimated from the median absolute residual. Errors of the motion
-and of the model are not covered.
-"""
+"""Robust estimation by iteratively reweighted least squares (Holland and Welsch 1977)."""
 
 from __future__ import annotations
 
@@ -83,9 +79,9 @@ def robust_estimate(
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once.
 
-    Tukey's loss starts from the solution and scales of Huber's (Yohai 1987). QR replaces Gram
-    matrices if the condition requires it. `gram`, the factor of the recordings, saves one pass. See
-    `converged` after `most_iterations` per loss.
+    The noise scale of each joint is estimated from the median absolute residual; Tukey's loss
+    starts from the solution and scales of Huber's (Yohai 1987). `gram`, the recordings' factor,
+    saves a pass.
 
     Raises:
         IdentificationError: no recordings, or no usable row.

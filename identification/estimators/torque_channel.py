@@ -55,12 +55,9 @@ def possible_low_passes(
     """Return settings with the best-fitting low-pass of each kind.
 
     Many controllers log a filtered torque, in which Coulomb friction is a slope instead of a step.
-    Kinds are causal filters, compared without a delay, and zero-phase ones. A kind whose residuals
-    are not clearly smaller than with a delay alone is left out. The motion is smoothed with a wide
-    bandwidth.
-
-    `undelayed` is the delay [s] without a low-pass, by default that of the options;
-    `noise_variance` (n,) as in :func:`identification.signals.samples.smooth`.
+    Causal filters are compared without a delay; a kind whose residuals are not clearly smaller than
+    with a delay alone is left out. `undelayed` is the delay [s] without a low-pass, by default that
+    of the options; `noise_variance` (n,) as for :func:`identification.signals.samples.smooth`.
     """
     still = options.torque_delay if undelayed is None else undelayed
     wide = replace(options, rigid_bandwidth=RIGID_BANDWIDTH, torque_bandwidth=None)

@@ -177,10 +177,7 @@ class Factor:
         return float(np.sqrt(self.squared_errors(values).sum() / power)) if power > 0.0 else np.nan
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
-        """Return equivalent rows (k, p) and target (k,) with joint weights (n,).
-
-        Directions below the rounding of the Gram matrix are left out.
-        """
+        """Return equivalent rows (k, p) and target (k,) with joint weights (n,)."""
         return rows_of(self.weighted(weights))
 
     def solve(self, weights: Array) -> Solution:
@@ -283,10 +280,7 @@ def _determined_part(length: Array, size: Array, vectors: Array, worst: float) -
 
 
 def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solution:
-    """Solve ``A x = b`` with columns scaled to unit length.
-
-    Directions of scaled condition above `worst` are left out; their parameters are undetermined.
-    """
+    """Solve ``A x = b`` with unit columns; parameters of a condition above `worst` are open."""
     length = np.sqrt(np.diag(equations.A))
     scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
@@ -295,10 +289,10 @@ def solve(equations: NormalEquations, worst: float = WORST_CONDITION) -> Solutio
 
 
 def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -> Solution:
-    """Solve ``rows @ x = target`` (k, p), (k,) by least squares.
+    """Solve ``rows @ x = target`` (k, p), (k,) without squaring the condition.
 
-    By a singular value decomposition of rows with unit columns, without squaring the condition
-    (Golub and Van Loan 2013, section 5.3); `worst` as for :func:`solve`.
+    By a singular value decomposition (Golub and Van Loan 2013, section 5.3); `worst` as for
+    :func:`solve`.
     """
     length = np.linalg.norm(rows, axis=0)
     left, singular, right = np.linalg.svd(rows / _unit_columns(length), full_matrices=True)
@@ -310,10 +304,7 @@ def solve_rows(rows: Array, target: Array, worst: float = WORST_ROW_CONDITION) -
 
 
 def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
-    """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``.
-
-    Directions below rounding (condition above `WORST_CONDITION`) are left out.
-    """
+    """Return rows (k, p) and target (k,) with ``rows'rows = A`` and ``rows'target = b``."""
     length = np.sqrt(np.maximum(np.diag(equations.A), 0.0))
     scale = _unit_columns(length)
     eigenvalues, vectors = np.linalg.eigh(equations.A / np.outer(scale, scale))
@@ -327,8 +318,7 @@ def rows_of(equations: NormalEquations) -> tuple[Array, Array]:
 def residual_variance(factor: Factor, values: Array, root: Array, weights: Array) -> Array:
     """Return the variance of the torque residual per joint (n,), NaN without rows.
 
-    Degrees of freedom are shared among joints by their information trace(w_j S' G_j S), with the
-    root S (p, k) of a :class:`Solution`.
+    Degrees of freedom are shared by the information trace(w_j S' G_j S) of joints, S = root (p, k).
     """
     squares = factor.products(np.append(-values, 1.0)[:, None])[:, 0, 0]
     spent = weights * np.trace(factor.products(root), axis1=1, axis2=2)
@@ -404,10 +394,7 @@ def estimate_of(
     covariance: Array | None = None,
     interval_factor: float = 1.96,
 ) -> Estimate:
-    """Return the estimate of a solution with weights (n,) per joint.
-
-    `covariance` (p, p) of the determined part is by default the inverse of A.
-    """
+    """Return the estimate of a solution with weights (n,); covariance by default A^-1."""
     covariance = solution.inverse if covariance is None else covariance.copy()
     mark_undetermined(covariance, solution.determined)
     variance = residual_variance(factor, solution.values, solution.root, weights)
@@ -478,8 +465,7 @@ class Rows(NamedTuple):
 def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
     """Yield [W | y] of a recording in chunks, zero for unusable rows.
 
-    ``model.plan.columns[j]`` are the parameters of the columns of joint j. With a torque low-pass
-    the regressor of the whole recording is computed at once and filtered as well.
+    ``model.plan.columns[j]`` are the parameters of the columns of joint j.
 
     Raises:
         ShapeError: wrong shape of an array.

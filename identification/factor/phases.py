@@ -32,10 +32,7 @@ _MOST_BLOCKS: Final = 400  # of one recording, for gains
 
 @dataclass(frozen=True, eq=False)
 class PhaseFactor:
-    """Factors of B short blocks of time since the motion's origin.
-
-    Repetitions of a motion add block by block.
-    """
+    """Factors of B short blocks of time since the motion's origin; repetitions add up."""
 
     #: per joint j over its columns and the torque, (B, c_j + 1, c_j + 1)
     gram: tuple[Array, ...]
@@ -68,8 +65,8 @@ class PhaseFactor:
     ) -> PhaseFactor:
         """Reduce chunks: per joint columns and torque (c_j + 1, k), zero if not usable (m, n).
 
-        `index` is the block of each row (m,), rising; `columns` are the parameters of each joint's
-        columns (c_j,), `names` those of all (p,).
+        `index` is the block of each row (m,), rising; `columns` the parameters of each joint's
+        columns.
         """
         count = int(index[-1]) + 1 if len(index) else 0
         gram = tuple(np.zeros((count, len(own) + 1, len(own) + 1)) for own in columns)
@@ -172,8 +169,7 @@ def instrument_factor(
 ) -> PhaseFactor:
     """Reduce a recording to blocks of [Z | W | y].
 
-    The instrument is a noise-free motion in the rows of the samples, known where `usable` (m, n).
-    Rows count if it moves as well, independently of noise.
+    Rows count if the noise-free instrument, known where `usable` (m, n), moves as well.
     """
     rows = samples.usable & model.moving(instrument.velocity)
     if usable is not None:
@@ -324,10 +320,9 @@ _MOST_ROWS: Final = 1000
 
 @dataclass(frozen=True, eq=False)
 class StandardGram:
-    """Sums over samples of products of [W0 | Wx | Wy | Wz | y] in standard parameters, by joint.
+    """Sums of products of [W0 | Wx | Wy | Wz | y] in standard parameters, by joint.
 
-    The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any
-    gravity. Base parameters would depend on it.
+    The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz; one pass serves any.
     """
 
     # (n, 4 s + 1, 4 s + 1) for s standard parameters, friction, springs and balancers

@@ -158,10 +158,9 @@ def eliminate(
     weights: Array | None = None,
     rule: CutRule = CutRule(),
 ) -> Elimination:
-    """Remove parameters one by one and choose the cut.
+    """Remove parameters one by one and choose the cut by the error on held-out samples.
 
-    The held-out samples, preferably of another motion, choose the cut, so their error is slightly
-    optimistic. Weights (n,) are by default the inverse residual variances of an ordinary fit.
+    Weights (n,) are by default the inverse residual variances of an ordinary fit.
 
     Raises:
         IdentificationError: one of the factors has no rows.
@@ -302,10 +301,7 @@ class _Path:
 
 
 def _is_significant(difference: Array) -> bool:
-    """Return whether a sum of differences by blocks (B,) is significantly above zero.
-
-    Student's t over blocks merged until neighbours are nearly uncorrelated.
-    """
+    """Return whether a sum of differences by blocks (B,) is significantly above zero."""
     if not difference.any():
         return False
     blocks = merged(difference, block_length(difference[:, None]))

@@ -2,11 +2,7 @@
 
 Each recording is cut into `FOLDS` segments. Parameters are estimated from all segments but one and
 predict all rows of that one, including rest. The score of a candidate is ``||e|| / ||tau||`` over
-all joints, averaged over the segments, so that a single poorly determined segment does not
-dominate. Held-out data are not read.
-
-Factors of the segments (:mod:`identification.factor.phases`) are computed once per preparation and
-shared by all estimators.
+all joints, averaged over the segments. Held-out data are not read.
 """
 
 from __future__ import annotations
@@ -219,19 +215,10 @@ def choose_settings(
     delays: Sequence[float] = (),
     ripples: Sequence[Sequence[TorqueRipple]] = (),
 ) -> tuple[Settings, tuple[Choice, ...]]:
-    """Choose settings one after the other.
+    """Choose settings one after the other, from data that `ready` prepares.
 
-    Args:
-        ready: prepares the fitted data.
-        start: initial settings.
-        questions: settings to choose.
-        low_passes: candidates for "low-pass".
-        delays: significant delays of the torque [s], of which one is used for "delay" if it
-            predicts no worse than that of `start`.
-        ripples: candidates for "ripple".
-
-    Returns:
-        Settings and decisions; `start` without decisions if the data are too short.
+    Significant `delays` of the torque [s] are candidates for "delay" that must predict no worse
+    than that of `start`. Returns settings and decisions; `start` alone if the data are too short.
     """
     trial = _Trial(ready)
     now = start
@@ -281,13 +268,10 @@ def _compare_delays(
     questions: Collection[Question],
     delays: Sequence[float],
 ) -> tuple[Settings, Settings, list[Choice]]:
-    """Compensate a significant delay unless it predicts worse.
+    """Compensate a significant delay unless it predicts worse, and choose the other settings again.
 
-    Compared on sliding rows, as presliding is similar to a delay. The other settings are chosen
-    again.
-
-    Returns:
-        The settings before and after the sweep, and its decisions.
+    Compared on sliding rows, as presliding is similar to a delay. Returns the settings before and
+    after the sweep, and its decisions.
     """
     compared: list[Choice] = []
     for delay in delays:
@@ -311,8 +295,7 @@ def _compare_low_passes(
 ) -> tuple[Settings, list[Choice]]:
     """Add a low-pass of the torque, or its delay alone, if that predicts better.
 
-    Starts from the `first` settings, as a narrow bandwidth or a long presliding displacement,
-    chosen `now`, would replace a part of it.
+    Starts from the `first` settings: a narrow bandwidth chosen `now` would replace a part of it.
     """
     possible = low_passes(first.model, first.preprocessing)
     if not possible:
@@ -361,10 +344,7 @@ class _Trial:
         by_joint: bool = False,
         rows: Literal["all", "fitted"] = "all",
     ) -> _Decision:
-        """Return the first candidate, or the best one if it predicts better by a share.
-
-        The default share is `WORTHWHILE`.
-        """
+        """Return the first candidate, or the best one if better by a share (`WORTHWHILE`)."""
         share = WORTHWHILE if share is None else share
         each = [self.errors(one, rows) for one in candidates]
         errors = [one.by_joint if by_joint else one.overall for one in each]

@@ -155,15 +155,12 @@ def _steps_by_phase(time: Array, step: float) -> Array:
 def true_times(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
     """Return the recording at the times of its samples, and sentences on the decision.
 
-    Two hypotheses are compared by positions, and velocities if given: the stamps, and even times
-    that follow the slow drift of the stamps, with missing samples counted. With even times, the
-    distance of each sample from the cubic through its neighbours is noise; if the stamps are
-    correct it also contains speed times stamp deviation. Its share of that product, over all
-    joints, is near one or near zero; otherwise the stamps are used. Rows that repeat the sample
-    before them although the arm moves are removed.
-
-    Args:
-        recording: samples in order; stamps may repeat or fall back.
+    Two hypotheses are compared by positions, and velocities if given: the stamps, which may repeat
+    or fall back, and even times that follow their slow drift, with missing samples counted. With
+    even times, the distance of each sample from the cubic through its neighbours is noise; if the
+    stamps are correct it also contains speed times stamp deviation, with a share near one instead
+    of zero; otherwise the stamps are used. Rows that repeat the sample before them in motion are
+    removed.
 
     Raises:
         RecordingError: NaN or infinity, or constant time stamps.

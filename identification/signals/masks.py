@@ -141,8 +141,7 @@ def long_rests(time: Array, still: Rows) -> Rows:
 def flat_topped(values: Array, moving: Rows) -> Rows:
     """Return rows (m, n) that are clipped: a moving channel constant at its extreme value.
 
-    At least `SHORTEST_TOP` equal values at the largest or smallest value, left faster than the peak
-    of a smooth signal with the channel's resolution.
+    At least `SHORTEST_TOP` equal values, left faster than the peak of a smooth signal would be.
     """
     clipped = np.zeros(values.shape, dtype=np.bool_)
     for j, channel in enumerate(values.T):
@@ -171,10 +170,7 @@ def near_reversal(time: Array, speed: Array, reach: Array) -> Rows:
 
 
 def near_any_reversal(model: RobotModel, motion: Motion, reach: Array) -> Rows:
-    """Return rows (m, n) within times (n,) [s] of a reversal of the joint or a coupled motor.
-
-    The time of a motor is that of its slowest joint.
-    """
+    """Return rows (m, n) within times (n,) [s] of a reversal of the joint or a coupled motor."""
     near = near_reversal(motion.time, motion.velocity, reach)
     shares = model.friction.motor_speeds()
     if len(shares):
@@ -186,10 +182,7 @@ def near_any_reversal(model: RobotModel, motion: Motion, reach: Array) -> Rows:
 
 
 def edge_rows(recording: Recording, end: float, delay: float = 0.0) -> NDArray[np.bool_]:
-    """Return rows (m,) within a time [s] of the ends of their segment, or in a short one.
-
-    Rows are read earlier by a delay [s].
-    """
+    """Return rows (m,), read a delay [s] earlier, within `end` [s] of the ends of their segment."""
     edge = np.ones(recording.n_samples, dtype=np.bool_)
     for segment in recording.segments():
         inside = recording.time[segment]

@@ -54,7 +54,6 @@ def difference_variance(time: Array, values: Array) -> Array:
 
     By divided differences of rising order, scaled to unit noise gain (Gasser, Sroka and
     Jennen-Steinmetz 1986), up to the order at which the next changes the estimate by less than 5 %.
-    A filtered channel without white noise gives almost zero.
 
     Raises:
         RecordingError: fewer samples than the highest order needs.
@@ -93,11 +92,7 @@ _SHORTEST_RUN: Final = 64  # samples
 
 
 class RepetitionNoise(NamedTuple):
-    """Variances of the differences between repetitions of one motion.
-
-    White measurement noise, the tolerance of a smoothing spline, without friction drift and servo
-    motion.
-    """
+    """Variances of the differences between repetitions: white noise, without friction drift."""
 
     position: Array  # (n,) [rad² or m²]
     torque: Array | None  # (n,) [N²·m² or N²], None where no torque was recorded
@@ -181,11 +176,7 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:
-    """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s].
-
-    Reduced to the points of a logarithmic figure. Uneven samples are interpolated at the median
-    interval; f is 0 with too few.
-    """
+    """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s]."""
     frequency, power = _power(time, signals, segments, "hann")
     if not frequency.size:
         return Spectrum(frequency, power)
@@ -198,10 +189,7 @@ def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum
 
 
 def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
-    """Return the frequency [Hz] above which signals (m, c) have no power, such as after a low-pass.
-
-    None if any signal has noise up to half the sampling rate, or with too few samples.
-    """
+    """Return the frequency [Hz] above which signals (m, c) have no power; None with noise."""
     frequency, power = _power(time, signals, segments, "blackmanharris")
     power = power[:, power.sum(axis=0) > 0.0]
     if not power.size:

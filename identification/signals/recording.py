@@ -69,10 +69,7 @@ class Recording:
         return len(self.joint_names)
 
     def checked(self, joint_names: Sequence[str] | None = None) -> Recording:
-        """Return the recording if it can be identified from.
-
-        Args:
-            joint_names: of the model; names and order must be those of the recording.
+        """Return the recording if it can be identified from, with joint names as given.
 
         Raises:
             RecordingError: too short, NaN or infinity, invalid time stamps, other joints than the
@@ -105,10 +102,7 @@ class Recording:
 
     @property
     def motion_start(self) -> float:
-        """Time of the first commanded motion [s], of the first sample without command.
-
-        The same instant of the plan in every repetition.
-        """
+        """Time of the first commanded motion [s], of the first sample without command."""
         if self.commanded_position is None:
             return float(self.time[0])
         known = np.isfinite(self.commanded_position).all(axis=1)
@@ -119,10 +113,7 @@ class Recording:
         return float(self.time[int(np.argmax(moved))])
 
     def segments(self) -> list[slice]:
-        """Return the segments without gap, in order.
-
-        Gaps are reported, or steps of more than `GAP_STEPS` times the median step.
-        """
+        """Segments between reported gaps, or steps above `GAP_STEPS` median steps, in order."""
         steps = np.diff(self.time)
         breaks = steps > GAP_STEPS * np.median(steps)
         if self.gap_before is not None:
@@ -228,10 +219,7 @@ def without_repeats(recording: Recording) -> Recording:
 
 
 def stuck(position: Array, command: Array) -> tuple[int, float] | None:
-    """Return where positions (m,) are constant while commands (m,) move most [rad or m].
-
-    First sample and command range; None if no range exceeds `STUCK_MOVEMENT`. NaN without command.
-    """
+    """Return first sample and command range where positions (m,) rest and commands (m,) move."""
     edges = np.flatnonzero(np.diff(position, prepend=np.nan, append=np.nan) != 0.0)
     starts = edges[:-1]
     highest = np.fmax.reduceat(command, starts)
@@ -252,10 +240,7 @@ _REFINED: Final = 21  # offsets tried within a step
 
 
 def offsets_of_repetitions(recordings: Sequence[Recording]) -> Array | None:
-    """Return the offset of each clock from the first one's (R,) [s] for one common motion.
-
-    None if motions differ, or for a single recording.
-    """
+    """Return the offsets of clocks from the first (R,) [s]; None without a common motion."""
     offsets = [0.0]
     for one in recordings[1:]:
         offset = _offset(recordings[0], one)

@@ -165,19 +165,11 @@ def smooth(
     noise_variance: Array | None = None,
     options: Preprocessing = Preprocessing(),
 ) -> tuple[Motion, Array]:
-    """Return the smoothed motion at each time minus the delay, and the bandwidth.
+    """Return the smoothed motion at each time minus the delay, and the bandwidth (n,) [Hz].
 
-    Rows of segments too short to smooth keep their position, at rest.
-
-    Args:
-        recording: checked.
-        noise_variance: of the measured positions (n,) [rad² or m²], from standstill and at least
-            resolution²/12. None: estimated from differences of positions.
-        options: bandwidth, velocity and delay.
-
-    Returns:
-        Motion in the rows of the recording, and the bandwidth per joint (n,) [Hz] of the longest
-            segment.
+    `noise_variance` of the measured positions (n,) [rad² or m²] is from standstill and at least
+    resolution²/12; None: estimated from differences of positions. Rows of segments too short to
+    smooth keep their position, at rest.
     """
     position = recording.position.copy()
     velocity, acceleration = np.zeros_like(position), np.zeros_like(position)
@@ -216,14 +208,9 @@ def prepare(
 ) -> Samples:
     """Prepare a recording for a model; the torque of a known payload is subtracted.
 
-    Args:
-        recording: with torque; joints in the model's order.
-        model: with standstill speeds and payload.
-        noise_variance: of the positions (n,), see :func:`smooth`.
-        torque_variance: of the torques (n,), for `options.smooth_torque` only; None: estimated.
-        options: settings.
-        origin: start time of the planned motion [s]; by default of the command.
-        current_limit: of the motors (n,) [A]; rows at it are excluded.
+    Variances of the positions and, for `options.smooth_torque`, of the torques (n,) are estimated
+    if None, see :func:`smooth`. `origin` is the start of the planned motion [s], by default of the
+    command; rows at the `current_limit` of the motors (n,) [A] are excluded.
 
     Raises:
         RecordingError: the recording is invalid or has no torque.

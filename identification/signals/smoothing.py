@@ -44,10 +44,7 @@ class SmoothingSpline:
     bandwidth: Array  # half-amplitude frequency per channel (c,) [Hz]
 
     def __call__(self, time: Array, derivative: int = 0) -> Array:
-        """Return value or derivative at times (m,): (m, c), per second to the power ``derivative``.
-
-        Extrapolates beyond the knots.
-        """
+        """Return value or derivative at times (m,): (m, c), per second to its power."""
         rows = _rows(self.start, self.spacing, len(self.coefficients) - DEGREE, time, derivative)
         return np.asarray(rows @ self.coefficients)
 
@@ -55,15 +52,10 @@ class SmoothingSpline:
 def fit_smoothing_spline(
     time: Array, values: Array, tolerance: Array, *, widest: float = np.inf
 ) -> SmoothingSpline:
-    """Smooth each channel to a mean squared residual equal to its tolerance.
+    """Smooth channels (m, c) to mean squared residuals equal to their tolerances (c,).
 
-    Limited by the closest spline with one knot per sample and the smoothest one, nearly a parabola.
-
-    Args:
-        time: strictly increasing (m,) [s]; at least `ORDER`.
-        values: (m, c).
-        tolerance: mean squared residual (c,), positive.
-        widest: largest bandwidth [Hz].
+    Limited by the largest bandwidth `widest` [Hz], by the closest spline with one knot per sample
+    and by the smoothest one, nearly a parabola.
     """
     for samples_per_knot in (4, 2, 1):
         problem = _Problem.of(time, values, samples_per_knot * float(np.median(np.diff(time))))
@@ -81,10 +73,7 @@ def fit_smoothing_spline(
 
 
 def low_pass(time: Array, values: Array, bandwidth: float) -> Array:
-    """Filter values (m, c) by the same smoother with a fixed bandwidth [Hz]: linear, zero-phase.
-
-    Applied to torque and regressor alike it preserves their linear relation.
-    """
+    """Filter values (m, c) by the same smoother with a fixed bandwidth [Hz]: linear, zero-phase."""
     step = float(np.median(np.diff(time)))
     problem = _Problem.of(time, values, max(step, _KNOT_OF_CUTOFF / (2.0 * np.pi * bandwidth)))
     correction = problem.correction(slice(None), problem.penalty_at(bandwidth))
@@ -213,11 +202,7 @@ def _penalty_band(intervals: int) -> Array:
 
 
 def _roughness(coefficients: Array) -> Array:
-    """Return the penalty matrix times coefficients (k, c), by third differences.
-
-    The third derivative is a quadratic spline of the third differences. The band times the
-    coefficients would lose eleven digits with a heavy penalty.
-    """
+    """Return the penalty matrix times coefficients (k, c), accurate also with a heavy penalty."""
     third = np.diff(coefficients, 3, axis=0)
     intervals = len(third) - 2
     product = np.zeros_like(third)
@@ -260,10 +245,7 @@ FORWARDS: Final = tuple(LowPassShape(order, causal=True) for order in (1, 2, 4))
 def low_passed(
     time: Array, columns: Array, bandwidth: float, shape: LowPassShape = SMOOTHER
 ) -> Array:
-    """Filter columns (m, c) of one segment by a low-pass [Hz].
-
-    Butterworth filters interpolate uneven times (m,) [s].
-    """
+    """Filter columns (m, c) of a segment by a low-pass [Hz]; Butterworth: at even times."""
     if shape == SMOOTHER:
         return low_pass(time, columns, bandwidth)
     step = float(np.median(np.diff(time)))

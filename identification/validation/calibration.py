@@ -70,10 +70,7 @@ class TorqueMeans:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Coverage of 95 % intervals by held-out mean torques, per joint (n,).
-
-    NaN for a joint without mean or interval.
-    """
+    """Coverage of 95 % intervals by held-out mean torques, per joint (n,); NaN without one."""
 
     blocks: NDArray[np.intp]  # number of held-out means
     inside: Array  # share inside the interval
@@ -140,9 +137,6 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
 
     Folds have equally many rows and are cut at equal times of all recordings. NaN where a mean is
     unknown, infinite where the other folds have no row of the joint.
-
-    Raises:
-        IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.
     """
     fine = round(BLOCK / FINE_BLOCK)
     rows = merged(phase.samples, fine).sum(axis=1)

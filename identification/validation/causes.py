@@ -100,10 +100,7 @@ class Causes(NamedTuple):
 def find_causes(
     model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str] = ()
 ) -> Causes:
-    """Find faults whose correction predicts blocks of the fitted recordings better.
-
-    `values` (p,) are the parameters estimated from the recordings, `names` their names.
-    """
+    """Find faults that explain the error of values (p,) estimated from the recordings."""
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
     search = _Search(model, recordings, values, words)
     first = trials = search.trials()
@@ -252,7 +249,7 @@ class _Search:
 
 
 class _Tables(NamedTuple):
-    """Sums over the rows of B blocks of products of columns, joint by joint.
+    """Sums of products of columns over the rows of B blocks, joint by joint.
 
     Columns: parameters (p), payload (10), rate of the predicted torque, torques of all joints (n).
     """

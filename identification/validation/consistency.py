@@ -1,7 +1,4 @@
-"""Effect of physical consistency on the torque error, and the parameters that prevent it.
-
-Undetermined parameters can be made consistent at no cost. If the error rises, some bound is active.
-"""
+"""Effect of physical consistency on the torque error, and the parameters that prevent it."""
 
 from __future__ import annotations
 

@@ -58,11 +58,7 @@ _PLAUSIBLE: Final = Implausible((), ())
 
 @dataclass(frozen=True, eq=False)
 class GravityDirection:
-    """Direction of gravity that fits the recordings best.
-
-    A wrong mounting direction increases the error of every axis that gravity loads, like several
-    wrong torque constants.
-    """
+    """Direction of gravity that fits the recordings best."""
 
     declared: Array  # gravity of the model (3,) [m/s²]
     best: Array  # gravity that fits the training motion best, of the same size (3,) [m/s²]
@@ -87,10 +83,7 @@ def _solved(factor: Factor, weights: Array) -> Array:
 def find_gravity(
     model: RobotModel, training: StandardGram, held_out: StandardGram
 ) -> GravityDirection:
-    """Fit the training motion under all directions of gravity, and predict the held-out one.
-
-    Starts at the best of the declared direction and six along the axes of the base.
-    """
+    """Fit the training motion under all directions of gravity, and predict the held-out one."""
 
     def fitted(gravity: Array) -> tuple[Array, Array]:
         """Return parameters, joints weighted by their residuals, and the squared errors (n,)."""
@@ -141,8 +134,7 @@ def repetition_noise(
     """Return the standard deviation of the residual between repetitions (n,) [N·m or N].
 
     The residual of parameters (p,), through a low-pass [Hz] if given, is compared at equal times,
-    rounded to the sampling interval. NaN for a joint that never moves twice at the same time, such
-    as in one normal and one slowed repetition.
+    rounded to the sampling interval; NaN for a joint that never moves at the same time twice.
     """
     step, parts = 0.0, []
     for samples in recordings:
@@ -181,11 +173,7 @@ def find_load(
     fitted: StandardGram,
     predicted: StandardGram,
 ) -> CarriedLoad:
-    """Fit the training motion, then ten parameters of the last link to the unseen motion.
-
-    If they explain the error, the mass is estimated again with friction that drifts between
-    recordings, for its interval.
-    """
+    """Fit the training motion, then ten parameters of the last link to the unseen motion."""
     seen, unseen = fitted.under(model.gravity), predicted.under(model.gravity)
     values = _solved(seen, fitted.rows / np.maximum(seen.gram[:, -1, -1], 1e-300))
     # Squared error of the fit, scaled to as many rows.
@@ -306,16 +294,9 @@ def gather(
 ) -> Evidence:
     """Collect the evidence for a verdict; every recording is read a few times.
 
-    Args:
-        model: the robot.
-        result: estimate from the training recordings.
-        training: as many recordings as the result has.
-        held_out: motions that were not fitted.
-        same_motion: whether the training recordings repeat one motion, so that noise is measured.
-        nominal: parameters (p,) of the nominal model.
-        context: data on the cell.
-        in_sample: whether the held-out motions are those of the training.
-        names: of the training recordings.
+    With `same_motion` the training recordings, in the order of the result, repeat one motion, and
+    noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
+    training.
 
     Raises:
         IdentificationError: nothing was held out.

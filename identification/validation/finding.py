@@ -33,9 +33,8 @@ def joined(names: Sequence[str], most: int = 6) -> str:
 class Thresholds:
     """Limits of a good result; shares are RMS values over the RMS measured torque of the axis.
 
-    Derived from simulated NS 16 campaigns with one wrong sign (each gear ratio, wrist coupling,
-    torque constant, Coulomb and viscous friction) and without a fault, with and without unmodelled
-    effects.
+    Derived from simulated NS 16 campaigns without a fault and with one wrong sign of the drive
+    train.
     """
 
     overall: float = 0.12  #: relative torque error over all axes; published fits: 4 to 9 %

@@ -1,7 +1,7 @@
 """Ratio of each axis's measured torque to that of the nominal inertias.
 
 A torque constant or gear ratio wrong by a factor fits equally well; only independent knowledge
-shows it. Friction is free in the comparison, and so are unknown rotor inertias.
+shows it.
 """
 
 from __future__ import annotations
@@ -48,10 +48,7 @@ class NominalScale(NamedTuple):
 
     @property
     def common(self) -> float:
-        """Factor common to most axes, such as a wrong unit or motor torques; 1 if there is none.
-
-        The factor of a single axis may come from a nominal torque far smaller than friction.
-        """
+        """Factor common to most axes, such as a wrong unit or motor torques; 1 if there is none."""
         known = np.isfinite(self.scale) & (self.scale > 0.0)
         if np.count_nonzero(known) < 2:
             return 1.0
@@ -149,10 +146,9 @@ class InertiaRatio(NamedTuple):
 def inertia_ratio(
     model: RobotModel, values: Array, position: Array, theirs: Array
 ) -> InertiaRatio | None:
-    """Compare a diagonal inertia (m, n) at positions (m, n) [rad or m] with that of values (p,).
+    """Compare a controller's diagonal inertia (m, n), joint side, with that of values (p,).
 
-    `theirs`, of the controller, is on the joint side [kg·m² or kg], zero where not sent. None if
-    there is nothing to compare.
+    At positions (m, n) [rad or m]; zero where not sent. None if there is nothing to compare.
     """
     if not np.any(theirs):
         return None

@@ -1,7 +1,4 @@
-"""Signs of estimated parameters that are physically impossible.
-
-A wrong sign counts only if it is significant.
-"""
+"""Signs of estimated parameters that are physically impossible, as far as they are significant."""
 
 from __future__ import annotations
 
@@ -134,10 +131,7 @@ def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> l
 
 
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:
-    """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n).
-
-    Computed from the torque of one joint's acceleration at a time.
-    """
+    """Return inertia matrices (k, n, n) with rotors, of parameters (p,) at positions (k, n)."""
     still = np.zeros_like(position)
     rest = model.torque(values, position, still, still)
     columns = [

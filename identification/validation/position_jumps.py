@@ -42,11 +42,7 @@ class PositionJump:
 
 
 def position_jumps(recording: Recording, name: str = "the recording") -> list[PositionJump]:
-    """Return lasting steps of the measured positions of a named recording, by joint and time.
-
-    Stretches between gaps are tested, at the times of
-    :func:`identification.signals.clock.true_times`.
-    """
+    """Return lasting steps of the measured positions of a named recording, by joint and time."""
     time, position = recording.time, recording.position
     parts = [part for part in recording.segments() if part.stop - part.start > 2 * _BESIDE + 2]
     if not parts:

@@ -22,10 +22,7 @@ FIGURE_BANDWIDTH: Final = 30.0  # Hz, the paper's Fig. 4
 
 @dataclass(frozen=True, eq=False)
 class PredictionError:
-    """Sums over the rows of a prediction error e = measured - predicted, per joint (n,).
-
-    The sums of several recordings add up.
-    """
+    """Sums over the rows of an error e = measured - predicted, per joint (n,); they add up."""
 
     rows: NDArray[np.intp]  #: usable rows
     absolute: Array  #: sum of |e|
@@ -86,10 +83,7 @@ class PredictionError:
 
     @property
     def explained(self) -> Array:
-        """Share of each joint's torque variance that the prediction explains (n,), R².
-
-        NaN for a joint without rows or torque variance.
-        """
+        """Share of each joint's torque variance that the prediction explains (n,), R²."""
         varies = self.torque_squared - self.torque_sum**2 / np.maximum(self.rows, 1)
         known = (self.rows > 0) & (varies > 1e-12 * self.torque_squared)
         return np.where(known, 1.0 - self.squared / np.where(known, varies, 1.0), np.nan)
@@ -104,10 +98,7 @@ class PredictionError:
 def residual(
     model: RobotModel, values: Array, samples: Samples, bandwidth: float | None = None
 ) -> Array:
-    """Return measured minus predicted torque (m, n) of parameters (p,), zero in unusable rows.
-
-    Filtered by a zero-phase low-pass of a bandwidth [Hz] if given.
-    """
+    """Return measured minus predicted torque (m, n), low-passed [Hz] if given; 0 if unusable."""
     return _usable_part(
         samples, samples.torque - samples.predicted_torque(model, values), bandwidth
     )
@@ -157,10 +148,7 @@ def slow_error(model: RobotModel, values: Array, samples: Samples, bandwidth: fl
 def prediction_error(
     model: RobotModel, values: Array, runs: Iterable[Samples], *, all_rows: bool = False
 ) -> tuple[PredictionError, ...]:
-    """Return the prediction error of parameters (p,) on each recording.
-
-    `all_rows` includes rows at standstill and near ends.
-    """
+    """Return the error of parameters (p,) on each recording, with `all_rows` also at standstill."""
     return tuple(
         PredictionError.between(
             run.torque, run.predicted_torque(model, values), None if all_rows else run.usable

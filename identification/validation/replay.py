@@ -2,10 +2,8 @@ r"""Forward simulation of a model under recorded torques: divergence from the re
 
 .. math:: (M(q) + R)\,\ddot q = \tau + \tau_f - h(q, \dot q) - f(\dot q)
 
-with rotor inertias R and a feedback :math:`\tau_f` on the recorded motion, a spring and damper of
-`FEEDBACK` on each joint that limits the divergence. Steps are at most `STEP`. Dry friction is an
-impulse that at most stops its joint. All arms are branches of one pinocchio model and simulated at
-once.
+with rotor inertias R and a spring and damper :math:`\tau_f` on the recorded motion. Dry friction is
+an impulse that at most stops its joint. All arms are branches of one pinocchio model.
 """
 
 from __future__ import annotations
@@ -46,7 +44,7 @@ def replay(arms: Simulated, samples: Samples) -> Array:
     """Return simulated minus recorded positions (V, m, n) [rad or m]; NaN between segments.
 
     Starts at the first recorded state of each segment, under the torque without payload and known
-    elements. The feedback uses the inertia of the first arm for all.
+    elements, with the feedback inertia of the first arm.
 
     Raises:
         numpy.linalg.LinAlgError: a joint without inertia.
@@ -89,10 +87,7 @@ class SlowResidual(NamedTuple):
 
 
 def slow_residual(arm: Simulated, recordings: Sequence[Samples]) -> SlowResidual:
-    """Return the slow torque residual, which makes a simulation diverge.
-
-    `arm`: model, first arm only; `recordings`: motion and torque.
-    """
+    """Return the slow torque residual of the first arm, which makes a simulation diverge."""
     slow: list[Array] = []
     turns: list[Array] = []
     for samples in recordings:

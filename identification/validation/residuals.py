@@ -58,8 +58,7 @@ class BlockMean(NamedTuple):
 def block_mean(parts: Sequence[Array], repeated: int = 1) -> BlockMean:
     """Return sum of values over sum of weights, with standard error by blocks.
 
-    Each part holds the sums of values and of weights by blocks (2, B, ...). The first `repeated`
-    parts repeat one motion and share blocks.
+    Each part holds both sums by blocks (2, B, ...); the first `repeated` parts share blocks.
     """
     shared = np.zeros((2, max(p.shape[1] for p in parts[:repeated]), *parts[0].shape[2:]))
     for part in parts[:repeated]:
@@ -103,10 +102,7 @@ class Profile(NamedTuple):
 
     @property
     def significant(self) -> Rows:
-        """Whether the mean of some bin differs significantly from zero (n,).
-
-        Student's t at `CHANCE` over all bins (Bonferroni).
-        """
+        """Whether the mean of some bin differs from zero (n,): Student's t, all bins together."""
         seen = np.isfinite(self.bins.mean)
         freedom = np.maximum(self.bins.blocks - 1, 1)
         limit = student_limit(0.5 * CHANCE / np.maximum(seen.sum(axis=1), 1)[:, None], freedom)
@@ -270,11 +266,7 @@ class Autocorrelation(NamedTuple):
 
     @property
     def time(self) -> Array:
-        """Integrated correlation time per joint (n,) [s], half a sampling step for white noise.
-
-        Summed up to the first pair of lags with negative sum (initial positive sequence, Geyer
-        1992).
-        """
+        """Integrated correlation time (n,) [s] (initial positive sequence, Geyer 1992)."""
         pairs = self.correlation[: len(self.lag) // 2 * 2].reshape(-1, 2, len(self.rows)).sum(1)
         positive = np.cumprod(pairs > 0.0, axis=0)
         return np.asarray(self.lag[1] * ((pairs * positive).sum(axis=0) - 0.5))
@@ -288,10 +280,7 @@ class Autocorrelation(NamedTuple):
 def autocorrelation(
     residuals: Sequence[tuple[Array, Rows]], step: float, longest: float = LONGEST_LAG
 ) -> Autocorrelation:
-    """Return the autocorrelation up to the longest lag [s] over recordings with a step [s].
-
-    Each recording is its residual (m, n) and its usable rows (m, n).
-    """
+    """Return the autocorrelation of residuals and usable rows (m, n) up to the longest lag [s]."""
     lags = max(2, min(_MOST_LAGS, round(longest / step)))
     products = sum(_products(np.where(usable, left, 0.0), lags) for left, usable in residuals)
     pairs = np.rint(sum(_products(usable.astype(np.float64), lags) for _, usable in residuals))
@@ -348,8 +337,7 @@ def check_residuals(
 ) -> ResidualChecks:
     """Check the residuals of parameters (p,) on all recordings.
 
-    Drift is tested on the training recordings in order; with `same_motion` they repeat one motion.
-    Ripple needs motor angles per joint angle (n, n).
+    Drift is tested on the training recordings in order; ripple needs motor angles per joint (n, n).
 
     Raises:
         IdentificationError: no recording was fitted.
