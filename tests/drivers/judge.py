@@ -74,6 +74,7 @@ class Conduct:
     lost: int = 0
     exiting: bool = False
     missed: int = 0
+    at_most: int = 0
     without_jerk_bound: int = 0
     kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     tally: dict[str, int] = field(default_factory=dict)
@@ -89,8 +90,13 @@ class Conduct:
         self.barrier = True
         self.sent, self.motor, self.exiting = [], None, False
 
-    def judge(self, packet: bytes, reply: bytes, record: np.void, missed: int) -> None:
-        """Check the reply to one new cyclic packet, after `missed` packets without a reply."""
+    def judge(
+        self, packet: bytes, reply: bytes, record: np.void, missed: int, at_most: int = 0
+    ) -> None:
+        """Check the reply to one new cyclic packet, after `missed` packets without a reply.
+
+        The session may count them as `at_most`, if that is more.
+        """
         n = len(self.arms)
         received, answer = oracle.parse(packet, n), oracle.parse(reply, n)
         assert len(reply) == oracle.length(n)
@@ -129,8 +135,8 @@ class Conduct:
         for slot in range(n):
             if slot not in self.slots or not ready[self.slots.index(slot)]:
                 assert answer.axes[slot] == safe.axes[slot], f"slot {slot}: not the safe answer"
-        self.stopping = self.stopping or missed > self.max_gap
-        self.missed = missed
+        self.stopping = self.stopping or max(missed, at_most) > self.max_gap
+        self.missed, self.at_most = missed, max(missed, at_most)
         # The record's word counts for nothing but this: set-points end with the exit.
         leaving, self.exiting = self.exiting, bool(record["state"] == State.EXITING)
         if all(ready) and not leaving:
@@ -261,7 +267,7 @@ class Conduct:
             self.motors, self.lag, self.lost, self.repeats = [], 0, 0, 0
         else:
             rounding_of_target = 0.0
-            if self.missed > self.max_gap:
+            if self.at_most > self.max_gap:
                 self._go_on_from_target(a, r)
                 rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"

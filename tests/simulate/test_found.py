@@ -162,7 +162,14 @@ def short_way(
     )
 
 
-@pytest.mark.parametrize("seed", [1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 20738, 21048])
-def test_a_motion_that_a_controller_held_or_led_on_breaks_no_law(seed: int, tmp_path: Path) -> None:
-    """In 5326 a motion that had just begun went on as if it had not been held."""
+HELD_OR_EXTRAPOLATED = (1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 22400)
+CLOSED_BY_THE_CONTROLLER = (20738, 22032)
+SHUT_DOWN_AT_A_SAVE = (21048, 21634, 22291)
+
+
+@pytest.mark.parametrize(
+    "seed", [*HELD_OR_EXTRAPOLATED, *CLOSED_BY_THE_CONTROLLER, *SHUT_DOWN_AT_A_SAVE]
+)
+def test_seed_breaks_no_law(seed: int, tmp_path: Path) -> None:
+    """In 5326 a motion that had just begun continued as if it had not been held."""
     assert not Stage(tmp_path).verdict(seed, shrink=False).broken

@@ -488,7 +488,7 @@ def cell_edited(path: Path) -> None:
 
 SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
     "a byte": (flipped,
-     {"archives": "{name}: is incomplete", "folder": "{name} is not what was entered",
+     {"archives": "{name}: is incomplete", "folder": "{name} differs from its checksum",
       "estimate": "{name} was pooled"}),
     "the tail": (lambda path: path.write_bytes(path.read_bytes()[:-300]),
      {"archives": "without a fault that truncated it"}),
@@ -496,7 +496,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
      {"archives": "cycles are in 0 archives",
       "folder": "{name} is in the manifest and not in the folder"}),
     "a digest": (lambda path: entered(path, lambda one: [one | {"sha256": "0" * 64}]),
-     {"folder": "is not what was entered"}),
+     {"folder": "differs from its checksum"}),
     "an entry twice": (lambda path: entered(path, lambda one: [one, one]),
      {"folder": "an archive is entered twice"}),
     "no entry": (lambda path: entered(path, lambda one: []), {"resume": "are missing"}),
@@ -570,7 +570,7 @@ def test_what_was_whole_is_neither_changed_nor_removed_nor_done_again(observed: 
     gone = {name: digest for name, digest in life.after.items() if name != kept}
     assert f"{kept} is gone" in found(with_life(observed, 1, after=gone), "folder")
     again = with_life(observed, 1, archives=(*life.archives, "standstill_000_a2.mcap"))
-    assert f"was done although {kept} was whole by then" in found(again, "folder")
+    assert f"was run although {kept} was complete by then" in found(again, "folder")
 
 
 def test_what_does_not_count_is_named_to_whoever_asks(

@@ -1,4 +1,4 @@
-"""The checker of the session tests, applied to all packets of some campaigns.
+"""The checks of the session tests, applied to all packets of some campaigns.
 
 It takes ten times as long as the vectorised laws and shares only the oracle with them. Lost
 answers, after which the bounds of a stop apply, are counted from the received targets.
@@ -80,10 +80,13 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
         if talk.silent[row]:
             conduct.interrupted()
         record, one = talk.records[row], talk.life.exchanged[index]
-        # Superseded packets count as missing.
-        missed = max(int(record["gap"]), index - last - 1)
+        # Superseded packets count as missing. The session counts those with a corrupted number
+        # twice: as stale, and as missing.
+        gap, between = int(record["gap"]), talk.life.exchanged[last + 1 : index]
+        missed = max(gap, len(between))
         last = index
-        conduct.judge(one.packet, one.replies[0], record, missed)
+        at_most = gap + sum(packet.given for packet in between)
+        conduct.judge(one.packet, one.replies[0], record, missed, at_most)
 
 
 def _note(conduct: Conduct, what: str) -> None:
