@@ -245,7 +245,7 @@ def drain(supervisor: int, ring_fd: int, result: str) -> None:
         result,
         cycle=records["cycle"],
         arrival=records["arrival"],
-        overflow=np.array(reader.overflow),
+        overflow=np.array(reader.missed),
     )
 
 

@@ -246,7 +246,12 @@ class Guard:
     Attributes:
         limits: of the arm.
         period: s, the controller's cycle.
+        following_error: (n,) motor revolutions, the narrower of limits and controller.
+        current: (n,) A, the narrower of limits and controller.
     """
+
+    following_error: Array
+    current: Array
 
     def __init__(self, limits: GuardLimits, period: float) -> None:
         if not period > 0.0:
@@ -296,16 +301,6 @@ class Guard:
             ]
         )
 
-    @property
-    def following_error(self) -> Array:
-        """Threshold, (n,) motor revolutions: the narrower of limits and controller."""
-        return self._threshold
-
-    @property
-    def current(self) -> Array:
-        """Limit, (n,) A: the narrower of limits and controller."""
-        return self._current
-
     def narrow(self, following_error: Array, current: Array) -> None:
         """Use the controller's own limits where they are narrower; NaN where it has none.
 
@@ -313,11 +308,11 @@ class Guard:
             following_error: (n,) motor revolutions.
             current: (n,) A.
         """
-        self._threshold = np.fmin(self.limits.following_error, following_error)
-        self._feedback_bounds[0] = self._threshold
-        self._feedback_bounds[1] = self._threshold
-        self._current = np.fmin(self.limits.current, current)
-        self._feedback_bounds[2] = self._current
+        self.following_error = np.fmin(self.limits.following_error, following_error)
+        self._feedback_bounds[0] = self.following_error
+        self._feedback_bounds[1] = self.following_error
+        self.current = np.fmin(self.limits.current, current)
+        self._feedback_bounds[2] = self.current
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
     def check_hold(self, target: Array, actual: Array, held: NDArray[np.bool_], cycle: int) -> None:
@@ -334,7 +329,9 @@ class Guard:
         """
         require_finite(target, held, cycle)
         error = np.abs(actual - target)
-        require(held, error, self._threshold * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle)
+        require(
+            held, error, self.following_error * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle
+        )
 
     def begin(self, q: Array, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """Check the first set-point: the target received when the last axis opened.
@@ -376,7 +373,7 @@ class Guard:
         """
         every = self._every
         require_finite(target, every, cycle)
-        bound = FIRST_FRACTION * self._threshold
+        bound = FIRST_FRACTION * self.following_error
         require(every, np.abs(target - actual), bound, FirstSetPoint, cycle)
         standstill = np.full(len(target), self.limits.standstill)
         for velocity in step:
@@ -442,7 +439,7 @@ class Guard:
         Raises:
             NotFinite, SetPointNotAccepted, VelocityAfterGap: to continue would be a jump.
         """
-        bound = FIRST_FRACTION * self._threshold
+        bound = FIRST_FRACTION * self.following_error
         require(where, np.abs(target - commanded), bound, SetPointNotAccepted, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -198,16 +198,35 @@ class OpenAxis(NamedTuple):
     slot: int
 
 
+def _per_axis(name: str) -> property:
+    """Return a property of the field `name` (4, 10) of an init packet."""
+    return property(lambda init: init.record[name][0])
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class InitPacket:
     """The controller's description of its arms, before the cyclic exchange.
 
+    Arrays are (4, 10), as received; entries of axes that are not open may hold anything, NaN
+    included.
+
     Attributes:
-        record: (1,) of `INIT_DTYPE`, every field as received. Entries of axes that are not open
-            may hold anything, NaN included.
+        record: (1,) of `INIT_DTYPE`, every field.
+        open_axes_map: slot of each logical axis; 0xFF (or -1) where the axis is not open.
+        calibration: motor revolutions at the joints' zero.
+        current_limit: A.
+        kinematic_influence: coupling coefficients; entries 3, 4, 5 of an arm are k54, k64, k65.
+        gear_ratio: TxRate, signed motor revolutions per joint revolution.
+        following_error: thresholds in motor revolutions.
     """
 
     record: NDArray[np.void] = field(repr=False)
+    open_axes_map = _per_axis("open_axes_map")
+    calibration = _per_axis("calibration")
+    current_limit = _per_axis("current_limit")
+    kinematic_influence = _per_axis("kinematic_influence")
+    gear_ratio = _per_axis("gear_ratio")
+    following_error = _per_axis("following_error")
 
     @classmethod
     def decode(cls, packet: bytes) -> InitPacket:
@@ -259,23 +278,20 @@ class InitPacket:
         """Return the 1200 bytes."""
         return self.record.tobytes()
 
-    def _field(self, name: str) -> Any:
-        return self.record[name][0]
-
     @property
     def number(self) -> int:
         """10 from a controller, 11 in the reply."""
-        return int(self._field("number"))
+        return int(self.record["number"][0])
 
     @property
     def n_axes(self) -> int:
         """Open axes over all arms: the axis blocks of each cyclic packet."""
-        return int(self._field("n_axes"))
+        return int(self.record["n_axes"][0])
 
     @property
     def sample_time(self) -> int:
         """Cycle in ms, as on the wire."""
-        return int(self._field("sample_time"))
+        return int(self.record["sample_time"][0])
 
     @property
     def period(self) -> float:
@@ -285,43 +301,8 @@ class InitPacket:
     @property
     def version(self) -> tuple[int, int, int]:
         """Major, minor and build number of the controller's software."""
-        major, minor, build = (int(part) for part in self._field("version"))
+        major, minor, build = (int(part) for part in self.record["version"][0])
         return major, minor, build
-
-    @property
-    def open_mode(self) -> NDArray[np.int32]:
-        """Mode of each logical axis, (4, 10)."""
-        return np.asarray(self._field("open_mode"))
-
-    @property
-    def open_axes_map(self) -> NDArray[np.int32]:
-        """Slot of each logical axis, (4, 10); 0xFF (or -1) where the axis is not open."""
-        return np.asarray(self._field("open_axes_map"))
-
-    @property
-    def calibration(self) -> NDArray[np.float32]:
-        """Motor revolutions at the joints' zero, (4, 10)."""
-        return np.asarray(self._field("calibration"))
-
-    @property
-    def current_limit(self) -> NDArray[np.float32]:
-        """A, (4, 10)."""
-        return np.asarray(self._field("current_limit"))
-
-    @property
-    def kinematic_influence(self) -> NDArray[np.float32]:
-        """Coupling coefficients, (4, 10); entries 3, 4, 5 are k54, k64, k65."""
-        return np.asarray(self._field("kinematic_influence"))
-
-    @property
-    def gear_ratio(self) -> NDArray[np.float32]:
-        """TxRate: signed motor revolutions per joint revolution, (4, 10)."""
-        return np.asarray(self._field("gear_ratio"))
-
-    @property
-    def following_error(self) -> NDArray[np.float32]:
-        """Thresholds in motor revolutions, (4, 10)."""
-        return np.asarray(self._field("following_error"))
 
     def wrist_coupling(self, arm: int = 1) -> tuple[float, float, float]:
         """Return (k54, k64, k65) of one arm."""

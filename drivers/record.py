@@ -123,6 +123,9 @@ class _Ring:
         acknowledge: write the position of this reader to the memory, so that the writer counts rows
             overwritten before they were read; for one reader at a time.
 
+    Attributes:
+        missed: rows overwritten before this reader read them.
+
     Raises:
         ValueError: the memory is not such a ring.
     """
@@ -153,7 +156,7 @@ class _Ring:
         self._readable = self.capacity if fd is None else self.capacity - 1
         self._acknowledge = acknowledge
         self._read = self._oldest()
-        self._missed = 0
+        self.missed = 0
 
     @staticmethod
     def _create(kind: _Kind, width: int, dtype: np.dtype[np.void], capacity: int) -> int:
@@ -174,30 +177,21 @@ class _Ring:
         begin = max(self._read, self._oldest())
         rows = self.rows.take(np.arange(begin, end), mode="wrap")
         overwritten = min(max(0, self._oldest() - begin), len(rows))
-        self._missed += begin - self._read + overwritten
+        self.missed += begin - self._read + overwritten
         self._read = end
         if self._acknowledge:
             self._words[_READ] = end
         return rows[overwritten:]
 
 
-class _Reader(_Ring):
-    """Reader of rows that another process writes, from the oldest one available."""
-
-    @property
-    def overflow(self) -> int:
-        """Rows overwritten before this reader read them."""
-        return self._missed
-
-
-class RingReader(_Reader):
+class RingReader(_Ring):
     """Reader of a ring of cycle records of `n_joints` joints; see `_Ring` for `acknowledge`."""
 
     def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
         super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), fd=fd, acknowledge=acknowledge)
 
 
-class PacketReader(_Reader):
+class PacketReader(_Ring):
     """Reader of a ring of raw packets, rows of `PACKET_DTYPE`."""
 
     def __init__(self, fd: int) -> None:
@@ -209,28 +203,20 @@ class _Writer(_Ring):
 
     Attributes:
         fd: descriptor of the memory, -1 for its own memory.
+        written: rows written.
+        overflow: rows overwritten before they were drained.
     """
 
     fd: int
-    _written = 0
-    _lost = 0
-
-    @property
-    def written(self) -> int:
-        """Rows written."""
-        return self._written
-
-    @property
-    def overflow(self) -> int:
-        """Rows overwritten before they were drained."""
-        return self._lost
+    written: int
+    overflow = 0
 
     def commit(self) -> None:
         """Add the row filled last to the ring."""
-        words, written = self._words, self._written
+        words, written = self._words, self.written
         if words[_READ] <= written - self.capacity:
-            self._lost += 1
-        self._written = words[_WRITTEN] = written + 1
+            self.overflow += 1
+        self.written = words[_WRITTEN] = written + 1
 
 
 class CycleRing(_Writer):
@@ -245,7 +231,7 @@ class CycleRing(_Writer):
     def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
         super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), capacity=capacity, fd=fd)
         self.fd = -1 if fd is None else fd
-        self._written = self._words[_WRITTEN]
+        self.written = self._words[_WRITTEN]
         self.n_joints = n_joints
         # Column views: assigning through them costs a third of assigning to a record's field.
         self.cycle = self.rows["cycle"]
@@ -281,12 +267,12 @@ class CycleRing(_Writer):
     @property
     def slot(self) -> int:
         """Index of the row to fill before `commit`."""
-        return self._written % self.capacity
+        return self.written % self.capacity
 
     def last(self, count: int) -> NDArray[np.void]:
         """Return a copy of the newest `count` records (or all of them), oldest first."""
-        count = min(count, self._written, self.capacity)
-        return self.rows.take(np.arange(self._written - count, self._written), mode="wrap")
+        count = min(count, self.written, self.capacity)
+        return self.rows.take(np.arange(self.written - count, self.written), mode="wrap")
 
 
 class PacketRing(_Writer):
@@ -296,7 +282,7 @@ class PacketRing(_Writer):
         width = PACKET_DTYPE.itemsize
         super().__init__(_PACKETS, width, PACKET_DTYPE, capacity=capacity, fd=fd)
         self.fd = -1 if fd is None else fd
-        self._written = self._words[_WRITTEN]
+        self.written = self._words[_WRITTEN]
 
     @classmethod
     def shared(cls, capacity: int = CAPACITY) -> Self:
@@ -305,7 +291,7 @@ class PacketRing(_Writer):
 
     def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
         """Store one packet; see `PACKET_DTYPE`."""
-        place = self._written % self.capacity * _ROW.size
+        place = self.written % self.capacity * _ROW.size
         length = min(len(packet), _MOST_LENGTH)
         _ROW.pack_into(self._memory, place, cycle, time, length, sent, packet)
         self.commit()

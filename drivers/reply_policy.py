@@ -79,19 +79,13 @@ class ReplyPolicy:
 
     Args:
         init: the init packet.
-        drive_train: the cell's.
-        guard: of the arm.
-        arm: its number, from 1.
-        mode: wanted open mode.
-        accept: adopt the controller's gear ratios, calibration and coupling where they differ.
-        other_axes: (arm, axis), from 1, that may be open although they are no joints.
-        max_gap: see `Session`.
-        only_axis: the only joint, from 1, that is to be open; None for all.
+        others: as of `Session`; `accept` is its `accept_init`.
     """
 
     def __init__(
         self,
         init: InitPacket,
+        *,
         drive_train: DriveTrain,
         guard: Guard,
         arm: int,
@@ -99,7 +93,7 @@ class ReplyPolicy:
         accept: bool,
         other_axes: frozenset[tuple[int, int]],
         max_gap: int,
-        only_axis: int | None = None,
+        only_axis: int | None,
     ) -> None:
         self.init = init
         self.init_check = compare(drive_train, guard.period, init, arm, accept, other_axes)

@@ -43,6 +43,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -207,13 +208,20 @@ class Session:
         self._ring = ring
         self._mode = mode
         self._max_gap = max_gap
-        self._arm = arm
         self._settle_cycles = settle_cycles
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
-        self._accept_init = accept_init
-        self._other_axes = frozenset(other_axes)
-        self._only_axis = only_axis
+        self._make_policy = partial(
+            ReplyPolicy,
+            drive_train=drive_train,
+            guard=guard,
+            arm=arm,
+            mode=mode,
+            accept=accept_init,
+            other_axes=frozenset(other_axes),
+            max_gap=max_gap,
+            only_axis=only_axis,
+        )
         self._machine = StateMachine(self.counters)
         self._sequence = PacketSequence()
         self._policy: ReplyPolicy | None = None
@@ -377,19 +385,9 @@ class Session:
         machine, syncing = self._machine, self.state is State.SYNC
         self._cold_start = syncing and self._sequence.last > 0
         if syncing and not self._sequence.leads_to(INIT_NUMBER, self._max_gap):
-            machine.end("lost", "the controller restarted")
+            machine.end("lost", "the controller restarted: sync packets are missing")
         machine.apply(Input.INIT)
-        self._policy = policy = ReplyPolicy(
-            init,
-            self._drive_train,
-            self._guard,
-            self._arm,
-            self._mode,
-            self._accept_init,
-            self._other_axes,
-            self._max_gap,
-            self._only_axis,
-        )
+        self._policy = policy = self._make_policy(init)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         machine.cycle = 0
         check = policy.init_check

@@ -27,8 +27,8 @@ from drivers.replies import Reading
 from drivers.states import HAS_SET_POINTS, TRANSITIONS, Input, State, keeps_request
 
 _LOSS: Final = {
-    Input.SYNC: "the controller restarted",
-    Input.INIT: "the controller restarted",
+    Input.SYNC: "the controller restarted: it sent a sync packet",
+    Input.INIT: "the controller restarted: it sent an init packet",
     Input.OFF: "the drive went off",
     Input.DRIVING_ON: "the drive was switched on again",
     Input.CLOSED: "the controller closed open mode",

@@ -14,8 +14,8 @@ from typing import Final
 import can
 
 from drivers.transports.base import TransportError
-from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
+from drivers.transports.can.layout import BusRates
 from drivers.transports.can.transport import CanSpec, Port, open_bus
 from sim_fixtures.serve import ControllerLinkError
 

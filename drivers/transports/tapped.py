@@ -1,9 +1,9 @@
-"""A link that copies its packets, both ways, to a ring."""
+"""A link that copies the packets received and sent to a ring."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +13,6 @@ from drivers.transports.base import Transport
 
 MAX_BUFFERED: Final = 256
 """Packets buffered until their cycle is known."""
-
-
-class _Passed(NamedTuple):
-    """A packet received or sent."""
-
-    time: float
-    sent: bool
-    packet: bytes
 
 
 class TappedTransport:
@@ -40,7 +32,7 @@ class TappedTransport:
         self._transport = transport
         self._sink = sink
         self._cycle = cycle
-        self._passed: list[_Passed] = []
+        self._buffered: list[tuple[float, bool, bytes]] = []  # time, sent, packet
 
     @property
     def now(self) -> float:
@@ -65,19 +57,19 @@ class TappedTransport:
 
     def receive(self, timeout: float) -> bytes | None:
         """See `Transport.receive`."""
-        if self._passed and (timeout > 0.0 or len(self._passed) >= MAX_BUFFERED):
+        if self._buffered and (timeout > 0.0 or len(self._buffered) >= MAX_BUFFERED):
             self.flush()
         packet = self._transport.receive(timeout)
         if packet is not None:
             arrived = self.arrived
             time = self._transport.now if arrived is None else arrived
-            self._passed.append(_Passed(time, False, packet))
+            self._buffered.append((time, False, packet))
         return packet
 
     def send(self, packet: bytes) -> None:
         """See `Transport.send`."""
         self._transport.send(packet)
-        self._passed.append(_Passed(self._transport.now, True, packet))
+        self._buffered.append((self._transport.now, True, packet))
 
     def rejected(self) -> dict[str, int]:
         """See `Transport.rejected`."""
@@ -95,6 +87,6 @@ class TappedTransport:
     def flush(self) -> None:
         """Copy the buffered packets to the ring."""
         cycle = self._cycle()
-        for time, sent, packet in self._passed:
+        for time, sent, packet in self._buffered:
             self._sink.put(cycle, time, sent, packet)
-        self._passed.clear()
+        self._buffered.clear()

@@ -250,7 +250,7 @@ class ArchiveProcess:
             self._close("interrupted", "another archive was opened")
         self._fill_buffer()
         records, events, packets = self._buffer.pop_session()
-        overflow, control = self._ring.overflow, self._control
+        overflow, control = self._ring.missed, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
@@ -265,7 +265,7 @@ class ArchiveProcess:
             recorder,
             command.until_ended,
             overflow,
-            0 if self._packets is None else self._packets.overflow,
+            0 if self._packets is None else self._packets.missed,
             accepted,
             ended_count,
             last_record=time.monotonic(),
@@ -284,7 +284,7 @@ class ArchiveProcess:
         # Read before the ring, so that nothing the exchange wrote is missed.
         exchange_ended, ended_count = self._exchange_ended(), self._control.ended_count
         events, records = self._events.drain(), self._ring.drain()
-        lost, job.overflow = self._ring.overflow - job.overflow, self._ring.overflow
+        lost, job.overflow = self._ring.missed - job.overflow, self._ring.missed
         if self._live is not None:
             self._live.publish(records, events)
         now = time.monotonic()
@@ -308,7 +308,7 @@ class ArchiveProcess:
         if self._packets is None:
             return
         packets, before = self._packets.drain(), job.packets_overflow
-        job.packets_overflow = self._packets.overflow
+        job.packets_overflow = self._packets.missed
         job.recorder.record_packets(packets, job.packets_overflow - before)
 
     def _close_if_ended(self, job: Job, now: float, *, exchange_ended: bool) -> None:

@@ -1,4 +1,4 @@
-"""Sessions over CAN on a bench: packets, buses, an emulated adapter, and the contract of a bus."""
+"""Test bench for CAN: packets, buses, an emulated adapter, the contract of a CAN transport."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from drivers import (
     exchange,
 )
 from drivers.packets import next_number
-from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd, PcEnd
+from drivers.transports.can.layout import BusRates
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
@@ -95,7 +95,7 @@ class Wire:
 
 
 class Cycles:
-    """A clock that only the packets move: no stall of this machine tears a set of frames."""
+    """A clock advanced by packets only: a pause of this computer does not truncate a set."""
 
     def __init__(self) -> None:
         self.time = 1.0
@@ -146,7 +146,7 @@ class PacedByPackets:
         if timeout <= 0.0:
             return self.near.receive(0.0)
         if self._awaiting:
-            # What others said on the bus waits there already.
+            # Frames of other nodes are queued already.
             if (waiting := self.near.receive(0.0)) is not None:
                 return waiting
             self._hand_over(None)
@@ -304,7 +304,7 @@ class SlcanBus:
         masters = {adapter.master: adapter for adapter in self._adapters}
         ending = False
         while True:
-            # What was written before the end is still obeyed.
+            # Commands written before the end are still executed.
             sources = [*masters] if ending else [*masters, self._wake[0]]
             full = [adapter.master for adapter in self._adapters if adapter.waiting]
             ready, free, _ = select.select(sources, full, [], 0.0 if ending else None)
@@ -319,9 +319,9 @@ class SlcanBus:
                 adapter = masters[master]
                 other = next(a for a in self._adapters if a is not adapter)
                 for line in adapter.lines():
-                    self._obey(adapter, other, line)
+                    self._execute(adapter, other, line)
 
-    def _obey(self, adapter: _Adapter, other: _Adapter, line: str) -> None:
+    def _execute(self, adapter: _Adapter, other: _Adapter, line: str) -> None:
         answer = _OK
         if line == "O":
             adapter.open = True
@@ -348,7 +348,7 @@ class SlcanBus:
 
 
 class Far:
-    """The contract's far end around ours."""
+    """The controller's end as the contract needs it."""
 
     def __init__(self, end: CanControllerLink) -> None:
         self.end = end
@@ -364,11 +364,11 @@ class Far:
 
 
 class CanContract(TransportContract):
-    """The contract of every transport, and what the cyclic frames have to do besides."""
+    """The contract of every transport, and the cyclic frames."""
 
-    def test_cyclic_packets_go_both_ways_once_an_init_has_passed(self, link):
+    def test_cyclic_packets_after_an_init_packet(self, link):
         near, far = link
-        # Cycles so long that no pause of this machine tears the frames of one apart.
+        # Cycles so long that a pause of this computer does not truncate a set of frames.
         begin = init_packet(sample_time=100)
         far.send(begin)
         init = near.receive(2.0)

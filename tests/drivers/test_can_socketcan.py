@@ -38,17 +38,17 @@ class TestSocketCan(CanContract):
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_a_whole_motion_completes(profile):
+def test_complete_motion(profile):
     near = CanSpec("socketcan", CHANNEL, profile, period=PERIOD).open()
     ends = near, open_controller_link(CanSpec("socketcan", CHANNEL, profile, period=PERIOD))
-    # An emulated machine may stall for longer than a set of frames may take; such a set is torn.
+    # An emulated machine may stall for longer than a set of frames may take; it is truncated then.
     run = Run(profile, ends=ends, cycles=250, missed_replies=50)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed", ended.reason
 
 
-def test_a_receive_queue_that_overflows_is_seen_in_the_numbers_only(ends):
-    """The kernel keeps some hundred frames and drops the rest without a word."""
+def test_overflow_of_the_receive_queue_is_a_gap(ends):
+    """The kernel stores some hundred frames and drops the others without an error."""
     near, far = ends
     far.send(init_packet())
     assert near.receive(5.0) is not None
@@ -64,4 +64,4 @@ def test_a_receive_queue_that_overflows_is_seen_in_the_numbers_only(ends):
         far.send(CyclicPacket.zeros(number, 6).encode())
         if (received := near.receive(0.5)) is not None:
             break
-    assert CyclicPacket.decode(received, 6).number == number, "and then the gap is plain"
+    assert CyclicPacket.decode(received, 6).number == number

@@ -251,7 +251,7 @@ def test_motion_is_run_and_recorded():
         # The record has what was sent, at the accuracy before the wire's float32.
         np.testing.assert_allclose(commanded[: len(controller.path)], controller.path, atol=1e-6)
         assert (np.diff(records["cycle"]) == 1).all()
-        assert reader.overflow == 0
+        assert reader.missed == 0
         status = exchange.status()
         assert status.state == State.CLOSED
         assert (status.missed, status.refused, status.overflow) == (0, 0, 0)

@@ -77,7 +77,7 @@ class TestRing:
         write(ring, range(25))
         reader = RingReader(ring.fd, N)
         assert reader.drain()["number"].tolist() == list(range(16, 25))
-        assert reader.overflow == 0
+        assert reader.missed == 0
 
     def test_writer_counts_records_overwritten_unread(self):
         ring = CycleRing.shared(N, 10)
@@ -104,7 +104,7 @@ class TestRing:
             written += count
             seen += reader.drain()["number"].tolist()
         assert seen == sorted(set(seen))
-        assert len(seen) + reader.overflow == written
+        assert len(seen) + reader.missed == written
         os.close(ring.fd)
 
     def test_records_overwritten_during_the_copy_are_dropped(self):
@@ -120,7 +120,7 @@ class TestRing:
 
         reader.rows = Overtaken()
         assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
-        assert reader.overflow == 4
+        assert reader.missed == 4
 
     def test_other_memory_is_refused(self):
         ring = CycleRing.shared(N, 10)

@@ -229,9 +229,9 @@ def test_a_reader_gets_every_packet_in_order_or_counts_it(
             ring.put(written, 0.5 * written, written % 2 == 1, written.to_bytes(2, "little"))
             written += 1
         if step is None:
-            lost = reader.overflow
+            lost = reader.missed
             rows = reader.drain()
-            seen += reader.overflow - lost
+            seen += reader.missed - lost
             assert rows["cycle"].tolist() == list(range(seen, written))
             assert rows["sent"].tolist() == [n % 2 for n in range(seen, written)]
             numbers = rows["data"][:, :2].astype(int) @ [1, 256]

@@ -48,6 +48,7 @@ from tests.drivers.rig import (
 )
 
 OFF = "the drive went off"
+RESTARTED = "the controller restarted: it sent an init packet"
 PAUSED = "the controller paused the exchange"
 
 
@@ -126,7 +127,7 @@ class TestLostMotion:
         reply = rig.send(rig.init.encode())
         assert reply[:4] == bytes([11, 0, 0, 0])
         assert rig.state is State.INIT
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", "the controller restarted")
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", RESTARTED)
         assert len(rig.seen(InitReceived)) == 2
         rig.number = 10
         advances = source.advances

@@ -283,7 +283,7 @@ class TestARequestThatWaitsForTheController:
         assert rig.session.requested is kept
         if not kept:
             assert rig.ended.outcome == "lost"
-            assert rig.ended.reason == "the controller restarted"
+            assert rig.ended.reason == "the controller restarted: sync packets are missing"
 
     def test_is_kept_if_made_after_the_silence(self):
         rig = self.waiting()

@@ -110,7 +110,9 @@ HAS_OPEN_AXES: Final = ("opening", "open at rest", "moving", "exiting")
 
 
 _SHORT: Final[Mapping[str, str]] = {
-    "the controller restarted": "restart",
+    "the controller restarted: it sent a sync packet": "restart",
+    "the controller restarted: it sent an init packet": "restart",
+    "the controller restarted: sync packets are missing": "restart",
     "the drive went off": "drive off",
     "the drive was switched on again": "drive off",
     "the controller closed open mode": "closed",

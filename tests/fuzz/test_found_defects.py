@@ -13,8 +13,8 @@ import pytest
 
 from drivers import CyclicPacket, InitPacket
 from drivers.states import State
-from drivers.transports.can.bus_load import BusRates
 from drivers.transports.can.ends import ControllerEnd
+from drivers.transports.can.layout import BusRates
 from hil.archive import Samples, write_samples
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal

@@ -36,7 +36,6 @@ from drivers.packets import (
     Mode,
     next_number,
 )
-from drivers.transports.can.bus_load import CanModeError, CanValueError
 from drivers.transports.can.layout import (
     CLASSIC_DOWN,
     CLASSIC_MODE_CODES,
@@ -56,6 +55,8 @@ from drivers.transports.can.layout import (
     REVOLUTION_BITS,
     UP_COUNTER_BITS,
     Action,
+    CanModeError,
+    CanValueError,
     Frame,
     Word,
 )

@@ -26,7 +26,6 @@ from drivers.packets import (
     is_init,
     next_number,
 )
-from drivers.transports.can.bus_load import BusRates, CanAxesError, CanModeError
 from drivers.transports.can.codecs import (
     NEVER,
     Ages,
@@ -47,6 +46,9 @@ from drivers.transports.can.layout import (
     PAYLOADS_FD,
     SEGMENT_DOWN,
     SEGMENT_UP,
+    BusRates,
+    CanAxesError,
+    CanModeError,
     Frame,
 )
 

@@ -23,15 +23,18 @@ from numpy.typing import NDArray
 from drivers.errors import TransportClosed
 from drivers.packets import Mode
 from drivers.transports.base import TransportError
-from drivers.transports.can.bus_load import (
+from drivers.transports.can.ends import End, PcEnd
+from drivers.transports.can.layout import (
+    MAX_AXES,
+    SEGMENT_DOWN,
+    SEGMENT_UP,
     BusRates,
     CanAxesError,
     CanError,
     CanModeError,
+    Frame,
     ProfileName,
 )
-from drivers.transports.can.ends import End, PcEnd
-from drivers.transports.can.layout import MAX_AXES, SEGMENT_DOWN, SEGMENT_UP, Frame
 
 _REMEDIES = {
     "socketcan": "bring it up: modprobe can_raw && ip link set {channel} up type can {rates}",
@@ -421,11 +424,7 @@ class CanSpec:
 
     @property
     def rates(self) -> BusRates:
-        """Profile and bit rates.
-
-        Raises:
-            ValueError: unknown profile, or a rate that is not positive.
-        """
+        """Profile and bit rates."""
         standard = BusRates(self.profile)
         return BusRates(
             self.profile,

@@ -18,9 +18,8 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from drivers.transports.can.bus_load import BusRates, CanError
 from drivers.transports.can.ends import ControllerEnd, PcEnd
-from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, Frame
+from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, BusRates, CanError, Frame
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 
