@@ -97,13 +97,7 @@ class SourceFailed(RefusalError):
 
 
 class AxisNotInMode(RefusalError):
-    """An axis is not in the open mode that the motion needs.
-
-    Attributes:
-        joint: index from 0.
-        mode: mode that the controller reports for it.
-        wanted: mode that the motion needs.
-    """
+    """Axis `joint` (from 0) is in `mode`, not in the open mode `wanted` that the motion needs."""
 
     def __init__(self, joint: int, mode: int, wanted: int, cycle: int) -> None:
         super().__init__(f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}", cycle)
@@ -113,12 +107,7 @@ class AxisNotInMode(RefusalError):
 
 
 class ModeRefused(RefusalError):
-    """An axis reports an unknown mode, or is open without having been closed before.
-
-    Attributes:
-        joint: index from 0.
-        mode: mode that the controller reports for it.
-    """
+    """Axis `joint` (from 0) reports an unknown mode, or is open without having been closed."""
 
     remedy = "have the controller's program go from mode 0 to the open mode of the cell file"
 
@@ -152,11 +141,7 @@ def error_text(error: BaseException) -> str:
 
 
 class ExitTimeout(RefusalError):
-    """The controller did not end open mode although the session asked for it.
-
-    Attributes:
-        cycles: the controller's cycles since the request.
-    """
+    """The controller did not end open mode in `cycles` since the session asked for it."""
 
     def __init__(self, cycles: int, cycle: int) -> None:
         super().__init__(
@@ -210,11 +195,7 @@ class NotFinite(GuardError, check="finiteness"):
 
 
 class TargetNotFinite(NotFinite):
-    """The target received of an open axis that is not a joint of the cell is not finite.
-
-    Attributes:
-        arm: from 1.
-    """
+    """The target of an open axis of `arm` (from 1) outside the cell is not finite."""
 
     def __init__(self, arm: int, joint: int, value: float, cycle: int) -> None:
         super().__init__(joint, value, float("inf"), cycle)

@@ -39,11 +39,7 @@ _AT_REST: Final = 1e-9
 class Execution(ABC):
     """Common part of motions and corrections.
 
-    Args:
-        source: the motion or correction.
-        n_joints: n.
-        settle_cycles: cycles for which the end is held.
-        stop_cycles: cycles that a stop or hold may take.
+    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`.
 
     Attributes:
         started: the first set-point was sent.
@@ -51,8 +47,7 @@ class Execution(ABC):
         held: a hold is active.
         leaving: the motion came to rest and open mode is being left.
         finished: the source is finished.
-        outcome: of the motion once open mode has been left.
-        reason: of the outcome.
+        outcome, reason: of the motion once open mode has been left.
     """
 
     def __init__(
@@ -108,11 +103,7 @@ class Execution(ABC):
         """Begin the source at this position, (n,) rad."""
 
     def stop(self, reason: str, cycle: int) -> None:
-        """Come to rest on the path. The first reason stays.
-
-        Raises:
-            SourceFailed: the source raised.
-        """
+        """Come to rest on the path; the first reason stays. Raises SourceFailed."""
         if self.outcome == "stopped" or self.finished:
             return
         self.outcome = "stopped"
@@ -231,11 +222,7 @@ class MotionExecution(Execution):
         self._source.begin(position.copy())
 
     def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
-        """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held.
-
-        Raises:
-            SourceFailed: the source raised or gave no valid set-point.
-        """
+        """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held."""
         try:
             if self.finished:
                 self._resting += 1
@@ -263,11 +250,7 @@ class MotionExecution(Execution):
         return running and callable(getattr(self._source, "resume_from", None))
 
     def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
-        """Continue from the controller's target, see `ResumableSource`.
-
-        Raises:
-            SourceFailed: the source cannot continue from there.
-        """
+        """Continue from the controller's target, see `ResumableSource`; raises SourceFailed."""
         try:
             # Copies, because the guard compares with these arrays.
             source = cast(ResumableSource, self._source)
@@ -276,11 +259,7 @@ class MotionExecution(Execution):
             raise _failed("cannot continue", error, cycle) from error
 
     def feed_forward(self, cycle: int) -> tuple[Array, Array]:
-        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
-
-        Raises:
-            SourceFailed: the source raised or gave no valid arrays.
-        """
+        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last."""
         if self._resting:
             return self._still, self._still
         try:
@@ -321,11 +300,7 @@ class CorrectionExecution(Execution):
         self._source.begin()
 
     def advance(self, cycle: int) -> tuple[Array, Array]:
-        """Return the next correction: motion (n,), see `CorrectionSource`, and current (n,) A.
-
-        Raises:
-            SourceFailed: the source raised or gave no valid correction.
-        """
+        """Return the next correction: motion (n,), see `CorrectionSource`, and current (n,) A."""
         if self.finished:
             self._resting += 1
             return self._still, self._still

@@ -76,15 +76,10 @@ def report(
     cycle: int,
     position_limits: Callable[[int, float], tuple[float, float]] | None = None,
 ) -> NoReturn:
-    """Raise for the first row and joint outside its bound; values that are not finite come first.
+    """Raise for the first row and joint outside its bound; not finite values come first.
 
-    Args:
-        magnitude: (k, n) compared with `allowed`.
-        found: (k, n) with its sign, for the error.
-        allowed: (k, n).
-        checks: (k,) error of each row.
-        cycle: for the error.
-        position_limits: (joint, value) of a position to the value and bound to be reported.
+    `magnitude` (k, n) is compared with `allowed` (k, n); `found` (k, n), with its sign, is in the
+    error: for a position what `position_limits` returns. `checks` has the error of each row.
     """
     not_finite = ~np.isfinite(magnitude)
     bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
@@ -117,17 +112,13 @@ class GuardLimits:
     """Limits that the guard enforces; arrays (n,).
 
     Attributes:
-        lower: rad, smallest joint position.
-        upper: rad, largest.
+        lower, upper: rad, range of the joint positions.
         velocity: rad/s, magnitude, in all three sets of bounds.
-        acceleration: rad/s², of the set "plan".
-        jerk: rad/s³, of the set "plan".
+        acceleration, jerk: rad/s², rad/s³, of the set "plan".
         following_error: motor revolutions.
         current: A.
-        override_acceleration: factor on acceleration while an override changes.
-        override_jerk: factor on jerk while an override changes.
-        stop_acceleration: factor on acceleration during hold and stop.
-        stop_jerk: factor on jerk during hold and stop.
+        override_acceleration, override_jerk: factors while an override changes.
+        stop_acceleration, stop_jerk: factors during hold and stop.
         standstill: motor revolutions per cycle, see `DEFAULT_STANDSTILL`.
         current_rise: shortest rise time of a commanded current from zero to its limit, s.
 
@@ -302,12 +293,7 @@ class Guard:
         )
 
     def narrow(self, following_error: Array, current: Array) -> None:
-        """Use the controller's own limits where they are narrower; NaN where it has none.
-
-        Args:
-            following_error: (n,) motor revolutions.
-            current: (n,) A.
-        """
+        """Use the controller's limits (n,) where they are narrower; NaN where it has none."""
         self.following_error = np.fmin(self.limits.following_error, following_error)
         self._feedback_bounds[0] = self.following_error
         self._feedback_bounds[1] = self.following_error
@@ -316,13 +302,7 @@ class Guard:
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
     def check_hold(self, target: Array, actual: Array, held: NDArray[np.bool_], cycle: int) -> None:
-        """Check that axes `held` (n,) can hold the target received while others are closed.
-
-        Args:
-            target: (n,) D1, motor revolutions.
-            actual: (n,) D3, motor revolutions.
-            held: (n,) which axes.
-            cycle: for the error.
+        """Check that axes `held` (n,) can hold their target (n,) D1 while others are closed.
 
         Raises:
             NotFinite, FollowingError: they cannot.
@@ -334,14 +314,9 @@ class Guard:
         )
 
     def begin(self, q: Array, target: Array, actual: Array, step: Array, cycle: int) -> None:
-        """Check the first set-point: the target received when the last axis opened.
+        """Check the first set-point q (n,) rad: the target (n,) D1 when the last axis opened.
 
-        Args:
-            q: (n,) rad, that target on the joint side.
-            target: (n,) D1, motor revolutions.
-            actual: (n,) D3, motor revolutions.
-            step: (2, n) D2 and D4, motor revolutions per cycle.
-            cycle: for the error.
+        The other arguments are those of `check_start`.
 
         Raises:
             NotFinite, PositionLimit, FirstSetPoint, NotAtStandstill: it must not be sent.
@@ -362,11 +337,7 @@ class Guard:
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """Check that the arm may begin to move in this cycle.
 
-        Args:
-            target: (n,) D1, motor revolutions.
-            actual: (n,) D3, motor revolutions.
-            step: (2, n) D2 and D4, motor revolutions per cycle.
-            cycle: for the error.
+        `target` is D1 (n,), `actual` D3 (n,), motor revolutions; `step` (2, n) D2 and D4, per cycle.
 
         Raises:
             NotFinite, FirstSetPoint, NotAtStandstill: it must not.
@@ -394,8 +365,7 @@ class Guard:
         differ where a reply was lost.
 
         Args:
-            target: (n,) D1, motor revolutions.
-            actual: (n,) D3, motor revolutions.
+            target, actual: (n,) D1 and D3, motor revolutions.
             current: (n,) D5, A.
             commanded: (n,) D1 of the last reply, motor revolutions.
             cycle: for the error.
@@ -423,7 +393,7 @@ class Guard:
         cycle: int,
         where: NDArray[np.bool_],
     ) -> None:
-        """Check the first packet after a long gap, before an axis continues.
+        """Check the first packet after a long gap, before the axes `where` (n,) continue.
 
         The target's velocity may differ by half the step sent last, or by the standstill
         threshold; so may the arm's, which lags behind, where it is at standstill.
@@ -434,7 +404,7 @@ class Guard:
             commanded: (n,) expected target, motor revolutions.
             step: (n,) D2 of the last reply, motor revolutions per cycle.
             cycle: for the error.
-            where: (n,) which joints.
+            where: which joints.
 
         Raises:
             NotFinite, SetPointNotAccepted, VelocityAfterGap: to continue would be a jump.
@@ -448,17 +418,12 @@ class Guard:
             require(joints, np.abs(found - step), bound, VelocityAfterGap, cycle)
 
     def check_after_pause(self, velocity: Array, cycle: int, where: NDArray[np.bool_]) -> None:
-        """Check after a late packet that the arm moves as the set-points sent last.
+        """Check after a late packet that the velocity (n,) rad/s is that of the set-points sent.
 
         The servo may lag behind by what it gains in `LAG` at the allowed acceleration.
 
-        Args:
-            velocity: (n,) of the arm, rad/s.
-            cycle: for the error.
-            where: (n,) which joints.
-
         Raises:
-            NotFinite, VelocityAfterPause: it does not; to continue would be a jump.
+            NotFinite, VelocityAfterPause: to continue would be a jump.
         """
         sent = (self._history[3] - self._history[2]) / self.period
         factor, _ = self.limits.factors(self._active.rank)
@@ -466,14 +431,10 @@ class Guard:
         require(where, np.abs(velocity - sent), bound, VelocityAfterPause, cycle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
-        """Check the next set-point, which then counts as sent.
+        """Check the next set-point q (n,) rad, qd (n,) rad/s, which then counts as sent.
 
-        Args:
-            q: (n,) rad.
-            qd: (n,) rad/s.
-            bounds: the set that applies from this set-point on. Wider bounds stay active until
-                no difference reaches back to them.
-            cycle: for the error.
+        `bounds` apply from this set-point on; wider ones stay active until no difference reaches
+        back to them.
 
         Raises:
             NotFinite, PositionLimit, VelocityLimit, VelocityMismatch, AccelerationLimit,
@@ -510,9 +471,7 @@ class CorrectionGuard:
     has the bounds of a velocity, as if the controller added it up cycle by cycle; so has its sum
     with the target. A current has a limit and a largest step per cycle. Nothing is clamped.
 
-    Args:
-        guard: provides limits and period.
-        kind: of the motion: a "velocity", rad/s, or an "offset" of positions, rad.
+    The motion is a "velocity", rad/s, or an "offset" of positions, rad.
     """
 
     def __init__(self, guard: Guard, kind: Literal["velocity", "offset"]) -> None:
@@ -586,14 +545,9 @@ class CorrectionGuard:
     def check_target(
         self, target: Array, offset: Array, sent_in: Array, rounding: Array, cycle: int
     ) -> None:
-        """Check the speed of target and offset together, which then count as sent.
+        """Check the speed of target and offset (n,) rad together, which then count as sent.
 
-        Args:
-            target: (n,) rad, received.
-            offset: (n,) rad, to be sent.
-            sent_in: (n,) cycle in which each target was sent.
-            rounding: (n,) rad, of a step of the target.
-            cycle: for the error.
+        `sent_in` (n,) is the cycle in which each target was sent, `rounding` (n,) rad of a step.
 
         Raises:
             NotFinite, VelocityLimit: too fast, with the offset as a position or as a step.
@@ -609,10 +563,7 @@ class CorrectionGuard:
     def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
         """Check the next current (n,) A, which then counts as sent.
 
-        Args:
-            current: fed forward, or added to the servo's own.
-            servo: (n,) A, the servo's own in the latter case.
-            cycle: for the error.
+        It is fed forward, or added to the servo's own (n,) A.
 
         Raises:
             NotFinite, CommandedCurrentLimit, CommandedCurrentStep: it must not be sent.
@@ -625,11 +576,7 @@ class CorrectionGuard:
         self._current[...] = current
 
     def check_position(self, q: Array, cycle: int) -> None:
-        """Check the position that the correction leads to, (n,) rad.
-
-        Raises:
-            NotFinite, PositionLimit: outside the range of a joint.
-        """
+        """Check the position (n,) rad that the correction leads to; raises PositionLimit."""
         limits = self._guard.limits
         require_finite(q, self._every, cycle)
         reach = RELATIVE_TOLERANCE * 0.5 * (limits.upper - limits.lower)
@@ -640,19 +587,11 @@ class CorrectionGuard:
             raise PositionLimit(joint, float(q[joint]), float(limit[joint]), cycle)
 
     def check_end(self, cycle: int) -> None:
-        """Check that a finished source gave zero last.
-
-        Raises:
-            CorrectionNotEnded: it did not.
-        """
+        """Check that a finished source gave zero last; raises CorrectionNotEnded."""
         self._require_zero(CorrectionNotEnded, cycle)
 
     def check_after_gap(self, cycle: int) -> None:
-        """Check after a long gap that the last correction is zero, as it may not be applied.
-
-        Raises:
-            CorrectionUnconfirmed: it is not.
-        """
+        """Check after a long gap that the last correction, which may be unapplied, is zero."""
         self._require_zero(CorrectionUnconfirmed, cycle)
 
     def _require_zero(self, kind: type[GuardError], cycle: int) -> None:

@@ -46,11 +46,9 @@ class InitCheck:
 
 @dataclass(frozen=True, eq=False)
 class ControllerLimits:
-    """Limits of an arm's motors in an init packet, (n,) each; NaN where it has none.
+    """Limits (n,) of an arm's motors in an init packet; NaN where it has none.
 
-    Attributes:
-        current: A.
-        following_error: thresholds in motor revolutions.
+    `current` in A, thresholds `following_error` in motor revolutions.
     """
 
     current: Array
@@ -84,21 +82,13 @@ def compare(
     accept: bool,
     other_axes: frozenset[tuple[int, int]] = frozenset(),
 ) -> InitCheck:
-    """Compare an init packet with the cell.
+    """Compare an init packet with the cell, for an arm from 1.
 
     With a wrong gear ratio, calibration or coupling the arm moves elsewhere, so any difference
     makes the session unusable unless the controller's values are accepted. So does an open axis of
-    any arm that is not a joint of the cell, because its targets are not checked. Undefined values
-    (NaN, or 0 for a ratio), values far off, another cycle and a joint that is not open cannot be
-    accepted.
-
-    Args:
-        drive_train: the cell's.
-        period: s, the cell's cycle.
-        init: the controller's init packet.
-        arm: the arm that is moved, from 1.
-        accept: accept the controller's values where that is allowed.
-        other_axes: (arm, axis), both from 1, that may be open as well.
+    any arm that is neither a joint of the cell nor one of `other_axes` (arm, axis, from 1), because
+    its targets are not checked. Undefined values (NaN, or 0 for a ratio), values far off, another
+    cycle than `period` (s) and a joint that is not open cannot be accepted.
     """
     fixed = _timing(period, init) + _axis_map(drive_train.n_joints, init, arm)
     unknown = _unknown_axes(drive_train.n_joints, init, arm, other_axes)
@@ -200,11 +190,7 @@ def _values(drive_train: DriveTrain, init: InitPacket, arm: int) -> tuple[str, .
 
 
 def _adopted(drive_train: DriveTrain, init: InitPacket, arm: int) -> DriveTrain:
-    """Return the drive train with the controller's gear ratios, calibration and coupling.
-
-    Raises:
-        DriveTrainError: one of them is not finite, or a ratio is zero.
-    """
+    """Return the drive train with the controller's values; raises DriveTrainError."""
     n, row = drive_train.n_joints, arm - 1
     k54, k64, k65 = init.wrist_coupling(arm)
     return replace(

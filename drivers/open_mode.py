@@ -35,20 +35,15 @@ REPETITIONS: Final = 100
 class SentSetPoints:
     """The set-points sent last, compared with the controller's target, motor revolutions.
 
-    While replies are lost the controller holds its target. If the motion continued, the next
-    set-point received would be as many steps away. So the last one is sent again until the target
-    shows that it was accepted; the motion waits, as it does for packets. After missed packets a
-    controller that extrapolates reports a target ahead of those sent.
+    While replies are lost the controller holds its target, so the last set-point is sent again
+    until the target shows that it was accepted; the motion waits, as it does for packets. After
+    missed packets a controller that extrapolates reports a target ahead of those sent.
 
     A controller that reports its target a cycle late cannot be distinguished from a lost reply in
     its first cycle. It is recognised in the first steps of a motion, which are small (`SLOW`):
     there nothing is sent again, and the lag of the target is not a loss from then on. A link that
     becomes late at speed is a loss in every second cycle, which soon stops the motion; while
     stopping it counts as late.
-
-    Args:
-        guard: provides following-error threshold and standstill.
-        depth: number of set-points that the target received may be one of.
 
     Attributes:
         again: the controller did not accept the last one: it is to be sent once more.
@@ -189,11 +184,7 @@ class _OpenMode:
         self.missed = 0
 
     def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Hold the axes that are open already, by the safe reply.
-
-        Raises:
-            GuardError: they cannot be held.
-        """
+        """Hold the axes that are open already, by the safe reply; raises GuardError."""
         self.lost = 0  # set-points of an earlier interval do not matter
         self._hold(reading.held, reading.held | reading.ready, measured, commanded, cycle)
 
@@ -207,19 +198,15 @@ class _OpenMode:
         """Require new targets for joints `held` (n,), and all of `where` near their targets.
 
         Raises:
-            FirstSetPointUnknown: the target was sent in an earlier cycle.
-            NotFinite, FollowingError: it is not finite, or the arm is elsewhere.
+            FirstSetPointUnknown, NotFinite, FollowingError: a target is old or not finite, or the
+                arm is elsewhere.
         """
         self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, held)
         raw = self._wire.raw
         self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
 
     def require_start(self, cycle: int) -> None:
-        """Require the conditions of the first set-point, for a motion that begins where it is held.
-
-        Raises:
-            NotFinite, FirstSetPoint: they are not met.
-        """
+        """Require the conditions of the first set-point; raises NotFinite, FirstSetPoint."""
         self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
         raw = self._wire.raw
         self._guard.check_start(raw[TARGET], raw[ACTUAL], raw[1:4:2], cycle)
@@ -265,11 +252,7 @@ class PositionMode(_OpenMode):
         )
 
     def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """Send the target received as the first set-point, at rest.
-
-        Raises:
-            GuardError: it must not be sent.
-        """
+        """Send the target received as the first set-point, at rest; raises GuardError."""
         self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
         raw = self._wire.raw
         target = raw[TARGET].copy()
@@ -409,22 +392,14 @@ class PositionMode(_OpenMode):
         self.held, self._sent = position, target
 
     def check_after_pause(self, reading: Reading, cycle: int) -> None:
-        """Require after a late packet that the arm moves as the set-points sent last.
-
-        Raises:
-            NotFinite, VelocityAfterPause: it does not.
-        """
+        """Require after a late packet that the arm moves as the set-points sent last."""
         where = self._continuing & reading.ready
         self._require_fresh((ACTUAL_VELOCITY,), AgeAfterGap, cycle, where)
         velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
         self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
 
     def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Hold axes that were always open at the last set-point, reopened ones at their target.
-
-        Raises:
-            GuardError: an axis still open does not follow, or its current is too large.
-        """
+        """Hold axes that were always open at the last set-point, reopened ones at their target."""
         raw, continuing, held = self._wire.raw, self._continuing, reading.held
         continuing &= reading.ready
         self.require_holdable(held & ~continuing, held | reading.ready, cycle)

@@ -74,12 +74,9 @@ class SafeReply:
 
 
 def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeReply:
-    """Compute the safe reply.
+    """Compute the safe reply to 4 status bytes and modes (n,).
 
-    Args:
-        status: 4 status bytes received.
-        modes: (n,) modes received.
-        arms: arm of each slot, from 1; None if unknown: every drive counts as on if any is.
+    `arms` is the arm of each slot, from 1; None if unknown: every drive counts as on if any is.
     """
     n = len(modes)
     on = [byte == DRIVE_ON for byte in status]
@@ -129,11 +126,7 @@ class ReplyFrame:
         self._words[:, MODE] = reply.modes
 
     def drive_off(self, reply: SafeReply, received: Words) -> None:
-        """Request drive-off: 505 in every slot.
-
-        The controller should ignore the targets in such a reply; in case it does not, they are
-        those it sent.
-        """
+        """Request drive-off: 505 in every slot, with the targets received in case they are used."""
         self._safe_and_finite(reply, received)
         self._words[:, MODE] = Mode.DRIVE_OFF_REQUEST
 

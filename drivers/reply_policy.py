@@ -137,10 +137,10 @@ class ReplyPolicy:
         measured: Array,
         commanded: Array,
     ) -> bytes:
-        """Fill the frame for the machine's state.
+        """Fill the frame for the machine's state, which is the one that the packet leads to.
 
         Args:
-            machine: already in the state that the packet leads to.
+            machine: state and motion.
             reading: status and modes of the packet.
             words: (n_axes, 9) its axis blocks.
             measured: (8, n) the same in SI, joint side.
@@ -186,8 +186,7 @@ class ReplyPolicy:
     def _hold_without_motion(self, machine: StateMachine, reading: Reading, words: Words) -> None:
         """Return open axes their target if that is possible, else request drive-off.
 
-        Raises:
-            GuardError: they cannot be held; raised once, not in each cycle.
+        Raises GuardError in the first cycle of these.
         """
         try:
             self._require_targets(reading.reply.held, machine.cycle)
@@ -224,11 +223,7 @@ class ReplyPolicy:
         return machine.stop_reason is not None
 
     def _exit_due(self, machine: StateMachine) -> bool:
-        """Whether to request the end of open mode once more.
-
-        Raises:
-            ExitTimeout: it was requested, or the controller began it, too long ago.
-        """
+        """Whether to request the end of open mode once more; raises ExitTimeout."""
         leaving = machine.cycle - machine.entered_at
         if leaving >= self._exit_cycles:
             raise ExitTimeout(leaving, machine.cycle)
@@ -264,14 +259,10 @@ class ReplyPolicy:
     def record(
         self, ring: CycleRing, row: int, reading: Reading, words: Words, ages: Ages | None
     ) -> None:
-        """Write a packet into its record; commanded values are NaN.
+        """Write a packet into a row of the ring; commanded values are NaN.
 
-        Args:
-            ring: of the records.
-            row: of the record.
-            reading: status and modes of the packet.
-            words: (n_axes, 9) its axis blocks.
-            ages: (n_axes, 8) cycles since their values were sent; None if with this packet.
+        `words` (n_axes, 9) are its axis blocks, `ages` (n_axes, 8) cycles since its values were
+        sent; None if with this packet.
         """
         ring.status[row] = reading.status
         ring.commanded[row] = math.nan
@@ -292,7 +283,7 @@ class ReplyPolicy:
         Args:
             unanswered: packets before this one without a reply.
             paused: this packet arrived late by the clock.
-            machine: already in the state that the packet leads to.
+            machine: in the state that the packet leads to.
             reading: status and modes of the packet.
 
         Raises:

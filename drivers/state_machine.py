@@ -77,11 +77,7 @@ class StateMachine:
         self._first_interval = 0
 
     def request(self, execution: Execution, unusable: str | None) -> None:
-        """Store a motion for the next time in open mode.
-
-        Raises:
-            RequestError: the state does not allow one.
-        """
+        """Store a motion for the next time in open mode; raises RequestError."""
         reason = None
         if self.execution is not None:
             reason = "another motion was requested before and has not ended"
@@ -110,11 +106,7 @@ class StateMachine:
             self.stop_reason = self.stop_reason or reason
 
     def override(self, fraction: float) -> None:
-        """Run the requested motion at this fraction of its speed.
-
-        Raises:
-            RequestError: there is none, or it cannot.
-        """
+        """Run the requested motion at this fraction of its speed; raises RequestError."""
         execution = self.execution
         before = None if execution is None else execution.fraction
         reason = _NO_MOTION if execution is None else execution.override(fraction)
@@ -124,11 +116,7 @@ class StateMachine:
             self.events.append(OverrideChanged(float(fraction), self.cycle))
 
     def hold(self) -> None:
-        """Come to rest on the path and wait there; stop if the source cannot hold.
-
-        Raises:
-            RequestError: there is no motion.
-        """
+        """Come to rest on the path and wait there; stop if the source cannot hold."""
         execution = self.execution
         if execution is None:
             raise self._request_error(_NO_MOTION, "hold")
@@ -141,11 +129,7 @@ class StateMachine:
             self.events.append(HoldChanged(True, self.cycle))
 
     def resume(self) -> None:
-        """Continue after a hold.
-
-        Raises:
-            RequestError: there is no motion, or it cannot.
-        """
+        """Continue after a hold; raises RequestError."""
         execution = self.execution
         before = execution is not None and execution.held
         reason = _NO_MOTION if execution is None else execution.resume()
@@ -180,11 +164,7 @@ class StateMachine:
             self.stop(f"{unanswered} packets were missed in a row")
 
     def require_axes(self, reading: Reading, mode: int) -> None:
-        """Require every wanted axis in its mode, from begin to end of a motion.
-
-        Raises:
-            AxisNotInMode: one is not.
-        """
+        """Require every wanted axis in its mode during a motion; raises AxisNotInMode."""
         execution = self.execution
         if execution is None or not reading.powered:
             return
@@ -197,11 +177,7 @@ class StateMachine:
             raise AxisNotInMode(joint, found, wanted, self.cycle)
 
     def begin_motion(self, position: Array) -> None:
-        """Begin the motion at its first set-point, (n,) rad.
-
-        Raises:
-            SourceFailed: it cannot begin there.
-        """
+        """Begin the motion at its first set-point, (n,) rad; raises SourceFailed."""
         assert self.execution is not None
         self.execution.begin(position, self.cycle)
         self.events.append(MotionStarted(self.interval, self.cycle))
@@ -209,9 +185,7 @@ class StateMachine:
     def apply(self, cause: Input, reason: str = "") -> None:
         """Change to the next state, and end a motion that the transition does not allow.
 
-        Args:
-            cause: input of the state table.
-            reason: of the loss of the motion; "" for that of the input.
+        `reason` is that of the loss of the motion; "" for that of the input.
         """
         before, after = self.state, TRANSITIONS[self.state][cause]
         if after is not before:

@@ -190,8 +190,8 @@ class Correction:
         self.stops += 1
 
 
-class GoesOn(Table):
-    """A table with the bounds of a stop from `stop` on, executed to its end."""
+class Unstopped(Table):
+    """A table executed to its end, with the bounds of a stop from `stop` on."""
 
     def stop(self):
         self.bounds = "stop"

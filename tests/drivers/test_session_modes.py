@@ -29,11 +29,11 @@ from tests.drivers.rig import (
     START,
     Correction,
     Cruise,
-    GoesOn,
     N,
     Rig,
     Table,
     Unspeakable,
+    Unstopped,
     accelerating,
     all_drive_off,
     assert_refused,
@@ -604,7 +604,7 @@ def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):
 WIDE = {"jerk": np.full(N, 1e9)}
 
 
-class Overridable(GoesOn):
+class Overridable(Unstopped):
     """Has the bounds of an override from the first on."""
 
     def __init__(self, positions):
