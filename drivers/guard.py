@@ -337,7 +337,8 @@ class Guard:
     def check_start(self, target: Array, actual: Array, step: Array, cycle: int) -> None:
         """Check that the arm may begin to move in this cycle.
 
-        `target` is D1 (n,), `actual` D3 (n,), motor revolutions; `step` (2, n) D2 and D4, per cycle.
+        Of the packet: `target` D1 and `actual` D3, (n,), and `step` D2 and D4, (2, n), motor
+        revolutions and per cycle.
 
         Raises:
             NotFinite, FirstSetPoint, NotAtStandstill: it must not.
@@ -365,7 +366,8 @@ class Guard:
         differ where a reply was lost.
 
         Args:
-            target, actual: (n,) D1 and D3, motor revolutions.
+            target: (n,) D1, motor revolutions.
+            actual: (n,) D3, motor revolutions.
             current: (n,) D5, A.
             commanded: (n,) D1 of the last reply, motor revolutions.
             cycle: for the error.
