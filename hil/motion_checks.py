@@ -167,7 +167,7 @@ class MotionChecks:
             return ""
         return (
             f"; the controller has {float32_text(theirs)} A as the limit of that motor, the "
-            f"cell file says {ours:.9g} A: write the controller's into [drive_train] current_limit"
+            f"cell file {ours:.9g} A: write the controller's into [drive_train] current_limit"
         )
 
 

@@ -68,13 +68,13 @@ class Silent:
     def task(self, title: str, total: float) -> Iterator[Task]:
         """Report `title`, and every tenth of the task."""
         self.say(title)
-        said = 0
+        printed = 0
 
         def show(done: float, note: str) -> None:
-            nonlocal said
+            nonlocal printed
             tenth = int(10 * done / max(total, 1e-12) + 1e-9)
-            if tenth > said:
-                said = tenth
+            if tenth > printed:
+                printed = tenth
                 self.say(f"{title}: {10 * tenth} %  {note}".rstrip())
 
         yield Task(show)

@@ -101,7 +101,7 @@ def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
 
 
 def is_not_a_file(error: OSError) -> bool:
-    """Return whether the error says that there is no regular file, not that reading failed."""
+    """Return whether the error means that there is no regular file, not that reading failed."""
     return error.errno in _ABSENT
 
 

@@ -641,7 +641,7 @@ class Screen:
         return self._full and can_read(sys.stdin)
 
     def accept_dry_run(self, found: DryRun) -> bool:
-        """Ask on the terminal's main page; False if nobody can be asked."""
+        """Ask on the terminal's main page; False without a terminal."""
         if not self.can_answer:
             return False
         self._undo.close()

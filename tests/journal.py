@@ -1,7 +1,7 @@
-"""Results of long commands in a file of JSON lines, from which the same command goes on.
+"""Results of long commands in a file of JSON lines, from which the same command resumes.
 
-A line is added by one call. A process that is killed leaves whole lines and at most one torn one at
-the end, which is left out by who reads and taken away by who adds.
+A line is added by one call. A process that is killed leaves complete lines and at most one
+truncated one at the end, which reading skips and adding removes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Final, Self, TypeVar
 
 COMPRESSED: Final = ".xz"
-"""End of the name of a journal that is kept small; nothing is added to it any more."""
+"""Suffix of a compressed journal, which is read-only."""
 
 Entry = TypeVar("Entry")
 
@@ -30,7 +30,7 @@ def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]
 
     Args:
         path: of the file; where its name ends in `.xz` it is compressed.
-        entry: makes an entry of what a line says, and raises where it is none.
+        entry: converts the object of a line; raises ValueError.
         what: a line should be, for a person: "result of a round".
 
     Raises:
@@ -59,10 +59,10 @@ def rounds(path: Path | None, *needed: str) -> dict[int, dict[str, Any]]:
         JournalError: as `entries`.
     """
 
-    def result(said: Any) -> tuple[int, dict[str, Any]]:
-        if missing := [name for name in needed if name not in said]:
+    def result(entry: Any) -> tuple[int, dict[str, Any]]:
+        if missing := [name for name in needed if name not in entry]:
             raise KeyError(*missing)
-        return int(said["round"]), said
+        return int(entry["round"]), entry
 
     return {} if path is None else dict(entries(path, result, "result of a round"))
 

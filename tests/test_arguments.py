@@ -117,13 +117,13 @@ def test_none_keeps_nothing() -> None:
     assert rounds(None) == {}
 
 
-def test_a_torn_last_line_costs_itself_and_no_other(tmp_path: Path) -> None:
+def test_only_a_truncated_last_line_is_lost(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
     whole = b'{"n":1}\n{"n":2}\n'
-    for torn in range(1, len(whole)):
-        path.write_bytes(whole[:torn])
-        known = [1] if torn >= len(whole) // 2 else []
-        assert read(path) == known, torn
+    for size in range(1, len(whole)):
+        path.write_bytes(whole[:size])
+        known = [1] if size >= len(whole) // 2 else []
+        assert read(path) == known, size
         with Journal(path) as journal:
             journal.add(n=9)
         assert read(path) == [*known, 9]
@@ -144,7 +144,7 @@ def test_a_line_that_is_no_entry_is_named(tmp_path: Path, line: str) -> None:
     assert str(caught.value) == f"{path}, line 2 is no number; name another --journal"
 
 
-def test_what_cannot_be_read_or_written_is_told_of(tmp_path: Path) -> None:
+def test_unreadable_journals_are_errors(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="cannot be read"):
         read(tmp_path)
     with pytest.raises(JournalError, match="cannot be written: Is a directory"):

@@ -33,9 +33,7 @@ def test_a_package_that_was_not_measured_is_named() -> None:
         figures(report(200), "planner")
 
 
-def test_what_is_no_report_is_told_in_a_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_other_files_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "notes.txt").write_text("[1]")
     for name in ("notes.txt", "nowhere.json"):
         with pytest.raises(SystemExit) as ended:

@@ -129,15 +129,15 @@ def move(
             "duration": move.duration,
             "target_deg": AngleFrame.of(cell).shown(move.target).tolist(),
         }
-        said = f"{ended.outcome}: {ended.reason or 'the arm has arrived'}; archived in {path}"
+        message = f"{ended.outcome}: {ended.reason or 'the arm has arrived'}; archived in {path}"
         if not json:
-            typer.echo(printable(said))
+            typer.echo(printable(message))
         try:
             link.close()
         except ControllerFault as fault:
             raise fault.beside(figures) from None
         if json and ended.outcome == "completed":
-            _print(said, figures, json=json)
+            _print(message, figures, json=json)
     if ended.outcome == "stopped" and stopped:
         how = f"the arm was stopped on its path; {path} is complete."
         raise OperatorStopError(how).beside(figures)

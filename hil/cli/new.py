@@ -144,7 +144,7 @@ def _asked(address: str, bind: str, n_joints: int, arm: int, wait: float, *, qui
     link = {"controller.transport": "udp", "controller.host": host, "controller.port": port}
     if bind != "0.0.0.0":
         link["controller.bind"] = bind
-    return from_init(init, n_joints, arm) | Known.said_by("as given to hil new", link)
+    return from_init(init, n_joints, arm) | Known.of_origin("as given to hil new", link)
 
 
 def _require_free(path: Path, *, force: bool, own: Path | None = None) -> None:

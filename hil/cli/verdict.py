@@ -85,14 +85,14 @@ def sentences(results: Results, *, quiet: bool = False) -> list[str]:
     judgement = results.judgement
     if judgement is None or quiet:
         return [f"note: {warning}" for warning in results.verdict.warnings]
-    said = {finding.words for finding in judgement.findings}
+    findings = {finding.words for finding in judgement.findings}
     lines = [
         f"{_LEVELS[level]}: {finding.words}"
         for level in ("good", "information", "doubtful", "wrong")
         for finding in judgement.findings
         if finding.level == level
     ]
-    lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in said]
+    lines += [f"note: {warning}" for warning in results.verdict.warnings if warning not in findings]
     return lines + [f"next: {step}" for step in judgement.next_steps]
 
 

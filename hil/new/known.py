@@ -49,7 +49,7 @@ class Known:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def said_by(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
+    def of_origin(cls, origin: str, values: Mapping[str, Any], notes: Sequence[str] = ()) -> Known:
         """Create from values of one origin, without unknown fields."""
         nothing: list[Any] = [UNKNOWN]
         known = {
@@ -89,7 +89,7 @@ def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
     }
     if np.all((limits.effort > 0.0) & np.isfinite(limits.effort)):
         values["limits.torque"] = limits.effort.tolist()
-    return Known.said_by("from the URDF", values)
+    return Known.of_origin("from the URDF", values)
 
 
 def assumed_for_design(known: Known, n_joints: int) -> Known:
@@ -130,7 +130,7 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
         values["limits.lower_deg"] = low
     if high != upper:
         values["limits.upper_deg"] = high
-    return Known.said_by(ASSUMED, values)
+    return Known.of_origin(ASSUMED, values)
 
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
@@ -155,7 +155,7 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
         closed = f"axes {missing} of arm {arm} are not open in the controller"
         notes.append(f"{closed}; a campaign needs all axes of the arm")
     version = ".".join(map(str, init.version))
-    return Known.said_by(f"from the init packet (C4G {version})", values, notes)
+    return Known.of_origin(f"from the init packet (C4G {version})", values, notes)
 
 
 def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known:
@@ -187,7 +187,7 @@ def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known
         values = {f"{name}.{key}": value for name in tables for key, value in tables[name].items()}
         for name in ("cell.urdf", "cell.mesh_folders"):  # paths on the recording computer
             values.pop(name, None)
-        known = Known.said_by(f"from {archive.path.name}", values)
+        known = Known.of_origin(f"from {archive.path.name}", values)
     packet = archive.attachments.get("init_packet.bin")
     if packet is not None:
         arm = known.values.get("controller.arm", 1)

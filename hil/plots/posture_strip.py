@@ -218,6 +218,6 @@ def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
     for wall in workspace.walls:
         normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
         across, up = normal[list(view.axes)]
-        if np.hypot(across, up) > 1.0 - 1e-9:  # planes parallel to the line of sight
+        if np.hypot(across, up) > 1.0 - 1e-9:  # planes parallel to the direction of view
             foot = (across * wall.offset, up * wall.offset)
             axes.axline(foot, (foot[0] - up, foot[1] + across), color=style.INK, zorder=1.6)

@@ -47,7 +47,7 @@ OTHER_PROGRAMS = {
 
 NOT_TYPED = {
     "hil demo --effects": "minutes",
-    "hil demo --resume": "goes on with one that was stopped; tests/hil/test_cli.py stops one",
+    "hil demo --resume": "resumes a stopped one; tests/hil/test_cli.py stops one",
     "hil demo --link udp": "minutes, in real time",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
     "hil demo --output runs/demo": "a campaign of the fixture stands in its place",
@@ -74,7 +74,7 @@ SHORTER = {
     "design": ("--settings", "quick.toml"),
     "doctor": ("--duration", "1"),
     "move": ("--yes",),
-}  # What is added so that a command takes seconds, and asks nobody
+}  # Added so that a command takes seconds and asks no question
 
 NOT_GOOD_EITHER = ("doctor", "identify", "run")
 """May end with 5: this computer need not be fit, a campaign of seconds no good one."""

@@ -68,17 +68,17 @@ def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_no_diagram_needs_a_script_to_be_drawn(page: Path) -> None:
+def test_no_diagram_needs_a_script(page: Path) -> None:
     assert "```mermaid" not in page.read_text("utf-8")
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:
     docs = ROOT / "docs"
-    listed = set()
+    indexed = set()
     for page in ("index.md", "api.md"):
         for block in re.findall(r"```{toctree}\n(.*?)```", (docs / page).read_text("utf-8"), re.S):
-            listed |= {line for line in block.splitlines() if line and line[0] != ":"}
-    assert listed == {page.stem for page in docs.glob("*.md")} - {"index"}
+            indexed |= {line for line in block.splitlines() if line and line[0] != ":"}
+    assert indexed == {page.stem for page in docs.glob("*.md")} - {"index"}
 
 
 def test_the_api_reference_covers_the_public_faces() -> None:

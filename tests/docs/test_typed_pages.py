@@ -167,7 +167,7 @@ class TestFirstHour:
     STEPS = commands(ROOT / "docs" / "first-hour.md")
 
     def edit(self, path: Path, **instead: int) -> None:
-        """What the page says is to be written into `[controller]` of the copy."""
+        """What the page asks to write into `[controller]` of the copy."""
         (block,) = re.findall(r"```toml\n(.*?)```", self.TEXT, re.DOTALL)
         link = tomllib.loads(block) | instead
         values = {f"controller.{key}": value for key, value in link.items()}
@@ -199,13 +199,13 @@ class TestFirstHour:
                 far = [part.replace("2001", port) for part in simulate]
                 controller = self.hil([*far, "--patience", "0.5"])
             done = self.hil([part.replace("2001", port) for part in step])
-            said, _ = done.communicate(timeout=180)
+            printed, _ = done.communicate(timeout=180)
             if controller is not None:
                 controller.terminate()
                 controller.communicate(timeout=60)
                 time.sleep(0.1)
             # doctor --quick is provisional: 5, whatever this computer can do.
-            assert done.returncode == (5 if step[1] == "doctor" else 0), (step, said)
+            assert done.returncode == (5 if step[1] == "doctor" else 0), (step, printed)
             if step[1] == "new":
                 with pytest.raises(UnknownFieldsError) as unknown:
                     Cell.load("cell.toml")
@@ -228,13 +228,13 @@ class TestFirstHour:
 
     def test_the_list_names_every_field_that_hil_new_leaves_open(self) -> None:
         items = re.findall(r"(?m)^- (`.*?):", self.TEXT)
-        said = {field for item in items for field in re.findall(r"`(\w+)`", item)}
+        printed = {field for item in items for field in re.findall(r"`(\w+)`", item)}
         elsewhere = {  # from URDF and init packet
             "lower_deg", "upper_deg", "velocity_deg", "gear_ratio", "calibration", "k54", "k64",
             "k65", "current_limit", "following_error", "cycle_ms", "host", "mesh_folders",
         }  # fmt: skip
-        assert len(said) == 12
-        assert {name.partition(".")[2] for name in WHERE} - elsewhere == said
+        assert len(printed) == 12
+        assert {name.partition(".")[2] for name in WHERE} - elsewhere == printed
 
 
 ROOT = Path(__file__).resolve().parents[2]

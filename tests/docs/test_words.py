@@ -69,8 +69,10 @@ class TestWords:
         """Each string that is no docstring; `LITERAL` has the exceptions."""
         wrong: list[str] = []
         for module in MODULES:
-            said = ((k, text) for k, text, inner in texts(module) if not inner)
-            wrong += found(module, ((k, text) for k, text in said if text not in LITERAL), IDIOMS)
+            literals = ((k, text) for k, text, inner in texts(module) if not inner)
+            wrong += found(
+                module, ((k, text) for k, text in literals if text not in LITERAL), IDIOMS
+            )
         assert not wrong, "\n".join(wrong)
 
     def test_docstrings_have_none_of_the_worst(self) -> None:

@@ -50,7 +50,7 @@ class Condition:
     louder: Array = field(default_factory=lambda: np.ones(6))
     """Factor on the noise of each joint."""
     stated: Payload | None = None
-    """What the cell says that it carries, in the frame of the last joint."""
+    """Payload stated by the cell, in the frame of the last joint."""
 
 
 Life = Callable[[int, np.random.Generator], Condition]

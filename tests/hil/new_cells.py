@@ -41,13 +41,13 @@ def described_robot(name: str) -> Path:
     return share / name
 
 
-def filled_in(path: Path, n: int, **said: object) -> str:
+def filled_in(path: Path, n: int, **values: object) -> str:
     """The text of a new cell file with every `"?"` replaced, on a simulated controller.
 
     Args:
         path: of the cell file.
         n: joints.
-        said: figures for fields, by their names with `__` for the dot.
+        values: figures for fields, by their names with `__` for the dot.
     """
     text = path.read_text("utf-8")
     figures: dict[str, object] = {
@@ -76,11 +76,11 @@ def filled_in(path: Path, n: int, **said: object) -> str:
         "controller.cycle_ms": 2,
         "controller.host": "10.2.12.150",
     }
-    figures |= {name.replace("__", "."): value for name, value in said.items()}
+    figures |= {name.replace("__", "."): value for name, value in values.items()}
     for name, value in figures.items():
         key = name.partition(".")[2]
         there = re.search(rf"(?m)^{key} = .*\"\?\"", text)
-        if there or name in {entry.replace("__", ".") for entry in said}:
+        if there or name in {entry.replace("__", ".") for entry in values}:
             text = with_values(text, {name: value})
     text = with_values(text, {"controller.transport": "simulated"})
     planted = {"seed": 1, "initial_deg": figures["campaign.home_deg"], "third": [0.0] * n}

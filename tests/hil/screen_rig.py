@@ -1,8 +1,7 @@
 """A screen on a terminal, for a test at the other end: writes what it was asked for to a file.
 
 `python screen_rig.py FILE ENDING`: shows a run until it is stopped, then ends in one of several
-ways, among them those that leave a terminal in a bad state. A line of JSON in FILE for each wish.
-`Terminal` is that other end, of any program.
+ways. A line of JSON in FILE for each request. `Terminal` controls the terminal of any program.
 """
 
 from __future__ import annotations
@@ -30,22 +29,22 @@ from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus
 from hil.screen import Screen
 
 LONGEST = 60.0
-"""s after which it gives up."""
+"""s after which it ends with an error."""
 NAMES = ("joint_1", "joint_2")
 
 
-def status(wish: OperatorRequest) -> RunStatus:
-    """In the third repetition, doing as wished."""
+def status(request: OperatorRequest) -> RunStatus:
+    """In the third repetition, with the requested override."""
     share, zero = np.array([0.1, 0.9]), np.zeros(2)
     motion = MotionProgress(
         1.0, 4.0, 1000, 0, 0, 0, State.OPEN, zero, zero, share, zero, share,
-        override=wish.override, held=wish.held,
+        override=request.override, held=request.held,
     )  # fmt: skip
     return RunStatus("repetition", 3, 30, 65.0, motion)
 
 
 class Terminal:
-    """The far end of a terminal on which a program runs in the foreground."""
+    """The controlling side of a pseudo-terminal on which a program runs in the foreground."""
 
     def __init__(self, *command: object, columns: int) -> None:
         self.near, self.far = pty.openpty()
@@ -127,12 +126,12 @@ def main() -> int:
                 for _ in range(3):
                     reported.write(json.dumps({"accepted": screen.accept_dry_run(found)}) + "\n")
             while not stop.requested and time.monotonic() < until:
-                wish = screen.request()
-                screen.show(status(wish))
-                if wish != last:
-                    last = wish
-                    said = {"override": round(wish.override, 3), "held": wish.held}
-                    reported.write(json.dumps(said) + "\n")
+                request = screen.request()
+                screen.show(status(request))
+                if request != last:
+                    last = request
+                    state = {"override": round(request.override, 3), "held": request.held}
+                    reported.write(json.dumps(state) + "\n")
                 time.sleep(0.01)
             reported.write(json.dumps({"stop": stop.requested}) + "\n")
         screen.say("the last line")

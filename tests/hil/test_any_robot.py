@@ -43,8 +43,8 @@ UR5 = "ur5_robot.urdf"
 EPOCH_MS = 1_700_000_000_000
 
 
-PLAIN = replace(FIXED, delay=None)
-"""Nothing chosen automatically, for a plain estimate."""
+NOTHING_CHOSEN = replace(FIXED, delay=None)
+"""Nothing chosen automatically: least squares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,9 @@ def identify(
     log: str,
     columns: str,
     locked: tuple[str, ...] = (),
-    options: Options = PLAIN,
+    options: Options = NOTHING_CHOSEN,
 ) -> Found:
-    """The way of `hil import log` and `hil identify`, up to the plain estimate."""
+    """The way of `hil import log` and `hil identify`, up to the estimate."""
     (folder / "map.toml").write_text(columns)
     archive = import_log(
         folder / log,
@@ -124,9 +124,9 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz_columns_in_another_order(tmp_
         """
     found = identify(tmp_path, simulated, "log.csv", columns, FINGERS)
     assert_found(found, simulated)
-    said = " ".join(found.prepared.notes)
-    assert "uneven" in said
-    assert "1 gaps" in said
+    notes = " ".join(found.prepared.notes)
+    assert "uneven" in notes
+    assert "1 gaps" in notes
 
 
 def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path) -> None:
@@ -153,9 +153,9 @@ def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path
     made = (torque / recorded.motor_current).mean(axis=0)
     assert made[1:5] == pytest.approx(gains[1:5], rel=0.03)
     assert found.held_out_error < 2.0 * TORQUE_NOISE
-    doubts = " ".join(found.prepared.sources.warnings)
-    assert "only currents were recorded" in doubts
-    assert "shoulder_pan_joint" in doubts  # its axis is vertical: no weight
+    warnings = " ".join(found.prepared.sources.warnings)
+    assert "only currents were recorded" in warnings
+    assert "shoulder_pan_joint" in warnings  # its axis is vertical: no weight
 
 
 def test_currents_of_a_robot_without_masses_are_refused_with_a_remedy(tmp_path: Path) -> None:
@@ -311,7 +311,7 @@ class TestFilteredTorque:
 
     @pytest.mark.parametrize("order", [1, 2])
     def test_a_lag_is_no_delay(self, tmp_path: Path, order: int, unfiltered: Prepared) -> None:
-        """A low-pass that runs forwards lags by some ten ms, which are not taken for a delay."""
+        """The lag of a causal low-pass, some 10 ms, is not identified as a delay."""
         found = prepared(tmp_path, order, causal=True)
         assert found.settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
         assert found.settings.preprocessing.torque_shape.causal

@@ -210,7 +210,7 @@ def changed() -> ArmTrend:
     return trend_of(troubled, 12)
 
 
-def test_an_arm_without_changes_is_said_to_have_none() -> None:
+def test_an_arm_without_changes_has_none() -> None:
     arm = quiet()
     assert [one.level for one in findings(arm)] == ["quiet"]
     assert summary(arm) == "no change"
@@ -429,7 +429,7 @@ def test_without_information_the_payload_is_not_tested() -> None:
 
 # --- the page ----------------------------------------------------------------------------------
 
-BROKEN = Unused("/data/<b>torn</b>.mcap", "its footer is missing")
+BROKEN = Unused("/data/<b>cut</b>.mcap", "its footer is missing")
 
 
 @cache
@@ -437,7 +437,7 @@ def page() -> str:
     return trend_page(Trends((changed(), quiet()), (BROKEN,), "wls", 48)).decode()
 
 
-def test_the_page_says_first_in_words_what_was_found() -> None:
+def test_the_page_begins_with_the_findings() -> None:
     head = page().split("<main>")[0]
     for one in findings(changed()):
         assert one.words.replace("'", "&#39;") in head
@@ -447,11 +447,11 @@ def test_the_page_says_first_in_words_what_was_found() -> None:
     assert page().count("<svg") >= 2 * 12
     assert all(name in page() for name in model().parameter_names)
     assert "its footer is missing" in page()
-    assert "&lt;b&gt;torn" in page() and "<b>torn" not in page()
+    assert "&lt;b&gt;cut" in page() and "<b>cut" not in page()
 
 
 @pytest.mark.slow
-def test_arms_that_do_not_change_are_rarely_said_to() -> None:
+def test_false_alarms_are_rare() -> None:
     """Any rule, over whole histories: at most the stated share of campaigns."""
     alarms = campaigns = drifts = 0
     for seed in range(60):
@@ -577,7 +577,7 @@ def in_memory(
     return compare_campaigns(CampaignSet(arm, tuple(levels), tuple(single), not folders, ()))
 
 
-def test_a_payload_that_nobody_stated_is_weighed() -> None:
+def test_an_unstated_payload_is_weighed() -> None:
     found = in_memory(Condition(), Condition(load=Load(3.0)))
     assert found.verdict == "Changed: payload"
     assert found.payload.mass[1] == pytest.approx(3.0, abs=3.0 * found.payload.mass_std[1])
@@ -682,11 +682,11 @@ def test_variances_and_counts_are_of_what_repetitions_share() -> None:
     white = [effective_count(random.standard_normal(30)) for _ in range(200)]
     assert np.median(white) > 24.0
     assert effective_count(np.ones(30)) == 30.0
-    assert effective_count(drifting[:3]) == 1.0  # nobody can tell
+    assert effective_count(drifting[:3]) == 1.0  # too few to tell
 
 
 @pytest.mark.parametrize(("count", "memory"), [(2, 0.0), (5, 0.7), (30, 0.0), (30, 0.7)])
-def test_of_two_alike_campaigns_few_are_said_to_differ(count: int, memory: float) -> None:
+def test_equal_campaigns_rarely_differ(count: int, memory: float) -> None:
     """At a level of 5 %, whether or not repetitions remember the one before."""
     random = np.random.default_rng(count)
 

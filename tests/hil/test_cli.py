@@ -238,10 +238,10 @@ def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None
             time.sleep(0.05)
         time.sleep(0.3)
         run.send_signal(signal.SIGINT)
-        _, said = run.communicate(timeout=60)
-    assert run.returncode == 130, said
-    assert "stopped" in said
-    assert "--resume" in said
+        _, output = run.communicate(timeout=60)
+    assert run.returncode == 130, output
+    assert "stopped" in output
+    assert "--resume" in output
     last = sorted((folder / "archives").iterdir(), key=lambda path: path.stat().st_mtime)[-1]
     archive = open_archive(last)
     assert archive.complete

@@ -264,7 +264,7 @@ def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: 
         port = controller.getsockname()[1]
         file = tmp_path / "cell.toml"
         file.write_text(cell_text(transport="udp", host="127.0.0.2", port=port))
-        # The cell's default bind, every address, is taken by the controller here.
+        # The cell's default bind, every address, is used by the controller here.
         scheduling = os.sched_getscheduler(0)
         ran = CliRunner().invoke(app, [str(file), "--duration", "1", "--json", "--output", "x"])
         controller.settimeout(0.0)
@@ -367,7 +367,7 @@ def of(judge: Judge, *cases: tuple[Any, ...]) -> list[Case]:
     return [(judge, one[0], one[3] if len(one) > 3 else {}, one[1], one[2]) for one in cases]
 
 
-def says(
+def prints(
     code: int, output: str = "", errors: str = "", command: str = "ethtool"
 ) -> dict[str, Answer]:
     return {command: Answer(code, output, errors)}
@@ -419,7 +419,7 @@ JUDGED = [
         ({"/proc/loadavg": "9 0 0"}, WARN, "top"), ({}, UNKNOWN, "uptime")),
     *of(lambda s: machine.user(0), ({}, WARN, "as the user")),
     *of(lambda s: machine.user(1000), ({}, OK, "not root")),
-    # What was given counts, whatever the limit says.
+    # What was given applies, not the limit.
     *of(lambda s: machine.scheduling(ALL, 0), ({}, OK, "SCHED_FIFO 50")),
     *of(lambda s: machine.scheduling(None, 0), ({}, UNKNOWN, "rtprio limit 0")),
     *of(lambda s: machine.scheduling(NOTHING, 0),
@@ -449,12 +449,12 @@ JUDGED = [
     *of(
         lambda s: link.coalescing("eth1", s),
         ({}, UNKNOWN, "ethtool -c eth1"),
-        ({}, OK, "rx-usecs 0", says(0, "Adaptive RX: off  TX: off\nrx-usecs: 0\n")),
-        ({}, WARN, "adaptive", says(0, "Adaptive RX: on  TX: on\nrx-usecs: 3\n")),
-        ({}, WARN, "200", says(0, "rx-usecs: 200\n")),
-        ({}, OK, "has none", says(1, "", "netlink error: Operation not supported")),
-        ({}, UNKNOWN, "not permitted", says(1, "", "netlink error: Operation not permitted")),
-        ({}, OK, "not stated", says(0, "\x00nonsense")),
+        ({}, OK, "rx-usecs 0", prints(0, "Adaptive RX: off  TX: off\nrx-usecs: 0\n")),
+        ({}, WARN, "adaptive", prints(0, "Adaptive RX: on  TX: on\nrx-usecs: 3\n")),
+        ({}, WARN, "200", prints(0, "rx-usecs: 200\n")),
+        ({}, OK, "has none", prints(1, "", "netlink error: Operation not supported")),
+        ({}, UNKNOWN, "not permitted", prints(1, "", "netlink error: Operation not permitted")),
+        ({}, OK, "not stated", prints(0, "\x00nonsense")),
     ),
     *of(
         lambda s: link.neighbour_check(C4G, "eth1", s),
@@ -467,15 +467,15 @@ JUDGED = [
         lambda s: link.firewall(C4G, 1000, s),
         ({}, OK, "no packet filter"),
         ({"/proc/net/netfilter/nf_log": ""}, UNKNOWN, "neither nft nor iptables"),
-        ({}, OK, "no rule", says(0, "", command="nft")),
-        ({}, WARN, "drop", says(0, CHAIN % ("drop", ""), command="nft")),
-        ({}, WARN, "drop", says(0, CHAIN % ("accept", "udp dport 1000 drop "), command="nft")),
-        ({}, WARN, "drop", says(0, "-P INPUT DROP\n", command="iptables")),
-        ({}, WARN, "drop", says(0, UFW, command="iptables")),
-        ({}, OK, "no rule", says(0, UFW.replace("DROP", "ACCEPT"), command="iptables")),
-        ({}, UNKNOWN, "root", says(1, "", "not permitted (you must be root)", command="nft")),
-        ({}, UNKNOWN, "root", says(0, "", command="nft")
-         | says(4, "", "Permission denied", command="iptables")),
+        ({}, OK, "no rule", prints(0, "", command="nft")),
+        ({}, WARN, "drop", prints(0, CHAIN % ("drop", ""), command="nft")),
+        ({}, WARN, "drop", prints(0, CHAIN % ("accept", "udp dport 1000 drop "), command="nft")),
+        ({}, WARN, "drop", prints(0, "-P INPUT DROP\n", command="iptables")),
+        ({}, WARN, "drop", prints(0, UFW, command="iptables")),
+        ({}, OK, "no rule", prints(0, UFW.replace("DROP", "ACCEPT"), command="iptables")),
+        ({}, UNKNOWN, "root", prints(1, "", "not permitted (you must be root)", command="nft")),
+        ({}, UNKNOWN, "root", prints(0, "", command="nft")
+         | prints(4, "", "Permission denied", command="iptables")),
     ),
     *of(
         lambda s: link.can_check(FD, s),

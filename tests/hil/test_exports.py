@@ -232,8 +232,8 @@ def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
     assert "f0_2" in source.splitlines()[1]
     rows = {row["name"]: row for row in table(tmp_path / "parameters.csv")}
     assert float(rows["f0_2"]["std"]) == np.inf
-    listed = json.loads((tmp_path / "parameters.json").read_text())["parameters"]
-    assert {p["name"] for p in listed if not p["determined"]} == set(arm.estimate.undetermined)
+    rows = json.loads((tmp_path / "parameters.json").read_text())["parameters"]
+    assert {p["name"] for p in rows if not p["determined"]} == set(arm.estimate.undetermined)
     arm = identified_arm(TWO_LINK, still=(1,))
     consistent = arm.consistency.consistent
     known = np.isfinite(arm.estimate.std)
@@ -402,11 +402,11 @@ class TestCommand:
     ) -> None:
         monkeypatch.setitem(sys.modules, "mujoco", None)
         monkeypatch.chdir(tmp_path)
-        said = command("export", log, "--to", "mjcf").stdout
-        assert "not read back: MuJoCo is not installed" in said
+        output = command("export", log, "--to", "mjcf").stdout
+        assert "not read back: MuJoCo is not installed" in output
         assert (tmp_path / "identified.xml").read_text().startswith("<mujoco")
 
-    def test_a_replay_draws_and_says_how_far_models_stray(self, log: Path, tmp_path: Path) -> None:
+    def test_a_replay_shows_the_deviation_of_models(self, log: Path, tmp_path: Path) -> None:
         picture = tmp_path / "deep" / "replay.svg"
         models = json.loads(command("replay", log, "-o", picture, "--json").stdout)["models"]
         assert max(models["identified"]["rms"]) < min(models["nominal"]["rms"])

@@ -59,12 +59,12 @@ def test_no_file_is_written_if_the_disk_fails_at_one(folder: Path, failing: str)
     assert unchanged(folder)
 
 
-@pytest.mark.parametrize("taken", ["new", None])
-def test_folder_in_place_of_a_file_is_named_and_left(folder: Path, taken: str | None) -> None:
+@pytest.mark.parametrize("third", ["new", None])
+def test_folder_in_place_of_a_file_is_named_and_left(folder: Path, third: str | None) -> None:
     (folder / "c").mkdir()
     (folder / "c" / "mine").touch()
     with pytest.raises(OutputError, match="c is a folder"):
-        write_files(folder, {"a": "new", "b": None, "c": taken, "d": None})
+        write_files(folder, {"a": "new", "b": None, "c": third, "d": None})
     assert (folder / "c" / "mine").exists()
     assert unchanged(folder)
 
@@ -99,7 +99,7 @@ def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     assert caught.value.exit_code == 1
 
 
-# --- Moments that somebody else wrote are read, or are none; reading them never fails
+# --- timestamps of foreign files
 
 
 @given(
@@ -125,7 +125,7 @@ def test_invalid_times(text: str) -> None:
     assert parse_time(text) is None
 
 
-# --- Numbers that somebody else wrote are read, or are none; reading them never fails
+# --- numbers of foreign files
 
 
 @given(st.integers(0, 10**18 - 1))

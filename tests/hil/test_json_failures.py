@@ -59,8 +59,8 @@ def test_usage_errors_are_json_too() -> None:
     for arguments in (("status",), ("bla",), ("plot", "--no-such-option")):
         result = called(*arguments)
         assert (result.exit_code, json.loads(result.stdout)["exit_code"]) == (2, 2)
-    plain = CliRunner().invoke(app, ["status"])
-    assert (plain.exit_code, plain.stdout) == (2, "")
+    without_json = CliRunner().invoke(app, ["status"])
+    assert (without_json.exit_code, without_json.stdout) == (2, "")
 
 
 @pytest.mark.parametrize("command", [*FAILING])
@@ -149,7 +149,7 @@ def test_the_exit_status_of_the_program_is_the_same_with_json(
     monkeypatch.setattr(sys, "argv", ["hil", "status", NOWHERE, *more])
     with pytest.raises(SystemExit) as ended:
         main()
-    said = capsys.readouterr()
+    output = capsys.readouterr()
     assert ended.value.code == 2
-    assert "is not a campaign folder" in said.err
-    assert bool(said.out) == bool(more)
+    assert "is not a campaign folder" in output.err
+    assert bool(output.out) == bool(more)

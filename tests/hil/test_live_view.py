@@ -58,10 +58,10 @@ def served(rate: float = 50.0) -> Iterator[live.LivePublisher]:
         publisher.close()
 
 
-def test_a_viewer_is_told_the_channels_and_schemas_of_an_archive() -> None:
+def test_a_viewer_receives_the_channels_of_an_archive() -> None:
     with served() as publisher, Viewer(publisher.port) as viewer:
         assert viewer.socket.subprotocol == SUBPROTOCOL
-        assert viewer.info["capabilities"] == []  # nobody can send anything from there
+        assert viewer.info["capabilities"] == []  # clients cannot publish
         assert set(viewer.channels) == {
             "/hil/cycle", "/joint_states", "/joint_states_commanded", "/hil/events"
         }  # fmt: skip
@@ -117,7 +117,7 @@ def test_events_come_all_of_them() -> None:
         pytest.fail("no event came")
 
 
-def test_a_viewer_that_reads_nothing_holds_nobody_up() -> None:
+def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
     """Ten times as much as waits for one client: what was recorded is left behind, not waited for.
 
     Meanwhile another viewer sees the newest.

@@ -165,7 +165,7 @@ def test_one_target_of_six_angles_is_asked_for(arguments: list[str]) -> None:
 def test_a_real_controller_is_not_driven_unless_a_person_confirms(
     ns16: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its link is told that the far end might be one; the far end is still simulated."""
+    """The link is declared real; the controller is still simulated."""
     with UdpController.started(ns16, tmp_path) as controller:
         monkeypatch.setattr("hil.campaign.live_link.is_local", lambda _: False)
         arguments = ["move", str(controller.cell_path), "--to", "home", "-o", str(tmp_path / "m")]

@@ -44,7 +44,7 @@ ON_THE_WIRE = (
 
 
 def new(urdf: Path, output: Path, *options: str) -> dict[str, list[str]]:
-    """What `hil new` says it wrote."""
+    """Summary that `hil new --json` prints."""
     arguments = ["new", "--urdf", str(urdf), "-o", str(output), "--json", *options]
     result = CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
@@ -126,7 +126,7 @@ def home_and_back(cell: Cell) -> CampaignPlan:
     return CampaignPlan(plan.excitation, validation=plan.validation[:1])
 
 
-def test_joints_that_slide_are_fixed_and_it_is_said(tmp_path: Path) -> None:
+def test_prismatic_joints_are_fixed_with_a_note(tmp_path: Path) -> None:
     urdf = described_robot(PANDA)
     summary = new(urdf, tmp_path / "panda.toml", "--fix", "panda_finger_joint1=0.02")
     assert len(summary["joints"]) == 7
@@ -152,9 +152,7 @@ def test_a_fixed_joint_leaves_the_dynamics_of_one_that_is_held(joint: str) -> No
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
 
 
-def test_an_archive_gives_all_that_its_own_cell_and_controller_said(
-    campaign: Campaign, tmp_path: Path
-) -> None:
+def test_an_archive_gives_its_cell_and_init_packet(campaign: Campaign, tmp_path: Path) -> None:
     archive = campaign.folder.completed("excitation")[0]
     summary = new(URDF_PATH, tmp_path / "cell.toml", "--from-archive", str(archive))
     assert summary["unknown"] == []
@@ -190,15 +188,15 @@ def test_a_controller_is_asked_over_udp(tmp_path: Path) -> None:
         )  # fmt: skip
     finally:
         simulator.terminate()
-        said = simulator.communicate(timeout=60)[0]
+        output = simulator.communicate(timeout=60)[0]
     written = tomllib.loads((tmp_path / "cell.toml").read_text())
     truth = tomllib.loads(CELL_PATH.read_text())
     for name in ON_THE_WIRE:
         assert written["drive_train"][name] == truth["drive_train"][name], name
     assert written["controller"]["cycle_ms"] == truth["controller"]["cycle_ms"]
     assert (written["controller"]["host"], written["controller"]["port"]) == ("127.0.0.1", port)
-    assert "drive_train.joint_sign" in summary["unknown"]  # which no packet tells
-    assert json.loads(said.splitlines()[-1])["rejected"] == 0  # every answer was a good one
+    assert "drive_train.joint_sign" in summary["unknown"]  # which no packet contains
+    assert json.loads(output.splitlines()[-1])["rejected"] == 0  # every answer was a good one
 
 
 def test_whoever_asks_a_controller_cannot_move_it() -> None:
@@ -234,9 +232,7 @@ def test_nothing_is_overwritten_unless_asked_for(two_joints: Path, tmp_path: Pat
     assert path.read_text() != "mine"
 
 
-def test_a_joint_that_follows_another_is_fixed_and_it_is_said(
-    two_joints: Path, tmp_path: Path
-) -> None:
+def test_mimic_joints_are_fixed_with_a_note(two_joints: Path, tmp_path: Path) -> None:
     """In a copy with a name of its own, should the cell file be called like the URDF."""
     follows = '<mimic joint="hip" multiplier="-1" offset="0.3"/><limit effort="60" velocity="0"/>'
     text = TWO_JOINTS.replace('<limit effort="60" velocity="0"/>', follows)
@@ -286,9 +282,7 @@ def test_an_archive_whose_cell_names_no_arm_is_of_the_first(arm: str, tmp_path: 
     assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
 
 
-def test_a_pipe_or_another_encoding_is_told_how_to_be_saved(
-    tmp_path: Path, two_joints: Path
-) -> None:
+def test_pipes_and_other_encodings_are_refused(tmp_path: Path, two_joints: Path) -> None:
     """As `hil new --urdf <(xacro robot.xacro)` does."""
     reading, writing = os.pipe()
     os.write(writing, TWO_JOINTS.encode())

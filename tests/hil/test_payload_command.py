@@ -139,7 +139,7 @@ class TestFigures:
             sum(figures[name]["value"] for name in ("Ixx", "Iyy", "Izz")), rel=0.3
         )
 
-    def test_a_check_outside_is_said(self, printed: dict[str, list[str]]) -> None:
+    def test_a_check_outside_is_reported(self, printed: dict[str, list[str]]) -> None:
         (sentence,) = printed["outside"]
         assert sentence.startswith("mass 4.5 kg is outside the 95 % interval")
 
@@ -275,7 +275,7 @@ class TestRun:
         assert weighed.pairs == 1
         assert "another pair is not needed" in weighed.sentence
 
-    def test_nobody_who_mounts_it_ends_the_recording(self, designed: Campaign) -> None:
+    def test_a_missing_operator_ends_the_recording(self, designed: Campaign) -> None:
         with pytest.raises(OperatorStopError, match="nothing was recorded"):
             weighing.weigh(
                 designed, "z", run=lambda *_: None, mount=lambda _: False, reporter=Silent()
@@ -295,9 +295,7 @@ class TestRun:
         with pytest.raises(InputError, match=sentence):
             CliRunner().invoke(app, ["run", root, *words], catch_exceptions=False)
 
-    def test_a_real_arm_needs_somebody_who_mounts_it(
-        self, designed: Campaign, tmp_path: Path
-    ) -> None:
+    def test_a_real_arm_needs_an_operator(self, designed: Campaign, tmp_path: Path) -> None:
         cell = designed.cell
         link = 'transport = "udp"\nhost = "127.0.0.1"'
         real = Cell.from_texts(

@@ -155,7 +155,7 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         (["--via", "VIA", "--csv", "motion.csv", "--rate", "nan"], "--rate: nan rows per second"),
     ],
 )
-def test_says_what_is_wrong(app, via, arguments, problem):
+def test_names_what_is_wrong(app, via, arguments, problem):
     arguments = [str(via) if argument == "VIA" else argument for argument in arguments]
     with pytest.raises(InputError, match=problem):
         CliRunner().invoke(app, [str(CELL_PATH), *arguments], catch_exceptions=False)
@@ -185,10 +185,10 @@ def test_invalid_via_points_are_reported(app, tmp_path, text, problem):
 
 
 def test_a_byte_order_mark_is_ignored(run, via, tmp_path):
-    plain, marked = tmp_path / "plain.csv", tmp_path / "marked.csv"
-    plain.write_text(VIA.split("\n", 2)[2])
-    marked.write_bytes(b"\xef\xbb\xbf" + plain.read_bytes())
-    assert run("--via", marked) == run("--via", plain) == run("--via", via)
+    points_only, marked = tmp_path / "points.csv", tmp_path / "marked.csv"
+    points_only.write_text(VIA.split("\n", 2)[2])
+    marked.write_bytes(b"\xef\xbb\xbf" + points_only.read_bytes())
+    assert run("--via", marked) == run("--via", points_only) == run("--via", via)
 
 
 @pytest.mark.parametrize("suffix", ["toml", "json"])
@@ -259,11 +259,11 @@ def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
     points = np.array([plan.start, *(move.target for move in plan.moves)])
     time = np.linspace(0.0, plan.trajectory.duration, 20_001)
     q = plan.trajectory.sample(time)[0]
-    ways = np.diff(points, axis=0)
+    moves = np.diff(points, axis=0)
     off = np.full(len(time), np.inf)
-    for start, way in zip(points, ways, strict=False):
-        along = np.clip((q - start) @ way / (way @ way), 0.0, 1.0)
-        off = np.minimum(off, np.linalg.norm(q - start - along[:, None] * way, axis=1))
+    for start, move in zip(points, moves, strict=False):
+        along = np.clip((q - start) @ move / (move @ move), 0.0, 1.0)
+        off = np.minimum(off, np.linalg.norm(q - start - along[:, None] * move, axis=1))
     straight = off < 1e-7
     inside = np.zeros(len(time), dtype=bool)
     for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
@@ -273,7 +273,7 @@ def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
     assert np.mean(straight[inside]) < 0.2
 
 
-def test_a_plan_without_corners_is_drawn(cell):
+def test_a_plan_without_corners_has_a_picture(cell):
     limits = cell.joint_limits
     middle = (limits.lower + limits.upper) / 2.0
     still = plan_moves(middle, [Move(middle), Move(middle)], limits)

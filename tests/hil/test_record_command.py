@@ -73,7 +73,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory, cell: Cell) -> Path:
     return path
 
 
-def test_every_cycle_is_archived_and_says_whose_motion_it_was(recorded: Path) -> None:
+def test_every_cycle_is_archived_with_its_source(recorded: Path) -> None:
     """And the recording alone gives the planted parameters."""
     archive = open_archive(recorded)
     assert archive.complete
@@ -254,14 +254,14 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
         assert recorder.poll() is None, "it left a moving arm alone"
         controller.send_signal(signal.SIGTERM)  # ends its program when the arm stands
         counts, _ = controller.communicate(timeout=60)
-        said, errors = recorder.communicate(timeout=60)
+        output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
-    counted = json.loads(counts)
-    assert counted["phase"] == "ended"
-    assert counted["missed"] <= 1  # the last packet, 504, needs no answer
-    summary = json.loads(said)
+    counters = json.loads(counts)
+    assert counters["phase"] == "ended"
+    assert counters["missed"] <= 1  # the last packet, 504, needs no answer
+    summary = json.loads(output)
     archive = open_archive(summary["archive"])
-    assert counted["cycles"] > summary["cycles"] + 1000
+    assert counters["cycles"] > summary["cycles"] + 1000
     assert summary["outcome"] == "completed"
     assert summary["records_lost"] == summary["events_lost"] == 0
     assert summary["cycles"] == archive.n_samples
@@ -272,7 +272,7 @@ def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
     assert np.isnan(archive.columns["commanded_position"]).all()
 
 
-def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(on_udp: tuple[Path, int]) -> None:
+def test_ctrl_c_ends_the_recording_a_second_one_replies(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
     archive = path.parent / "a.mcap"
     with running(*own_motion(path, port)), recorder_of(path) as recorder:
@@ -281,10 +281,10 @@ def test_ctrl_c_ends_the_recording_and_a_second_one_the_answers(on_udp: tuple[Pa
         assert recorder.stdout is not None
         next(line for line in recorder.stdout if "replying until" in line)
         recorder.send_signal(signal.SIGINT)
-        said, errors = recorder.communicate(timeout=60)
+        output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
-    assert "ended by the operator" in said
-    assert "replies late" in said
+    assert "ended by the operator" in output
+    assert "replies late" in output
     assert open_archive(archive).complete
 
 
@@ -293,23 +293,27 @@ def test_an_arm_at_rest_is_left_after_a_second(on_udp: tuple[Path, int]) -> None
     # It opens its axes, which are held where they are; only a PC that leaves ends the interval.
     still = [one for one in own_motion(path, port, "--intervals", "1") if one != "--own-motion"]
     with running(*still), recorder_of(path, "--duration", "1.5", "--json") as recorder:
-        said, errors = recorder.communicate(timeout=60)
+        output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
-    assert json.loads(said)["outcome"] == "completed"
+    assert json.loads(output)["outcome"] == "completed"
 
 
 @pytest.mark.slow
-def test_a_session_that_ends_before_the_duration_is_over_is_told(on_udp: tuple[Path, int]) -> None:
+def test_a_session_that_ends_early_is_reported(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
     with (
         running(*own_motion(path, port, "--duration", "3")),
         recorder_of(path, "--duration", "60", "--json") as recorder,
     ):
-        said, errors = recorder.communicate(timeout=60)
+        output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
-    told = json.loads(said)  # one object: what was recorded, and why that is not all
-    assert (told["outcome"], told["kind"], told["exit_code"]) == ("completed", "ControllerFault", 4)
-    assert told["cycles"] > 0
+    result = json.loads(output)  # one object: what was recorded, and why that is not all
+    assert (result["outcome"], result["kind"], result["exit_code"]) == (
+        "completed",
+        "ControllerFault",
+        4,
+    )
+    assert result["cycles"] > 0
     words = " ".join(errors.split())
     assert "the controller ended the session after" in words
     assert "of 60 s" in words
@@ -342,7 +346,7 @@ def test_a_killed_exchange_ends_a_recording_as_lost(on_udp: tuple[Path, int]) ->
 
 
 @pytest.mark.slow
-def test_a_hanging_archive_process_is_ended_and_answers_go_on(on_udp: tuple[Path, int]) -> None:
+def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
     path, port = on_udp
     archive = path.parent / "a.mcap"
     with (
@@ -352,8 +356,8 @@ def test_a_hanging_archive_process_is_ended_and_answers_go_on(on_udp: tuple[Path
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
         assert recorder.stdout is not None
-        told = next(line for line in recorder.stdout if "replying until" in line)
-        assert "sent no heartbeat for 5 s and was ended" in told
+        result = next(line for line in recorder.stdout if "replying until" in line)
+        assert "sent no heartbeat for 5 s and was ended" in result
         controller.send_signal(signal.SIGTERM)
         counts, _ = controller.communicate(timeout=60)
         _, errors = recorder.communicate(timeout=60)

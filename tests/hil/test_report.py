@@ -75,7 +75,7 @@ def make_results(**changes: Any) -> Results:
         "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
                       "prior": "nominal parameters to 10 %", "condition": 26.4,
                       "grouping": "40 of 66 standard parameters are independent."},
-        "endogeneity": {"sentence": "Nothing says that noise has biased least squares.",
+        "endogeneity": {"sentence": "No sign that noise has biased least squares.",
                         "biased": False, "statistic": 1.2, "p_value": 0.33,
                         "degrees_of_freedom": [6, 33], "noise": [0.001] * 6, "shifted": [],
                         "shift": [0.0] * size},
@@ -109,8 +109,8 @@ def make_results(**changes: Any) -> Results:
             "warnings": ["f2_1 is not distinct from zero."],
         },
     }
-    plain = json.loads(json.dumps(fields | changes, default=lambda a: np.asarray(a).tolist()))
-    return Results.model_validate(plain)
+    text = json.dumps(fields | changes, default=lambda a: np.asarray(a).tolist())
+    return Results.model_validate_json(text)
 
 
 def real_recording() -> Results:
@@ -249,8 +249,8 @@ def full_series() -> ReportSeries:
     fitted = np.ones((2000, N))
     fitted[:500] = 0.0
     fitted[1000:1100, 0] = 0.0
-    counted = np.ones((k, N))
-    counted[-100:] = 0.0
+    used = np.ones((k, N))
+    used[-100:] = 0.0
     split = {
         f"example_{part}": share * bare.example_predicted
         for part, share in (("gravity", 0.6), ("inertia", 0.2), ("coriolis", 0.05))
@@ -264,7 +264,7 @@ def full_series() -> ReportSeries:
     return replace(
         bare,
         excitation_fitted=fitted,
-        example_used=counted,
+        example_used=used,
         example_friction=0.15 * bare.example_predicted,
         **split,
         friction_speed=speed,
@@ -380,7 +380,7 @@ class TestPage:
         assert Page(card).text == f"{word} So it is. because"
         assert 'class="badge"' in card
 
-    def test_says_what_was_simulated(self, whole: Page, recording: Page) -> None:
+    def test_names_what_was_simulated(self, whole: Page, recording: Page) -> None:
         assert "SIMULATED. No robot moved" in whole.text
         assert all(effect in whole.text for effect in make_results().effects)
         assert "lower bound" not in whole.text
@@ -420,8 +420,8 @@ class TestPage:
         assert "<script>alert(1)</script>" in found.text
 
     def test_describes_and_numbers_each_figure(self, whole: Page, html: str) -> None:
-        drawn = [a for tag, a in whole.tags if tag == "svg" and a.get("role") == "img"]
-        assert all(len(a["aria-label"] or "") > 30 for a in drawn)
+        drawings = [a for tag, a in whole.tags if tag == "svg" and a.get("role") == "img"]
+        assert all(len(a["aria-label"] or "") > 30 for a in drawings)
         assert sum(tag == "h1" for tag, _ in whole.tags) == 1
         assert sum(tag == "caption" for tag, _ in whole.tags) == len(whole.tables)
         for kind, count in (("Figure", 8), ("Table", len(whole.tables))):
@@ -762,7 +762,7 @@ class TestTrust:
         named = html.split("Not determined by these data")[1].split("</p>")[0]
         assert "f0_2" in named and "I2m" in named
 
-    def test_says_why_parameters_are_essential(self, arm: IdentifiedArm) -> None:
+    def test_names_why_parameters_are_essential(self, arm: IdentifiedArm) -> None:
         sections = Sections(arm)
         html, part = sections.html, sections.essential
         text = re.sub(r"<[^>]*>", "", html)
@@ -801,10 +801,10 @@ class TestTrust:
 DRIVER = """
 const $ = (selector) => Array.from(document.querySelectorAll(selector));
 addEventListener("load", () => {
-  const said = {};
-  said.copies = $("button.copy").length;
-  said.captions = $("caption").length;
-  document.execCommand = () => { said.copied = document.activeElement.value; return true; };
+  const state = {};
+  state.copies = $("button.copy").length;
+  state.captions = $("caption").length;
+  document.execCommand = () => { state.copied = document.activeElement.value; return true; };
   Object.defineProperty(window, "isSecureContext", { value: false });
   $("button.copy")[0].click();
   const svg = $("svg[data-traces]")[6], box = svg.getBoundingClientRect();
@@ -815,13 +815,13 @@ addEventListener("load", () => {
   const figure = svg.closest("figure"), panels = svg.closest(".panels");
   const key = (name) => panels.dispatchEvent(new KeyboardEvent("keydown", { key: name }));
   setTimeout(() => {
-    said.zoomed = figure.querySelectorAll("svg.zoomed").length;
-    said.lines = figure.querySelectorAll("svg.zoomed .zoom-line").length;
-    said.range = figure.querySelector(".zoom-bar span").textContent;
+    state.zoomed = figure.querySelectorAll("svg.zoomed").length;
+    state.lines = figure.querySelectorAll("svg.zoomed .zoom-line").length;
+    state.range = figure.querySelector(".zoom-bar span").textContent;
     key("0");
     setTimeout(() => {
-      said.whole = figure.querySelectorAll("svg.zoomed").length;
-      document.title = JSON.stringify(said);
+      state.whole = figure.querySelectorAll("svg.zoomed").length;
+      document.title = JSON.stringify(state);
     }, 200);
   }, 200);
 });
@@ -843,11 +843,11 @@ def test_in_a_browser_tables_are_copied_and_plots_zoomed(tmp_path: Path) -> None
         [*command, path.as_uri()], capture_output=True, text=True, timeout=120, check=True
     )
     title = re.search(r"<title>(.*?)</title>", done.stdout, re.S)
-    said = json.loads(html_module.unescape(title[1]))
+    state = json.loads(html_module.unescape(title[1]))
     found = Page(html)
-    assert said["copies"] == said["captions"] == len(found.tables)
-    rows = [row.split("\t") for row in said["copied"].rstrip("\n").split("\n")]
+    assert state["copies"] == state["captions"] == len(found.tables)
+    rows = [row.split("\t") for row in state["copied"].rstrip("\n").split("\n")]
     assert rows == [[" ".join(cell.split()) for cell in row] for row in found.tables[0]]
-    assert said["zoomed"] == 6 and said["lines"] == 18 and said["whole"] == 0
-    begin, end = (float(text) for text in re.findall(r"[\d.]+", said["range"]))
+    assert state["zoomed"] == 6 and state["lines"] == 18 and state["whole"] == 0
+    begin, end = (float(text) for text in re.findall(r"[\d.]+", state["range"]))
     assert 0.0 < begin < end < traces_in(html)[6]["end"] / 2.0 + 1.0

@@ -775,7 +775,7 @@ CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
     ("line", "error", "told"),
     [
         (CURRENT, MotionRefusedError,
-         r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file says 20 A: write"),
+         r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file 20 A: write"),
         (("following_error = [1.0, 1.0]", "following_error = [1.0, 0.01]"), NotRehearsedError,
          r"elbow: 0\.01 motor revolutions in the controller, 1 in the cell file.*rehearse"),
         (("cycle_ms = 2", "cycle_ms = 1"), ControllerFault,

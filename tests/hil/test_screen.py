@@ -75,7 +75,7 @@ def status(**changes: Any) -> RunStatus:
     )  # fmt: skip
 
 
-def drawn(width: int, height: int, shown: Shown | None = None) -> list[str]:
+def screen_lines(width: int, height: int, shown: Shown | None = None) -> list[str]:
     if shown is None:
         shown = Shown("ns16-october", NAMES, status(), OperatorRequest(0.8))
     console = Console(width=width, height=height, file=StringIO(), color_system=None)
@@ -87,17 +87,20 @@ def drawn(width: int, height: int, shown: Shown | None = None) -> list[str]:
 # --- what is shown ---------------------------------------------------------------------------
 
 
-def test_a_motion_that_says_nothing_of_friction_leaves_the_last_figure() -> None:
+def test_friction_of_the_last_motion_remains() -> None:
     before = status()
     assert before.drift is not None
     change = np.append(before.drift.change, np.nan)
     after = replace(before, drift=replace(before.drift, change=change))
-    for shown in ("\n".join(drawn(80, 24, Shown("x", NAMES, after))), layout.status_line(after)):
+    for shown in (
+        "\n".join(screen_lines(80, 24, Shown("x", NAMES, after))),
+        layout.status_line(after),
+    ):
         assert "friction changed by 1.7 % (warm below 2 %)" in shown
 
 
 def test_eighty_by_twenty_four_hold_everything() -> None:
-    screen = drawn(80, 24)
+    screen = screen_lines(80, 24)
     assert len(screen) == 24
     text = "\n".join(screen)
     for words in (
@@ -129,23 +132,25 @@ def test_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -
     nothing = status(following_error=None, following_share=None, current=None, current_share=None)
     between = RunStatus("move", 1, 3, 1.0)
     for at in (whole, nothing, between, None):
-        screen = drawn(width, height, Shown("a title that is long " * 4, NAMES, at, stopping=True))
+        screen = screen_lines(
+            width, height, Shown("a title that is long " * 4, NAMES, at, stopping=True)
+        )
         assert len(screen) <= height
         assert max(map(len, screen)) <= width
 
 
-def test_stop_hold_and_silence_are_said() -> None:
+def test_stop_hold_and_silence_are_shown() -> None:
     at = status()
-    assert "HELD" in drawn(80, 24, Shown("x", NAMES, at, OperatorRequest(held=True)))[2]
-    assert "STOPPING" in drawn(80, 24, Shown("x", NAMES, at, stopping=True))[2]
-    assert "no news for 3 s" in drawn(80, 24, Shown("x", NAMES, at, age=3.2))[2]
+    assert "HELD" in screen_lines(80, 24, Shown("x", NAMES, at, OperatorRequest(held=True)))[2]
+    assert "STOPPING" in screen_lines(80, 24, Shown("x", NAMES, at, stopping=True))[2]
+    assert "no news for 3 s" in screen_lines(80, 24, Shown("x", NAMES, at, age=3.2))[2]
 
 
 @pytest.mark.parametrize("width", [48, 64, 80])
 @pytest.mark.parametrize("far_end", ["SIMULATED", "10.2.12.150"])
 def test_the_first_line_names_the_controller(width: int, far_end: str) -> None:
     shown = Shown("a long title " * 6, NAMES, status(), controller=far_end, left="0:42 left")
-    first = drawn(width, 24, shown)[0]
+    first = screen_lines(width, 24, shown)[0]
     assert far_end in first
     assert first.endswith("0:42 left")
     assert "repetition" in first
@@ -154,13 +159,13 @@ def test_the_first_line_names_the_controller(width: int, far_end: str) -> None:
 def test_the_controller_is_simulated_or_has_an_address() -> None:
     cell = Cell.load(CELL_PATH)
 
-    def said(**link: Any) -> str:
+    def reported(**link: Any) -> str:
         return controller_of(cell.with_link(**link))
 
-    assert said() == said(transport="udp", host="127.0.0.1") == "SIMULATED"
-    assert said(transport="udp") == "10.2.12.150"
+    assert reported() == reported(transport="udp", host="127.0.0.1") == "SIMULATED"
+    assert reported(transport="udp") == "10.2.12.150"
     can = CanTable(interface="socketcan", channel="can0")
-    assert said(transport="can", can=can) == "socketcan:can0"
+    assert reported(transport="can", can=can) == "socketcan:can0"
 
 
 def test_in_virtual_time_the_time_left_is_that_of_waiting() -> None:
@@ -202,11 +207,11 @@ def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
     ],
 )  # fmt: skip
 def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
-    wish = OperatorRequest()
+    request = OperatorRequest()
     for key in keys:
-        wish = after(wish, key, wish.override)
-    assert wish.override == pytest.approx(override)
-    assert wish.held is held
+        request = after(request, key, request.override)
+    assert request.override == pytest.approx(override)
+    assert request.held is held
 
 
 def test_arrows_mean_nothing_and_a_paste_nothing_faster() -> None:
@@ -245,7 +250,7 @@ def test_a_dry_runs_override_ends_with_it_and_lowers_from_it() -> None:
     screen.press("5")
     screen.show(RunStatus("repetition", 1, 4, 1.0))
     assert screen.request().override == 0.5
-    # What goes on at 20 % by order of the run goes on at 10 % after one key, not at 90 %.
+    # Resumed at 20 % by the run, one key lowers it to 10 %, not to 90 %.
     screen = Screen(NAMES, Stop(), quiet=True)
     screen.show(status(override=0.2))
     screen.press("-")
@@ -270,30 +275,30 @@ class Rig:
     def stop_reading(self) -> None:
         self._end.reads = False
 
-    def await_told(self, **expected: object) -> None:
-        """Wait until the last thing that the program was told is this."""
+    def await_request(self, **expected: object) -> None:
+        """Wait until this is the last request that the program received."""
         until = time.monotonic() + 30.0
-        while not self.said() or self.said()[-1] != expected:
-            assert time.monotonic() < until, self.said()
+        while not self.reported() or self.reported()[-1] != expected:
+            assert time.monotonic() < until, self.reported()
             self.look()
 
-    def said(self) -> list[dict[str, object]]:
+    def reported(self) -> list[dict[str, object]]:
         if not self._file.exists():
             return []
         return [json.loads(line) for line in self._file.read_text().splitlines()]
 
     def answer(self, words: str, number: int) -> None:
-        """Type an answer until it is the so manieth that was taken.
+        """Type an answer until the program has read `number` of them.
 
         What is typed before the question is none.
         """
         until = time.monotonic() + 20.0
-        while len(self.said()) < number:
-            assert time.monotonic() < until, self.said()
+        while len(self.reported()) < number:
+            assert time.monotonic() < until, self.reported()
             time.sleep(0.1)
             self.press(words)
             again = time.monotonic() + 3.0
-            while len(self.said()) < number and time.monotonic() < again:
+            while len(self.reported()) < number and time.monotonic() < again:
                 self.look()
 
 
@@ -308,28 +313,28 @@ ENTER, LEAVE = b"\x1b[?1049h", b"\x1b[?1049l"
 
 def test_keys_arrive_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
-        end.await_told(override=1.0, held=False)
+        end.await_request(override=1.0, held=False)
         end.await_seen(b"repetition 3 of 30")
         assert ENTER in end.seen
         end.press("h")
-        end.await_told(override=1.0, held=True)
+        end.await_request(override=1.0, held=True)
         end.await_seen(b"HELD")
         end.press(" ")
-        end.await_told(override=1.0, held=False)
+        end.await_request(override=1.0, held=False)
         end.press("-")
-        end.await_told(override=0.9, held=False)
+        end.await_request(override=0.9, held=False)
         end.press("3")
-        end.await_told(override=0.3, held=False)
+        end.await_request(override=0.3, held=False)
         end.press("\x1b[A")  # an arrow
         end.press("\x1a")  # Ctrl-Z would take the program's signs of life away
         end.resize(40, 10)
         end.press("+")
-        end.await_told(override=0.4, held=False)
+        end.await_request(override=0.4, held=False)
         end.clear()
         end.await_seen(b"h hold")
         end.press("s")
         assert end.end() == 0
-        assert end.said()[-1] == {"stop": True}
+        assert end.reported()[-1] == {"stop": True}
         assert LEAVE in end.seen
         assert end.seen.rindex(b"the last line") > end.seen.rindex(LEAVE)
         assert termios.tcgetattr(end.far) == end.before
@@ -361,18 +366,18 @@ def test_the_terminal_is_as_it_was_at_every_end(
 
 
 @pytest.mark.parametrize(
-    ("ending", "asked", "answers"),
+    ("ending", "asked", "replies"),
     [
         ("question", b"Type yes to accept", ("y\n", "\n", "yes\n")),
         ("contradiction", b"type joint_2 to accept", ("yes\n", "joint_1\n", "joint_2\n")),
     ],
 )
 def test_a_dry_run_is_accepted_by_one_word_only(
-    tmp_path: Path, ending: str, asked: bytes, answers: tuple[str, ...]
+    tmp_path: Path, ending: str, asked: bytes, replies: tuple[str, ...]
 ) -> None:
     """By yes, or by the names of the joints whose torque contradicts their weight."""
     with terminal(tmp_path, ending) as end:
-        for number, answer in enumerate(answers, start=1):
+        for number, answer in enumerate(replies, start=1):
             end.await_seen(asked)
             assert (b"joint_2: measured torque runs against" in end.seen) is (ending != "question")
             end.clear()
@@ -380,7 +385,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
         end.await_seen(b"repetition 3 of 30")  # the screen is back
         end.press("s")
         assert end.end() == 0
-        assert [said["accepted"] for said in end.said()[:3]] == [False, False, True]
+        assert [reported["accepted"] for reported in end.reported()[:3]] == [False, False, True]
 
 
 def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
@@ -390,7 +395,7 @@ def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
         time.sleep(1.5)  # some hundred kB of pictures later it blocks
         end.process.send_signal(signal.SIGTERM)
         until = time.monotonic() + 3.0
-        while {"stop": True} not in end.said():
+        while {"stop": True} not in end.reported():
             assert time.monotonic() < until, "the stop was not seen"
             time.sleep(0.02)
 
@@ -439,7 +444,7 @@ def broken(_: str) -> None:
     raise KeyError("no key")
 
 
-def test_a_picture_that_cannot_be_drawn_ends_nothing(
+def test_a_failing_picture_ends_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(layout, "status_line", lambda *_: 1 / 0)
@@ -500,12 +505,12 @@ def await_text(out: StringIO, words: str) -> None:
         time.sleep(0.02)
 
 
-# Long work says how far it is: bars on a terminal, lines elsewhere, nothing when quiet.
+# Progress of long work: bars on a terminal, lines elsewhere, nothing when quiet.
 
 
 def test_lines_come_every_tenth_of_the_way(capsys: pytest.CaptureFixture[str]) -> None:
-    plain = LineReporter()
-    with plain.task("smoothing", 40) as task:
+    lines_only = LineReporter()
+    with lines_only.task("smoothing", 40) as task:
         for k in range(40):
             task.advance(1, f"file {k}")
     lines = capsys.readouterr().out.splitlines()
@@ -540,7 +545,7 @@ def test_eighty_columns_hold_count_times_and_note(title: str) -> None:
     assert note in lines
 
 
-def test_quiet_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     quiet = reporter(quiet=True)
     assert isinstance(quiet, Silent)
     quiet.say("nothing")

@@ -90,10 +90,10 @@ class Forked:
         self.stdout = os.fdopen(reading)
 
     def finish(self, timeout: float) -> str:
-        """The rest of what it says, once it has ended."""
-        said = self.stdout.read()
+        """Rest of its output, once it has ended."""
+        output = self.stdout.read()
         self.process.join(timeout)
-        return said
+        return output
 
     def signal(self, number: int) -> None:
         assert self.process.pid is not None
@@ -141,11 +141,11 @@ def session(
             wait_for(until or [], program.stdout)
             if until:
                 cabinet.signal(signal.SIGTERM)
-            said = cabinet.finish(timeout=30)
-            assert cabinet.status == 0, said
+            output = cabinet.finish(timeout=30)
+            assert cabinet.status == 0, output
         heard = program.stdout.read()
         assert program.wait(timeout=10) == 0, heard
-    return last_json(said), last_json(heard)
+    return last_json(output), last_json(heard)
 
 
 def wait_for(states: list[str], lines: Iterable[str]) -> None:
@@ -205,7 +205,7 @@ MISSING = ["--miss", "5", "--miss-count", "30"]
 @pytest.mark.parametrize(
     ("controller", "pc", "after", "reason"),
     [
-        # And it stays off: nobody pressed the button.
+        # And it stays off without the button.
         (["--cycle", "2", *PATIENT], ["--send-505", "40", "--wrong-targets"], OFF,
          "the PC asked for drive off (505)"),
         (["--cycle", "2", "--intervals", "1", *PATIENT], ["--send-508", "40", "--wrong-targets"],
@@ -240,10 +240,10 @@ def test_the_controller_waits_for_a_program_that_starts_later():
                 break
         with running(*FOREIGN, "--port", port, "--exit-after", "50") as program:
             heard, _ = program.communicate(timeout=30)
-        said = cabinet.finish(timeout=30)
+        output = cabinet.finish(timeout=30)
     assert last_json(heard)["seen"]["sync"] == 9
     assert cabinet.status == 0
-    assert "the session has ended (504)" in said
+    assert "the session has ended (504)" in output
 
 
 def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
@@ -260,26 +260,26 @@ def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
         cabinet.signal(signal.SIGUSR2)
         wait_for([OFF], program.stdout)
         cabinet.signal(signal.SIGTERM)
-        said = cabinet.finish(timeout=20)
+        output = cabinet.finish(timeout=20)
         assert program.wait(timeout=10) == 0
     assert cabinet.status == 0
-    assert "emergency stop" in said
+    assert "emergency stop" in output
 
 
 def test_who_never_comes_or_is_interrupted_has_its_exit_status():
     with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{free_port()}", "--json",
              "--duration", "0.5") as cabinet:  # fmt: skip
-        said = last_json(cabinet.finish(timeout=10))
+        output = last_json(cabinet.finish(timeout=10))
     assert cabinet.status == 4
-    assert (said["cycles"], said["ended"]) == (0, False)
+    assert (output["cycles"], output["ended"]) == (0, False)
     with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{free_port()}") as cabinet:
         for line in cabinet.stdout:
             if "starting" in line:
                 break
         cabinet.signal(signal.SIGINT)
-        said = cabinet.finish(timeout=10)
+        output = cabinet.finish(timeout=10)
     assert cabinet.status == 130
-    assert "no reply of a PC program" in said
+    assert "no reply of a PC program" in output
 
 
 def test_scripted_faults_strike_over_real_sockets():
@@ -342,12 +342,12 @@ def test_open_mode_lost_again_and_again_ends_the_session_with_a_reason_and_a_sta
         hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--cycle", "2",
             "--missed", "30", "--intervals", "100") as cabinet,
     ):  # fmt: skip
-        said = cabinet.finish(timeout=30)
+        output = cabinet.finish(timeout=30)
         assert program.wait(timeout=10) == 0
     assert cabinet.status == 4
-    assert "the session has ended (504): open mode was lost 5 times in a row" in said
-    assert said.count("axes opening") == 2  # the first two; the others are summed up
-    assert "open mode lost 4 times in a row" in said
+    assert "the session has ended (504): open mode was lost 5 times in a row" in output
+    assert output.count("axes opening") == 2  # the first two; the others are summed up
+    assert "open mode lost 4 times in a row" in output
 
 
 def test_own_postures_are_within_limits_and_clear_on_the_way():
@@ -396,7 +396,7 @@ def invoke(*options: str) -> Any:
         (["--udp", "127.0.0.1:2001", "--fault", "saturate@3:axis=9"], "axes 1..6"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_anything_is_sent(options, complaint):
+def test_impossible_options_are_refused_first(options, complaint):
     result = invoke(*options)
     assert result.exception is not None
     assert complaint in str(result.exception)
@@ -432,14 +432,14 @@ def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
                     descriptor=writer)  # fmt: skip
     try:
         for _ in range(3000):
-            status.say("x" * 100)  # more than the pipe holds: a plain write would block here
+            status.say("x" * 100)  # more than the pipe holds: a blocking write would wait here
     finally:
         os.close(reader)
-    status.say("nobody is there any more")
+    status.say("the reader has gone")
     os.close(writer)
 
 
-def test_datagrams_from_elsewhere_or_to_nobody_are_borne():
+def test_foreign_and_lost_datagrams_are_ignored():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         far_end = far_end_at(f"127.0.0.1:{free_port()}")
         stranger.sendto(b"hello", ("127.0.0.1", far_end.source_port))

@@ -297,7 +297,7 @@ class TestVerdict:
         assert compared_pairs([A, B, B0, AP]) == [(A, B), (A, B0), (B, B0), (AP, B)]
 
 
-PLAIN = Condition("plain", "without unmodelled effects", (), drifts=False)
+WITHOUT_EFFECTS = Condition("plain", "without unmodelled effects", (), drifts=False)
 EFFECTS = Condition("effects", "with unmodelled effects", ("ripple",), drifts=False)
 PARAMETERS = [StudyParameter(name=f"p{k}", unit="kg", truth=0.0) for k in range(2)]
 
@@ -305,7 +305,7 @@ PARAMETERS = [StudyParameter(name=f"p{k}", unit="kg", truth=0.0) for k in range(
 def condition(
     ratio: float,
     *,
-    named: Condition = PLAIN,
+    named: Condition = WITHOUT_EFFECTS,
     scatter: float = 0.05,
     repetitions: int = 5,
     noise: float = 0.01,

@@ -1,4 +1,4 @@
-"""The pytest plugin in somebody else's project: its page's example, and what it costs."""
+"""The pytest plugin in another project: its page's example, and what it costs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "testing.md"
 
 
 def pytest_in(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """pytest as a stranger runs it: no configuration or conftest of ours."""
+    """pytest as in another project: no configuration or conftest of ours."""
     environment = {key: value for key, value in os.environ.items() if key != "PYTEST_ADDOPTS"}
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--strict-markers", *arguments],

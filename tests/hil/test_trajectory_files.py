@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 def new_cell(folder: Path, urdf: str, *options: str) -> tuple[Path, dict[str, Any]]:
-    """What `hil new --design-only` writes and says."""
+    """Cell and summary of `hil new --design-only`."""
     (folder / "arm.urdf").write_text(urdf)
     cell = folder / "cell.toml"
     words = ["new", "--design-only", "--urdf", str(folder / "arm.urdf"), "-o", str(cell), "--json"]
@@ -47,8 +47,8 @@ class TestDesignOnlyCell:
     """Nothing is asked that a design does not need."""
 
     def test_a_urdf_with_speeds_leaves_no_question(self, tmp_path: Path) -> None:
-        path, said = new_cell(tmp_path, WITH_SPEED)
-        assert said["unknown"] == []
+        path, summary = new_cell(tmp_path, WITH_SPEED)
+        assert summary["unknown"] == []
         cell = Cell.load(path)
         assert cell.file.drive_train is None
         assert cell.file.controller is None
@@ -57,10 +57,10 @@ class TestDesignOnlyCell:
         }
         assert np.degrees(cell.joint_limits.upper)[1] == pytest.approx(180.0)
 
-    def test_a_speed_that_nobody_states_is_asked_for(self, tmp_path: Path) -> None:
-        _, said = new_cell(tmp_path, TWO_JOINTS)
+    def test_a_missing_speed_is_asked_for(self, tmp_path: Path) -> None:
+        _, summary = new_cell(tmp_path, TWO_JOINTS)
         names = ("velocity_deg", "acceleration_deg", "jerk_deg")
-        assert said["unknown"] == [f"limits.{name}" for name in names]
+        assert summary["unknown"] == [f"limits.{name}" for name in names]
 
     def test_home_is_clear_of_the_floor(self, tmp_path: Path) -> None:
         """At zero this arm hangs below its base."""
@@ -185,12 +185,12 @@ class TestCommand:
         words = [str(path), "--quick", "--repetitions", "3", "-o", str(tmp_path / "out"), "--json"]
         result = CliRunner().invoke(app, ["design", *words], catch_exceptions=False)
         assert result.exit_code == 0, result.output
-        said = json.loads(result.stdout)
-        assert said["campaign"] is None
-        assert said["no_campaign"] is None
-        for name in said["trajectories"]:
+        summary = json.loads(result.stdout)
+        assert summary["campaign"] is None
+        assert summary["no_campaign"] is None
+        for name in summary["trajectories"]:
             assert (tmp_path / "out" / name).exists()
-        assert {"excitation.csv", "validation_001.yaml"} <= {*said["trajectories"]}
+        assert {"excitation.csv", "validation_001.yaml"} <= {*summary["trajectories"]}
 
     def test_quick_and_a_method_are_refused_together(self) -> None:
         words = ["design", str(CELL_PATH), "--quick", "--method", "b"]

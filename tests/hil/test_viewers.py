@@ -86,7 +86,7 @@ class TestCopies:
     def test_each_archive_of_a_motion_has_one_that_is_no_archive(
         self, copies: list[Path], found: Identification
     ) -> None:
-        """Nobody fits one recording twice."""
+        """The same recording is fitted once."""
         moving = {path.name for path in found.paths if "standstill" not in path.name}
         assert {path.name for path in copies} == moving
         with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
@@ -250,8 +250,8 @@ class TestFrame:
         columns = open_archive(excitation).columns
         sign = np.array(campaign.cell.drive_table.joint_sign)
         assert -1 in sign
-        drawn = {q.title.partition(" [")[0]: q.traces for q in view_of(excitation).quantities}
-        for joint, trace in enumerate(drawn["torque at the joint"]):
+        traces = {q.title.partition(" [")[0]: q.traces for q in view_of(excitation).quantities}
+        for joint, trace in enumerate(traces["torque at the joint"]):
             shown = columns["torque"][:, joint] * sign[joint]
             assert np.nanmax(trace.value) == shown.max()
             assert np.nanmin(trace.value) == shown.min()
@@ -337,8 +337,8 @@ def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
     assert "Zoom over time" in page and "MotionEnded" in page
 
 
-def test_the_header_says_whether_packets_were_missed(excitation: Path) -> None:
-    """In words also where none was, and nothing where nobody counts them."""
+def test_the_header_counts_missed_packets(excitation: Path) -> None:
+    """In also where none was, and nothing where they are not counted."""
     view = view_of(excitation)
 
     def header(view: ArchiveView) -> str:
