@@ -222,8 +222,7 @@ def log(
 app.command("log")(log)
 # Hidden aliases.
 app.command("mcap", hidden=True)(rosbag2)
-for _name in ("csv", "npz"):
-    app.command(_name, hidden=True)(log)
+app.command("csv", hidden=True)(log)
 
 
 def _print(path: Path, *, json: bool) -> None:

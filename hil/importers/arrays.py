@@ -120,15 +120,10 @@ class Stored(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Arrays of one file, by name; each is read on first use.
-
-    Attributes:
-        path: the file.
-        stored: arrays of numbers with one or two dimensions.
-    """
+    """Arrays of one file, by name; each is read on first use."""
 
     path: Path
-    stored: Mapping[str, Stored]
+    stored: Mapping[str, Stored]  #: arrays of numbers with one or two dimensions
     _loaded: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     @property
@@ -155,40 +150,45 @@ class ArrayFile:
             raise SourceError(path, "has no array of numbers with one or two dimensions")
         return cls(path, usable)
 
-    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
+    def numbers(
+        self,
+        columns: Sequence[Column],
+        field: str,
+        array: str | None = None,
+        *,
+        rows: bool = False,
+    ) -> Array:
         """Return columns side by side, shape (m, columns).
 
-        Args:
-            columns: names of arrays; or of the named `array`, indices of its columns.
-            field: of the map, for errors.
-            array: the matrix of the indices.
+        They are arrays by name; or of the matrix `array`, columns (`rows`: rows) by index. `field`
+        is that of the map, for errors.
 
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
         """
-        found = [self.column(column, field, array).astype(np.float64) for column in columns]
+        found = [self._column(one, field, array, rows=rows).astype(np.float64) for one in columns]
         if len({len(one) for one in found}) > 1:
             lengths = ", ".join(f"{c} {len(one)}" for c, one in zip(columns, found, strict=True))
-            raise SourceError(
-                self.path, f"its arrays differ in length: {lengths}", field=field, remedy="cut them"
-            )
+            problem = f"its arrays differ in length: {lengths}"
+            raise SourceError(self.path, problem, field=field, remedy="cut them")
         return np.column_stack(found)
 
     def matrix(self, name: str | None, field: str) -> Array:
-        """Return an array of two dimensions; without a name the only one there is.
+        """Return an array as a matrix; without a name the only one there is.
 
         Raises:
             SourceError: no such array.
         """
-        array = self._named(name, field).astype(np.float64)
+        return self._matrix(name, field).astype(np.float64)
+
+    def _matrix(self, name: str | None, field: str) -> NDArray[Any]:
+        array = self._named(name, field)
         return array[:, None] if array.ndim == 1 else array
 
-    def column(self, column: Column, field: str, array: str | None = None) -> NDArray[Any]:
-        """Return one column (m,), in its own type.
-
-        Raises:
-            SourceError: no such array or column.
-        """
+    def _column(
+        self, column: Column, field: str, array: str | None, *, rows: bool = False
+    ) -> NDArray[Any]:
+        """Return one column (m,), in its own type."""
         if array is None and isinstance(column, str):
             found = self._named(column, field)
             if found.ndim == 2 and 1 not in found.shape:
@@ -196,21 +196,20 @@ class ArrayFile:
                 remedy = "name an array of one dimension, or a column of it by index"
                 raise SourceError(self.path, problem, field=field, remedy=remedy)
             return found.ravel()
-        whole = self._named(array, field)
-        whole = whole[:, None] if whole.ndim == 1 else whole
-        if not isinstance(column, int) or column >= whole.shape[1]:
-            problem = f"array {array or next(iter(self.stored))!r} has no column {column!r}"
-            remedy = f"it has {whole.shape[1]}, counted from 0"
+        matrix = self._matrix(array, field)
+        matrix = matrix.T if rows else matrix
+        if not isinstance(column, int) or column >= matrix.shape[1]:
+            what = "row" if rows else "column"
+            problem = f"array {array or next(iter(self.stored))!r} has no {what} {column!r}"
+            remedy = f"it has {matrix.shape[1]}, counted from 0"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
-        return np.asarray(whole[:, column])
+        return np.asarray(matrix[:, column])
 
     def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
-        """Return times as whole nanoseconds; dates in numpy's types have no `decimals`.
+        """Return times as whole nanoseconds.
 
-        Args:
-            column: name or index; an index without `array` is of the only array there is.
-            decimals: decimal places between the unit and the second.
-            array: the matrix of the index.
+        There are `decimals` decimal places between the unit and the second; dates in numpy's types
+        need none. An index without `array` is of the only array there is.
 
         Raises:
             SourceError: no such array or column, or a time that is not finite.
@@ -218,7 +217,7 @@ class ArrayFile:
         if isinstance(column, int) and array is None:
             times: NDArray[Any] = self.matrix(None, "time").ravel()
         else:
-            times = self.column(column, "time", array)
+            times = self._column(column, "time", array)
         factor = 10 ** (9 - decimals)
         if times.dtype.kind in "mM":
             kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
@@ -236,6 +235,7 @@ class ArrayFile:
         return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
 
     def _named(self, name: str | None, field: str) -> NDArray[Any]:
+        """Return an array; without a name the only one there is."""
         if name is None and len(self.stored) == 1:
             (name,) = self.stored
         if name is None or name not in self.stored:
@@ -243,11 +243,8 @@ class ArrayFile:
         if name not in self._loaded:
             stored = self.stored[name]
             if math.prod(stored.shape) > MOST_NUMBERS:
-                raise SourceError(
-                    self.path,
-                    f"array {name!r} has the shape {stored.shape}: too large to be read at once",
-                    remedy="save the log in parts",
-                )
+                problem = f"array {name!r} of shape {stored.shape} is too large to be read at once"
+                raise SourceError(self.path, problem, remedy="save the log in parts")
             with _readable(self.path):
                 array = stored.load()
             if array.dtype.kind not in _NUMBERS or array.shape != stored.shape:
@@ -258,12 +255,12 @@ class ArrayFile:
     def _absent(self, name: str | None, field: str) -> SourceError:
         """Return the error of a missing array, with those that may be meant."""
         if name is None:
-            problem, near = "the name of the array is missing", [*self.stored]
+            problem, similar = "the name of the array is missing", [*self.stored]
         else:
             problem = f"there is no array {name!r}"
             heads = (f"{name}.", f"{name}(", f"{name.rpartition('.')[0]}.")
-            near = [key for key in self.stored if key.startswith(heads)] or [*self.stored]
-        shapes = [f"{key} {self.stored[key].shape}" for key in near]
+            similar = [key for key in self.stored if key.startswith(heads)] or [*self.stored]
+        shapes = [f"{key} {self.stored[key].shape}" for key in similar]
         if len(shapes) > _MOST_NAMED:
             shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
         remedy = f"its arrays are {', '.join(shapes)}"
@@ -332,8 +329,8 @@ def _mat(path: Path) -> dict[str, Stored]:
 def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
     """Return name, shape and class of the variables.
 
-    Tables, strings and time series of MATLAB have no shape; scipy then lists none of the variables,
-    and each is read by itself.
+    scipy lists none of them if one has no shape (tables, strings, time series of MATLAB); each is
+    then read by itself.
     """
     try:
         return list(whosmat(path))
@@ -347,10 +344,7 @@ def _variables(path: str) -> list[tuple[str, tuple[int, ...], str]]:
 
 
 def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Return every array of numbers within structs, by its MATLAB path: ``log.joint(2).q``.
-
-    Elements of cell arrays have round brackets as well: braces are for the joint's number.
-    """
+    """Return the arrays of numbers within structs and cells, by path: ``log.joint(2).q``."""
     found: dict[str, NDArray[Any]] = {}
 
     def walk(value: object, place: str) -> None:

@@ -1,7 +1,6 @@
-"""The column map of a log: which columns or arrays hold which quantity.
+"""The column map of a log, a TOML file: which columns or arrays hold which quantity.
 
-It is a small TOML file, or built in Python. `docs/archive-format.md` describes it,
-`docs/bring-your-own-robot.md` has an example.
+`docs/archive-format.md` describes its entries.
 """
 
 from __future__ import annotations
@@ -36,7 +35,6 @@ RATES = {
 TORQUES = {"N.m": 1.0, "N·m": 1.0, "Nm": 1.0, "mN.m": 1e-3, "kN.m": 1e3, "N": 1.0}
 CURRENTS = {"A": 1.0, "mA": 1e-3}
 UNITS = {"position": ANGLES, "velocity": RATES, "torque": TORQUES, "motor_current": CURRENTS}
-QUANTITIES = tuple(UNITS)
 TIMES = {"s": 0, "ms": 3, "us": 6, "ns": 9}  # decimal places to shift
 
 Vector = tuple[FiniteFloat, ...]
@@ -57,18 +55,16 @@ class Quantity(_Table):
     Attributes:
         columns: one per joint, by name or by index from 0; or one name with ``{}`` in place of the
             joint's number, from 1. In files of arrays a name is that of an array. None: all
-            columns, one per joint.
+            columns of the file, one per joint.
         array: in files of arrays, the matrix that `columns` are columns of.
-        file: the file, relative to the log; None for the log itself.
-        files: one file per joint instead, as a list or as one name with ``{}`` in place of the
-            joint's number. `columns` is then the one column or array of each; None where a file
-            has only one.
-        joints_along: whether the joints of a whole matrix are its ``columns`` or ``rows``;
-            None: time is along the longer side.
+        file: relative to the log; None for the log itself.
+        files: one per joint instead, as a list or one name with ``{}``. `columns` is then the one
+            column or array of each; None if each has only one.
+        joints_along: of a whole matrix; None: time is along the longer side.
         unit: a unit of the quantity; None for the SI one.
         offset: added to the recorded numbers, one for all joints or one each.
         scale: factor after that, one for all joints or one each.
-        side: ``joint``, or ``motor`` when it was measured before the gears.
+        side: ``motor`` if it was measured before the gears.
     """
 
     columns: Annotated[tuple[Column, ...], Field(min_length=1)] | str | None = Field(
@@ -88,13 +84,9 @@ class Quantity(_Table):
 
 
 class TimeColumn(_Table):
-    """The column of the time.
+    """The column of the time, in the file of the positions or in another `file`.
 
-    Attributes:
-        column: by name or index from 0; in files of arrays the name of an array.
-        array: in files of arrays, the matrix that `column` is a column of.
-        file: the file, relative to the log; None for that of the positions. If these have one per
-            joint, all must have the same times.
+    If there is a file of positions per joint, all must have the same times.
     """
 
     column: Column = Field(default=0, description="a name or an index from 0")
@@ -137,8 +129,6 @@ class Format(_Table):
     """Format of the text; None is detected.
 
     Attributes:
-        delimiter: between columns.
-        decimal: the decimal mark.
         skip_rows: lines before the header, or before the data.
         header: whether a line of column names comes first.
         transposed: whether the lines of the file are channels instead of samples.
@@ -159,16 +149,10 @@ class Format(_Table):
 
 
 class ColumnMap(_Table):
-    """The column map.
+    """The column map, with either a time column or a `sample_rate` [Hz].
 
-    Attributes:
-        position: always required.
-        velocity, torque, motor_current: where recorded.
-        time: the time column; either it or `sample_rate` [Hz].
-        joints: the URDF's joint of each column, where the order differs from that of the URDF, or
-            where the log has joints that the URDF does not have: their columns are not used.
-        drive: gears, for quantities of the motor side.
-        format: delimiter and the like.
+    `joints` are the URDF's joint of each column, where the order differs from that of the URDF, or
+    where the log has joints that the URDF does not have: their columns are not used.
     """
 
     position: Quantity
@@ -189,9 +173,8 @@ class ColumnMap(_Table):
             raise ValueError("give either a time column or sample_rate")
         for name, quantity in self.quantities().items():
             if quantity.unit not in (None, *UNITS[name]):
-                raise ValueError(
-                    f"{quantity.unit!r} is not a unit of {name}; use {', '.join(UNITS[name])}"
-                )
+                units = ", ".join(UNITS[name])
+                raise ValueError(f"{quantity.unit!r} is not a unit of {name}; use {units}")
             if quantity.side == "motor" and name != "motor_current" and not self.drive.geared:
                 raise ValueError(f"{name} is of the motor side, so drive.gear_ratio is needed")
             if quantity.files is not None and (quantity.file or quantity.joints_along):
@@ -211,7 +194,7 @@ class ColumnMap(_Table):
 
     def quantities(self) -> dict[str, Quantity]:
         """Return the quantities in the log, by name."""
-        found = {name: getattr(self, name) for name in QUANTITIES}
+        found = {name: getattr(self, name) for name in UNITS}
         return {name: quantity for name, quantity in found.items() if quantity is not None}
 
     @classmethod
@@ -226,10 +209,8 @@ class ColumnMap(_Table):
             return cls.model_validate(parse_toml(read_text(path)))
         except ValidationError as error:
             wrong = first_error(path, error, cls, documentation=_DOCUMENTATION)
-            raise SourceError(
-                path, wrong.problem, field=wrong.field, remedy=wrong.remedy
-            ) from error
+            problem, field, remedy = wrong.problem, wrong.field, wrong.remedy
+            raise SourceError(path, problem, field=field, remedy=remedy) from error
         except (OSError, ValueError) as error:
-            raise SourceError(
-                path, f"cannot be read ({error})", remedy="name a TOML file"
-            ) from error
+            problem = f"cannot be read ({error})"
+            raise SourceError(path, problem, remedy="name a TOML file") from error

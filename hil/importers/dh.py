@@ -6,17 +6,15 @@ import csv
 import math
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple, cast, get_args
 from xml.sax.saxutils import quoteattr
 
 from hil.errors import InputError
 from hil.reading import read_input
 
 Convention = Literal["standard", "modified"]
-CONVENTIONS: Final[tuple[Convention, ...]] = get_args(Convention)
 
 _NAMES: Final = ("joint", "type", "a", "alpha", "d", "theta_offset")
-_NUMBERS: Final = _NAMES[2:]
 _OTHER: Final = {
     "a": ("a_mm", 1e-3),
     "d": ("d_mm", 1e-3),
@@ -25,7 +23,7 @@ _OTHER: Final = {
 }
 """Names of columns in another unit, and that unit in m or rad."""
 _TYPES: Final = {"revolute": "continuous", "prismatic": "prismatic"}
-_LARGEST: Final = {"a": 20.0, "d": 20.0, "alpha": 2.0 * math.pi, "theta_offset": 2.0 * math.pi}
+_LARGEST: Final = {"a": 20.0, "alpha": 2.0 * math.pi, "d": 20.0, "theta_offset": 2.0 * math.pi}
 """m and rad; larger numbers are in mm or degrees."""
 
 
@@ -82,14 +80,13 @@ def urdf_of_dh(path: str | PathLike[str], convention: Convention) -> str:
 
 
 def convention_of(text: str | None) -> Convention:
-    """Return the convention of a name, which is required: a table does not show it.
+    """Return the convention of a name.
 
     Raises:
-        InputError: there is no such convention.
+        InputError: there is no such convention, or no name: a table does not show it.
     """
-    for known in CONVENTIONS:
-        if text == known:
-            return known
+    if text in get_args(Convention):
+        return cast(Convention, text)
     raise InputError(
         None,
         "is not given" if text is None else f"{text!r} is unknown",
@@ -138,16 +135,15 @@ def _rows(path: Path) -> list[_Row]:
     if len(filled) < 2:
         raise InputError(path, "has no row of a joint", remedy=f"write {','.join(_NAMES)} and rows")
     delimiter = ";" if ";" in filled[0][1] else ","
-    cells = [
-        (number, [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))])
-        for number, line in filled
-    ]
-    columns = _columns(path, cells[0][1])
-    rows = [_row(path, number, row, columns) for number, row in cells[1:]]
-    names = [row.joint for row in rows]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise InputError(path, f"has two joints {twice!r}", field="joint", remedy="rename one")
+    header, *table = (
+        [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter))]
+        for _, line in filled
+    )
+    columns = _columns(path, header)
+    rows: list[_Row] = []
+    for (number, _), cells in zip(filled[1:], table, strict=True):
+        texts = {name: cells[k] if k < len(cells) else "" for name, (k, _) in columns.items()}
+        rows.append(_row(path, number, texts, columns, [row.joint for row in rows]))
     return rows
 
 
@@ -158,37 +154,38 @@ def _columns(path: Path, header: list[str]) -> dict[str, tuple[int, float]]:
         other, unit = _OTHER.get(name, (name, 1.0))
         found = [spelling for spelling in dict.fromkeys((name, other)) if spelling in header]
         if len(found) != 1:
-            raise InputError(
-                path,
-                f"has {'no column' if not found else 'columns'} {' and '.join(found or [name])}",
-                field="header",
-                remedy=f"its columns are {','.join(_NAMES)}; lengths in m (a_mm, d_mm: in mm), "
-                "angles in rad (alpha_deg, theta_offset_deg: in degrees)",
+            problem = f"has columns {' and '.join(found)}" if found else f"has no column {name}"
+            remedy = (
+                f"its columns are {','.join(_NAMES)}; lengths in m (a_mm, d_mm: in mm), angles in "
+                "rad (alpha_deg, theta_offset_deg: in degrees)"
             )
+            raise InputError(path, problem, field="header", remedy=remedy)
         columns[name] = header.index(found[0]), 1.0 if found[0] == name else unit
     return columns
 
 
-def _row(path: Path, line: int, cells: list[str], columns: dict[str, tuple[int, float]]) -> _Row:
-    texts = {name: cells[k] if k < len(cells) else "" for name, (k, _) in columns.items()}
+def _row(
+    path: Path,
+    line: int,
+    texts: dict[str, str],
+    columns: dict[str, tuple[int, float]],
+    earlier: list[str],
+) -> _Row:
+    def check(valid: bool, field: str, remedy: str) -> None:
+        if not valid:
+            problem = f"line {line} has {repr(texts[field]) if texts[field] else 'nothing'}"
+            raise InputError(path, problem, field=field, remedy=remedy)
 
-    def refusal(field: str, problem: str, remedy: str) -> InputError:
-        return InputError(path, f"line {line} has {problem}", field=field, remedy=remedy)
-
-    kind = _TYPES.get(texts["type"].lower())
-    if kind is None:
-        raise refusal("type", f"the type {texts['type']!r}", f"write {' or '.join(_TYPES)}")
-    if not texts["joint"]:
-        raise refusal("joint", "no name", "write one")
+    kind, joint = _TYPES.get(texts["type"].lower(), ""), texts["joint"]
+    check(kind != "", "type", f"write {' or '.join(_TYPES)}")
+    check(joint not in ("", *earlier), "joint", "give each joint a name of its own")
     values = {}
-    for name in _NUMBERS:
+    for name, largest in _LARGEST.items():
         try:
             values[name] = float(texts[name]) * columns[name][1]
         except ValueError:
             values[name] = math.nan
-        if not abs(values[name]) <= _LARGEST[name]:
-            largest = f"{_LARGEST[name]:.3g} {'m' if name in 'ad' else 'rad'}"
-            problem = repr(texts[name]) if texts[name] else "nothing"
-            remedy = f"write a number of at most {largest}, or call the column {_OTHER[name][0]}"
-            raise refusal(name, problem, remedy)
-    return _Row(texts["joint"], kind, **values)
+        limit = f"{largest:.3g} {'m' if name in 'ad' else 'rad'}"
+        remedy = f"write a number of at most {limit}, or call the column {_OTHER[name][0]}"
+        check(abs(values[name]) <= largest, name, remedy)
+    return _Row(joint, kind, **values)

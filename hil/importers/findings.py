@@ -1,7 +1,6 @@
 """Plausibility of an imported recording: units, signs and order of the joints.
 
-Where another order of the joints fits better, both are given with their errors: the deviation of
-velocities from the slopes of the positions, and the share of rows outside the URDF's limits.
+Where another order fits better, its error is given with that of the map.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from identification.signals.clock import time_base
 
 Array = NDArray[np.float64]
 
-SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
-FASTEST: Final = 20_000.0  # Hz
+_SLOWEST: Final = 20.0  # Hz; a robot's dynamics need faster sampling
+_FASTEST: Final = 20_000.0  # Hz
 _NO_MOTION: Final = 10.0  # Hz; 5 kHz in ms, read as s, are 5 Hz
 _TOLERANCE: Final = 0.05  # rad or m beyond a limit, for calibration and overshoot
 _LEAST_TRAVEL: Final = 0.1  # rad or m
@@ -44,27 +43,24 @@ def check_clock(stamp: NDArray[np.int64], path: Path) -> None:
     backward = np.flatnonzero(steps < 0)
     if backward.size:
         first = int(backward[0]) + 1
-        raise SourceError(
-            path,
+        problem = (
             f"sample {first} is {-1e-9 * steps[first - 1]:.3g} s older than the one before it "
-            f"({backward.size} such steps)",
-            field="time",
-            remedy="cut the recording where its clock runs backwards, or name another time column",
+            f"({backward.size} such steps)"
         )
+        remedy = "cut the recording where its clock runs backwards, or name another time column"
+        raise SourceError(path, problem, field="time", remedy=remedy)
     if steps.size and not steps.any():
         problem = f"all {len(stamp)} samples have the same time"
         remedy = "name the column of the time, or give sample_rate instead"
         raise SourceError(path, problem, field="time", remedy=remedy)
     rate = 1e9 / float(np.median(steps[steps > 0])) if steps.size else np.inf
     if rate < _NO_MOTION:
-        raise SourceError(
-            path,
-            f"has {rate:.2g} samples per second, too few for a motion",
-            field="time",
-            remedy="check its unit ([time] unit, or sample_rate in Hz): milliseconds read as "
-            f"seconds would give {1e3 * rate:.4g} samples per second; at least {SLOWEST:g} are "
-            "needed",
+        problem = f"has {rate:.2g} samples per second, too few for a motion"
+        remedy = (
+            "check its unit ([time] unit, or sample_rate in Hz): milliseconds read as seconds "
+            f"would give {1e3 * rate:.4g} samples per second; at least {_SLOWEST:g} are needed"
         )
+        raise SourceError(path, problem, field="time", remedy=remedy)
 
 
 def examine(
@@ -76,11 +72,7 @@ def examine(
 ) -> Findings:
     """Return the findings on samples of the joint side, in SI units.
 
-    Args:
-        samples: of the recording.
-        joint_names: in the order of the columns.
-        urdf: robot description.
-        locked: positions [rad or m] of joints that are not in the model, by name.
+    `locked` are positions [rad or m] of joints that are not in the model, by name.
     """
     time, position = np.asarray((samples.stamp - samples.stamp[0]) * 1e-9), samples.position
     limits = limits_of(urdf, joint_names)
@@ -94,9 +86,8 @@ def examine(
     lines = [f"time: {'; '.join(base.describe())}", *lines]
     lines += map(_range, joint_names, position.T, turning, limits.lower, limits.upper)
     warnings = []
-    if not SLOWEST <= base.rate <= FASTEST:
-        text = f"{base.rate:.3g} samples per second are unusual: check the unit of the time"
-        warnings.append(text)
+    if not _SLOWEST <= base.rate <= _FASTEST:
+        warnings += [f"{base.rate:.3g} samples per second are unusual: check the unit of the time"]
     warnings += _positions(time, position, joint_names, limits, turning)
     if samples.velocity is not None:
         warnings += _velocities(time, position, samples.velocity, joint_names)
@@ -125,12 +116,6 @@ def _range(name: str, position: Array, turns: bool, lower: float, upper: float) 
     return text
 
 
-def _outside(position: Array, limits: UrdfLimits) -> str:
-    """Return the share of the rows (m, n) in which a joint is outside its limits [%]."""
-    outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
-    return f"{100.0 * float(np.mean(outside.any(axis=1))):.3g} %"
-
-
 def _fits(position: Array, limits: UrdfLimits) -> NDArray[np.bool_]:
     """Return whether each column of positions fits the limits of each joint (joints, columns)."""
     above = limits.lower[:, None] - _TOLERANCE <= position.min(axis=0)
@@ -150,9 +135,10 @@ def _positions(
     low, high = position.min(axis=0), position.max(axis=0)
     if beyond:
         ranges = ", ".join(f"{names[j]}: {low[j]:.3g} .. {high[j]:.3g}" for j in beyond)
+        outside = (position < limits.lower - _TOLERANCE) | (position > limits.upper + _TOLERANCE)
         text = (
-            f"as mapped, {_outside(position, limits)} of the rows leave the limits of the URDF "
-            f"({ranges})"
+            f"as mapped, {100.0 * float(np.mean(outside.any(axis=1))):.3g} % of the rows leave the "
+            f"limits of the URDF ({ranges})"
         )
         radians = np.where(turning, np.radians(position), position)
         farthest = 3.0 * np.maximum(-limits.lower, limits.upper)

@@ -36,21 +36,11 @@ def import_log(
     use: Use = "excitation",
     coupled: bool = True,
 ) -> Path:
-    """Convert a log to an archive of kind ``imported``.
+    """Convert a log to an archive of kind ``imported``, and return its path.
 
-    Args:
-        source: the log; with quantities in several files, one of them or their folder. Files that
-            end in .npz, .npy, .mat or .m hold arrays, all others text.
-        output: the archive to write.
-        robot: the robot. Where the map couples joints, its model gets the inertias and the friction
-            of the coupled motors, unless its cell states otherwise or `coupled` is false.
-        columns: which columns or arrays hold which quantity.
-        held_joints: joints that were held still.
-        use: what identification uses it for.
-        coupled: whether the model gets the coupling of the map; angles and torques always do.
-
-    Returns:
-        The archive's path.
+    The source is the log; with quantities in several files, one of them or their folder. Where the
+    map couples joints, the model gets the inertias and the friction of the coupled motors, unless
+    its cell states otherwise or `coupled` is false. Angles and torques always use the coupling.
 
     Raises:
         SourceError: a file cannot be read, a column is missing, a cell is not a number, or the map
@@ -60,15 +50,13 @@ def import_log(
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
-    stamp, origin = log.stamps(len(values["position"]))
-    log.check_alike({**values, "time": stamp}, "quantities")
+    stamp, origin, clock = log.stamps(len(values["position"]))
+    _check_lengths({**values, "time": stamp}, log.path, "quantities")
     metadata = {"importer": "log", "clock_origin_ns": str(origin)}
     if columns.format.missing == "drop":
-        whole = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
-        if not whole.any():
-            raise SourceError(log.path, "no row has all of its numbers")
-        metadata["dropped_rows"] = str(np.count_nonzero(~whole))
-        stamp, values = stamp[whole], {name: array[whole] for name, array in values.items()}
+        complete = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
+        metadata["dropped_rows"] = str(np.count_nonzero(~complete))
+        stamp, values = stamp[complete], {name: array[complete] for name, array in values.items()}
     if columns.drive.geared:
         matrix = log.matrix[np.ix_(log.order, log.order)]
         metadata["motor_from_joint"] = json.dumps(matrix.tolist())
@@ -79,13 +67,13 @@ def import_log(
     return write_imported(
         output,
         Samples(stamp, **joint_side),
-        source=log.files,
+        source=[*log.files],
         robot=robot,
         metadata=metadata,
         held_joints=held_joints,
         period=None if columns.sample_rate is None else 1.0 / columns.sample_rate,
         use=use,
-        clock=log.clock,
+        clock=clock,
     )
 
 
@@ -94,6 +82,7 @@ class _Log:
 
     Attributes:
         path: the log itself.
+        files: those that were read, by path, the log first.
         joints: of the log, in its order.
         order: the log's column of each joint of the robot.
         matrix: motor angles per joint angle (k, k), in the log's order.
@@ -103,33 +92,31 @@ class _Log:
         self.path = path
         self._folder = path if path.is_dir() else path.parent
         self._map = columns
-        self._files: dict[Path, Table | ArrayFile] = {}
+        self.files: dict[Path, Table | ArrayFile] = {}
         self.joints = columns.joints or robot.joint_names
         self.order = self._joint_order(robot)
         self.matrix = self._motor_from_joint()
-
-    @property
-    def files(self) -> list[Path]:
-        """The files read, the log first."""
-        return list(self._files)
 
     def read(self, name: str) -> Array:
         """Return a quantity in SI units, (m, k), columns in the log's joint order."""
         quantity = self._map.quantities()[name]
         values = self._numbers(name, quantity)
         factor = UNITS[name][quantity.unit] if quantity.unit else 1.0
-        scale, offset = (
-            self._per_joint(value, f"{name}.{key}")
-            for key, value in (("scale", quantity.scale), ("offset", quantity.offset))
-        )
-        return np.asarray((values + offset) * (factor * scale))
+        for key, value in (("scale", quantity.scale), ("offset", quantity.offset)):
+            if isinstance(value, tuple):
+                self._check_count(value, f"{name}.{key}")
+        return np.asarray((values + quantity.offset) * np.multiply(factor, quantity.scale))
 
-    def stamps(self, count: int) -> tuple[NDArray[np.int64], int]:
-        """Return the samples' stamps [ns], and the origin that was subtracted to store them."""
-        if self._map.sample_rate is not None:
-            return np.rint(np.arange(count) * (1e9 / self._map.sample_rate)).astype(np.int64), 0
-        time, (first, *others) = self._map.time, self._clocks()
-        assert time is not None
+    def stamps(self, count: int) -> tuple[NDArray[np.int64], int, Path]:
+        """Return stamps [ns], the origin that was subtracted to store them, and their file."""
+        time, rate, position = self._map.time, self._map.sample_rate, self._map.position
+        if time is None:
+            assert rate is not None
+            return np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64), 0, self.path
+        if time.file is None and position.files is not None:
+            first, *others = self._file_per_joint(position.files, "position.files")
+        else:
+            first, *others = (self._file(time.file or position.file, "time.file"),)
         times = first.times(time.column, TIMES[time.unit], time.array)
         for other in others:
             if other.times(time.column, TIMES[time.unit], time.array) != times:
@@ -141,20 +128,7 @@ class _Log:
             problem = f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s"
             remedy = "give the unit of its time: s, ms, us or ns"
             raise SourceError(first.path, problem, field="time", remedy=remedy)
-        return np.array([one - origin for one in times], np.int64), origin
-
-    @property
-    def clock(self) -> Path:
-        """The file of the times, or else the log."""
-        return self.path if self._map.time is None else self._clocks()[0].path
-
-    def _clocks(self) -> list[Table | ArrayFile]:
-        """Return the files with times."""
-        time, position = self._map.time, self._map.position
-        assert time is not None
-        if time.file is None and position.files is not None:
-            return self._file_per_joint(position.files, "position.files")
-        return [self._file(time.file or position.file, "time.file")]
+        return np.array([one - origin for one in times], np.int64), origin, first.path
 
     def _numbers(self, name: str, quantity: Quantity) -> Array:
         """Return the numbers of a quantity as in the file, (m, k)."""
@@ -166,20 +140,11 @@ class _Log:
             columns = tuple(self._numbered(columns, file.names, "columns", field))
         if columns is None or (isinstance(columns, str) and isinstance(file, ArrayFile)):
             return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
-        if isinstance(columns, str):
-            problem = f"the pattern {columns!r} has no {{}} for the joint's number"
-            remedy = 'write it there, as in "q{}"'
-            raise SourceError(file.path, problem, field=field, remedy=remedy)
-        self._check_length(columns, field)
-        if quantity.joints_along != "rows" or isinstance(file, Table):
-            return file.numbers(columns, field, array)
-        rows = file.matrix(array, field)
-        chosen = [row for row in columns if isinstance(row, int) and row < len(rows)]
-        if len(chosen) < len(columns):
-            remedy = f"it has {len(rows)}, counted from 0"
-            problem = f"the matrix does not have all of the rows {', '.join(map(str, columns))}"
-            raise SourceError(file.path, problem, field=field, remedy=remedy)
-        return np.asarray(rows[chosen].T)
+        columns = (columns,) if isinstance(columns, str) else columns
+        self._check_count(columns, field)
+        if isinstance(file, ArrayFile) and quantity.joints_along == "rows":
+            return file.numbers(columns, field, array, rows=True)
+        return file.numbers(columns, field, array)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
         """Return the numbers of a quantity that has a file per joint, (m, k)."""
@@ -190,7 +155,7 @@ class _Log:
         elif columns is not None and len(columns) == 1:
             columns *= len(files)
         if columns is not None:
-            self._check_length(columns, field)
+            self._check_count(columns, field)
         for joint, file in enumerate(files):
             if columns is not None:
                 values = file.numbers([columns[joint]], field, quantity.array)
@@ -202,7 +167,8 @@ class _Log:
                 raise SourceError(file.path, problem, field=field, remedy=remedy)
             found.append(values.ravel())
         places = [os.path.relpath(file.path, self._folder) for file in files]
-        self.check_alike(dict(zip(places, found, strict=True)), "files", f"{name}.files")
+        lengths = dict(zip(places, found, strict=True))
+        _check_lengths(lengths, self.path, "files", f"{name}.files")
         return np.column_stack(found)
 
     def _file_per_joint(self, names: str | Sequence[str], field: str) -> list[Table | ArrayFile]:
@@ -211,17 +177,13 @@ class _Log:
             possible = [names.replace("{}", str(number)) for number in numbers]
             found = [name for name in possible if (self._folder / name).is_file()]
             names = self._numbered(names, found, "files", field)
-        self._check_length(names, field)
+        self._check_count(names, field)
         return [self._file(name, field) for name in names]
 
     def _numbered(
         self, pattern: str, known: Collection[str], what: Literal["columns", "files"], field: str
     ) -> list[str]:
-        """Return names of columns or files from a pattern, counted from 1, or from 0 if so named.
-
-        Raises:
-            SourceError: a joint has none, or there are more names than joints.
-        """
+        """Return names of columns or files from a pattern, numbered from 1, or else from 0."""
         count = len(self.joints)
         names = [pattern.replace("{}", str(number)) for number in range(count + _MORE)]
         first = 0 if names[0] in known and names[count] not in known else 1
@@ -277,12 +239,11 @@ class _Log:
             remedy = 'name a file in it: file = "q.txt", or one per joint: files = "q_{}.txt"'
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         path = self.path if name is None else self._folder / name
-        if path not in self._files:
+        if path not in self.files:
             arrays = path.suffix.lower() in READERS
-            self._files[path] = (
-                ArrayFile.read(path) if arrays else Table.read(path, self._map.format)
-            )
-        return self._files[path]
+            read = ArrayFile.read(path) if arrays else Table.read(path, self._map.format)
+            self.files[path] = read
+        return self.files[path]
 
     def _joint_order(self, robot: Robot) -> list[int]:
         """Return the column of the log of each joint of the robot."""
@@ -301,45 +262,36 @@ class _Log:
         """Return motor angles per joint angle (k, k), in the log's order."""
         drive, n = self._map.drive, len(self.joints)
         for name in ("gear_ratio", "joint_offset", "torque_constant", "motor_from_joint"):
-            values = getattr(drive, name)
-            rows = values if name == "motor_from_joint" and values is not None else ()
-            for part in (values, *rows):
-                if part is not None:
-                    self._check_length(part, f"drive.{name}")
+            if (values := getattr(drive, name)) is not None:
+                self._check_count(values, f"drive.{name}")
+        for row in drive.motor_from_joint or ():
+            self._check_count(row, "drive.motor_from_joint")
         diagonal = np.diag(drive.gear_ratio or np.ones(n))
         matrix = np.array(drive.motor_from_joint or diagonal.tolist(), np.float64)
         for motor, joint, ratio in drive.coupling:
             if max(motor, joint) > n:
-                raise SourceError(
-                    self.path,
-                    f"there are {n} joints, not {max(motor, joint)}",
-                    field="drive.coupling",
-                )
+                problem = f"there are {n} joints, not {max(motor, joint)}"
+                raise SourceError(self.path, problem, field="drive.coupling")
             matrix[motor - 1, joint - 1] = ratio
         if np.linalg.matrix_rank(matrix) < n:
-            raise SourceError(
-                self.path, "no motor would move one of the joints", field="drive.gear_ratio"
-            )
+            problem = "no motor would move one of the joints"
+            raise SourceError(self.path, problem, field="drive.gear_ratio")
         return matrix
 
-    def check_alike(self, arrays: Mapping[str, NDArray[Any]], what: str, field: str = "") -> None:
-        """Check that arrays have one length."""
-        if len({len(array) for array in arrays.values()}) > 1:
-            listing = ", ".join(f"{name} {len(array)}" for name, array in arrays.items())
-            problem = f"the {what} differ in length: {listing}"
-            raise SourceError(self.path, problem, field=field, remedy="cut them alike")
-
-    def _per_joint(self, value: float | Sequence[float], field: str) -> Array:
-        values = np.asarray(value, np.float64)
-        if values.ndim:
-            self._check_length(values, field)
-        return values
-
-    def _check_length(self, values: Sequence[object] | Array, field: str) -> None:
+    def _check_count(self, values: Sequence[object] | Array, field: str) -> None:
         if len(values) != len(self.joints):
             problem = f"has {len(values)} entries"
             remedy = f"one for each of the joints {', '.join(self.joints)}"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
+
+
+def _check_lengths(
+    arrays: Mapping[str, NDArray[Any]], path: Path, what: str, field: str = ""
+) -> None:
+    if len({len(array) for array in arrays.values()}) > 1:
+        listing = ", ".join(f"{name} {len(array)}" for name, array in arrays.items())
+        problem = f"the {what} differ in length: {listing}"
+        raise SourceError(path, problem, field=field, remedy="cut them alike")
 
 
 def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict[str, Array]:
@@ -357,8 +309,7 @@ def _joint_side(values: dict[str, Array], columns: ColumnMap, log: _Log) -> dict
         joint["torque"] = values["torque"] @ matrix
     drive = columns.drive
     if drive.joint_offset is not None:
-        joint["position"] = joint["position"] + np.asarray(drive.joint_offset)
+        joint["position"] = joint["position"] + drive.joint_offset
     if "torque" not in joint and "motor_current" in joint and drive.torque_constant is not None:
-        motor_torque = joint["motor_current"] * np.asarray(drive.torque_constant, np.float64)
-        joint["torque"] = motor_torque @ matrix
+        joint["torque"] = (joint["motor_current"] * drive.torque_constant) @ matrix
     return {name: array[:, log.order] for name, array in joint.items()}

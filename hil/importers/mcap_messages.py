@@ -25,25 +25,15 @@ MOST_BYTES: Final = 4 << 30
 _HEAD: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _READ: Final = (container.SCHEMA, container.CHANNEL, container.MESSAGE, container.CHUNK)
 
-JOINT_STATES = frozenset({"sensor_msgs/msg/JointState", "sensor_msgs/JointState"})
-"""Names of the ROS 2 type of joint states."""
-
 
 @dataclass(frozen=True)
 class Topic:
-    """Type and encoding of the messages of a topic.
+    """Type and encoding of the messages of a topic."""
 
-    Attributes:
-        kind: type, such as ``sensor_msgs/msg/JointState``.
-        encoding: of the messages, such as ``cdr``, ``json`` or ``protobuf``.
-        schema_encoding: of the definition, such as ``ros2msg``.
-        definition: of the type.
-    """
-
-    kind: str
-    encoding: str
-    schema_encoding: str = ""
-    definition: bytes = b""
+    kind: str  #: type, such as ``sensor_msgs/msg/JointState``
+    encoding: str  #: of the messages, such as ``cdr``, ``json`` or ``protobuf``
+    schema_encoding: str = ""  #: of the definition, such as ``ros2msg``
+    definition: bytes = b""  #: of the type
 
     @property
     def is_ros2(self) -> bool:
@@ -59,16 +49,10 @@ def read(
 ) -> tuple[dict[str, Topic], list[tuple[str, int, bytes]]]:
     """Return the topics of a file by name, and the wanted messages in the order of time.
 
-    Args:
-        path: the file.
-        wanted: predicate on name and topic.
-
-    Returns:
-        Topics; topic name, log time [ns] and data of each message.
+    `wanted` is a predicate on name and topic. Of a message: name of the topic, log time [ns], data.
 
     Raises:
-        SourceError: it cannot be read, is not an MCAP file or is truncated, or the messages are too
-            many.
+        SourceError: it cannot be read, is no MCAP file, is truncated, or has too many messages.
     """
     schemas: dict[int, Schema] = {}
     topics: dict[str, Topic] = {}
@@ -93,20 +77,16 @@ def read(
                     found.append((name, log_time, record.body[_HEAD.size :]))
                     size += len(record.body)
             if size > MOST_BYTES:
-                raise SourceError(
-                    path,
-                    f"has more than {MOST_BYTES} bytes of numbers: too large to be read at once",
-                    remedy="cut it, or leave out topics (`mcap filter`)",
+                problem = (
+                    f"has more than {MOST_BYTES} bytes of numbers: too large to be read at once"
                 )
+                remedy = "cut it, or leave out topics (`mcap filter`)"
+                raise SourceError(path, problem, remedy=remedy)
     return topics, sorted(found, key=lambda message: message[1])
 
 
 def _records(stream: BinaryIO) -> Iterator[Record]:
-    """Yield schemas, channels and messages in the order of the file, also those in chunks.
-
-    Raises:
-        Damage: it is truncated, or a chunk is invalid or too large.
-    """
+    """Yield schemas, channels and messages in the order of the file, also those in chunks."""
     size = os.fstat(stream.fileno()).st_size
     for record in container.records(stream, size, only=_READ):
         if record.opcode != container.CHUNK:
@@ -129,9 +109,6 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         raise SourceError(path, f"cannot be read: {error.strerror or error}") from error
     except (Damage, KeyError, struct.error) as error:
         place = f"at byte {error.offset}: " if isinstance(error, Damage) else ""
-        raise SourceError(
-            path,
-            f"is not an MCAP file, or truncated ({place}{type(error).__name__}: {error})",
-            remedy="recover it first (`hil archive repair` for archives of hil, `mcap recover` "
-            "for others)",
-        ) from error
+        problem = f"is not an MCAP file, or truncated ({place}{type(error).__name__}: {error})"
+        remedy = "recover it (`hil archive repair` for archives of hil, `mcap recover` for others)"
+        raise SourceError(path, problem, remedy=remedy) from error

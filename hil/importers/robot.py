@@ -1,7 +1,4 @@
-"""The robot of an imported recording, and the last step of every importer.
-
-The archive contains URDF and settings of the model; samples are checked before.
-"""
+"""The robot of an imported recording, and the last step of every importer."""
 
 from __future__ import annotations
 
@@ -42,19 +39,12 @@ NOT_RECORDED: Final = "lock joints that were not recorded (--locked NAME, or all
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """The robot of a recording.
+    """The robot of a recording."""
 
-    Attributes:
-        cell: text of a cell file, of which identification needs the robot's table only.
-        urdf: text of the robot description.
-        joint_names: its joints that move and are not locked, in the order of the model.
-        locked: position [rad or m] of locked joints, by name.
-    """
-
-    cell: str
-    urdf: str
-    joint_names: tuple[str, ...]
-    locked: Mapping[str, float] = field(default_factory=dict)
+    cell: str  #: text of a cell file, of which identification needs the robot's table only
+    urdf: str  #: text of the robot description
+    joint_names: tuple[str, ...]  #: that move and are not locked, in the order of the model
+    locked: Mapping[str, float] = field(default_factory=dict)  #: positions [rad or m] by joint
 
     @classmethod
     def from_urdf(
@@ -64,7 +54,6 @@ class Robot:
         convention: Convention | None = None,
         friction: FrictionLaw | None = None,
         gravity: Sequence[float] = STANDARD_GRAVITY,
-        rotor_inertia: bool = True,
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
     ) -> Robot:
@@ -75,7 +64,6 @@ class Robot:
             convention: of such a table, see :func:`hil.importers.dh.urdf_of_dh`; None for a URDF.
             friction: friction law of every joint, None for `IMPORTED_LAW`.
             gravity: in the base frame [m/s²].
-            rotor_inertia: whether every joint has a rotor inertia.
             locked: position [rad or m] of joints that are not in the model, such as a gripper's.
             recorded: recorded joints; all others are locked at zero, or at the middle of their
                 range if that excludes zero. None: only those in `locked` are.
@@ -91,8 +79,7 @@ class Robot:
         except ModelError as error:  # an error of this file, not of a cell file
             raise SourceError(path, str(error), remedy=otherwise) from error
         held = _held(urdf, locked or {}, recorded, path)
-        law = friction or IMPORTED_LAW
-        text = _cell_text(path.stem, law, gravity, rotor_inertia, held)
+        text = _cell_text(path.stem, friction or IMPORTED_LAW, gravity, held)
         return cls._checked(text, urdf, path)
 
     @classmethod
@@ -104,13 +91,9 @@ class Robot:
         locked: Mapping[str, float] | None = None,
         recorded: Collection[str] | None = None,
     ) -> Robot:
-        """Return a robot by a cell file; see `from_urdf` for `locked` and `recorded`.
+        """Return a robot by a cell file; see `from_urdf` for the arguments.
 
-        Args:
-            path: the cell file.
-            gravity: in the base frame [m/s²]; None for that of the cell.
-            locked: in addition to those of the cell.
-            recorded: recorded joints.
+        `locked` joints are added to those of the cell; no `gravity` is that of the cell.
 
         Raises:
             InputError: the cell file or its URDF is invalid, or has no such joint.
@@ -148,11 +131,7 @@ class Robot:
 
 
 def _cell_text(
-    name: str,
-    friction: FrictionLaw,
-    gravity: Sequence[float],
-    rotor_inertia: bool,
-    locked: Mapping[str, float],
+    name: str, friction: FrictionLaw, gravity: Sequence[float], locked: Mapping[str, float]
 ) -> str:
     """Return a minimal cell file: the robot, without limits, drive train or controller."""
     lines = [
@@ -162,7 +141,7 @@ def _cell_text(
         "",
         "[robot]",
         f"gravity = {_vector(gravity)}",
-        f"rotor_inertia = {toml_value(rotor_inertia)}",
+        "rotor_inertia = true",
         *([f"locked = {_inline(locked)}"] if locked else []),
         "",
         "[robot.friction]",
@@ -174,22 +153,17 @@ def _cell_text(
 def _held(
     urdf: str, locked: Mapping[str, float], recorded: Collection[str] | None, path: Path
 ) -> dict[str, float]:
-    """Return the positions of locked joints: those given, and all that were not recorded.
-
-    Raises:
-        SourceError: none of the robot's joints was recorded.
-    """
+    """Return the positions of locked joints: those given, and all that were not recorded."""
     if recorded is None:
         return dict(locked)
     names = tuple(pinocchio_model(urdf).names)[1:]
     if not set(names) & set(recorded):
-        raise SourceError(
-            path,
-            f"none of its joints {', '.join(names)} was recorded",
-            field="--lock-others",
-            remedy=f"recorded are {', '.join(recorded)}; use the names of the URDF (joints in the "
-            "map of a log, --rename RECORDED=URDF of a bag)",
+        problem = f"none of its joints {', '.join(names)} was recorded"
+        remedy = (
+            f"recorded are {', '.join(recorded)}; use the names of the URDF (joints in the map of "
+            "a log, --rename RECORDED=URDF of a bag)"
         )
+        raise SourceError(path, problem, field="--lock-others", remedy=remedy)
     limits = limits_of(urdf, names)
     rest = {
         name: 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
@@ -230,20 +204,11 @@ def write_imported(
     use: Use = "excitation",
     clock: Path | None = None,
 ) -> Path:
-    """Write the samples of a recording, joints in the order of the robot's, as an archive.
+    """Write samples of the joint side in SI units, joints in the robot's order, as an archive.
 
     Findings on their plausibility (:mod:`hil.importers.findings`) are stored in its metadata.
-
-    Args:
-        output: the archive.
-        samples: joint side, SI units.
-        source: the files they come from.
-        robot: the robot.
-        metadata: further metadata.
-        held_joints: joints that were held still.
-        period: sampling step [s] of a recording at a fixed rate.
-        use: whether identification fits them, predicts them, or takes the noise from them.
-        clock: the file that the stamps come from; None for the first.
+    `period` is the sampling step [s] of a recording at a fixed rate, `clock` the file that the
+    stamps come from, by default the first `source`.
 
     Raises:
         SourceError: no sample, a value that is not finite or above 1e12, or an invalid clock.
@@ -284,16 +249,16 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
         "torque": samples.torque,
         "motor current": samples.motor_current,
     }
-    elapsed = (samples.stamp - samples.stamp[0]) * 1e-9
     for name, values in quantities.items():
         if values is None:
             continue
         rows, columns = np.nonzero(~(np.abs(values) <= _MOST))
         if rows.size:
-            raise SourceError(
-                source,
-                f"{name} of joint {joints[columns[0]]} is {values[rows[0], columns[0]]} in sample "
-                f"{rows[0]} ({elapsed[rows[0]]:.6g} s; {rows.size} such values)",
-                remedy="cut the recording there, or leave the quantity out (numbers up to "
-                f"{_MOST:g} can be used)",
+            row, column = rows[0], columns[0]
+            elapsed = (samples.stamp[row] - samples.stamp[0]) * 1e-9
+            problem = (
+                f"{name} of joint {joints[column]} is {values[row, column]} in sample {row} "
+                f"({elapsed:.6g} s; {rows.size} such values)"
             )
+            remedy = f"cut the recording there, or leave out the quantity (largest: {_MOST:g})"
+            raise SourceError(source, problem, remedy=remedy)

@@ -23,7 +23,7 @@ from hil.archive import Samples
 from hil.archive.container import MOST_INFLATION
 from hil.errors import SourceError
 from hil.importers import mcap_messages
-from hil.importers.mcap_messages import JOINT_STATES, Topic
+from hil.importers.mcap_messages import Topic
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.reading import open_file
 
@@ -42,30 +42,20 @@ def bag_files(source: Path) -> list[Path]:
     Raises:
         SourceError: there is none.
     """
-    if not source.exists():
-        raise SourceError(
-            source, "does not exist", remedy="name a .db3 or .mcap file, or a bag's folder"
-        )
-    if not source.is_dir():
-        return [_regular(source)]
+    files = [source]
     try:
-        files = [path for path in source.iterdir() if _storage(path) in SUFFIXES]
+        if source.is_dir():
+            files = sorted((p for p in source.iterdir() if _storage(p) in SUFFIXES), key=_sort_key)
+        for file in files:
+            open_file(file).close()  # raises for a pipe, which would block
     except OSError as error:
-        raise SourceError(source, f"cannot be read: {error.strerror}") from error
+        problem = f"cannot be read: {error.strerror}"
+        remedy = "name a .db3 or .mcap file, or a bag's folder"
+        raise SourceError(error.filename, problem, remedy=remedy) from error
     if not files:
-        raise SourceError(
-            source, "has no .db3 and no .mcap file in it", remedy="name the folder of a rosbag2"
-        )
-    return sorted(map(_regular, files), key=_place)
-
-
-def _regular(file: Path) -> Path:
-    """Return the file, which must be a regular one: a pipe would block."""
-    try:
-        open_file(file).close()
-    except OSError as error:
-        raise SourceError(file, f"cannot be read: {error.strerror}") from error
-    return file
+        problem, remedy = "has no .db3 and no .mcap file in it", "name the folder of a rosbag2"
+        raise SourceError(source, problem, remedy=remedy)
+    return files
 
 
 def topics(file: Path) -> dict[str, Topic]:
@@ -97,11 +87,7 @@ def messages(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 @contextmanager
 def unpacked(files: list[Path]) -> Iterator[list[Path]]:
-    """Yield the files, compressed ones as temporary decompressed copies.
-
-    Raises:
-        SourceError: one cannot be decompressed.
-    """
+    """Yield the files, compressed ones as temporary decompressed copies."""
     with TemporaryDirectory() as folder:
         yield [
             _unpacked(file, Path(folder) / file.stem) if file.suffix in _PACKED else file
@@ -138,7 +124,7 @@ def _storage(path: Path) -> str:
     return Path(path.stem).suffix if path.suffix in _PACKED else path.suffix
 
 
-def _place(path: Path) -> list[tuple[int, str]]:
+def _sort_key(path: Path) -> list[tuple[int, str]]:
     """Return a key that sorts ``x_10`` behind ``x_2``."""
     parts = re.split(r"(\d+)", path.name)
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
@@ -161,11 +147,7 @@ def _of_sqlite(file: Path, topic: str) -> Iterator[tuple[int, bytes]]:
 
 @contextmanager
 def _connected(file: Path) -> Iterator[sqlite3.Connection]:
-    """Open the bag read-only, without side files unless another process is writing it.
-
-    Raises:
-        SourceError: it is not a bag, or is damaged.
-    """
+    """Open the bag read-only, without side files unless another process is writing it."""
     options = "mode=ro" if file.with_name(file.name + "-wal").exists() else "mode=ro&immutable=1"
     try:
         with closing(sqlite3.connect(f"{file.resolve().as_uri()}?{options}", uri=True)) as bag:
@@ -185,7 +167,8 @@ def _connected(file: Path) -> Iterator[sqlite3.Connection]:
 Array = NDArray[np.float64]
 Effort = Literal["torque", "motor_current", "ignore"]
 
-JOINT_STATE = "sensor_msgs/msg/JointState"
+_JOINT_STATE = "sensor_msgs/msg/JointState"
+_JOINT_STATES = (_JOINT_STATE, "sensor_msgs/JointState")
 
 
 def import_rosbag2(
@@ -199,23 +182,13 @@ def import_rosbag2(
     held_joints: Sequence[str] = (),
     use: Use = "excitation",
 ) -> Path:
-    """Convert the joint states of a bag to an archive of kind ``imported``.
+    """Convert the joint states of a bag to an archive of kind ``imported``, and return its path.
 
-    Joints are found by name. Messages with none of them (a gripper on the same topic) are ignored.
-    Stamps are those in the messages' headers; where all are empty, the bag's.
-
-    Args:
-        source: a ``.db3`` or ``.mcap`` file, or the folder of a bag; compressed ones as well.
-        output: the archive to write.
-        robot: the robot.
-        topic: the topic, None where only one carries joint states.
-        effort: meaning of the messages' effort: joint torque [N·m], motor current [A], or nothing.
-        joint_names: name in the URDF by name in the bag, where they differ.
-        held_joints: joints that were held still.
-        use: what identification uses it for.
-
-    Returns:
-        The archive's path.
+    The source is a ``.db3`` or ``.mcap`` file, or the folder of a bag; compressed ones as well.
+    Joints are found by name; `joint_names` are names in the URDF by name in the bag, where they
+    differ. Messages with none of them (a gripper on the same topic) are ignored. Stamps are those
+    in the messages' headers; where all are empty, the bag's. The effort is a joint torque [N·m] or
+    a motor current [A].
 
     Raises:
         SourceError: no bag, no such topic, a joint that was not recorded, a value not finite.
@@ -243,8 +216,6 @@ def recorded_joints(
 ) -> tuple[str, ...]:
     """Return the joints of a bag, by their names in the URDF: those of its longest message.
 
-    Arguments are those of `import_rosbag2`.
-
     Raises:
         SourceError: no bag, no such topic, or no message.
     """
@@ -264,17 +235,11 @@ def _messages(
     """Open the topic of the joint states: yield time of receipt [ns] and data of its messages."""
     with unpacked(files) as unpacked_file:
         known = [topics(file) for file in unpacked_file]
-        chosen = _choose(
-            {name: t for topics in known for name, t in topics.items()}, files[0], topic
-        )
-        yield (
-            chosen,
-            chain.from_iterable(
-                messages(file, chosen)
-                for file, topics in zip(unpacked_file, known, strict=True)
-                if chosen in topics  # a part of a split bag may lack it
-            ),
-        )
+        everything = {name: found for part in known for name, found in part.items()}
+        chosen = _choose(everything, files[0], topic)
+        # A part of a split bag may lack the topic.
+        parts = [file for file, part in zip(unpacked_file, known, strict=True) if chosen in part]
+        yield chosen, chain.from_iterable(messages(file, chosen) for file in parts)
 
 
 @cache
@@ -283,23 +248,18 @@ def _typestore() -> Typestore:
 
 
 def _decoded(data: bytes, file: Path, number: int) -> Any:
-    """Return a joint state.
-
-    Raises:
-        SourceError: it cannot be decoded.
-    """
+    """Return a joint state."""
     try:
-        return _typestore().deserialize_cdr(data, JOINT_STATE)
+        return _typestore().deserialize_cdr(data, _JOINT_STATE)
     except Exception as error:  # rosbags does not document what it raises
-        raise SourceError(
-            file, f"message {number} cannot be decoded ({error or type(error).__name__})"
-        ) from error
+        problem = f"message {number} cannot be decoded ({error or type(error).__name__})"
+        raise SourceError(file, problem) from error
 
 
 def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
     """Return the requested topic, or the only one that carries joint states."""
     fitting = [
-        name for name, found in topics.items() if found.is_ros2 and found.kind in JOINT_STATES
+        name for name, found in topics.items() if found.is_ros2 and found.kind in _JOINT_STATES
     ]
     if topic is None and len(fitting) == 1:
         (topic,) = fitting
@@ -307,7 +267,7 @@ def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
         return topic
     problem = f"there is no topic {topic}"
     if topic is None:
-        problem = f"{len(fitting) or 'no'} topics carry {JOINT_STATE}"
+        problem = f"{len(fitting) or 'no'} topics carry {_JOINT_STATE}"
     elif topic in topics:
         problem = f"topic {topic} carries {topics[topic]}, not measured joint states"
     listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
@@ -347,12 +307,9 @@ def _samples(
     if not count:
         seen = dict.fromkeys(name for names in orders for name in names)
         recorded = f"recorded are {', '.join(seen)}" if seen else "it is empty"
-        raise SourceError(
-            source,
-            f"none of the joints {', '.join(joints)} was recorded; {recorded}",
-            field="joints",
-            remedy="give the URDF of this robot, or map its joints: --rename RECORDED=URDF",
-        )
+        problem = f"none of the joints {', '.join(joints)} was recorded; {recorded}"
+        remedy = "give the URDF of this robot, or map its joints: --rename RECORDED=URDF"
+        raise SourceError(source, problem, field="joints", remedy=remedy)
     columns: dict[str, Array | None] = {}
     if effort == "ignore":
         rows["effort"] = []

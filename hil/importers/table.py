@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
 
@@ -34,25 +34,15 @@ _MISSING = frozenset({"", "-", "--", "na", "n/a", "null", "none"})
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A text file of numbers, not yet converted.
-
-    Attributes:
-        path: the file.
-        names: column names, empty when the file has none.
-        width: number of columns.
-        lines: the rows of numbers as text, with decimal points and exponents as Python reads them.
-        numbered: line numbers in the file, from 1.
-        delimiter: between columns, None for white space.
-        gaps: whether rows may lack numbers.
-    """
+    """A text file of numbers, not yet converted."""
 
     path: Path
-    names: tuple[str, ...]
-    width: int
-    lines: list[str] = field(repr=False)
-    numbered: Sequence[int] = field(repr=False)
-    delimiter: str | None
-    gaps: bool
+    names: tuple[str, ...]  #: of the columns; empty if the file has none
+    width: int  #: number of columns
+    lines: list[str]  #: rows of numbers as text, points and exponents as Python reads them
+    numbered: Sequence[int]  #: line numbers in the file, from 1
+    delimiter: str | None  #: between columns; None for white space
+    gaps: bool  #: whether rows may lack numbers
 
     @classmethod
     def read(cls, path: Path, form: Format) -> Table:
@@ -80,7 +70,7 @@ class Table:
         numbers, lines = [number for number, _ in numbered], [line for _, line in numbered]
         names: tuple[str, ...] = ()
         if lines:
-            cells = _cells(lines[0], delimiter)
+            cells = lines[0].split(delimiter)
             if form.header or (form.header is None and not _are_numbers(cells, decimal)):
                 names = tuple(cell.strip().strip("\"'").strip() for cell in cells)
                 numbers, lines = numbers[1:], lines[1:]
@@ -90,8 +80,8 @@ class Table:
             lines = [line.replace(",", ".") for line in lines]
         if _FORTRAN.search(lines[0]):
             lines = [_FORTRAN.sub("e", line) for line in lines]
-        width = len(_cells(lines[0], delimiter))
-        if len(names) < width > 1 and not _cells(lines[0], delimiter)[-1].strip():
+        width = len(lines[0].split(delimiter))
+        if len(names) < width > 1 and not lines[0].split(delimiter)[-1].strip():
             width -= 1  # each line ends with a delimiter
         if names and len(names) < width:
             raise SourceError(
@@ -102,13 +92,12 @@ class Table:
             )
         return cls(path, names, width, lines, numbers, delimiter, form.missing == "drop")
 
-    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
+    def numbers(self, columns: Sequence[Column], field: str, _array: str | None = None) -> Array:
         """Return columns as numbers, shape (rows, columns), NaN where missing ones are allowed.
 
         Raises:
             SourceError: no such column, or a cell that is not a finite number.
         """
-        self._no_arrays(array, field)
         indices = [self._index(column, field) for column in columns]
         try:
             values = np.loadtxt(
@@ -125,56 +114,35 @@ class Table:
             return self._cell_by_cell(indices, field)
         return np.asarray(values)
 
-    def matrix(self, name: str | None, field: str) -> Array:
-        """Return all columns.
-
-        Raises:
-            SourceError: a cell is not a finite number.
-        """
-        self._no_arrays(name, field)
+    def matrix(self, _name: str | None, field: str) -> Array:
+        """Return all columns; see `numbers`."""
         return self.numbers(range(self.width), field)
 
-    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
+    def times(self, column: Column, decimals: int, _array: str | None = None) -> list[int]:
         """Return a column of times as whole nanoseconds, exactly; of a single line, that line.
 
-        Args:
-            column: name or index.
-            decimals: decimal places between the column's unit and the second.
-            array: None, since text has no arrays.
+        There are `decimals` decimal places between the column's unit and the second.
 
         Raises:
             SourceError: no such column, or a time that is not a number.
         """
-        self._no_arrays(array, "time")
         index = self._index(column, "time")
-        alone = len(self.lines) == 1 and not self.names
-        texts = (
-            [(self.numbered[0], cell) for cell in _cells(self.lines[0], self.delimiter)]
-            if alone
-            else [
-                (number, (_cells(line, self.delimiter)[index : index + 1] or [""])[0])
+        if len(self.lines) == 1 and not self.names:
+            texts = [(self.numbered[0], cell) for cell in self.lines[0].split(self.delimiter)]
+        else:
+            texts = [
+                (number, (line.split(self.delimiter)[index : index + 1] or [""])[0])
                 for number, line in zip(self.numbered, self.lines, strict=True)
             ]
-        )
         found = []
         for number, text in texts:
             try:
                 found.append(_nanoseconds(text, decimals))
             except (ArithmeticError, ValueError) as error:
                 shown = repr(text.strip()) if text.strip() else "nothing"
-                raise SourceError(
-                    self.path,
-                    f"line {number} has {shown} for the time",
-                    field="time",
-                ) from error
+                problem = f"line {number} has {shown} for the time"
+                raise SourceError(self.path, problem, field="time") from error
         return found
-
-    def _no_arrays(self, name: str | None, field: str) -> None:
-        if name is not None:
-            raise SourceError(
-                self.path, f"is text in columns, without an array {name!r}", field=field,
-                remedy="give columns, by name or by index from 0",
-            )  # fmt: skip
 
     def _index(self, column: Column, field: str) -> int:
         if isinstance(column, str):
@@ -192,24 +160,21 @@ class Table:
         """Return what `numbers` does, or raise the error that names the first invalid cell."""
         values = np.full((len(self.lines), len(indices)), np.nan)
         for row, line in enumerate(self.lines):
-            cells = _cells(line, self.delimiter)
+            cells = line.split(self.delimiter)
             for place, index in enumerate(indices):
                 cell = cells[index].strip() if index < len(cells) else ""
-                if _is_number(cell):
-                    values[row, place] = float(cell)
-                if np.isfinite(values[row, place]):
-                    continue
-                if self.gaps and (cell.lower() in _MISSING or _is_number(cell)):
-                    values[row, place] = np.nan
-                    continue
-                name = self.names[index] if index < len(self.names) else str(index)
-                raise SourceError(
-                    self.path,
-                    f"line {self.numbered[row]} has {repr(cell) if cell else 'nothing'} in column "
-                    f"{name}, not a number",
-                    field=field,
-                    remedy='correct it, or leave such rows out: [format] missing = "drop"',
-                )
+                number = float(cell) if _is_number(cell) else np.nan
+                if np.isfinite(number):
+                    values[row, place] = number
+                elif not (self.gaps and (cell.lower() in _MISSING or _is_number(cell))):
+                    name = self.names[index] if index < len(self.names) else str(index)
+                    shown = repr(cell) if cell else "nothing"
+                    raise SourceError(
+                        self.path,
+                        f"line {self.numbered[row]} has {shown} in column {name}, not a number",
+                        field=field,
+                        remedy='correct it, or leave such rows out: [format] missing = "drop"',
+                    )
         return values
 
 
@@ -238,13 +203,12 @@ def _transposed(
     numbered: list[tuple[int, str]], delimiter: str | None, path: Path
 ) -> list[tuple[int, str]]:
     """Return columns as lines, numbered by sample."""
-    cells = [_cells(line, delimiter) for _, line in numbered]
+    cells = [line.split(delimiter) for _, line in numbered]
     widths = {len(row) for row in cells}
     if len(widths) > 1:
-        raise SourceError(
-            path, f"its lines have from {min(widths)} to {max(widths)} numbers",
-            field="format.transposed", remedy="all channels must be equally long",
-        )  # fmt: skip
+        problem = f"its lines have from {min(widths)} to {max(widths)} numbers"
+        remedy = "all channels must be equally long"
+        raise SourceError(path, problem, field="format.transposed", remedy=remedy)
     joiner = " " if delimiter is None else delimiter
     return [(sample, joiner.join(row)) for sample, row in enumerate(zip(*cells, strict=True))]
 
@@ -260,7 +224,7 @@ def _written(lines: Sequence[str], form: Format) -> tuple[str | None, str]:
         tried = [(form.delimiter, marks[0])]
     body = lines[1:] or lines
     for delimiter, mark in tried:
-        split = [_cells(line, delimiter) for line in body]
+        split = [line.split(delimiter) for line in body]
         width = {len(row) for row in split}
         if len(width) > 1 or (width == {1} and delimiter is not None):
             continue
@@ -278,10 +242,6 @@ def _nanoseconds(text: str, decimals: int) -> int:
     if time and time.adjusted() > _LONGEST_TIME:
         raise ValueError(f"{text!r} is not a time")
     return int(time.scaleb(9 - decimals).to_integral())
-
-
-def _cells(line: str, delimiter: str | None) -> list[str]:
-    return line.split(delimiter)
 
 
 def _is_number(text: str) -> bool:

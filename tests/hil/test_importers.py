@@ -195,7 +195,7 @@ class TestBadInput:
             ),
             ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
             ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
-            ({"torque": {"columns": "tau"}}, "has no {} for the joint's number"),
+            ({"torque": {"columns": "tau"}}, "has 1 entries; one for each of the joints hip"),
             ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
             ({"drive": {"gear_ratio": (1, 2)}}, "drive.gear_ratio: has 2 entries"),
             ({"drive": {"gear_ratio": (1, 0, 2)}}, "no motor would move one of the joints"),
@@ -500,7 +500,11 @@ class TestArrays:
             ({"p": Q[:3]}, {}, 'square matrix; state whether joints are along "columns" or "rows"'),
             ({"p": Q[:, :2]}, {}, r"shape \(40, 2\), joints along its columns, and there are 3"),
             ({"p": Q}, {"columns": (0, 1, 7), "array": "p"}, r"'p' has no column 7; it has 3"),
-            ({"p": Q.T}, {"columns": (0, 9, 1), "joints_along": "rows"}, "rows 0, 9, 1; it has 3"),
+            (
+                {"p": Q.T},
+                {"columns": (0, 9, 1), "joints_along": "rows"},
+                "'p' has no row 9; it has 3",
+            ),
             ({"a": TIME, "b": TIME[1:]}, {"columns": ("a", "b", "a")}, "a 40, b 39, a 40"),
             ({"p": np.array(["x"])}, {}, "has no array of numbers"),
         ],
@@ -692,7 +696,7 @@ class TestDamageAndMalice:
 
 @pytest.mark.parametrize("name", ["rob\x7f", "\U0001f916arm", 'a"\\', "\udc80rob", ""])
 def test_any_name_of_a_file_or_joint_makes_a_cell_file(name: str) -> None:
-    text = _cell_text(name, FrictionLaw(), (0, 0, np.nan), True, {name: 0.5})
+    text = _cell_text(name, FrictionLaw(), (0, 0, np.nan), {name: 0.5})
     cell = tomllib.loads(text.encode().decode())
     assert cell["cell"]["name"] == (name.replace("\udc80", "?") or "robot")
     assert list(cell["robot"]["locked"].values()) == [0.5]
@@ -930,7 +934,7 @@ class TestDhRefusals:
             ),
             (
                 f"{DH_HEADER}\nj,spherical,0,0,0,0\n",
-                "type: line 2 has the type 'spherical'; write rev",
+                "type: line 2 has 'spherical'; write rev",
             ),
             (
                 f"{DH_HEADER}\nj,revolute,0,90,0,0\n",
@@ -939,8 +943,11 @@ class TestDhRefusals:
             (f"{DH_HEADER}\nj,revolute,400,0,0,0\n", "a: line 2 has '400'.*call the column a_mm"),
             (f"{DH_HEADER}\nj,revolute,0,0,0,\n", "theta_offset: line 2 has nothing"),
             (f"{DH_HEADER}\nj,revolute,0,nan,0,0\n", "alpha: line 2 has 'nan'"),
-            (f"{DH_HEADER}\n,revolute,0,0,0,0\n", "joint: line 2 has no name"),
-            (f"{DH_HEADER}\nj,revolute,0,0,0,0\nj,revolute,0,0,0,0\n", "joint: has two joints 'j'"),
+            (f"{DH_HEADER}\n,revolute,0,0,0,0\n", "joint: line 2 has nothing"),
+            (
+                f"{DH_HEADER}\nj,revolute,0,0,0,0\nj,revolute,0,0,0,0\n",
+                "joint: line 3 has 'j'; give each",
+            ),
         ],
     )
     def test_name_line_field_and_remedy(self, tmp_path: Path, text: str, sentence: str) -> None:
@@ -1154,7 +1161,7 @@ class TestImportCommand:
         (tmp_path / "map.toml").write_text(
             '[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'  # the unit is missing
         )
-        arguments = ["import", "npz", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
+        arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
         arguments += ["--map", str(tmp_path / "map.toml"), "--urdf", str(arm.urdf)]
         result = CliRunner().invoke(app, [*arguments, "--kind", "validation"])
         assert result.exit_code == 0

@@ -333,7 +333,7 @@ class TestBadInput:
         (tmp_path / "x.db3").write_text("time,q1")
         with pytest.raises(SourceError, match=r"x\.db3: is not a rosbag2 in sqlite3 storage"):
             import_rosbag2(tmp_path / "x.db3", tmp_path / "a.mcap", robot=robot)
-        with pytest.raises(SourceError, match="does not exist"):
+        with pytest.raises(SourceError, match="No such file"):
             import_rosbag2(tmp_path / "y.db3", tmp_path / "a.mcap", robot=robot)
         (tmp_path / "empty").mkdir()
         with pytest.raises(SourceError, match=r"has no \.db3 and no \.mcap file"):
@@ -706,5 +706,5 @@ class TestMcap:
     ) -> None:
         monkeypatch.setattr(mcap_messages, "MOST_BYTES", 600)
         path = chunked(tmp_path / "x.mcap")
-        with pytest.raises(SourceError, match="too large to be read at once"):
+        with pytest.raises(SourceError, match="too large to be read"):
             read_mcap(path)
