@@ -16,7 +16,7 @@ from hil.cell.text import urdf_limits
 from hil.errors import InputError
 from hil.files import make_folder, write_files
 from hil.identify import Identification
-from hil.identify.surroundings import torque_limits
+from hil.identify.cell_context import torque_limits
 from hil.outcome import provenance_of
 from identification.estimators.consistent import (
     ConsistentEstimate,

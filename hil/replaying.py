@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hil.exporting import consistent_of
 from hil.identify import Identification
+from hil.identify.cell_context import nominal_of
 from hil.identify.run import FIGURE_SAMPLES
-from hil.identify.surroundings import nominal_of
 from hil.plots.style import RULE, bare, page
 from hil.progress import Reporter
 from hil.report import ReportSeries

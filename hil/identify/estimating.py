@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -29,6 +29,7 @@ from identification.estimators.instrumental import (
     same_plan,
 )
 from identification.estimators.least_squares import (
+    Fit,
     RepeatedEstimate,
     Weighting,
     estimate_repetitions,
@@ -46,6 +47,7 @@ from identification.factor.factor import QR_CONDITION, Estimate, Factor, no_rows
 from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
+from identification.validation.finding import joined
 
 from .options import Estimator, Options
 from .prepared import Prepared
@@ -58,15 +60,11 @@ from .settings import samples_of
 MIN_IV_BANDWIDTH: Final = 20.0
 # Difference between data and prior, in standard deviations, that is reported.
 _MAX_PRIOR_DEVIATION: Final = 4.0
-_MAX_NAMES: Final = 6
-"""Number of parameters named in a warning."""
 FRICTION_SHARE: Final = 0.5
 """Relative standard deviation of nominal friction, which varies by tens of per cent with
 temperature, lubricant and wear (Bittencourt and Gunnarsson 2012)."""
 
 Array = NDArray[np.float64]
-Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
-"""Estimate from samples and the sum of their factors."""
 
 # Time since the origin and commanded positions of a motion, and the lag of each axis, which is the
 # same in every repetition.
@@ -261,7 +259,7 @@ def _by_factor(
         if name != "consistent":
             raise
         problem = f"no physically consistent parameters were found: {error}"
-        remedy = "use --estimator wls and read what its verdict says about consistency"
+        remedy = "use --estimator wls and read the consistency in its verdict"
         raise InputError(None, problem, field="--estimator consistent", remedy=remedy) from error
 
 
@@ -294,15 +292,10 @@ def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> li
     if not far.size:
         return []
     return [
-        f"data and prior of {_abbreviated([model.parameter_names[k] for k in far])} differ by more"
+        f"data and prior of {joined([model.parameter_names[k] for k in far])} differ by more"
         f" than {_MAX_PRIOR_DEVIATION:g} standard deviations: correct the CAD values, or their"
         " uncertainty in [nominal]"
     ]
-
-
-def _abbreviated(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return f"{', '.join(names[:_MAX_NAMES])}{more}"
 
 
 # Instruments
@@ -364,4 +357,4 @@ def _instrumental(
         model, found.pooled.estimate, found.each, total_phase(model, fitted)
     )
     weak = found.pooled.weak
-    return result, [f"the instruments are too weak for {_abbreviated(weak)}"] if weak else []
+    return result, [f"the instruments are too weak for {joined(weak)}"] if weak else []

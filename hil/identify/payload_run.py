@@ -31,8 +31,7 @@ from .sources import aligned, archives_in, arm_differences, gather_sources, refu
 
 Array = NDArray[np.float64]
 
-# Flange frames of controllers, by their ROS-Industrial names.
-_FLANGES: Final = ("tool0", "flange")
+_FLANGES: Final = ("tool0", "flange")  # flange frames of controllers, by their ROS-Industrial names
 _UNITS: Final = dict(zip(NAMES, ["kg", *["m"] * 3, *["kg·m²"] * 6], strict=True))
 
 

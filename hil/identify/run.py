@@ -32,12 +32,12 @@ from identification.validation.evidence import gather
 from identification.validation.prediction import for_figure
 from identification.validation.verdict import Verdict, judge
 
+from .cell_context import cell_context_of, nominal_of
 from .estimating import Estimation, estimate_with
 from .options import Options
 from .prepared import Prepared, prepare_sources
 from .sources import gather_sources
 from .summary import moving_rows, summarise
-from .surroundings import nominal_of, surroundings_of
 
 Array = NDArray[np.float64]
 
@@ -205,7 +205,7 @@ def identify_archives(
             prepared.held_out,
             same_motion=sources.same_motion,
             nominal=None if nominal is None else nominal.values,
-            context=surroundings_of(prepared, result.pooled),
+            context=cell_context_of(prepared, result.pooled),
             in_sample=sources.in_sample,
             names=[source.name for source in sources.training],
         )

@@ -137,8 +137,7 @@ def _array(figures: tuple[float, ...] | None) -> Array | None:
 
 MAX_RECORDINGS: Final = 32
 """Recordings that settings are chosen from."""
-# A stated delay is checked on the first samples of a recording.
-_DELAY_SAMPLES: Final = 8000
+_DELAY_SAMPLES: Final = 8000  # A stated delay is checked on the first samples of a recording
 RIPPLE: Final = ((1,), (2,), (1, 2))
 """Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
 

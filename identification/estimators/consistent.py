@@ -62,15 +62,12 @@ Array = NDArray[np.float64]
 
 _STEPS: Final = 200
 _HALVINGS: Final = 40
-# Over all weights; fits without a solution ended within 1400 steps.
-_PATH_STEPS: Final = 3000
-# Tolerance of an active bound, in units of the reference.
-_ON_BOUND: Final = 1e-6
+_PATH_STEPS: Final = 3000  # over all weights; fits without a solution ended within 1400 steps
+_ON_BOUND: Final = 1e-6  # tolerance of an active bound, in units of the reference
 _CONVERGED: Final = 1e-13
 # Distance to the minimum as a share of the prior's weight, and of the objective.
 _SMALL: Final = 1e-6
-# Ratio of Cholesky pivots of a singular matrix.
-_SINGULAR: Final = 1e-7
+_SINGULAR: Final = 1e-7  # ratio of Cholesky pivots of a singular matrix
 _ROUNDING: Final = 1e-12
 _VANISHING: Final = 1e-30
 _ENOUGH: Final = 1e-2  # required share of the predicted decrease
@@ -80,8 +77,7 @@ _N_LINK: Final = len(LINK_SYMBOLS)
 # Factor of -log det of the rotors' coupled inertia matrix, in units of the total torque: keeps it
 # positive definite and moves well-determined rotors by less than 0.5 % of their deviation.
 _ROTOR_BARRIER: Final = 1e-2
-# Smallest eigenvalue of a pseudo-inertia relative to the reference's.
-_INSIDE: Final = 1e-6
+_INSIDE: Final = 1e-6  # smallest eigenvalue of a pseudo-inertia relative to the reference's
 # Rows beyond which the prior's weight is constant if no consistent parameters fit: the solution
 # would be singular to rounding.
 _MOST_ROWS: Final = 100_000
@@ -575,8 +571,7 @@ def fit_shrunk(
 # Smallest relative eigenvalue of the covariance in units of standard deviations, so that it is not
 # singular.
 _BEST_KNOWN: Final = 1e-8
-# The prior's weight is constant: the covariance includes model errors.
-_ROWS: Final = 1_000_000_000
+_ROWS: Final = 1_000_000_000  # the prior's weight is constant: the covariance includes model errors
 
 
 @dataclass(frozen=True, eq=False)

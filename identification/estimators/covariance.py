@@ -44,15 +44,13 @@ SHORTEST_BLOCK: Final = 2  # fine blocks
 # Correlation of neighbouring scores up to which blocks are lengthened; the rest is corrected in
 # `_sandwich`.
 _CORRELATED: Final = 0.1
-# Fewer blocks make the covariance itself too uncertain.
-_FEWEST_BLOCKS: Final = 20
+_FEWEST_BLOCKS: Final = 20  # fewer blocks make the covariance itself too uncertain
 # Leverages between which the variance changes from own residual to other blocks. On simulated NS 16
 # data whose joint 6 moves for 0.2 of 16 s the nominal 95 % intervals of its friction covered 3 to
 # 80 % without this.
 _LOW_LEVERAGE: Final = 0.5
 _HIGH_LEVERAGE: Final = 0.9
-# Smallest share of information in the other blocks when one is left out.
-_ALONE: Final = 1e-6
+_ALONE: Final = 1e-6  # smallest share of information in the other blocks when one is left out
 _AT_ONCE: Final = 8  # blocks whose matrices fit the cache
 
 

@@ -136,13 +136,10 @@ _BIN: Final = 0.01  # s
 _PROFILE_STEP: Final = 0.01  # s
 _ITERATIONS: Final = 12
 _CONVERGED, _OF_STD = 1e-6, 0.02  # s, and share of the standard deviation
-# Difference of log variance up to which two minima are equally good.
-_MODEL_ERROR: Final = 0.05
-# Periods of the smoothing's bandwidth beside a velocity reversal.
-_REVERSAL_PERIODS: Final = 0.5
+_MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
+_REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
 _FOLDS: Final = 5
-# Blocks of time.
-_BLOCKS: Final = 80
+_BLOCKS: Final = 80  # blocks of time
 _WORTHWHILE: Final = 0.02  # required reduction of the squared error by a deviation
 _CHANCE: Final = 0.005  # one-sided probability of a false delay
 

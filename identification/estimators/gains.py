@@ -28,10 +28,8 @@ from identification.signals.masks import SHORTEST_STRETCH
 
 Array = NDArray[np.float64]
 
-# Tolerance of a maker's torque constant.
-WORST_RELATIVE_STD: Final = 0.05
-# Relative length of the payload's column that is rounding.
-_NO_LOAD: Final = 1e-9
+WORST_RELATIVE_STD: Final = 0.05  # tolerance of a maker's torque constant
+_NO_LOAD: Final = 1e-9  # relative length of the payload's column that is rounding
 _ITERATIONS: Final = 50
 _VANISHING: Final = 1e-100
 _LEAST_NOISE: Final = 1e-6  # rounding of the Gram matrix, as a share of the current
@@ -195,8 +193,7 @@ class CurrentScale:
     """Torque per current of n motors relative to the nominal masses."""
 
     values: Array  # (n,) [N·m/A or N/A, motor side], 1 if undetermined
-    # standard deviations for exact masses (n,); infinite if undetermined
-    std: Array
+    std: Array  # standard deviations for exact masses (n,); infinite if undetermined
     # motors identified by inertia without rotor, for lack of gravity load (n,)
     inertial: NDArray[np.bool_]
 

@@ -58,8 +58,7 @@ class Instruments(NamedTuple):
 
     motion: Motion  # m instants of n joints
     usable: NDArray[np.bool_]  # rows with a command (m, n)
-    # of the measured motion behind the command (n,) [s]; NaN without motion
-    lag: Array
+    lag: Array  # of the measured motion behind the command (n,) [s]; NaN without motion
 
 
 def planned_motion(samples: Samples, commanded: Array, *, lag: Array | None = None) -> Instruments:
@@ -158,8 +157,7 @@ class InstrumentalEstimate:
     estimate: Estimate  #: with cluster-robust covariance
     least_squares: Estimate  #: with the same rows and weights
     weights: Array  #: per joint (n,)
-    #: parameters with weak instruments
-    weak: tuple[str, ...]
+    weak: tuple[str, ...]  #: parameters with weak instruments
 
 
 class CrossSolution(NamedTuple):

@@ -71,8 +71,7 @@ def clustered_fit(
     return solution, block_covariance(phase, weights, solution.values)
 
 
-# Probability that the scatter of equal repetitions is not significant.
-_CERTAIN: Final = 0.99
+_CERTAIN: Final = 0.99  # probability that the scatter of equal repetitions is not significant
 
 Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
 """Estimator: recordings and their factor to an estimate."""
@@ -82,8 +81,7 @@ Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
 class RepeatedEstimate:
     """Estimates from R repetitions of one motion."""
 
-    #: result, from all samples, with covariance clustered by time of the motion
-    pooled: Estimate
+    pooled: Estimate  #: result, from all samples, with covariance clustered by time of the motion
     repetitions: tuple[Estimate, ...]  #: from each alone
     phase: PhaseFactor  #: sum of the factors, by time of the motion
     factor: Factor  #: the same summed over time

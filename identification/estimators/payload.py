@@ -56,8 +56,7 @@ Array = NDArray[np.float64]
 
 DRIFT: Final = 0.1
 """Prior standard deviation of the relative change of friction between recordings."""
-# Prior standard deviation of offset changes, as a share of the friction.
-_OFFSET: Final = 1.0
+_OFFSET: Final = 1.0  # prior standard deviation of offset changes, as a share of the friction
 _BODY: Final = len(LINK_SYMBOLS)
 _WEIGHT: Final = np.arange(6, _BODY)  # mass and first moment
 _INERTIA: Final = np.arange(6)
@@ -96,8 +95,7 @@ class Run:
     """Reduced recording."""
 
     name: str
-    # parameters of the arm, of the body (10), and offsets of the joints (n)
-    phase: PhaseFactor
+    phase: PhaseFactor  # parameters of the arm, of the body (10), and offsets of the joints (n)
     loaded: bool  # whether the arm carried the body
 
     @classmethod
@@ -149,18 +147,15 @@ class Difference:
 class PayloadEstimate:
     """Payload of the arm at a frame."""
 
-    # about the frame's origin (10,), as `LINK_SYMBOLS`, unconstrained
-    parameters: Array
+    parameters: Array  # about the frame's origin (10,), as `LINK_SYMBOLS`, unconstrained
     covariance: Array  # (10, 10), cluster-robust; infinite variance if undetermined
     interval_factor: float  # standard deviations in half a 95 % interval
-    # closest consistent body; None without significant mass
-    body: Body | None
+    body: Body | None  # closest consistent body; None without significant mass
     # 95 % intervals of `NAMES` (10, 2), including `body`; infinite if undetermined
     intervals: Array
     # mass times distance of centre from the frame's origin [kg m], and interval
     moment: tuple[float, float, float]
-    # undetermined figures, taken from the reference body
-    undetermined: tuple[str, ...]
+    undetermined: tuple[str, ...]  # undetermined figures, those of the reference body
     contradicted: bool  # whether no consistent body fits the recordings to their noise
     method: str  # description of the covariance
 
@@ -173,7 +168,7 @@ def identify_payload(
     `box`: edges of the uniform reference body [m] along the axes of the frame; None: a point.
 
     Raises:
-        PayloadError: no bare or no loaded recording, undetermined mass, or negative mass.
+        PayloadError: undetermined mass, or negative mass.
         IdentificationError: no usable row.
     """
     found = _body_estimate(model, runs)
@@ -232,7 +227,6 @@ def mass_difference(model: RobotModel, runs: Sequence[Run]) -> tuple[float, floa
     """Return the mass difference of loaded to bare recordings [kg], and its 95 % interval.
 
     Raises:
-        PayloadError: no bare or no loaded recording.
         IdentificationError: no usable row.
     """
     return _body_estimate(model, runs).mass
@@ -242,7 +236,6 @@ def find_difference(model: RobotModel, runs: Sequence[Run]) -> Difference | None
     """Return the recording with the largest difference to the first of its kind, if significant.
 
     Raises:
-        PayloadError: no bare or no loaded recording.
         IdentificationError: no usable row.
     """
     first = {kind: next((r for r in runs if r.loaded == kind), None) for kind in (False, True)}
@@ -294,8 +287,6 @@ def _fit(
     model: RobotModel, runs: Sequence[Run], carried: list[list[bool]], shapes: list[Array]
 ) -> _Fit:
     """Solve the joint problem."""
-    if not any(run.loaded for run in runs) or all(run.loaded for run in runs):
-        raise PayloadError("recordings without and with the payload are required")
     rows = np.sum([run.phase.samples.sum(axis=0) for run in runs], axis=0)
     if not rows.any():
         raise IdentificationError(no_rows_message(model))

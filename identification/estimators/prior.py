@@ -36,8 +36,7 @@ Array = NDArray[np.float64]
 # Posterior over prior standard deviation of a parameter that is determined by the data, which then
 # gave three quarters of its information (inverse variance).
 LEARNED: Final = 0.5
-# A weak prior still determines what the data leave open.
-_WORST_CONDITION: Final = 1e13
+_WORST_CONDITION: Final = 1e13  # A weak prior still determines what the data leave open
 _FEWEST_ROWS: Final = 2  # per parameter, to estimate the noise
 
 

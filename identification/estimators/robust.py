@@ -27,15 +27,13 @@ from identification.signals.samples import Samples
 Array = NDArray[np.float64]
 
 MOST_ITERATIONS: Final = 60
-# Final change of the parameters, in standard deviations of white noise.
-TOLERANCE: Final = 1e-4
+TOLERANCE: Final = 1e-4  # final change of the parameters, in standard deviations of white noise
 # Changes of parameters (likewise) and scales (relative) at which the scales are fixed and the next
 # loss starts.
 _STEP_TOLERANCE: Final = 0.01
 _SCALE_TOLERANCE: Final = 1e-3
 OUTLYING: Final = 4.0  # scales; one Gaussian row in 16 000
-# Share of outlying rows above which the model is wrong.
-MOST_OUTLYING: Final = 0.1
+MOST_OUTLYING: Final = 0.1  # share of outlying rows above which the model is wrong
 _MAD: Final = 0.6744897501960817  # median of |x| for a standard Gaussian x
 _SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
 
@@ -44,10 +42,8 @@ _SMALLEST_SCALE: Final = 1e-6  # of the torque's RMS
 class RobustEstimate:
     """Robust fit with its outliers."""
 
-    #: with cluster-robust covariance; `noise_std` is the robust scale per joint
-    estimate: Estimate
-    #: share of rows beyond `OUTLYING` scales (n,), NaN without rows
-    outlying: Array
+    estimate: Estimate  #: with cluster-robust covariance; `noise_std` is the robust scale per joint
+    outlying: Array  #: share of rows beyond `OUTLYING` scales (n,), NaN without rows
     iterations: int  #: passes over the samples
     converged: bool
 

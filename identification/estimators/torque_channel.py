@@ -29,10 +29,8 @@ from identification.signals.smoothing import (
 Array = NDArray[np.float64]
 
 LOWEST_BANDWIDTH: Final = 0.5  # Hz
-# Required relative reduction of the residual, mean over joints.
-_WORTHWHILE: Final = 0.05
-# Candidates per decade of bandwidth, before refinement.
-_COARSE: Final = 4.0
+_WORTHWHILE: Final = 0.05  # required relative reduction of the residual, mean over joints
+_COARSE: Final = 4.0  # candidates per decade of bandwidth, before refinement
 _RATE: Final = 250.0  # Hz; rows beyond it are averaged
 _SHORTEST: Final = 12  # samples
 

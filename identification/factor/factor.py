@@ -145,17 +145,13 @@ class Factor:
         """
         same = self.matrices.shape == other.matrices.shape
         if not same or self.parameter_names != other.parameter_names:
-            raise IdentificationError(
-                "two factors with different joints or parameters cannot be added: "
-                f"{self.n_joints} joints and {self.n_parameters} parameters, "
-                f"{other.n_joints} joints and {other.n_parameters} parameters"
-            )
+            raise IdentificationError("factors with different joints or parameters cannot be added")
         both = self._added(other)
         return type(self)(both, self.samples + other.samples, self.parameter_names)
 
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint (n,): 1/variance."""
-        total = np.tensordot(self._checked(weights), self.gram, axes=1)
+        total = np.tensordot(weights, self.gram, axes=1)
         return NormalEquations(
             A=total[:-1, :-1], b=total[:-1, -1], yy=float(total[-1, -1]), n=int(self.samples.sum())
         )
@@ -202,13 +198,6 @@ class Factor:
         target[np.ix_(place, place)] = matrix
         return target
 
-    def _checked(self, weights: Array) -> Array:
-        """Raise ShapeError unless there is one weight per joint."""
-        weights = np.asarray(weights, dtype=np.float64)
-        if weights.shape != (self.n_joints,):
-            raise ShapeError("weights", weights.shape, f"({self.n_joints},)")
-        return weights
-
 
 class QRFactor(Factor):
     """Upper triangular factors of [W | y], one per joint, instead of Gram matrices."""
@@ -224,7 +213,7 @@ class QRFactor(Factor):
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
         """Return the triangle of all joints."""
-        rows = np.sqrt(self._checked(weights))[:, None, None] * self.matrices
+        rows = np.sqrt(weights)[:, None, None] * self.matrices
         triangle = _triangle(rows.reshape(-1, rows.shape[2]))
         return triangle[:-1, :-1], triangle[:-1, -1]
 
@@ -354,8 +343,7 @@ class Estimate:
     samples: NDArray[np.intp]  #: rows per joint (n,)
     method: str  #: description of estimator and covariance
     condition: float  #: condition number of the weighted regressor with unit columns
-    #: undetermined parameters, alone or in a combination
-    undetermined: tuple[str, ...] = ()
+    undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
     #: standard deviations in half a 95 % interval: 1.96, more for covariances of few data
     interval_factor: float = 1.96
 

@@ -34,10 +34,8 @@ _MOST_BLOCKS: Final = 400  # of one recording, for gains
 class PhaseFactor:
     """Factors of B short blocks of time since the motion's origin; repetitions add up."""
 
-    #: per joint j over its columns and the torque, (B, c_j + 1, c_j + 1)
-    gram: tuple[Array, ...]
-    #: per joint the parameter indices of its columns (c_j,)
-    columns: tuple[NDArray[np.intp], ...]
+    gram: tuple[Array, ...]  #: per joint j over its columns and the torque, (B, c_j + 1, c_j + 1)
+    columns: tuple[NDArray[np.intp], ...]  #: per joint the parameter indices of its columns (c_j,)
     samples: NDArray[np.intp]  #: usable rows (B, n)
     parameter_names: tuple[str, ...]  #: (p,)
 
@@ -325,8 +323,7 @@ class StandardGram:
     The regressor is affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz; one pass serves any.
     """
 
-    # (n, 4 s + 1, 4 s + 1) for s standard parameters, friction, springs and balancers
-    gram: Array
+    gram: Array  # (n, 4 s + 1, 4 s + 1) for s standard parameters, friction, springs and balancers
     rows: NDArray[np.intp]  # summed rows (n,)
 
     def under(self, gravity: Array) -> Factor:

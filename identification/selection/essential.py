@@ -35,10 +35,8 @@ Indices = NDArray[np.intp]
 
 _CHANCE: Final = 0.05
 _TINY: Final = 1e-300
-# Share of the fitted motion used for the fit of a blind choice.
-_FITTED_SHARE: Final = 0.7
-# Minimum blocks for an error.
-_FEWEST_BLOCKS: Final = 10
+_FITTED_SHARE: Final = 0.7  # share of the fitted motion used for the fit of a blind choice
+_FEWEST_BLOCKS: Final = 10  # minimum blocks for an error
 _MOST_BLOCKS: Final = 150
 
 
@@ -65,8 +63,7 @@ class EliminationStep(NamedTuple):
     removed: str | None  # None for the full model
     left: int  # parameters left
     spread: float  # largest over smallest relative standard deviation of those left
-    # classical; infinite if undetermined
-    largest_relative_std: float
+    largest_relative_std: float  # classical; infinite if undetermined
     in_sample: float  # relative torque error ||e|| / ||tau|| on the fitted motion
     held_out: float  # on the held-out motion
 
@@ -78,8 +75,7 @@ class Elimination:
     #: step k has k removals; after the cut by relative standard deviation alone
     steps: tuple[EliminationStep, ...]
     cut: int  #: index of the chosen step
-    #: parameters whose removal was refused, in order
-    refused: tuple[str, ...]
+    refused: tuple[str, ...]  #: parameters whose removal was refused, in order
     reason: str  #: explanation of the cut
     #: of the remaining parameters, with cluster-robust covariance that ignores their selection
     estimate: Estimate
@@ -108,10 +104,8 @@ class EssentialChoice(NamedTuple):
     """Essential parameters of a robot, with their evaluation."""
 
     elimination: Elimination  # chosen on the held-out motion
-    # last step by standard deviations alone, for comparison
-    by_spread: EliminationStep
-    # None if the fitted motion is too short
-    blind: BlindChoice | None
+    by_spread: EliminationStep  # last step by standard deviations alone, for comparison
+    blind: BlindChoice | None  # None if the fitted motion is too short
 
 
 def choose_essential(
@@ -120,10 +114,8 @@ def choose_essential(
     """Choose the essential parameters of fitted samples, and evaluate the choice.
 
     Raises:
-        IdentificationError: nothing was fitted or held out.
+        IdentificationError: nothing was fitted, or no row was held out.
     """
-    if not held_out:
-        raise IdentificationError("no held-out motion to choose parameters on")
     weights = joint_weights(training.total)
     # Blocks are merged to some hundred, enough for significance.
     longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)

@@ -23,21 +23,16 @@ Rows = NDArray[np.bool_]
 # less than 1 % of its amplitude.
 UNIFORM: Final = 0.01
 _LAG: Final = 7  # steps for measuring the usual step
-# Samples averaged for the phase; slower changes are drift.
-_PHASE: Final = 51
+_PHASE: Final = 51  # samples averaged for the phase; slower changes are drift
 _REFINEMENTS: Final = 3  # iterations of step and count of steps
 _DRIFT: Final = 101
-# Required significance of the decision, standard deviations.
-_MARGIN: Final = 3.0
-# Limit of the influence of a row, standard deviations.
-_OUTLIER: Final = 6.0
+_MARGIN: Final = 3.0  # required significance of the decision, standard deviations
+_OUTLIER: Final = 6.0  # limit of the influence of a row, standard deviations
 _SHORTEST: Final = 32  # samples; shorter segments keep their stamps
 _BESIDE: Final = 4  # steps to either side for the speed at one
 _SPEED_TIME: Final = 0.025  # s to either side for the speed beside a residual
-# Steps are counted by positions that resolve an eighth of a clock step.
-_CLEAR: Final = 8.0
-# Multiples of noise and resolution of a moving joint.
-_MOVES: Final = 3.0
+_CLEAR: Final = 8.0  # steps are counted by positions that resolve an eighth of a clock step
+_MOVES: Final = 3.0  # multiples of noise and resolution of a moving joint
 # Rounding noise of the distance from the cubic: sqrt((1 + 17 / 18) / 12).
 _ROUNDING: Final = 0.4  # steps of the encoder
 _CUBIC: Final = np.array([-2, -1, 1, 2])  # samples beside
@@ -54,8 +49,7 @@ class TimeBase:
     largest_deviation: float  #: of such a step, in steps
     repeated: int  #: samples with the time stamp of the one before
     backward: int  #: samples with an earlier time stamp than the one before
-    #: missing samples in steps of up to `GAP_STEPS`
-    dropped: int
+    dropped: int  #: missing samples in steps of up to `GAP_STEPS`
     gaps: int  #: longer steps and reported gaps
 
     @property

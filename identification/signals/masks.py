@@ -29,8 +29,7 @@ LONGEST_END: Final = 0.25  # s
 REVERSAL_PERIODS: Final = 1.0
 # Twice the minimum of the smoother.
 SHORTEST_STRETCH: Final = 24  # samples
-# Share of the limit, for the resolution of drives.
-AT_LIMIT: Final = 0.995
+AT_LIMIT: Final = 0.995  # share of the limit, for the resolution of drives
 SHORTEST_TOP: Final = 5  # samples
 # A rounded smooth peak has a flat top as well. One top length further a parabola has fallen by at
 # most 8 resolutions, 12 with the worst rounding.
@@ -53,11 +52,9 @@ REVERSAL: Final = "near a velocity reversal"
 class RowMask:
     """Usable rows, and reasons against the others."""
 
-    # excluded rows (m, n) by reason; a row may have several
-    reasons: Mapping[str, Rows]
+    reasons: Mapping[str, Rows]  # excluded rows (m, n) by reason; a row may have several
     shape: tuple[int, int]  # (m, n)
-    # rows (m, n) without reason against them in sliding motion
-    moving: Rows
+    moving: Rows  # rows (m, n) without reason against them in sliding motion
 
     @property
     def usable(self) -> Rows:

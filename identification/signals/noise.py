@@ -104,10 +104,8 @@ def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
     Times are rounded to the sampling interval; the remaining shift is smooth and does not count.
 
     Raises:
-        IdentificationError: fewer than two, other joints or rates, or no common segment.
+        IdentificationError: other joints or rates, or no common segment.
     """
-    if len(recordings) < 2:
-        raise IdentificationError(f"noise from repetitions requires two, got {len(recordings)}")
     first = recordings[0]
     step = float(np.median(np.diff(first.time)))
     for one in recordings[1:]:
@@ -162,10 +160,8 @@ def _common_runs(
 _STRETCH: Final = 4.0  # s; resolution 0.25 Hz
 _FEWEST: Final = 32  # samples
 _BINS: Final = 120
-# Share of a signal's power; noise of 0.1 % of the amplitude.
-_NO_POWER: Final = 1e-6
-# Share of half the sampling rate; anti-alias filters cut at about 0.8.
-_LOW_PASSED: Final = 0.75
+_NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
+_LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
 
 
 class Spectrum(NamedTuple):

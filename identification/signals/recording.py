@@ -20,8 +20,7 @@ Array = NDArray[np.float64]
 STUCK_MOVEMENT: Final = 0.02  # rad or m
 LONGEST_PAUSE: Final = 600.0
 """Longest time without sample, s; empty blocks of time take memory."""
-# Clock steps of a gap, in usual steps.
-GAP_STEPS: Final = 5.0
+GAP_STEPS: Final = 5.0  # clock steps of a gap, in usual steps
 
 
 class RecordingError(IdentificationError, ValueError):
@@ -38,15 +37,11 @@ class Recording:
     #: joint torque or force (m, n) [N·m or N], None where only currents are known
     torque: Array | None = None
     velocity: Array | None = None  #: measured (m, n) [rad/s or m/s], None where it was not
-    #: (m, n) [A]
-    motor_current: Array | None = None
+    motor_current: Array | None = None  #: (m, n) [A]
     commanded_position: Array | None = None  #: (m, n) [rad or m], NaN where nothing was commanded
-    #: (m,) whether samples are missing before
-    gap_before: NDArray[np.bool_] | None = None
-    #: joints that are clamped or switched off
-    held_joints: tuple[str, ...] = ()
-    #: origin of the recording
-    provenance: Mapping[str, str] = field(default_factory=dict)
+    gap_before: NDArray[np.bool_] | None = None  #: (m,) whether samples are missing before
+    held_joints: tuple[str, ...] = ()  #: joints that are clamped or switched off
+    provenance: Mapping[str, str] = field(default_factory=dict)  #: origin of the recording
 
     def __post_init__(self) -> None:
         shape = (len(self.time), len(self.joint_names))
@@ -234,8 +229,7 @@ def stuck(position: Array, command: Array) -> tuple[int, float] | None:
 _STEP: Final = 0.01  # s
 # Largest difference of repetitions as a share of each joint's scatter.
 _MAX_DIFFERENCE: Final = 0.02
-# Required overlap as a share of the longer recording.
-_OVERLAP: Final = 0.8
+_OVERLAP: Final = 0.8  # required overlap as a share of the longer recording
 _REFINED: Final = 21  # offsets tried within a step
 
 

@@ -57,8 +57,7 @@ class Preprocessing:
     #: otherwise of a low-pass in the recorded torque, also applied to the regressor (None: no
     #: low-pass)
     torque_bandwidth: float | None = None
-    #: of that low-pass; ignored with `smooth_torque`
-    torque_shape: LowPassShape = SMOOTHER
+    torque_shape: LowPassShape = SMOOTHER  #: of that low-pass; ignored with `smooth_torque`
     #: lag of the recorded torque behind the position [s], without that of a causal low-pass
     torque_delay: float = 0.0
 
@@ -73,14 +72,11 @@ class Preprocessing:
 class Samples:
     """m samples of n joints, prepared for a fit, in the rows of their recording."""
 
-    #: smoothed positions and derivatives, at the times of the torque
-    motion: Motion
+    motion: Motion  #: smoothed positions and derivatives, at the times of the torque
     torque: Array  #: (m, n) [N·m or N]
-    #: (m, n) moving, and away from gaps, ends and reversals
-    usable: NDArray[np.bool_]
+    usable: NDArray[np.bool_]  #: (m, n) moving, and away from gaps, ends and reversals
     segments: tuple[slice, ...]  #: stretches without a gap
-    #: start time of the planned motion [s], common to repetitions
-    origin: float
+    origin: float  #: start time of the planned motion [s], common to repetitions
     position_bandwidth: Array  #: of the smoothing (n,) [Hz]
     #: of the low-pass of torque and regressor (n,) [Hz]; None: no low-pass
     torque_bandwidth: Array | None = None

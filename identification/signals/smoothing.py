@@ -30,8 +30,7 @@ ORDER: Final = DEGREE + 1  # non-zero basis functions per knot interval
 # normal equations.
 _LIGHTEST: Final = 1e-9
 _HEAVIEST: Final = 1e11
-# Radians of the cutoff frequency per knot.
-_KNOT_OF_CUTOFF: Final = 0.5
+_KNOT_OF_CUTOFF: Final = 0.5  # radians of the cutoff frequency per knot
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +211,8 @@ def _roughness(coefficients: Array) -> Array:
     return -np.diff(np.pad(product, ((3, 3), (0, 0))), 3, axis=0)
 
 
-# Largest cut-off as a share of the sampling rate.
-_HIGHEST: Final = 0.45
-# Periods of point reflection at the ends of a zero-phase filter.
-_PADDING_PERIODS: Final = 1.0
+_HIGHEST: Final = 0.45  # largest cut-off as a share of the sampling rate
+_PADDING_PERIODS: Final = 1.0  # periods of point reflection at the ends of a zero-phase filter
 _UNEVEN: Final = 0.01  # of a step
 
 

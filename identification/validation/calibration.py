@@ -41,8 +41,7 @@ Refit = Callable[[Factor], Array]
 class TorqueMeans:
     """Means of [W | y] over B blocks of `BLOCK` seconds, rows at rest included."""
 
-    # (B, n, p + 1), torque last; NaN where less than half of the block is known
-    rows: Array
+    rows: Array  # (B, n, p + 1), torque last; NaN where less than half of the block is known
     block: NDArray[np.intp]  # index since the origin of the motion (B,)
     count: NDArray[np.intp]  # averaged samples (B, n)
 

@@ -39,8 +39,7 @@ Kind = Literal[
 # Standard errors over the blocks, and relative reduction of the error, of a significant correction.
 SIGMAS: Final = 3.0
 LEAST_GAIN: Final = 0.1
-# Error ratio up to which a fault with fewer coefficients is preferred.
-_ALIKE: Final = 1.05
+_ALIKE: Final = 1.05  # error ratio up to which a fault with fewer coefficients is preferred
 # Largest relative error of each joint with a corrected sign or order: more error than that means
 # another cause.
 _EXPLAINED: Final = 0.5
@@ -85,8 +84,7 @@ class Cause(NamedTuple):
     fault: Fault
     # error of predicted blocks with the correction over that without: geometric mean over joints
     ratio: float
-    # delay [s], factor less one, or mass [kg]; None without size
-    size: float | None
+    size: float | None  # delay [s], factor less one, or mass [kg]; None without size
     std: float  # standard deviation over the blocks
 
 

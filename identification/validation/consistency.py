@@ -18,8 +18,7 @@ Array = NDArray[np.float64]
 
 # Smallest second moment of a link relative to the nominal body's at which a bound counts as active.
 _EDGE: Final = 0.01
-# Standard deviations of a significant change.
-_MOVED: Final = 3.0
+_MOVED: Final = 3.0  # standard deviations of a significant change
 _SHOWN_BOUNDS: Final = 4
 # Rise of the relative held-out torque error over all joints, and of one joint, that is noticeable,
 # or means that no consistent parameters exist. NS 16 campaigns without a fault: below 0.0001 over
@@ -45,8 +44,7 @@ class ConsistencyCheck:
     # smallest second moment of each link over the nominal body's in the same direction (n,), zero
     # at the bound
     room: Array
-    # parameters changed by more than three standard deviations
-    moved: tuple[str, ...]
+    moved: tuple[str, ...]  # parameters changed by more than three standard deviations
     # messages on impossible parameters of the unconstrained estimate, by rise of the joint's error
     bounds: tuple[str, ...]
     judged_on: str = "held-out"  # "held-out" or "in-sample"

@@ -29,27 +29,21 @@ Array = NDArray[np.float64]
 LEVEL: Final = 0.05
 # Share of an axis's torque (RMS); models of industrial arms have errors of 2 to 10 %.
 MATTERS: Final = 0.005
-# Share of the torque below which measured and instrument motion are equal.
-_SAME: Final = 1e-9
+_SAME: Final = 1e-9  # share of the torque below which measured and instrument motion are equal
 
 
 @dataclass(frozen=True, eq=False)
 class EndogeneityTest:
     """Result of the test."""
 
-    #: F of the hypothesis of no bias; NaN if untested
-    statistic: float
+    statistic: float  #: F of the hypothesis of no bias; NaN if untested
     p_value: float  #: probability of a larger F without bias, NaN likewise
     freedom: tuple[int, int]  #: degrees of freedom of the F
-    #: per joint (n,): minus the noise share of its column; NaN without
-    coefficient: Array
-    #: torque V pi as a share of each joint's torque (n,), both RMS
-    noise: Array
+    coefficient: Array  #: per joint (n,): minus the noise share of its column; NaN without
+    noise: Array  #: torque V pi as a share of each joint's torque (n,), both RMS
     shift: Array  #: least squares minus instrumental variables (p,)
-    #: parameters that differ significantly (5 % over all)
-    shifted: tuple[str, ...]
-    #: difference of the predicted torques as a share of each joint's torque (n,)
-    predicted: Array
+    shifted: tuple[str, ...]  #: parameters that differ significantly (5 % over all)
+    predicted: Array  #: difference of the predicted torques as a share of each joint's torque (n,)
     words: str  #: result as sentences
 
     @property

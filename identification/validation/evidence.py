@@ -48,11 +48,9 @@ _STANDARD: Final = 9.81  # m/s²
 _PASSES: Final = 2
 # Condition beyond which combinations of standard parameters count as undetermined.
 _WORST_CONDITION: Final = 10.0**4.5
-# Power ratio beyond which a joint's error exceeds that of the fit.
-_GROWN: Final = 4.0
+_GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
 _POSTURES: Final = 40
-# Enough recordings to determine gravity and load.
-_MOST_RECORDINGS: Final = 3
+_MOST_RECORDINGS: Final = 3  # enough recordings to determine gravity and load
 _PLAUSIBLE: Final = Implausible((), ())
 
 
@@ -159,11 +157,9 @@ class CarriedLoad(NamedTuple):
     """Body on the last link that explains errors on unseen motion only."""
 
     mass: float  # mass difference to the fitted motion [kg]
-    # share of the additional error on unseen motion that it explains
-    explained: float
+    explained: float  # share of the additional error on unseen motion that it explains
     axes: int  # number of joints whose error is far above that of the fit
-    # of the mass, 95 % [kg]; infinite if unknown
-    half_interval: float = np.inf
+    half_interval: float = np.inf  # of the mass, 95 % [kg]; infinite if unknown
 
 
 def find_load(
@@ -254,8 +250,7 @@ class Evidence:
     residuals: ResidualChecks | None = None  #: patterns of the residual
     #: coupling index I_c (paper, eq. 5), infinite with undetermined parameters, and I_c,max
     coupling: tuple[float, float] | None = None
-    #: data on the cell
-    context: CellContext = CellContext()
+    context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     #: whether nothing was held out, so that all errors are those of the fit
     in_sample: bool = False

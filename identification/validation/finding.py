@@ -50,8 +50,7 @@ class Thresholds:
     cause: float = 0.7
     unexplained: float = 0.06  #: error over all axes accepted without a cause, whatever the noise
     multiple: float = 5.0  #: the same, in noise floors
-    #: torque difference of one repetition's estimate to the pooled one
-    inconsistency: float = 0.10
+    inconsistency: float = 0.10  #: torque difference of one repetition's estimate to the pooled one
     friction: float = 0.03  #: change of friction to unseen motion that is doubtful
     drift: float = 0.03  #: change of friction during the recordings, as a share of the torque
     #: error on unseen over error on fitted motion; wrong if also above half of `axis`

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError
 from identification.estimators.prior import NOMINAL_SHARE
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
@@ -42,7 +41,7 @@ class NominalScale(NamedTuple):
     @property
     def off(self) -> NDArray[np.bool_]:
         """Whether the scale of each axis differs significantly from 1 (n,)."""
-        # A factor that may be zero says nothing on the nominal torque.
+        # A factor that may be zero does not determine the nominal torque.
         known = (self.tolerance < _WIDEST) & (np.abs(self.scale) > self.tolerance)
         return known & (np.abs(self.scale - 1.0) > self.tolerance)
 
@@ -84,12 +83,7 @@ def nominal_scale(
 
     `rotors_known`: the nominal parameters include rotor inertias; `share`: relative standard
     deviation of the nominal torque.
-
-    Raises:
-        IdentificationError: no recording.
     """
-    if not runs:
-        raise IdentificationError("no recording to compare with the nominal model")
     found, regressors = [], [run.regressor(model) for run in runs]
     for joint in range(model.n_joints):
         columns, turning = regressors[0].columns[joint], [joint]

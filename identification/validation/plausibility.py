@@ -16,8 +16,7 @@ from identification.model.robot import RobotModel
 Array = NDArray[np.float64]
 
 _SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign
-# Added where the worst of many directions and postures is tested.
-_SEARCHED: Final = 2.0
+_SEARCHED: Final = 2.0  # added where the worst of many directions and postures is tested
 # Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
@@ -26,8 +25,7 @@ class Implausible(NamedTuple):
     """Messages on wrong signs of an estimate."""
 
     impossible: tuple[str, ...]  # wrong signs with a torque above the prediction error
-    # wrong signs with a smaller torque
-    doubtful: tuple[str, ...]
+    doubtful: tuple[str, ...]  # wrong signs with a smaller torque
 
 
 def implausibilities(

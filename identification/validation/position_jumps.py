@@ -16,8 +16,7 @@ from identification.signals.recording import GAP_STEPS, Recording
 
 Array = NDArray[np.float64]
 
-# Robust standard deviations of a jump.
-_STANDS_OUT: Final = 15.0
+_STANDS_OUT: Final = 15.0  # robust standard deviations of a jump
 # The same relative to the frequent large departures (starts, stops, reversals).
 _USUAL: Final = 20  # departures
 _BEYOND_USUAL: Final = 3.0
@@ -26,8 +25,7 @@ _FASTEST: Final = 150.0  # rad/s² or m/s²
 _BESIDE: Final = 4  # steps to either side
 # Standard deviations by which other joints must move for a missing row to be visible.
 _SHOWS: Final = 5.0
-# Tolerance of departures by whole steps of the motion, as a share of a step.
-_WHOLE: Final = 0.15
+_WHOLE: Final = 0.15  # tolerance of departures by whole steps of the motion, as a share of a step
 _NORMAL: Final = 1.4826  # standard deviation over median absolute value
 
 

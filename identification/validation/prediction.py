@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from functools import reduce
+from operator import add
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import ShapeError
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
@@ -119,8 +121,7 @@ class SlowError(NamedTuple):
     """Low-frequency error of a prediction, with the part that a change of friction explains."""
 
     error: PredictionError  # what is left
-    # relative change of each joint's friction (n,), not limited
-    friction_change: Array
+    friction_change: Array  # relative change of each joint's friction (n,), not limited
     apart: PredictionError  # error without this change
 
 
@@ -158,15 +159,8 @@ def prediction_error(
 
 
 def pooled_error(runs: Iterable[PredictionError]) -> PredictionError:
-    """Return the error over all recordings together.
-
-    Raises:
-        IdentificationError: no recordings.
-    """
-    errors = list(runs)
-    if not errors:
-        raise IdentificationError("no recording to validate on")
-    return sum(errors[1:], errors[0])
+    """Return the error over all recordings together, at least one."""
+    return reduce(add, runs)
 
 
 def for_figure(time: Array, torque: Array) -> Array:

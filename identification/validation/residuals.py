@@ -15,7 +15,6 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.distributions import student_limit
-from identification.errors import IdentificationError
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.validation.prediction import PredictionError
@@ -26,20 +25,15 @@ Rows = NDArray[np.bool_]
 
 # Model errors are correlated over tenths of a second.
 BLOCK: Final = 0.5  # s
-# Fewer blocks give no standard error.
-FEWEST_BLOCKS: Final = 5
+FEWEST_BLOCKS: Final = 5  # fewer blocks give no standard error
 BINS: Final = 12
-# Probability of a false finding per joint, over all its bins.
-CHANCE: Final = 0.001
+CHANCE: Final = 0.001  # probability of a false finding per joint, over all its bins
 # Per motor turn: eccentricity 1; strain wave gears 2; pole pairs and slots of servo motors above.
 HARMONICS: Final = (1, 2, 3, 4, 6)
-# Largest of five harmonics: probability of about 0.001.
-_SIGMAS: Final = 4.1
+_SIGMAS: Final = 4.1  # largest of five harmonics: probability of about 0.001
 _FEWEST_PIECES: Final = 4  # parts for a trend of friction
-# Parts of all recordings together.
-_PIECES: Final = 12
-# Robust standard deviations; one normal sample in 500 million is beyond six.
-_BEYOND: Final = 6.0
+_PIECES: Final = 12  # parts of all recordings together
+_BEYOND: Final = 6.0  # robust standard deviations; one normal sample in 500 million is beyond six
 _NORMAL: Final = 1.4826
 # Longer than the settling of a move.
 LONGEST_LAG: Final = 0.5  # s
@@ -83,8 +77,7 @@ class Profile(NamedTuple):
     """Mean residual of n joints in K bins of their own speed or position."""
 
     edges: Array  # (n, K + 1) [rad/s, m/s, rad or m]
-    # residual (n, K) [N·m or N], NaN with too few blocks
-    bins: BlockMean
+    bins: BlockMean  # residual (n, K) [N·m or N], NaN with too few blocks
 
     @property
     def centres(self) -> Array:
@@ -313,10 +306,8 @@ class ResidualChecks:
     autocorrelation: Autocorrelation  # of the fitted recordings
     speed: Profile  # over the joint's own speed
     position: Profile  # over the joint's own position
-    # over the motor angle; None without gear ratios
-    ripple: Ripple | None
-    # None with too few recordings
-    drift: FrictionDrift | None
+    ripple: Ripple | None  # over the motor angle; None without gear ratios
+    drift: FrictionDrift | None  # None with too few recordings
     friction_share: Array  # friction over measured torque of the fitted recordings (n,)
     outliers: Outliers  # of the unseen motion, or of the fitted one without it
 
@@ -338,12 +329,7 @@ def check_residuals(
     """Check the residuals of parameters (p,) on all recordings.
 
     Drift is tested on the training recordings in order; ripple needs motor angles per joint (n, n).
-
-    Raises:
-        IdentificationError: no recording was fitted.
     """
-    if not training:
-        raise IdentificationError("no recording to check residuals of")
     runs, fitted = [*training, *held_out], len(training)
     left = [
         np.where(run.usable, run.torque - run.predicted_torque(model, values), 0.0) for run in runs

@@ -30,7 +30,7 @@ _RICHER: Final = "design a motion for this arm (`hil design`) and record it"
 _WARMER: Final = "warm the arm up by moving it before recording"
 _FASTER: Final = "move {joints} faster and further, so that the torque exceeds the noise"
 _INERTIA_OFF: Final = 1.2  # ratio of inertias; data sheets are accurate to 10 %
-# Beyond this ratio the unit is wrong, or motor torques were taken for joint torques (gear ratios
+# Beyond this ratio the unit is wrong, or motor torques are in place of joint torques (gear ratios
 # are 30 to 200); descriptions in use are closer.
 _IMPOSSIBLE_SCALE: Final = 10.0
 _JUMPS_SHOWN: Final = 3

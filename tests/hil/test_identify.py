@@ -13,7 +13,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import hil.identify.surroundings
+import hil.identify.cell_context
 from hil.archive import Archive, Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cell import Cell
@@ -21,6 +21,12 @@ from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
+from hil.identify.cell_context import (
+    cell_context_of,
+    controller_error,
+    nominal_of,
+    torque_limits,
+)
 from hil.identify.estimating import (
     MIN_IV_BANDWIDTH,
     Estimation,
@@ -31,12 +37,6 @@ from hil.identify.options import ESTIMATORS, FIXED, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import uncertainty_result
-from hil.identify.surroundings import (
-    controller_error,
-    nominal_of,
-    surroundings_of,
-    torque_limits,
-)
 from hil.importers import ColumnMap, Robot, import_log
 from hil.outcome import rewrite_report, write_outcome
 from hil.progress import Silent
@@ -345,7 +345,7 @@ class TestJudgement:
             zeros = np.zeros_like(archive.columns["model_current"])
             return replace(archive, columns={**archive.columns, "model_current": zeros})
 
-        monkeypatch.setattr(hil.identify.surroundings, "open_archive", silent)
+        monkeypatch.setattr(hil.identify.cell_context, "open_archive", silent)
         assert controller_error(cell, sources, samples) is None
 
     def test_limits_are_of_the_drive_or_else_the_urdf(self, cell: Cell) -> None:
@@ -634,7 +634,7 @@ class TestSurroundings:
         position[len(position) // 2 :, 2] += 0.02
         slipped = replace(source, recording=replace(source.recording, position=position))
         sources = replace(prepared.sources, training=(slipped,))
-        around = surroundings_of(replace(prepared, sources=sources), split.estimate.pooled)
+        around = cell_context_of(replace(prepared, sources=sources), split.estimate.pooled)
         assert [jump.joint for jump in around.jumps] == [source.recording.joint_names[2]]
 
 

@@ -29,8 +29,8 @@ from hil.archive import ArchiveHeader, Findings, Samples, open_archive
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import InputError, SourceError
+from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.identify.surroundings import nominal_of
 from hil.importers import ColumnMap, Convention, Robot, import_log, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile

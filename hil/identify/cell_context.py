@@ -91,7 +91,7 @@ _MAX_ROUNDING: Final = 0.02  # of accelerations, as a share
 _FAST: Final = 2.0  # a low-pass above this multiple of the motion's bandwidth has no effect
 
 
-def surroundings_of(prepared: Prepared, estimate: Estimate) -> CellContext:
+def cell_context_of(prepared: Prepared, estimate: Estimate) -> CellContext:
     """Collect the facts about the cell and the recordings that a verdict needs."""
     cell, sources = prepared.sources.cell, prepared.sources
     recorded = sources.training if sources.in_sample else (*sources.training, *sources.held_out)
