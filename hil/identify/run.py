@@ -74,9 +74,7 @@ class Identification:
 
 
 def consistency_of(
-    model: RobotModel,
-    training: PhaseFactor,
-    held_out: Factor,
+    model: RobotModel, training: PhaseFactor, held_out: Factor
 ) -> ConsistencyCheck | str:
     """Compare the consistent with the unconstrained estimate, or return why that failed."""
     total = training.total
@@ -117,11 +115,7 @@ def identify_sources(
 
 
 def identify_campaign(
-    root: Path,
-    reporter: Reporter,
-    options: Options = Options(),
-    *,
-    predict: Sequence[Path] = (),
+    root: Path, reporter: Reporter, options: Options = Options(), *, predict: Sequence[Path] = ()
 ) -> Identification:
     """Identify from the complete archives of a campaign folder; `predict` adds held-out archives.
 

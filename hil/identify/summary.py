@@ -30,11 +30,7 @@ from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate
 from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
-from identification.validation.prediction import (
-    PredictionError,
-    pooled_error,
-    prediction_error,
-)
+from identification.validation.prediction import PredictionError, pooled_error, prediction_error
 from identification.validation.residuals import BLOCK, Profile
 from identification.validation.verdict import Verdict
 from planner import FourierSeries

@@ -114,11 +114,7 @@ def cluster_covariance(
 
 
 def _sandwich(
-    shares: Array,
-    scores: Array,
-    solution: Solution,
-    duration: float,
-    prior: Array | None = None,
+    shares: Array, scores: Array, solution: Solution, duration: float, prior: Array | None = None
 ) -> Clustered:
     """Return the covariance by shares of information (B, k, k) and scores (B, p) of blocks.
 

@@ -26,12 +26,7 @@ from numpy.typing import NDArray
 from identification.distributions import fisher_tail
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.factor.factor import (
-    NormalEquations,
-    mark_undetermined,
-    no_rows_message,
-    solve,
-)
+from identification.factor.factor import NormalEquations, mark_undetermined, no_rows_message, solve
 from identification.factor.phases import (
     FINE_BLOCK,
     PhaseFactor,

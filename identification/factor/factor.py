@@ -89,11 +89,7 @@ class Factor:
 
     @classmethod
     def from_samples(
-        cls,
-        model: RobotModel,
-        motion: Motion,
-        torque: Array,
-        mask: NDArray[np.bool_] | None = None,
+        cls, model: RobotModel, motion: Motion, torque: Array, mask: NDArray[np.bool_] | None = None
     ) -> Self:
         """Reduce m samples of a motion and the torque of W pi [N·m, N] (m, n).
 

@@ -160,10 +160,7 @@ class PhaseFactor:
 
 
 def instrument_factor(
-    model: RobotModel,
-    samples: Samples,
-    instrument: Motion,
-    usable: NDArray[np.bool_] | None = None,
+    model: RobotModel, samples: Samples, instrument: Motion, usable: NDArray[np.bool_] | None = None
 ) -> PhaseFactor:
     """Reduce a recording to blocks of [Z | W | y].
 

@@ -92,11 +92,7 @@ class Calibration:
 
 
 def calibrate(
-    estimate: Estimate,
-    phase: PhaseFactor,
-    fitted: TorqueMeans,
-    held_out: TorqueMeans,
-    refit: Refit,
+    estimate: Estimate, phase: PhaseFactor, fitted: TorqueMeans, held_out: TorqueMeans, refit: Refit
 ) -> Calibration:
     """Compare held-out mean torques with 95 % intervals from `phase` and `fitted` means.
 

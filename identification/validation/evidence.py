@@ -14,11 +14,7 @@ from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
-from identification.excitation.criteria import (
-    coupling_index,
-    coupling_index_max,
-    information,
-)
+from identification.excitation.criteria import coupling_index, coupling_index_max, information
 from identification.factor.factor import Estimate, Factor, solve
 from identification.factor.phases import StandardGram, gravity_loads
 from identification.model.regressor import LINK_SYMBOLS

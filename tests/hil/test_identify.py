@@ -21,12 +21,7 @@ from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
-from hil.identify.cell_context import (
-    cell_context_of,
-    controller_error,
-    nominal_of,
-    torque_limits,
-)
+from hil.identify.cell_context import cell_context_of, controller_error, nominal_of, torque_limits
 from hil.identify.estimating import (
     MIN_IV_BANDWIDTH,
     Estimation,

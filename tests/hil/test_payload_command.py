@@ -42,11 +42,7 @@ LAW = FrictionLaw(third=None, offset=True)
 def archive(path: Path, simulated: Simulated, law: FrictionLaw = LAW) -> Path:
     table = path.with_suffix(".npz")
     np.savez(table, q=simulated.position, tau=simulated.torque, t=simulated.time)
-    columns = {
-        "time": {"column": "t"},
-        "position": {"columns": "q"},
-        "torque": {"columns": "tau"},
-    }
+    columns = {"time": {"column": "t"}, "position": {"columns": "q"}, "torque": {"columns": "tau"}}
     return import_log(
         table,
         path,

@@ -14,7 +14,6 @@ from hil.simulation import planted_truth, simulated_drive
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
-    DelayEstimate,
     compensate,
     estimate_delays,
     rate_products,
@@ -132,6 +131,9 @@ class TestCommonDelay:
     def test_it_is_exact_without_noise(self) -> None:
         recording = a_recording(MODEL, TRUTH, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
         assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=5e-6)
+        time = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))  # uneven
+        recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
+        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
 
     def test_noise_does_not_bias_it_and_the_interval_covers(self) -> None:
         """Mean within its standard error, scatter over seeds as estimated."""
@@ -157,11 +159,6 @@ class TestCommonDelay:
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
         assert found.reason == "the residual decreases up to the longest delay tested"
         np.testing.assert_array_equal(found.applied, 0.0)
-
-    def test_uneven_time_does_not_matter(self) -> None:
-        time = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))
-        recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
-        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
 
     def test_it_is_found_in_a_filtered_torque(self) -> None:
         time = np.arange(0.0, 8.0, 0.004)
@@ -194,8 +191,7 @@ class TestCommonDelay:
         late = motion(time - 0.005)
         direction = model.friction.direction(time, late[0], late[1])
         recording = replace(
-            a_recording(model, TRUTH, 0.0),
-            torque=model.torque(TRUTH, *late, direction),
+            a_recording(model, TRUTH, 0.0), torque=model.torque(TRUTH, *late, direction)
         )
         assert estimate_delays(recording, model).common == pytest.approx(0.005, abs=5e-5)
 
@@ -209,24 +205,16 @@ class TestCommonDelay:
         assert found.common == pytest.approx(planted, abs=5e-5)
 
 
-@pytest.fixture(scope="module")
-def slow() -> DelayEstimate:
-    return estimate_delays(a_recording(MODEL, TRUTH, 0.0, speed=0.05), MODEL)
-
-
 class TestUndeterminedDelay:
-    def test_a_slow_motion_does_not_determine_it(self, slow: DelayEstimate) -> None:
+    def test_a_slow_motion_does_not_determine_it(self) -> None:
+        slow = estimate_delays(a_recording(MODEL, TRUTH, 0.0, speed=0.05), MODEL)
         assert not slow.determined.any()
         assert np.isnan(slow.delays).all()
         assert np.isinf(slow.std).all()
         np.testing.assert_array_equal(slow.applied, 0.0)
-
-    def test_the_reason_is_given(self, slow: DelayEstimate) -> None:
         (line,) = slow.describe()
         assert line.startswith("all axes: not determined; 95 % interval of ± ")
         assert line.endswith("the torques change too slowly, or are too noisy")
-
-    def test_its_variance_is_bounded(self, slow: DelayEstimate) -> None:
         unknown = replace(slow, common_std=np.inf)
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
@@ -296,25 +284,22 @@ class TestCompensation:
         time = late.time
         gap = np.zeros(len(time), dtype=np.bool_)
         gap[2500] = True
-        torn = replace(late, gap_before=gap)
-        there = compensate(torn, PLANTED)
+        gapped = replace(late, gap_before=gap)
+        there = compensate(gapped, PLANTED)
         assert there.torque is not None
         exact = MODEL.torque(TRUTH, *motion(there.time))
         clear = np.abs(motion(there.time)[1]) > 0.1  # Coulomb friction jumps between samples
         assert np.abs(there.torque - exact)[clear].max() < 2e-3
         assert len(there.segments()) == 2
         # No interpolation across the gap: samples beside it are dropped.
-        assert there.n_samples == torn.n_samples - 2 * 3
+        assert there.n_samples == gapped.n_samples - 2 * 3
 
-    def test_zero_delays_change_nothing(self) -> None:
+    def test_zero_delays_change_nothing_and_long_ones_raise(self) -> None:
         recording = a_recording(MODEL, TRUTH, 0.0)
         same = compensate(recording, [0.0, 0.0])
         assert recording.torque is not None
         np.testing.assert_array_equal(same.torque, recording.torque)
         np.testing.assert_array_equal(same.time, recording.time)
-
-    def test_a_delay_longer_than_the_recording_raises(self) -> None:
-        recording = a_recording(MODEL, TRUTH, 0.0)
         with pytest.raises(IdentificationError, match="shorter than the delay"):
             compensate(recording, [100.0, 0.0])
 

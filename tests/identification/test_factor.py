@@ -169,8 +169,6 @@ class TestFactor:
         one = kind.of(MODEL, samples)
         with pytest.raises(IdentificationError, match="cannot be added"):
             _ = one + kind.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
-        with pytest.raises(ShapeError, match="weights"):
-            one.rows(np.ones(3))
         for name in ("torque", "usable"):
             short = getattr(samples, name)[:, :1]
             with pytest.raises(ShapeError, match=name):

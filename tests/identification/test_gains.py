@@ -8,26 +8,14 @@ from numpy.typing import NDArray
 
 from hil.identify.prepared import current_warnings
 from identification.errors import IdentificationError
-from identification.estimators.gains import (
-    CurrentScale,
-    Gains,
-    identify_gains,
-    scale_from_nominal,
-)
+from identification.estimators.gains import CurrentScale, Gains, identify_gains, scale_from_nominal
 from identification.factor.phases import PhaseFactor, gain_factor, joined
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
-from tests.identification.two_link import (
-    MODEL,
-    a_motion,
-    as_samples,
-    coloured,
-    sine_motion,
-    truth,
-)
+from tests.identification.two_link import MODEL, a_motion, as_samples, coloured, four_sines, truth
 
 Array = NDArray[np.float64]
 
@@ -35,6 +23,7 @@ LOAD = Payload(2.0, (0.03, 0.0, 0.45))
 PLANTED = np.array([12.0, 5.0])  # N m / A
 NOISE = np.array([0.3, 0.1])  # A
 SEEDS = 100
+TIME = np.arange(2000) * 5e-3
 
 # Lifts along gravity, then turns about it: no payload loads the second axis.
 LIFT_AND_TURN = """<robot name="lift"><link name="base"/>
@@ -52,12 +41,6 @@ def load_torque(model: RobotModel, payload: Payload, motion: Motion) -> Array:
     return Load(model.chain, model.gravity, payload).torque(*motion[1:4])
 
 
-def lively(n: int, *, count: int = 2000, step: float = 5e-3, speed: float = 1.0) -> Motion:
-    rng = np.random.default_rng(12)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, n))
-    return sine_motion(np.arange(count) * step, a, w * speed, phase)
-
-
 def factor_of(
     noise: Array = NOISE,
     *,
@@ -70,7 +53,7 @@ def factor_of(
     transmission: Array | None = None,
 ) -> PhaseFactor:
     """Reduce a recording without payload and one with it; noise is on the currents."""
-    motion = lively(model.n_joints) if motion is None else motion
+    motion = four_sines(TIME, n=model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
     rng = np.random.default_rng(seed)
     torque = model.torque(truth() if values is None else values, *motion[1:])
@@ -164,15 +147,13 @@ class TestGains:
         assert np.all(np.abs(values.mean(axis=0) - PLANTED) < 3.0 * error)
 
     def test_an_unloaded_axis_is_undetermined(self) -> None:
+        """An eccentric payload determines it."""
         gains = lifted(Payload(4.0, (0.0, 0.0, 0.1)))
         assert gains.values[0] == pytest.approx(PLANTED[0], abs=4.0 * gains.std[0])
         assert gains.determined.tolist() == [True, False]
         assert np.isnan(gains.values[1])
         assert np.isinf(gains.std[1])
-        reason = "the payload does not load it"
-        assert gains.reasons == (None, reason)
-
-    def test_an_eccentric_payload_determines_it(self) -> None:
+        assert gains.reasons == (None, "the payload does not load it")
         gains = lifted(Payload(4.0, (0.2, 0.0, 0.1)))
         assert np.all(np.abs(gains.values - PLANTED) < 4.0 * gains.std)
 
@@ -183,7 +164,7 @@ class TestGains:
         assert np.all(gains.std < 0.02 * CONSTANTS)
 
     def test_on_a_slow_ns16_only_loaded_axes_are_determined(self) -> None:
-        gains = ns16(lively(6, speed=0.03, count=6000, step=0.02))
+        gains = ns16(four_sines(np.arange(6000) * 0.02, 0.03, n=6))
         assert not gains.determined[0]
         assert gains.determined[[1, 2]].all()
         assert np.all(np.abs(gains.values - CONSTANTS)[1:3] < 4.0 * gains.std[1:3])

@@ -26,7 +26,7 @@ from identification.signals.samples import Samples
 from identification.signals.smoothing import fit_smoothing_spline
 from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from tests.identification import two_link
-from tests.identification.two_link import URDF, as_samples, sine_motion, truth
+from tests.identification.two_link import URDF, as_samples, four_sines, truth
 
 Array = NDArray[np.float64]
 
@@ -39,27 +39,15 @@ LARGE, SMALL = 5e-4, 3e-6  # rad, encoder noise
 MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, standstill=0.1))
 
 
-def sines(seed: int, size: float = 1.0) -> Motion:
-    rng = np.random.default_rng(seed)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    return sine_motion(TIME, size * a, w, phase)
-
-
-PLAN = sines(12)
+PLAN = four_sines(TIME)
 
 
 def executed(
-    seed: int,
-    *,
-    position_noise: float = 0.0,
-    correlation: float = 0.02,
-    noise: float = 1.0,
+    seed: int, *, position_noise: float = 0.0, correlation: float = 0.02, noise: float = 1.0
 ) -> Samples:
     """Return the plan followed within 2 %, with noisy encoders and a 40 Hz smoother."""
-    rng = np.random.default_rng(seed)
-    true = Motion(
-        TIME, *(a + b for a, b in zip(PLAN[1:4], sines(13 + seed, 0.02)[1:4], strict=True))
-    )
+    rng, beside = np.random.default_rng(seed), four_sines(TIME, seed=13 + seed, size=0.02)
+    true = Motion(TIME, *(a + b for a, b in zip(PLAN[1:4], beside[1:4], strict=True)))
     torque = MODEL.torque(TRUTH, *true[1:]) + noise * two_link.coloured(
         rng, len(TIME), STEP, correlation
     )
@@ -122,7 +110,7 @@ def test_it_solves_the_weighted_instrumental_equations() -> None:
     np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
 
 
-def test_where_position_noise_is_large_it_beats_least_squares() -> None:
+def test_with_large_position_noise_it_beats_least_squares() -> None:
     runs = [fit(executed(s, position_noise=LARGE))[1] for s in range(30)]
     instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
     least = np.array([run.least_squares.values for run in runs]) - TRUTH
@@ -175,7 +163,7 @@ def test_strength_is_sheas_partial_r2() -> None:
 
 def test_unrelated_instruments_are_weak() -> None:
     samples = executed(1)
-    factor, result = fit(samples, sines(99))
+    factor, result = fit(samples, four_sines(TIME, seed=99))
     assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
     assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
@@ -313,25 +301,21 @@ def test_a_known_lag_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_repetitions_share_a_plan_for_any_clock() -> None:
     plan = TIME, PLAN.position
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
-    later = TIME[20:-20] + 0.3 * STEP
-    torn = spline(later)
-    torn[100:120] = np.nan
-    assert same_plan(plan, (later, torn))
-    assert not same_plan(plan, (TIME, 0.9 * PLAN.position))
-    assert not same_plan(plan, (TIME, PLAN.position[::-1]))
-    assert not same_plan(plan, (TIME[: len(TIME) // 2], PLAN.position[: len(TIME) // 2]))
-    assert not same_plan(plan, (TIME, PLAN.position[:, :1]))
-    assert not same_plan(plan, (TIME, np.full_like(PLAN.position, np.nan)))
+    later, half = TIME[20:-20] + 0.3 * STEP, len(TIME) // 2
+    gapped = spline(later)
+    gapped[100:120] = np.nan
+    assert same_plan(plan, (later, gapped))
+    assert not same_plan(plan, (TIME[:half], PLAN.position[:half]))
+    others = 0.9 * PLAN.position, PLAN.position[::-1], PLAN.position[:, :1], np.nan * PLAN.position
+    assert not any(same_plan(plan, (TIME, other)) for other in others)
 
 
 def test_missing_commands() -> None:
-    samples = executed(0)
-    command = PLAN.position.copy()
+    samples, command = executed(0), PLAN.position.copy()
     command[300:340, 1] = np.nan
     instruments = planned_motion(samples, command)
     assert not instruments.usable[300:340].any()
     assert instruments.usable[400:-400].all()
-    with pytest.raises(IdentificationError, match="no commanded positions"):
-        planned_motion(samples, np.full_like(command, np.nan))
-    with pytest.raises(IdentificationError, match="no joint is commanded to move"):
-        planned_motion(samples, np.ones_like(command))
+    for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
+        with pytest.raises(IdentificationError, match=words):
+            planned_motion(samples, np.full_like(command, value))

@@ -112,8 +112,8 @@ class TestLowPassShape:
         shape = LowPassShape(order=1, causal=True)
         how = Preprocessing(torque_bandwidth=BANDWIDTH, torque_shape=shape)
         samples = prepare(a_recording(None), MODEL, options=how)
-        plain = replace(samples, torque_bandwidth=None)
+        unfiltered = replace(samples, torque_bandwidth=None)
         expected = low_passed(
-            samples.motion.time, plain.predicted_torque(MODEL, truth()), BANDWIDTH, shape
+            samples.motion.time, unfiltered.predicted_torque(MODEL, truth()), BANDWIDTH, shape
         )
         assert samples.predicted_torque(MODEL, truth()) == pytest.approx(expected, abs=1e-9)

@@ -10,12 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.estimators.prior import (
-    GaussianPrior,
-    fit_with_prior,
-    nominal_prior,
-    with_prior,
-)
+from identification.estimators.prior import GaussianPrior, fit_with_prior, nominal_prior, with_prior
 from identification.factor.factor import Factor, QRFactor, estimate
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -61,9 +56,6 @@ def independent(mean: Array, std: Array) -> GaussianPrior:
     return GaussianPrior.of_combinations(np.eye(len(mean)), mean, std)
 
 
-# The prior itself ---------------------------------------------------------------------------
-
-
 @given(seed=st.integers(0, 999), size=st.floats(1e-6, 1e6))
 def test_the_root_inverts_the_covariance(seed: int, size: float) -> None:
     covariance = some_covariance(seed, size)
@@ -93,9 +85,6 @@ def test_infinite_is_the_limit_of_large_deviations(seed: int, flat: int) -> None
 def test_an_invalid_deviation_raises(std: list[float]) -> None:
     with pytest.raises(IdentificationError, match="must be positive"):
         independent(np.zeros(2), np.array(std))
-
-
-# The posterior ------------------------------------------------------------------------------
 
 
 @given(seed=st.integers(0, 999), size=st.floats(1e-3, 1e3))
@@ -196,9 +185,7 @@ def test_few_rows_require_weights() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(
-    correlation: float,
-) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
     prior = nominal_prior(MODEL, known=KNOWN)
     spread = np.linalg.inv(prior.root)  # no flat direction
     motion = a_motion()
@@ -242,21 +229,18 @@ def test_the_method_names_the_prior() -> None:
         fit_with_prior(MODEL, [empty], nominal_prior(MODEL))
 
 
-# The prior from a URDF ----------------------------------------------------------------------
-
-
 def test_the_nominal_prior_is_that_of_sampled_arms() -> None:
     prior = nominal_prior(MODEL, 0.1, known=KNOWN)
     nominal = MODEL.nominal.reshape(2, 11)
     rng = np.random.default_rng(3)
-    drawn = np.repeat(nominal[None], 20_000, axis=0)
-    drawn[:, :, 10] = [0.3, 0.1] + np.array([0.2, 0.05]) * rng.standard_normal((20_000, 2))
+    sampled = np.repeat(nominal[None], 20_000, axis=0)
+    sampled[:, :, 10] = [0.3, 0.1] + np.array([0.2, 0.05]) * rng.standard_normal((20_000, 2))
     for link in range(2):
         for part in (slice(0, 6), slice(6, 9), slice(9, 10)):
             size = 0.1 * np.abs(nominal[link, part]).max()
             count = part.stop - part.start
-            drawn[:, link, part] += size * rng.standard_normal((20_000, count))
-    base = drawn.reshape(20_000, -1) @ MODEL.base.grouping.T
+            sampled[:, link, part] += size * rng.standard_normal((20_000, count))
+    base = sampled.reshape(20_000, -1) @ MODEL.base.grouping.T
     rank = MODEL.base.rank
     np.testing.assert_allclose(
         prior.mean[:rank],
@@ -286,12 +270,12 @@ def test_rotors_and_friction_have_no_nominal_prior() -> None:
 
 def test_invalid_nominal_priors_raise() -> None:
     bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
-    with pytest.raises(IdentificationError, match="no inertia"):
-        nominal_prior(bare)
-    with pytest.raises(IdentificationError, match="I9m"):
-        nominal_prior(MODEL, known={"I9m": (1.0, 1.0)})
-    with pytest.raises(IdentificationError, match="not positive"):
-        nominal_prior(MODEL, 0.0)
+    known = {"I9m": (1.0, 1.0)}
+    for model, share, some, words in (
+        (bare, 0.1, None, "no inertia"), (MODEL, 0.1, known, "I9m"), (MODEL, 0.0, None, "not pos")
+    ):  # fmt: skip
+        with pytest.raises(IdentificationError, match=words):
+            nominal_prior(model, share, some)
 
 
 def test_missing_moments_or_mass_are_scaled() -> None:

@@ -113,33 +113,22 @@ class TestChecks:
 
     @pytest.mark.parametrize(
         "expected",
-        [
-            ("elbow", "shoulder", "wrist"),
-            ("shoulder", "elbow", "hand"),
-            ("shoulder", "elbow"),
-        ],
+        [("elbow", "shoulder", "wrist"), ("shoulder", "elbow", "hand"), ("shoulder", "elbow")],
     )
     def test_other_joints_than_the_model_raise(self, expected: tuple[str, ...]) -> None:
         with pytest.raises(RecordingError, match=f"the model's are {', '.join(expected)}"):
             a_recording().checked(expected)
 
 
-def test_gaps_split_a_recording() -> None:
+def test_gaps_split_a_recording_but_jitter_does_not() -> None:
     recording = a_recording()
     gap = np.zeros(200, dtype=bool)
     gap[30] = True
     time = recording.time.copy()
     time[100:] += 0.5
-    assert replace(recording, time=time, gap_before=gap).segments() == [
-        slice(0, 30),
-        slice(30, 100),
-        slice(100, 200),
-    ]
-
-
-def test_clock_jitter_is_not_a_gap() -> None:
+    parts = [slice(0, 30), slice(30, 100), slice(100, 200)]
+    assert replace(recording, time=time, gap_before=gap).segments() == parts
     jitter = np.random.default_rng(1).uniform(-4e-4, 4e-4, 200)
-    recording = a_recording()
     assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
 
 
@@ -160,9 +149,6 @@ def test_a_motion_starts_with_its_command() -> None:
     assert replace(recording, commanded_position=command).motion_start == recording.time[41]
     command[:10] = np.nan
     assert replace(recording, commanded_position=command).motion_start == recording.time[41]
-
-
-def test_without_a_command_a_motion_starts_with_the_recording() -> None:
     assert a_recording(commanded=False).motion_start == 0.0
 
 
@@ -234,12 +220,9 @@ def test_late_stamps_are_not_missing_samples(seed: int) -> None:
     late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
     lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
 
-    whole, torn = time_base(late), time_base(np.delete(late, lost))
-
-    assert whole.dropped == 0
-    assert torn.dropped == 25
-    assert whole.rate == pytest.approx(100.0, rel=1e-3)
-    assert torn.rate == pytest.approx(100.0, rel=1e-3)
+    for base, dropped in ((time_base(late), 0), (time_base(np.delete(late, lost)), 25)):
+        assert base.dropped == dropped
+        assert base.rate == pytest.approx(100.0, rel=1e-3)
 
 
 def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
@@ -256,15 +239,8 @@ def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
     words = " ".join(base.describe())
     for part in ("repeat", "older", "missing", "gaps", "resampling"):
         assert part in words
-
-
-def test_a_reported_gap_counts_without_a_time_step() -> None:
-    gap = np.zeros(100, dtype=np.bool_)
-    gap[50] = True
-    assert time_base(np.arange(100) * 1e-3, gap).gaps == 1
-
-
-def test_constant_time_stamps_raise() -> None:
+    reported = np.arange(100) == 50  # without a time step
+    assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
     with pytest.raises(RecordingError, match="same time stamp"):
         time_base(np.full(5, 3.0))
 
@@ -279,8 +255,5 @@ def test_samples_of_one_stamp_are_averaged() -> None:
     np.testing.assert_array_equal(merged.position, [[0, 1], [3, 4], [6, 7], [10, 11]])
     even = Recording(np.arange(7.0), torque, ("a", "b"))
     assert without_repeats(even) is even
-
-
-def test_samples_are_not_reordered() -> None:
     with pytest.raises(RecordingError, match="falls back at sample 2"):
         without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))

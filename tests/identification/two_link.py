@@ -63,11 +63,13 @@ def one_sine(time: Array, size: Any = (0.9, 1.2), phase: Any = (0.3, 1.1), **nam
     return sine_motion(time, np.array(size), np.array([2.1, 3.7]), np.array(phase), **named)
 
 
-def four_sines(time: Array, speed: float = 1.0) -> Motion:
-    """Four sines for each joint."""
-    rng = np.random.default_rng(12)
-    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, 2))
-    return sine_motion(time, a, w * speed, phase)
+def four_sines(
+    time: Array, speed: float = 1.0, *, n: int = 2, seed: int = 12, size: float = 1.0
+) -> Motion:
+    """Four sines for each of n joints."""
+    rng = np.random.default_rng(seed)
+    a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, n))
+    return sine_motion(time, size * a, w * speed, phase)
 
 
 def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
