@@ -106,7 +106,7 @@ def measure(folder: Path, seconds: float, *, packets: bool) -> dict[str, Any]:
         exchange.run(seconds)
         elapsed = time.monotonic() - started
         process.send(Close(1, "completed", "as long as was asked for"))
-        closed = _require(process.answer(ANSWER, 1), Closed)
+        closed = _require(process.answer(ANSWER, 1), Closed).recorded
         used = _processor_time(process.process.pid) - used
     finally:
         process.end()

@@ -15,7 +15,8 @@ from hil.files import make_folder
 from hil.version import software
 
 if TYPE_CHECKING:
-    from hil.campaign.motion_link import MotionLink, Recorded, Watch
+    from hil.archive.recorder import Recorded
+    from hil.campaign.motion_link import MotionLink, Watch
     from hil.campaign.operator import Stop
 
 KINDS = ("excitation", "validation", "standstill")

@@ -50,8 +50,7 @@ class MessageLayout:
     Attributes:
         dtype: the fields that change from message to message, of the length of a message.
         template: a message with every constant byte in place.
-        constant: the bytes that are the same in every message, without padding, which may be
-            anything.
+        constant: the bytes that are the same in every message, without padding.
     """
 
     dtype: np.dtype[np.void]
@@ -111,11 +110,7 @@ class LayoutBuilder:
             self.variable(name, primitive, count)
 
     def build(self) -> MessageLayout:
-        """Return the layout of the fields added so far.
-
-        Raises:
-            LayoutError: two fields have one name.
-        """
+        """Return the layout of the fields added so far; `LayoutError` if two have one name."""
         names, formats, offsets = ([field[k] for field in self._fields] for k in range(3))
         if len(set(names)) != len(names):
             raise LayoutError("two of its fields have one name")

@@ -1,8 +1,4 @@
-"""Conformance of an archive with the profile, aspect by aspect, and an overview of its content.
-
-`docs/archive-format.md` is the profile; each rule here is one of its sentences. Only the file is
-checked, not the quality of the motion.
-"""
+"""Conformance of an archive with the profile of `docs/archive-format.md`; its overview."""
 
 from __future__ import annotations
 
@@ -66,14 +62,9 @@ _MOST = 5  # faults of one aspect that are shown
 
 @dataclass(frozen=True)
 class Check:
-    """Result of a check.
+    """Result of a check: faults by aspect, those that conform left out; samples that can be read.
 
-    Attributes:
-        path: the file.
-        version: of the profile, as stated in the file.
-        faults: what is wrong, by aspect; an aspect without entry conforms.
-        samples: number of samples that can be read.
-        repaired: whether the outcome states a repair with loss.
+    `repaired` is whether the outcome states a repair with loss.
     """
 
     path: Path
@@ -230,11 +221,7 @@ class _Checker:
             self.add("schemas", f"that of {topic} is not the text of the profile")
 
     def _rows(self, found: Scan, topic: str, messages: Messages) -> Rows:
-        """Return the messages as a structured array.
-
-        Raises:
-            LayoutError: one has another layout than the first.
-        """
+        """Return the messages as a structured array; LayoutError if one differs from the first."""
         assert found.header is not None
         if topic not in self._layouts:
             self._layouts[topic] = None
@@ -294,20 +281,16 @@ _SHOWN_ELSEWHERE = frozenset(
 
 @dataclass(frozen=True)
 class Overview:
-    """Overview of an archive, as `hil archive info` prints it.
+    """Overview of an archive, as `hil archive info` prints it; times in s, sizes in bytes.
 
     Attributes:
         title: kind, index and attempt.
-        outcome: how it ended, and why.
-        lost: what the link or this PC lost, "" where nothing.
-        duration: from the first to the last sample [s].
-        period: cycle [s], None where it is not fixed.
-        size: of the file in bytes.
+        outcome, lost: how it ended and why; what the link or this PC lost, "" where nothing.
+        duration: from the first to the last sample.
         per_minute: bytes for a minute of motion, None without samples.
         channels: topic, type and number of messages.
-        attachments: bytes by name.
-        metadata: the other entries.
-        events: time [s], kind and text of the first ones.
+        metadata: entries that are not shown elsewhere.
+        events: time, kind and text of the first ones.
         damage: what is wrong with the file, None where nothing.
     """
 

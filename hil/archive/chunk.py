@@ -83,11 +83,7 @@ class Messages:
 class ChunkParser:
     """Finds the messages of chunks, and reads the schemas and channels among them.
 
-    A number or a topic must not be redefined: samples of one channel would be mistaken for those of
-    another.
-
-    Attributes:
-        schemas, channels: those known so far, by their numbers.
+    A number or a topic must not be redefined: samples of two channels would be confused.
     """
 
     def __init__(self) -> None:
@@ -114,11 +110,7 @@ class ChunkParser:
         return self.schemas.get(identity)
 
     def define(self, record: Record) -> None:
-        """Read a schema or channel; other records are ignored.
-
-        Raises:
-            Damage: the record is truncated, or redefines a number or topic.
-        """
+        """Read a schema or channel; other records are ignored. `Damage` if it is one redefined."""
         if record.opcode not in (container.SCHEMA, container.CHANNEL):
             return
         item, again = container.parse_item(record), ""
@@ -137,11 +129,9 @@ class ChunkParser:
             raise Damage(record.offset, f"defines {again} a second time, differently")
 
     def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
-        """Return the messages of a chunk, or of several consecutive ones, by channel.
+        """Return the messages of one chunk or of several consecutive ones, by channel.
 
-        Args:
-            chunk: decompressed records.
-            offset: where the chunk's record begins in the file, for the error.
+        `offset` is where its record begins in the file.
 
         Raises:
             Damage: the chunk has truncated records, or contradictory definitions.

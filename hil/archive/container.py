@@ -1,10 +1,7 @@
-"""The MCAP container: records in file order, each verified.
+"""The MCAP container (https://mcap.dev/spec): records in file order, each verified.
 
 The `mcap` library reads and writes single records; files are read here, twice as fast, and a
-truncated or forged record becomes `Damage` with its place. Only the data section is trusted: chunks
-and attachments have checksums, so a truncated file is readable up to its last complete chunk.
-
-Layout: https://mcap.dev/spec
+truncated or forged record becomes `Damage` with its place.
 """
 
 from __future__ import annotations
@@ -67,12 +64,7 @@ _Parsed = TypeVar("_Parsed", bound=McapRecord)
 
 
 class Damage(Exception):  # noqa: N818 - also passed on as a finding
-    """Bytes that violate the format.
-
-    Attributes:
-        offset: where in the file the damaged record begins.
-        reason: what is wrong, to follow "the record at byte ...".
-    """
+    """Bytes that violate the format: `reason` follows "the record at byte `offset`"."""
 
     def __init__(self, offset: int, reason: str) -> None:
         super().__init__(reason)
@@ -117,11 +109,7 @@ class _Body(ReadDataStream):
 
 
 def parse(kind: type[_Parsed], record: Record) -> _Parsed:
-    """Return a record of this kind.
-
-    Raises:
-        Damage: the body does not fit the kind.
-    """
+    """Return a record of this kind; `Damage` if the body does not fit it."""
     try:
         found: _Parsed = kind.read(_Body(record.body))  # type: ignore[attr-defined]
     except EndOfFile:
@@ -139,11 +127,7 @@ def encode(record: McapRecord) -> bytes:
 
 
 def record_bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, int]:
-    """Return opcode and end of the record at `at`, in a chunk or summary at `offset` of the file.
-
-    Raises:
-        Damage: it is truncated.
-    """
+    """Return opcode and end of the record at `at`, in a chunk or summary at `offset`."""
     if len(data) - at >= RECORD.size:
         opcode, length = RECORD.unpack_from(data, at)
         end = at + RECORD.size + length
@@ -153,11 +137,7 @@ def record_bounds(data: bytes | memoryview, at: int, offset: int) -> tuple[int, 
 
 
 def split_records(data: bytes, offset: int) -> Iterator[Record]:
-    """Yield the records of a chunk or summary, each with its place in it.
-
-    Raises:
-        Damage: the last one is truncated.
-    """
+    """Yield the records of a chunk or summary, each with its place in it."""
     at = 0
     while at < len(data):
         opcode, end = record_bounds(data, at, offset)
@@ -166,11 +146,7 @@ def split_records(data: bytes, offset: int) -> Iterator[Record]:
 
 
 def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
-    """Read the record that an index places at `offset`, `length` with its head.
-
-    Raises:
-        Damage: it is not there.
-    """
+    """Read the record that an index places at `offset`, `length` with its head."""
     if RECORD.size <= length <= LARGEST_RECORD and offset <= _FARTHEST:
         stream.seek(offset)
         data = stream.read(length)
@@ -246,11 +222,7 @@ def _footer(tail: bytes) -> Footer | None:
 
 
 def parse_item(record: Record) -> Any:
-    """Return a schema, channel, metadata record, attachment or entry of an index.
-
-    Raises:
-        Damage: it is of another kind, or damaged.
-    """
+    """Return a schema, channel, metadata record, attachment or entry of an index."""
     if record.opcode == ATTACHMENT:
         return parse_attachment(record)
     if record.opcode not in _KINDS:
@@ -342,11 +314,8 @@ class Summary:
     def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
         """Read the summary; None where it is missing or incomplete.
 
-        Args:
-            stream: the file.
-            size: its length.
-            start: where the data section ends, of a file in which records may have moved; the
-                places in the summary may then be wrong.
+        `start` is where the data section ends, of a file in which records may have moved: the
+        places in the summary may then be wrong.
         """
         last = size - FOOTER_SIZE - len(MAGIC)
         if last < 0:

@@ -33,12 +33,8 @@ class Level(IntEnum):
 class ArchivedEvent:
     """An event of the recorded interval.
 
-    Attributes:
-        time: seconds since the controller's initialisation.
-        name: kind of event, such as ``MotionEnded``.
-        text: one line.
-        level: severity.
-        data: machine-readable content: numbers, strings, lists and mappings.
+    `time` [s] since the controller's initialisation, kind of event such as ``MotionEnded``, one
+    line of text, and machine-readable data: numbers, strings, lists and mappings.
     """
 
     time: float
@@ -55,8 +51,7 @@ class ArchivedEvent:
     def encode(self, stamp: int | None = None) -> bytes:
         """Return the CDR bytes: the line of text and, if there are data, one of JSON.
 
-        Args:
-            stamp: replaces `self.stamp`, ns.
+        `stamp` [ns] replaces `self.stamp`.
         """
         lines = [" ".join(self.text.split())]
         if self.data:

@@ -1,8 +1,4 @@
-"""File name, header and outcome of an archive, parsed and bounded once when the file is opened.
-
-MCAP metadata are texts by name, from any writer. Here they become typed values, which the rest of
-the program trusts.
-"""
+"""File name, header and outcome of an archive, parsed and bounded once when the file is opened."""
 
 from __future__ import annotations
 
@@ -75,10 +71,8 @@ def motion_name(kind: str, index: int) -> str:
 class ArchiveName:
     """File name of an archive: ``excitation_007_a1.mcap`` is kind, index and attempt.
 
-    Attributes:
-        kind: why the arm moved, one of `KINDS`.
-        index: number of the interval within its kind, from 0.
-        attempt: from 1; a truncated or stopped interval is repeated as the next attempt.
+    `kind` is one of `KINDS`, `index` the number of the interval within its kind, from 0, `attempt`
+    from 1: a truncated or stopped interval is repeated as the next attempt.
     """
 
     kind: str
@@ -116,11 +110,7 @@ class ArchiveName:
 
 
 class HeaderError(ValueError):
-    """Invalid entries of a header.
-
-    Attributes:
-        problems: what is wrong, by entry.
-    """
+    """Invalid entries of a header; `problems` states what is wrong, by entry."""
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         self.problems = dict(problems)
@@ -184,11 +174,9 @@ class ArchiveHeader(BaseModel):
         plan_hash: digest of cell, URDF and plan.
         recorded_at: time of day, None in virtual time.
         effects: effects of a simulated arm that the model does not contain.
-        held_joints: joints that were held still.
         motor_from_joint: motor angles per joint angle, n rows of n numbers.
         planted: true parameters of a simulated arm by name; None where not stated, empty where
             unreadable.
-        findings: of an import.
         entries: all entries as texts, without the checksum.
     """
 
@@ -273,16 +261,12 @@ class ArchiveOutcome(BaseModel):
     """How a recording ended, and what was written; an invalid count is None.
 
     Attributes:
-        outcome: such as ``completed``, ``stopped``, ``refused``.
-        reason: why it did not complete.
+        outcome, reason: such as ``completed``, ``stopped``, ``refused``; why it did not complete.
         samples, events, packets: numbers written.
-        first_cycle, last_cycle: of the controller.
         lost_packets, records_lost, events_lost: lost by the link and by this PC.
         late_replies: late, or omitted because a newer packet had arrived.
-        replies_not_accepted: not accepted according to the target of the controller.
         repaired: whether the file was repaired with loss.
-        samples_lost: by repairs, None where unknown.
-        losses: by repairs, a sentence each.
+        samples_lost, losses: by repairs, None where unknown; a sentence each.
         description: checksum of the header, None in older files.
         chunks: checksums of all chunks in order; None in older files, or where invalid.
         record: all entries as texts, without the checksum of the record.

@@ -1,8 +1,7 @@
 """Live view of a recording: the Foxglove WebSocket protocol.
 
-It sends a part of the messages of the archive. It cannot delay the recording: a queue drops the
-oldest rows, a thread encodes them, and the server (the official SDK, in its own threads) drops the
-oldest messages of slow clients.
+It cannot delay the recording: a queue drops the oldest rows, a thread encodes them, and the server
+(the official SDK, in its own threads) drops the oldest messages of slow clients.
 """
 
 from __future__ import annotations
@@ -61,13 +60,7 @@ class LiveViewError(InputError):
 
 @dataclass(frozen=True)
 class LiveView:
-    """Settings of a live view; pickles.
-
-    Attributes:
-        host: address of this computer; all who can reach it can connect.
-        port: TCP.
-        rate: cycles published per second, at most.
-    """
+    """Address and rate of a live view; pickles. All who can reach `host` can connect."""
 
     host: str = LOOPBACK
     port: int = PORT
@@ -101,14 +94,9 @@ Records = NDArray[np.void]
 
 @dataclass(frozen=True, eq=False)
 class Serve:
-    """Command to serve a live view, with and without an open archive.
+    """Command to serve a live view, with and without an open archive; see `Serving`, `Failed`.
 
-    Attributes:
-        job: number of the answer, `Serving` or `Failed`.
-        view: address and rate.
-        joint_names: of the link.
-        period: of the controller, s.
-        drive_train: used until an archive is opened with its own.
+    `drive_train` is used until an archive is opened with its own.
     """
 
     job: int
@@ -126,14 +114,7 @@ class _Batch:
 
 
 class LivePublisher:
-    """Serves viewers until `close`.
-
-    Args:
-        command: address, rate and link.
-
-    Attributes:
-        port: TCP port.
-        drive_train: of the link; converts target currents to joint torques.
+    """Serves viewers until `close`; `drive_train` converts target currents to joint torques.
 
     Raises:
         LiveViewError: the address cannot be bound, or foxglove-sdk is not installed.
@@ -199,8 +180,7 @@ class LivePublisher:
 class ViewerClock:
     """Converts stamps to this computer's clock, evenly spaced as the controller's cycles.
 
-    The stamps in the messages start at zero in each session, which time lines of viewers cannot
-    display.
+    Stamps start at zero in each session, which viewers cannot display.
     """
 
     def __init__(self) -> None:

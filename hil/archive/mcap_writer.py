@@ -1,10 +1,8 @@
 """Writer of MCAP files that adds whole batches of messages at a time.
 
-It makes the same records as `mcap.writer.Writer`, but for the level of compression. The library
-adds messages singly, at some microseconds each, which would be most of the time of an archive with
-three messages a millisecond; here a batch of messages of constant size is one structured array.
-
-Layout: https://mcap.dev/spec
+It writes the records of `mcap.writer.Writer` (https://mcap.dev/spec). The library adds messages
+singly, at some microseconds each, too slow for three messages a millisecond; here a batch of
+messages of constant size is one structured array.
 """
 
 from __future__ import annotations
@@ -73,9 +71,8 @@ def span(entries: Entries) -> tuple[int, int]:
 class McapWriter:
     """Writes one MCAP file to `write`, which receives complete records.
 
-    Chunks end at `flush` only; a chunk without messages is not written, and what was registered for
-    it is added to the next. Compressed by Zstandard; chunks, attachments, index have checksums.
-    Message indexes and summary depend on the other records only, so a repair restores them exactly.
+    Chunks end at `flush` only; one without messages is not written. Message indexes and summary
+    depend on the other records only, so that a repair restores them exactly.
 
     Attributes:
         position: where the next record begins.
@@ -107,11 +104,7 @@ class McapWriter:
         self.put(encode(Attachment(0, 0, name, media_type, data)))
 
     def put(self, data: bytes) -> None:
-        """Add an encoded record other than a chunk, and list it in the summary.
-
-        Raises:
-            Damage: its body is not of its kind.
-        """
+        """Add an encoded record other than a chunk, and list it in the summary."""
         record, place = Record(self.position, data[0], data[RECORD.size :]), self.position
         if record.opcode == container.METADATA:
             name, _ = container.parse_metadata(record)
@@ -163,11 +156,8 @@ class McapWriter:
     ) -> None:
         """Add messages of several channels, one of each at each stamp.
 
-        Args:
-            channels: their ids.
-            stamp: shape (k,), nanoseconds.
-            sequence: shape (k,), number of the messages at each stamp, below 2^32.
-            messages: per channel its k messages, contiguous.
+        `stamp` (k,) is in ns, `sequence` (k,) below 2^32; `messages` has, for each channel, its k
+        messages, contiguous.
         """
         if not len(stamp):
             return

@@ -1,11 +1,9 @@
 """The archive process of a real link: writes the exchange's shared memory to files.
 
-Run as ``python -m hil.archive.process`` with the descriptors of ring, event log, control block,
-command socket and exchange process, the number of joints, and the descriptor of the raw packets
-if they are stored. It has its own process session and ignores SIGINT and SIGHUP, so that the end
-of a terminal does not end a recording. If the supervisor dies, it continues until the exchange has
-ended the motion or is dead, closes the archive with the true outcome, and ends. If it cannot write,
-it sets the archive's state in the control block to failed, and the exchange stops the arm.
+It has its own process session and ignores SIGINT and SIGHUP, so that the end of a terminal does not
+end a recording. If the supervisor dies, it continues until the exchange has ended the motion or is
+dead, closes the archive with the true outcome, and ends. If it cannot write, it sets the archive's
+state in the control block to failed, and the exchange stops the arm.
 """
 
 from __future__ import annotations
@@ -73,10 +71,7 @@ class PreTriggerBuffer:
                 parts.pop(0)
 
     def pop_session(self) -> tuple[Records, list[ExchangeEvent], Records]:
-        """Remove and return records, events and raw packets of the latest session.
-
-        Its init packet is not among the events.
-        """
+        """Remove and return what is of the last session, behind its init packet."""
         events = self._events
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
         session = (
@@ -121,17 +116,15 @@ DETACHED_SILENCE: Final = 60.0
 
 @dataclass
 class Job:
-    """The open archive.
+    """The open archive, and what was counted when it began.
 
     Attributes:
         number: identifies it to the supervisor.
-        recorder: fills it.
         until_ended: whether it is closed at the end of the motion.
-        overflow, packets_overflow: of the readers at its begin.
-        accepted, ended_count: fields of the control block at its begin.
-        last_record: time of the last record, monotonic s.
+        overflow, packets_overflow: of the readers.
+        accepted, ended_count: of the control block at its begin.
+        last_record, ended: times of the last record and of the end of the motion, monotonic s.
         flushed: whether all records were written to the disk.
-        ended: time at which the end of the motion was read, monotonic s.
         exchange_silent: whether silence of the exchange was recorded.
     """
 
@@ -151,11 +144,7 @@ class Job:
 class ArchiveProcess:
     """Transfers records, events and packets to archives as commanded by the supervisor.
 
-    Args:
-        ring, events, control: memory of the exchange.
-        commands: channel to the supervisor.
-        exchange: descriptor of the exchange process (a pidfd), readable after its death.
-        packets: memory of the raw packets, None if they are not recorded.
+    `exchange` is a pidfd of the exchange process; `packets` is None if they are not recorded.
     """
 
     def __init__(
@@ -369,26 +358,11 @@ class ArchiveProcess:
             while self._packets and recorder.lacks_packets and time.monotonic() < until:
                 time.sleep(PACKET_DELAY)
                 self._transfer_packets(job)
-            recorder.close(outcome, reason)
+            recorded = recorder.close(outcome, reason)
         except Exception as error:
             self._fail(job.number, error)
             return
-        ended = recorder.ended
-        self._reply(
-            Closed(
-                job.number,
-                outcome,
-                reason,
-                interval=-1 if ended is None else ended.interval,
-                records=recorder.records,
-                records_lost=recorder.records_lost,
-                events_lost=recorder.events_lost,
-                missed=recorder.missed,
-                late=recorder.late,
-                not_accepted=recorder.not_accepted,
-                disk_waited=recorder.writer.slowest_flush,
-            )
-        )
+        self._reply(Closed(job.number, recorded))
 
     def _fail(self, number: int, error: Exception) -> None:
         """Report a failure; first by the field that makes the exchange stop the arm."""

@@ -34,13 +34,7 @@ _REMEDIES: Final = {
 
 @dataclass(frozen=True)
 class ArchiveDamage:
-    """Damage of an archive.
-
-    Attributes:
-        offset: byte in the file from which nothing was read.
-        bytes_dropped: bytes from there to the end of the file.
-        text: what is wrong, and how much could be read.
-    """
+    """Damage of an archive: from byte `offset` on, `bytes_dropped` bytes were not read."""
 
     offset: int
     bytes_dropped: int
@@ -55,12 +49,11 @@ class Archive:
     """The content of an archive.
 
     Attributes:
-        header: metadata at its beginning.
         outcome: how the recording ended, None where missing.
         attachments: content by file name.
         columns: contiguous read-only arrays (m,) or (m, n) by name: the fields of the cycle
             message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
-            recording where recorded; and ``stamp`` (m,), nanoseconds.
+            recording where recorded; and ``stamp`` (m,), ns.
         events: in the order of writing.
         damage: what was lost, None when nothing was.
     """

@@ -110,17 +110,7 @@ AFTERMATH = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ArchiveSpec:
-    """An archive to be written; pickles.
-
-    Attributes:
-        path: the file, which must not exist.
-        joint_names: joints in the order of the records' columns.
-        period: cycle of the controller [s].
-        metadata: entries of the ``hil`` record.
-        attachments: content by file name.
-        durable: wait at each flush until the data are on the disk.
-        packets: whether raw packets are stored as well.
-    """
+    """Arguments of an `ArchiveWriter`; pickles."""
 
     path: Path
     joint_names: tuple[str, ...]
@@ -147,6 +137,35 @@ class ArchiveSpec:
         return ArchiveWriter(**{one.name: getattr(self, one.name) for one in fields(self)})
 
 
+@dataclass(frozen=True)
+class Recorded:
+    """How an archive ended, and what it contains.
+
+    Attributes:
+        outcome, reason: as in the file.
+        interval: of the motion, -1 without one.
+        seconds: of the controller's time since its init packet.
+        records, records_lost: cycles archived, and overwritten before they could be.
+        events_lost: events overwritten before they could be archived.
+        missed: packets that never arrived.
+        late: packets whose reply was late, or left out for a newer one.
+        not_accepted: replies that the controller did not accept.
+        disk_waited: longest write [s].
+    """
+
+    outcome: str
+    reason: str
+    interval: int
+    seconds: float
+    records: int
+    records_lost: int
+    events_lost: int
+    missed: int
+    late: int
+    not_accepted: int
+    disk_waited: float
+
+
 class Recorder:
     """Fills one archive from records and events, and closes it with the true outcome.
 
@@ -163,10 +182,6 @@ class Recorder:
         link_lost: whether the link was lost meanwhile.
         refused: the last refusal of the session meanwhile, None without one.
         records: number of archived records.
-        records_lost, events_lost, packets_lost: numbers overwritten before they were archived.
-        missed: packets that never arrived.
-        late: packets answered late, or dropped for a newer one.
-        not_accepted: replies not accepted by the controller.
         newest: cycle of the newest archived record, -1 before the first.
     """
 
@@ -177,26 +192,26 @@ class Recorder:
         self.link_lost = False
         self.refused: Refused | None = None
         self.records = 0
-        self.records_lost = 0
-        self.events_lost = 0
-        self.packets_lost = 0
-        self.missed = 0
-        self.late = 0
-        self.not_accepted = 0
         self.newest = -1
+        self._records_lost = 0
+        self._events_lost = 0
+        self._packets_lost = 0
+        self._missed = 0
+        self._late = 0
+        self._not_accepted = 0
         self._drive_train = drive_train
         self._newest_packet = -1
         self._cut = False
         self._packets_cut = False
 
     def record_packets(self, packets: Records, lost: int = 0) -> None:
-        """Archive raw packets, `lost` of which were overwritten before.
+        """Archive raw packets, `lost` of which were overwritten before; call it before `record`.
 
-        To be called before `record` with their records. An archive without packets drops them.
+        An archive without packets drops them.
         """
         if not self.writer.with_packets:
             return
-        self.packets_lost += lost
+        self._packets_lost += lost
         if self._packets_cut or not len(packets):
             return
         packets, self._packets_cut = self._own_rows(packets, self._newest_packet, least=0)
@@ -219,14 +234,14 @@ class Recorder:
         self._write(records)
         for event in own:
             if isinstance(event, EventsLost):
-                self.events_lost += event.count
+                self._events_lost += event.count
             elif isinstance(event, AnswersLost):
-                self.not_accepted += event.count
+                self._not_accepted += event.count
             elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
-                self.late += event.count
+                self._late += event.count
             self._archive(event)
         if lost:
-            self.records_lost += lost
+            self._records_lost += lost
             self.writer.event(None, "RecordsLost", f"{lost} records overwritten", level=Level.ERROR)
 
     def motion_ended(self, outcome: Outcome, interval: int) -> None:
@@ -254,18 +269,31 @@ class Recorder:
             return True
         return self.newest >= self._last_cycle
 
-    def close(self, outcome: str, reason: str = "") -> None:
-        """Complete the archive."""
+    def close(self, outcome: str, reason: str = "") -> Recorded:
+        """Complete the archive, and return what it contains."""
         counts = {
-            "records_lost": self.records_lost,
-            "events_lost": self.events_lost,
-            "late_answers": self.late,
-            "answers_not_taken": self.not_accepted,
+            "records_lost": self._records_lost,
+            "events_lost": self._events_lost,
+            "late_answers": self._late,
+            "answers_not_taken": self._not_accepted,
         }
         if self.writer.with_packets:
-            counts["packets_lost"] = self.packets_lost
+            counts["packets_lost"] = self._packets_lost
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
+        return Recorded(
+            outcome=outcome,
+            reason=reason,
+            interval=-1 if self.ended is None else self.ended.interval,
+            seconds=(self.newest + 1) * self.writer.period,
+            records=self.records,
+            records_lost=self._records_lost,
+            events_lost=self._events_lost,
+            missed=self._missed,
+            late=self._late,
+            not_accepted=self._not_accepted,
+            disk_waited=self.writer.file.slowest_flush,
+        )
 
     def update(self, events: Sequence[ExchangeEvent]) -> None:
         """Update the state of the interval by events, without archiving them."""
@@ -292,10 +320,7 @@ class Recorder:
     def _own_rows(self, rows: Records, newest: int, *, least: int) -> tuple[Records, bool]:
         """Return rows up to the end of session and aftermath, and whether others follow.
 
-        Args:
-            rows: new rows.
-            newest: cycle of the row before them.
-            least: smallest increment of the cycle from row to row.
+        `newest` is the cycle before them, `least` the smallest step of the cycle from row to row.
         """
         cycles = rows["cycle"]
         beyond = (np.diff(cycles, prepend=newest) < least) | (cycles > self._last_cycle)
@@ -310,7 +335,7 @@ class Recorder:
             return
         self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
         self.records += len(records)
-        self.missed += int(records["gap"].sum())
+        self._missed += int(records["gap"].sum())
         self.newest = int(records["cycle"][-1])
 
 

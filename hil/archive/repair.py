@@ -1,8 +1,7 @@
 """Repair of truncated or damaged archives.
 
-What passes the checks of `hil.archive.scan` is copied record by record, also behind a damage;
-message indexes and summary are regenerated, and the outcome states what is lost. What cannot be
-verified is left out.
+What passes the checks of `hil.archive.scan` is copied, also behind a damage; message indexes and
+summary are regenerated, and the outcome states what is lost.
 """
 
 from __future__ import annotations
@@ -30,11 +29,7 @@ Visit = Callable[[Scan, Mapping[str, Messages], int], None]
 
 
 def scan_file(path: Path, visit: Visit = lambda *_: None) -> Scan:
-    """Scan a whole file, past its damages.
-
-    Args:
-        path: the file.
-        visit: called with each valid chunk, with its messages by topic and its offset.
+    """Scan a whole file, past its damages; `visit` gets each valid chunk, see `Scan`.
 
     Raises:
         ArchiveError: it cannot be read.
@@ -51,12 +46,10 @@ class Repair:
     """Result of a repair.
 
     Attributes:
-        path: the archive.
         output: the repaired file, None where nothing had to be written.
         intact: whether the archive had no fault.
         losses: what is lost, one sentence each; empty if all that was written is there.
-        samples: number of samples in the repaired file.
-        samples_lost: number of samples lost, None where unknown.
+        samples, samples_lost: in the repaired file, and lost; None where unknown.
     """
 
     path: Path
@@ -78,15 +71,11 @@ def repair(
     *,
     in_place: bool = False,
 ) -> Repair:
-    """Repair an archive.
+    """Repair an archive; it is unchanged unless `in_place`.
 
-    The output gets its name only when it is complete and has been read back. A file that lost only
-    its index is restored to the byte; an intact one is copied where an output is named.
-
-    Args:
-        path: the archive, unchanged unless `in_place`.
-        output: the file to write, which must not exist; `repaired_name` by default.
-        in_place: replace the archive by the repaired one instead.
+    The output, by default `repaired_name`, must not exist, and gets its name only when it is
+    complete and has been read back. A file that lost only its index is restored to the byte; an
+    intact one is copied where an output is named.
 
     Raises:
         NotAnArchiveError: another kind of file, or its header is lost.
@@ -113,15 +102,7 @@ def repair(
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
-    """Replace outcome and reason of an intact archive.
-
-    The file is written beside the old one, read back, and then renamed: an interruption leaves the
-    old or the new file.
-
-    Args:
-        path: the archive.
-        outcome: such as ``rejected``.
-        reason: why, in a sentence.
+    """Replace outcome and reason of an intact archive, of which always one version exists.
 
     Raises:
         ArchiveError: it is not an intact archive.
@@ -155,15 +136,10 @@ def has_valid_index(path: Path, found: Scan) -> bool:
 def _rewrite(
     path: Path, found: Scan, target: Path, outcome: Mapping[str, str] | None = None
 ) -> None:
-    """Write the valid content of an archive to `target`, which is replaced as a whole.
+    """Write the valid content of an archive to `target`, which may be the source.
 
-    The output is on the disk when this returns, and has the mode of its source.
-
-    Args:
-        path: the source.
-        found: its valid content.
-        target: the file to write or to replace, which may be the source.
-        outcome: entries of its outcome to replace.
+    The output is on the disk when this returns, and has the mode of its source. `outcome` has
+    entries of the outcome to replace.
 
     Raises:
         ArchiveWriteError: the output cannot be written.

@@ -1,9 +1,9 @@
 """Verification of an archive, record by record.
 
 A reader stops at the first damage, checks and repairs continue behind it. The checksum of a chunk
-shows that it is intact, not that it belongs to this recording: a file system may put a chunk of
-another archive in its place. The outcome therefore lists the checksums of all chunks in order;
-where this list is missing, cycle numbers must increase.
+does not show that it belongs to this recording: a file system may put a chunk of another archive in
+its place. The outcome therefore lists the checksums of all chunks in order; where this list is
+missing, cycle numbers must increase.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Expected:
 
     Attributes:
         written_by: profile and library, None where the record is damaged.
-        chunks: their checksums in order, shape (k,); None where not stated.
+        chunks: their checksums in order, (k,); None where not stated.
         mixed: whether the end is of another recording than the beginning.
         repaired: whether messages were lost before the file was written.
         samples: how many were written, limited to what fits into the file.
@@ -112,13 +112,7 @@ def _own_metadata(records: Iterable[Record]) -> dict[str, dict[str, str]]:
 
 
 class Fault(NamedTuple):
-    """A violation of the profile.
-
-    Attributes:
-        aspect: part of the profile: container, metadata, attachments, chunks, sequence or outcome.
-        text: what is wrong, without full stop.
-        loss: whether content is lost; otherwise it can be restored from the rest.
-    """
+    """A violation of the profile: its aspect, a sentence, and whether content is lost."""
 
     aspect: str
     text: str
@@ -129,7 +123,6 @@ class Scan:
     """The verified content of an archive.
 
     Args:
-        stream: the file.
         visit: receives verified messages by topic, of the chunk at an offset (and of some that
             follow); raises `Damage` where they cannot be used, and then they do not count.
         topics: channels wanted, None for those of the samples and the events; others are verified
@@ -139,21 +132,14 @@ class Scan:
             `damage`.
 
     Attributes:
-        size: of the file.
-        expected: what the file states about its content.
-        metadata: entries of the ``hil`` record, None until it was read.
-        header: the same, parsed; None where invalid (`header_error`) or of another version.
+        metadata, header: the ``hil`` record as read, and parsed: None where invalid
+            (`header_error`) or of another version.
         outcome: the ``hil.outcome`` record, None until it was read.
-        attachments: content by file name.
-        parser: of the chunks.
         definitions: schema and channel records of the summary.
         counts: messages by topic.
         chunks: number of valid chunks.
-        pieces: valid records except header and outcome, in the order of the file: opcode, offset
-            and length with the head.
-        record: the record in progress.
-        damage: the first damage, where the scan stops there.
-        faults: what is wrong, except message indexes and summary, where it continues.
+        pieces: opcode, offset and length of the valid records except header and outcome.
+        faults: what is wrong, except message indexes and summary.
     """
 
     def __init__(
@@ -435,7 +421,7 @@ class Scan:
     def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
         """Add messages that must be the next of their channels; else none of them.
 
-        Several chunks at once must not define channels: the chunks before must be checked first.
+        Several chunks at once must not define channels.
         """
         parser = self.parser
         before = dict(parser.schemas), dict(parser.channels)
@@ -502,9 +488,10 @@ class Scan:
             self._add_fault("sequence", damage, loss=True)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
-        """Check that cycles increase; return the newest stamp [ns], -1 without cycles.
+        """Check that cycles increase, and that all channels have the same times without cycles.
 
-        Without cycles, all channels must have the same times.
+        Returns:
+            The newest stamp [ns], -1 without cycles.
         """
         samples = [topic for topic in found if topic in NUMBERS]
         timed = [schema.CYCLE] if schema.CYCLE in samples else samples

@@ -139,10 +139,7 @@ uint32 line
 
 @dataclass(frozen=True)
 class Channel:
-    """One topic and the ros2msg schema of its messages, with all its dependencies.
-
-    Writer and reader compute their byte layouts from the text, and other programs decode with it.
-    """
+    """One topic and the ros2msg schema of its messages, with all its dependencies."""
 
     topic: str
     schema: str
@@ -218,12 +215,7 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
 
 
 class Batch(NamedTuple):
-    """Messages of several channels, one of each at each stamp.
-
-    Attributes:
-        stamp: shape (k,), nanoseconds.
-        messages: by topic, k of each.
-    """
+    """Messages of several channels, one of each at each stamp (k,) [ns]."""
 
     stamp: NDArray[np.int64]
     messages: Mapping[str, Rows]
@@ -232,11 +224,7 @@ class Batch(NamedTuple):
 def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: Array) -> Batch:
     """Return the messages of k cycles: `/hil/cycle` and two JointState channels for viewers.
 
-    Args:
-        names: of the joints.
-        period: of the controller [s].
-        records: of the cycles.
-        torque: of the joints (k, n) [N·m].
+    `period` [s] of the controller, joint `torque` (k, n) [N·m].
     """
     stamp = _stamp(records, period)
     columns = {name: records[name] for name in records.dtype.names or ()}
@@ -267,11 +255,8 @@ def sample_messages(
 ) -> Batch:
     """Return samples of an imported recording as messages.
 
-    Args:
-        names: of the joints.
-        stamp: (k,) [ns].
-        states: ``position``, ``velocity`` and ``effort`` (k, n), where recorded.
-        motor_current: (k, n) [A], None where not recorded.
+    `stamp` (k,) [ns]; `states` are ``position``, ``velocity`` and ``effort`` (k, n), where known;
+    `motor_current` (k, n) [A], None where not recorded.
     """
     messages = {MEASURED: joint_states(names, stamp, states)}
     if motor_current is not None:
@@ -283,12 +268,9 @@ def sample_messages(
 def joint_states(
     names: Sequence[str], stamp: NDArray[np.int64], values: Mapping[str, Array]
 ) -> Rows:
-    """Return messages sensor_msgs/JointState.
+    """Return messages sensor_msgs/JointState at `stamp` (k,) [ns].
 
-    Args:
-        names: of the joints.
-        stamp: (k,) [ns].
-        values: those of ``position``, ``velocity`` and ``effort`` that are known, (k, n).
+    `values` are those of ``position``, ``velocity`` and ``effort`` that are known, (k, n).
     """
     position, velocity, effort = (
         len(names) * (word in values) for word in ("position", "velocity", "effort")
@@ -298,12 +280,7 @@ def joint_states(
 
 
 def set_points(records: Rows | Mapping[str, NDArray[Any]], name: str) -> Array:
-    """Return set-points (k, n) for viewers: those inside the controller where none was sent.
-
-    Args:
-        records: of cycles, or columns of them.
-        name: ``position`` or ``velocity``.
-    """
+    """Return commanded ``position`` or ``velocity`` (k, n), the controller's target where NaN."""
     sent = records[f"commanded_{name}"]
     return np.where(np.isnan(sent), records[f"target_{name}"], sent)
 
@@ -334,11 +311,8 @@ def message_layout(
 ) -> MessageLayout:
     """Return the layout of the messages of a topic of numbers.
 
-    Args:
-        topic: of the messages.
-        joints: names of the joints.
-        record: the schema in the file, None where it has none.
-        first: one of the messages; joint states may lack quantities.
+    `record` is the schema in the file, None where it has none; `first` is one of the messages:
+    joint states may lack quantities.
 
     Raises:
         LayoutError: a number is missing, or of another type or length than in the profile.

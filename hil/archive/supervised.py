@@ -19,7 +19,7 @@ from typing import IO, Any, Protocol
 from drivers.drive_train import DriveTrain
 from drivers.exchange.control import ControlBlock, HeartbeatMonitor
 from hil.archive.live import Serve
-from hil.archive.recorder import ArchiveSpec
+from hil.archive.recorder import ArchiveSpec, Recorded
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,8 @@ class Open:
     """Open an archive; one that is open is closed as interrupted.
 
     Attributes:
-        job: number of the archive.
-        spec: file and content.
-        drive_train: of the link.
-        from_now: leave out earlier records; otherwise begin with the oldest buffered record of
-            the session.
+        from_now: leave out earlier records; otherwise begin with the oldest buffered one of the
+            session.
         until_ended: close it when the motion has ended; otherwise only on `Close`.
     """
 
@@ -73,36 +70,15 @@ class Serving:
 
 @dataclass(frozen=True)
 class Closed:
-    """Archive `job` is complete.
-
-    Attributes:
-        job: its number.
-        outcome, reason: as in the file.
-        interval: of the motion, -1 without one.
-        records, records_lost, events_lost, missed, late, not_accepted: as of `Recorder`.
-        disk_waited: longest write [s].
-    """
+    """Archive `job` is complete."""
 
     job: int
-    outcome: str
-    reason: str
-    interval: int
-    records: int
-    records_lost: int
-    events_lost: int
-    missed: int
-    late: int
-    not_accepted: int
-    disk_waited: float
+    recorded: Recorded
 
 
 @dataclass(frozen=True)
 class Failed:
-    """Archive `job` could not be opened or written; what was flushed is intact.
-
-    Attributes:
-        errno: of the operating system, None for other failures.
-    """
+    """Archive `job` could not be opened or written; what was flushed is intact."""
 
     job: int
     path: str
@@ -118,8 +94,7 @@ Answer = Opened | Closed | Serving | Failed
 class Channel:
     """One end of the command socket, a `SOCK_SEQPACKET`.
 
-    A message is sent in parts, preceded by their number. Neither end waits longer than `TIMEOUT`
-    for the other.
+    A message is sent in parts after their number; neither end waits longer than `TIMEOUT` s.
     """
 
     PART = 64 << 10
@@ -196,13 +171,7 @@ def _import_paths() -> list[str]:
 
 @dataclass(eq=False)
 class ArchiveProcessHandle:
-    """Starts, commands and ends the archive process.
-
-    Attributes:
-        process: the child, in its own process session.
-        channel: to its command socket.
-        monitor: of its heartbeat.
-    """
+    """Starts, commands and ends the archive process, a child in its own process session."""
 
     process: subprocess.Popen[bytes]
     channel: Channel
@@ -303,11 +272,7 @@ class ArchiveProcessHandle:
         return f" ({lines[-1]})" if lines else f" (exit status {self.process.poll()})"
 
     def end(self) -> str | None:
-        """Close the open archive and end the process; one that hangs is killed.
-
-        Returns:
-            Its fault, None without one.
-        """
+        """Close the open archive and end the process, killed if it hangs; return its fault."""
         if self.alive:
             self.send(End())
         deadline = time.monotonic() + END_TIMEOUT

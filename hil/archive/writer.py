@@ -68,15 +68,12 @@ _MEDIA_TYPES: Final = {
 class ArchiveFile:
     """An MCAP file of the archive profile, open for writing.
 
-    The file has its final name from the start; without footer it is truncated, and readable up to
-    its last complete chunk. An existing file is never overwritten.
+    It has its final name from the start; without footer it is truncated, and readable up to its
+    last complete chunk. An existing file is never overwritten.
 
     Args:
-        path: where to write.
-        joint_names: joints in the order of the columns.
-        topics: of the channels.
-        metadata: entries of the ``hil`` metadata record. Kind, index and attempt are read from the
-            file name where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, is required.
+        metadata: entries of the ``hil`` record. Kind, index and attempt are read from the file name
+            where it is an `ArchiveName`; otherwise ``kind``, one of `KINDS`, is required.
         period: cycle time [s], None where it is not fixed.
         attachments: content by file name; viewers get a ``robot.urdf`` as a message as well.
         durable: wait at each flush until the data are on the disk.
@@ -232,11 +229,7 @@ def _create(path: Path) -> int:
 
 
 def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
-    """Return the caller's entries with those of the file name.
-
-    Raises:
-        ArchiveWriteError: the kind is missing or unknown, or entries contradict the file name.
-    """
+    """Return the caller's entries with those of the file name, which must agree."""
     name = ArchiveName.parse(path)
     named = name.metadata() if name else {}
     entries = {**named, **{key: str(value) for key, value in metadata.items()}}
@@ -268,10 +261,12 @@ class ArchiveWriter:
         joint_names: joints in the order of the records' columns.
         period: cycle time of the controller [s].
         metadata: see `ArchiveFile`. Times of day only if a real arm moves.
-        attachments: by file name: ``cell.toml``, ``robot.urdf``, ``drive_train.json``,
-            ``plan.json``.
+        attachments: ``cell.toml``, ``robot.urdf``, ``drive_train.json``, ``plan.json`` by name.
         durable: wait at each flush until the data are on the disk.
         packets: whether to store raw packets, see `add_packets`.
+
+    Attributes:
+        file: counts of messages, time of the slowest flush, and whether it is closed.
 
     Raises:
         ArchiveWriteError: the file exists or cannot be written, or the metadata are invalid.
@@ -298,7 +293,7 @@ class ArchiveWriter:
         self._first: int | None = None
         self._newest = 0
         self._lost = 0
-        self._file = ArchiveFile(
+        self.file = ArchiveFile(
             self.path,
             joint_names=joint_names,
             topics=(CYCLE, MEASURED, COMMANDED, EVENTS, *([PACKETS] if packets else [])),
@@ -314,39 +309,24 @@ class ArchiveWriter:
         begun = 0 if self._first is None else self._newest + 1 - self._first
         return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self.period
 
-    @property
-    def slowest_flush(self) -> float:
-        """Longest time that the disk took for one flush [s]."""
-        return self._file.slowest_flush
-
-    @property
-    def closed(self) -> bool:
-        """Whether the archive is closed."""
-        return self._file.closed
-
     def write(self, records: Rows, torque: Array | None = None) -> None:
         """Append cycle records.
 
         Args:
-            records: shape (k,), of type `drivers.cycle_dtype`; referenced until their chunk is
-                written, so pass a copy. Batches of some 100 cycles are most efficient.
-            torque: joint torque of each record, shape (k, n) [N·m]; None where unknown.
+            records: (k,), of type `drivers.cycle_dtype`; referenced until their chunk is written,
+                so pass a copy. Batches of some 100 cycles are most efficient.
+            torque: joint torque of each record, (k, n) [N·m]; None where unknown.
 
         Raises:
             ArchiveWriteError: the disk fails, the archive is closed, or the cycles do not increase,
                 in which case none of these records is written.
         """
-        if self._file.closed:
+        if self.file.closed:
             raise ArchiveWriteError(self.path, "the archive is closed")
         if not len(records):
             return
-        shape = (len(records), len(self._joint_names))
-        torques = np.full(shape, np.nan) if torque is None else np.asarray(torque, np.float64)
-        if torques.shape != shape or records["position"].shape != shape:
-            raise ValueError(
-                f"records are {records['position'].shape}, torques {torques.shape}, "
-                f"expected {shape}"
-            )
+        unknown = np.full((len(records), len(self._joint_names)), np.nan)
+        torques = unknown if torque is None else np.asarray(torque, np.float64)
         cycles = records["cycle"]
         self._check_growth(cycles)
         if self._first is None:
@@ -373,14 +353,10 @@ class ArchiveWriter:
         )
 
     def add_packets(self, packets: Rows) -> None:
-        """Add raw packets; each is written with the chunk of its cycle.
+        """Add raw packets (k,) of type `drivers.record.PACKET_DTYPE`, cycles not decreasing.
 
-        Packets must be added before the records of the same cycles: a packet whose chunk was
-        written goes into the next.
-
-        Args:
-            packets: shape (k,), of type `drivers.record.PACKET_DTYPE`, cycles not decreasing;
-                referenced until written, so pass a copy.
+        Each is written with the chunk of its cycle; one whose chunk was written goes into the next.
+        They are referenced until then, so pass a copy.
 
         Raises:
             ValueError: the archive was opened without packets.
@@ -399,23 +375,19 @@ class ArchiveWriter:
         level: Level = Level.INFO,
         data: Mapping[str, Any] | None = None,
     ) -> None:
-        """Add an event; it is flushed with the cycles that follow.
+        """Add an event of one line of text; it is flushed with the cycles that follow.
 
-        Args:
-            cycle: cycle of the controller in which it happened, None for the newest one written.
-            name: kind of event.
-            text: one line of text.
-            level: severity.
-            data: machine-readable content, JSON values.
+        `cycle` is that of the controller in which it happened, None for the newest one written;
+        `data` are JSON values.
         """
         time = (self._newest if cycle is None else cycle) * self.period
-        self._file.add_event(ArchivedEvent(time, name, text, level, data or {}))
+        self.file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
     def flush(self) -> None:
         """Write all pending records, also those of an incomplete chunk."""
         self._emit(everything=True)
         self._emit_packets(None)
-        self._file.flush()
+        self.file.flush()
 
     def close(
         self, outcome: str, *, reason: str = "", details: Mapping[str, str] | None = None
@@ -425,13 +397,13 @@ class ArchiveWriter:
         Args:
             outcome: how the interval ended, such as ``completed``, ``stopped``, ``refused``.
             reason: why it did not complete.
-            details: further entries of the ``hil.outcome`` metadata record.
+            details: further entries of the ``hil.outcome`` record.
         """
-        if self._file.closed:
+        if self.file.closed:
             return
         self._emit(everything=True)
         self._emit_packets(None if self._first is None else self._newest)
-        counts = self._file.counts
+        counts = self.file.counts
         cycles = {
             "samples": counts[CYCLE],
             "events": counts[EVENTS],
@@ -441,7 +413,7 @@ class ArchiveWriter:
         if self._first is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self._newest}
         texts = {key: str(value) for key, value in cycles.items()}
-        self._file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
+        self.file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
 
     def __enter__(self) -> Self:
         return self
@@ -469,9 +441,9 @@ class ArchiveWriter:
         for start, stop in pairwise(cuts):
             part = records[start:stop]
             batch = cycle_messages(self._joint_names, self.period, part, torque[start:stop])
-            self._file.add(batch)
+            self.file.add(batch)
             self._emit_packets(int(part["cycle"][-1]))
-            self._file.flush()
+            self.file.flush()
         rest = cuts[-1]
         self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []
 
@@ -483,7 +455,7 @@ class ArchiveWriter:
         count = len(packets)
         if last is not None:
             count = int(np.searchsorted(packets["cycle"], last, side="right"))
-        self._file.add(packet_messages(self.period, packets[:count]))
+        self.file.add(packet_messages(self.period, packets[:count]))
         self._pending_packets = [packets[count:]] if count < len(packets) else []
 
 
@@ -516,16 +488,9 @@ def write_samples(
     period: float | None = None,
     durable: bool = True,
 ) -> Path:
-    """Write a recording as an archive of kind ``imported``.
+    """Write a recording as an archive of kind ``imported``; see `ArchiveWriter`.
 
-    Args:
-        path: the file, which must not exist.
-        samples: of the recording.
-        joint_names: joints in the order of the columns.
-        metadata: entries of the ``hil`` metadata record.
-        attachments: content by file name.
-        period: sampling step [s] of a recording at a fixed rate.
-        durable: wait until the data are on the disk.
+    `period` is the step [s] of a recording at a fixed rate.
 
     Raises:
         ArchiveWriteError: the file exists or cannot be written, or a stamp cannot be stored.

@@ -1,5 +1,7 @@
 """Campaign: plan, run, archive; resumable."""
 
+from hil.archive.recorder import Recorded
+
 from .campaign import Campaign
 from .errors import (
     CampaignFolderError,
@@ -11,7 +13,7 @@ from .folder import CampaignFolder
 from .intervals import Interval, require_runnable
 from .link import Link
 from .live_link import LiveLink
-from .motion_link import MotionLink, Progress, Recorded
+from .motion_link import MotionLink, Progress
 from .operator import Stop, stop_on_interrupt
 from .plan import CampaignPlan, PlannedMotion, design, plan_around
 

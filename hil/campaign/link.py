@@ -26,6 +26,7 @@ from drivers.transports.base import Transport
 from drivers.transports.simulated import SimulatedTransport
 from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
+from hil.archive.recorder import Recorded
 from hil.cell import Cell
 from hil.errors import ControllerFault
 
@@ -34,7 +35,6 @@ from .motion_link import (
     Connection,
     MotionLink,
     Progress,
-    Recorded,
     StartTimeout,
     Watch,
     described,
@@ -145,11 +145,9 @@ class Link(MotionLink):
             finally:
                 self._archiving = None  # which refers to this link
 
-    def complete(self, outcome: str, reason: str) -> Recorder:
+    def complete(self, outcome: str, reason: str) -> Recorded:
         """See `MotionLink.complete`."""
-        recorder = self._open_archiving.recorder
-        recorder.close(outcome, reason)
-        return recorder
+        return self._open_archiving.recorder.close(outcome, reason)
 
     def drain_packets(self) -> NDArray[np.void] | None:
         """Return the raw packets since the last call; None if they are not stored."""
@@ -246,8 +244,7 @@ class Link(MotionLink):
             limited=duration is not None,
             refused=recorder.refused,
         ) or ("completed", "the controller ended the session")
-        self.complete(*end)
-        return Recorded.of(*end, (recorder.newest + 1) * spec.period, recorder)
+        return self.complete(*end)
 
     def _no_session(self, _wait: float, /) -> str:
         return "the controller did not start a session"

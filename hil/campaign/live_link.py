@@ -49,7 +49,7 @@ from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
 from hil.archive.live import LiveView, LiveViewError, Serve
-from hil.archive.recorder import describe
+from hil.archive.recorder import Recorded, describe
 from hil.archive.supervised import (
     ArchiveProcessHandle,
     Close,
@@ -70,7 +70,6 @@ from .motion_link import (
     Connection,
     MotionLink,
     Progress,
-    Recorded,
     StartTimeout,
     Watch,
     active_drive_train,
@@ -461,7 +460,7 @@ class LiveLink(MotionLink):
         self._restart_reader()
         yield
 
-    def complete(self, outcome: str, reason: str) -> Closed:
+    def complete(self, outcome: str, reason: str) -> Recorded:
         """See `MotionLink.complete`.
 
         Raises:
@@ -474,14 +473,14 @@ class LiveLink(MotionLink):
         closed = self._request(Close(self.job, outcome, reason), Closed, incomplete)
         if closed is None:
             raise ControllerFault(f"{path} was not completed within {OPEN_TIMEOUT:g} s")
-        self._add_counts(closed)
-        return closed
+        self._add_counts(closed.recorded)
+        return closed.recorded
 
-    def _add_counts(self, closed: Closed) -> None:
+    def _add_counts(self, recorded: Recorded) -> None:
         self.open_path = ""
-        self.cycles += closed.records
-        self.late += closed.late
-        self.not_accepted += closed.not_accepted
+        self.cycles += recorded.records
+        self.late += recorded.late
+        self.not_accepted += recorded.not_accepted
 
     def _write_failed(self, failed: Failed) -> ArchiveWriteError:
         self.open_path = ""
@@ -647,8 +646,8 @@ class LiveLink(MotionLink):
             self.exchange.stop()
             self.view.poll()
             reason = self.view.failure() or str(error)
-            closed = self.complete("void", reason)
-            raise ControllerFault(f"{reason}; {path} is {closed.outcome}") from error
+            recorded = self.complete("void", reason)
+            raise ControllerFault(f"{reason}; {path} is {recorded.outcome}") from error
         finally:
             if not accepted:
                 self.heart.rest()
@@ -679,7 +678,7 @@ class LiveLink(MotionLink):
                 return self._give_up(spec, reason)
             answer = self.archive.answer(POLL, self.job)
             if isinstance(answer, Closed):
-                return self._ended(answer)
+                return self._ended(answer.recorded)
             if isinstance(answer, Failed):
                 error = self._write_failed(answer)
                 self._come_to_rest()
@@ -691,23 +690,23 @@ class LiveLink(MotionLink):
                 late = f"{spec.path} was not completed within {REST_TIMEOUT:g} s"
                 raise ControllerFault(f"the motion has ended, but {late}")
 
-    def _ended(self, closed: Closed) -> MotionEnded:
+    def _ended(self, recorded: Recorded) -> MotionEnded:
         """Return how the motion of a completed archive ended."""
         view = self.view
-        self._add_counts(closed)
+        self._add_counts(recorded)
         view.poll()
         ended = view.ended
-        if ended is None and closed.outcome in get_args(Outcome) and view.motion_ended:
-            outcome: Outcome = closed.outcome  # type: ignore[assignment]
-            ended = MotionEnded(outcome, closed.reason, closed.interval, -1)
+        if ended is None and recorded.outcome in get_args(Outcome) and view.motion_ended:
+            outcome: Outcome = recorded.outcome  # type: ignore[assignment]
+            ended = MotionEnded(outcome, recorded.reason, recorded.interval, -1)
         if ended is None:
-            failure = view.failure() or closed.reason
+            failure = view.failure() or recorded.reason
             raise ControllerFault(
                 f"{failure}; the controller gets no answers and acts by its own watchdog; "
-                f"the archive ({closed.outcome}) is complete up to then"
+                f"the archive ({recorded.outcome}) is complete up to then"
             )
-        if ended.reason == NO_ARCHIVE and closed.disk_waited > SLOW_DISK:
-            waited = f"it waited for its disk for {closed.disk_waited:.1f} s"
+        if ended.reason == NO_ARCHIVE and recorded.disk_waited > SLOW_DISK:
+            waited = f"it waited for its disk for {recorded.disk_waited:.1f} s"
             return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: check that disk)")
         return replace(ended, reason=self.heart.with_cause(ended.reason))
 
@@ -777,9 +776,8 @@ class LiveLink(MotionLink):
             self._new_records()
             self._show_recording(watch)
             if ending is not None:
-                closed = self.complete(*ending)
                 seconds = (status.cycle + 1) * period
-                return Recorded.of(closed.outcome, closed.reason, seconds, closed)
+                return replace(self.complete(*ending), seconds=seconds)
             if isinstance(answer := self.archive.answer(POLL, self.job), Failed):
                 raise write_error(answer)
             if (failure := self._archive_failure()) is not None:

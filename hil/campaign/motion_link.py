@@ -28,8 +28,7 @@ from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.states import State
 from hil.archive import ArchiveSpec
-from hil.archive.recorder import Recorder, describe
-from hil.archive.supervised import Closed
+from hil.archive.recorder import Recorded, describe
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 from hil.motion_checks import MotionChecks
@@ -70,38 +69,6 @@ class StartTimeout:
         if now - self._requested > START_TIMEOUT:
             return f"the motion did not begin within {START_TIMEOUT:g} s ({state.name})"
         return None
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """How a recording of the controller's own motion ended.
-
-    Attributes:
-        outcome: "completed", "stopped", "lost" or "refused".
-        reason: in a sentence.
-        seconds: of the controller's time since its init packet.
-        records, records_lost: cycles archived, and overwritten before they could be.
-        events_lost: events overwritten before they could be archived.
-        missed: packets that never arrived.
-        late: packets whose reply was late, or left out for a newer one.
-        not_accepted: replies that the controller did not accept.
-    """
-
-    outcome: str
-    reason: str
-    seconds: float
-    records: int
-    records_lost: int
-    events_lost: int
-    missed: int
-    late: int
-    not_accepted: int
-
-    @classmethod
-    def of(cls, outcome: str, reason: str, seconds: float, counts: Recorder | Closed) -> Recorded:
-        """Return the result with the counts of its archive."""
-        names = ("records", "records_lost", "events_lost", "missed", "late", "not_accepted")
-        return cls(outcome, reason, seconds, **{name: getattr(counts, name) for name in names})
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,8 +297,8 @@ class MotionLink(ABC):
         """Open an archive, of one motion or of the controller's own; nothing moves before."""
 
     @abstractmethod
-    def complete(self, outcome: str, reason: str) -> Recorder | Closed:
-        """Complete the archive that is open, and return its counts."""
+    def complete(self, outcome: str, reason: str) -> Recorded:
+        """Complete the archive that is open, and return what it contains."""
 
     def _may_start(self, steering: Steering, stop: Stop) -> bool:
         """Wait for the end of a hold; return whether the motion may be requested now."""

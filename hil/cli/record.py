@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.status import Status
 
 from hil.archive.live import LiveView
+from hil.archive.recorder import Recorded
 from hil.campaign import Progress, Stop, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
-from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError

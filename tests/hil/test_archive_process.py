@@ -28,6 +28,7 @@ from drivers.exchange.event_log import EventReader, EventWriter
 from drivers.record import CycleRing, PacketReader, PacketRing, RingReader, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
 from hil.archive.process import ArchiveProcess
+from hil.archive.recorder import Recorded
 from hil.archive.supervised import (
     Answer,
     ArchiveProcessHandle,
@@ -105,16 +106,16 @@ class Rig:
     def answer(self, job: int) -> Answer | None:
         return self.process.answer(30.0, job)
 
-    def end(self) -> Closed:
+    def end(self) -> Recorded:
         """End the archive of the first job."""
         time.sleep(0.1)
         self.process.send(Close(1, "completed", "enough"))
         return self.closed(1)
 
-    def closed(self, job: int) -> Closed:
+    def closed(self, job: int) -> Recorded:
         answer = self.answer(job)
         assert isinstance(answer, Closed)
-        return answer
+        return answer.recorded
 
 
 @pytest.fixture

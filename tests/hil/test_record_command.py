@@ -23,8 +23,8 @@ from drivers.states import State
 from drivers.transports.faults import Corrupt, Lose
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
+from hil.archive.recorder import Recorded
 from hil.campaign import Link, Progress, Stop
-from hil.campaign.motion_link import Recorded
 from hil.cell import Cell
 from hil.cli.record import record as record_command
 from hil.demo_link import SIMULATE, free_port
