@@ -327,6 +327,8 @@ class ArchiveWriter:
             return
         unknown = np.full((len(records), len(self._joint_names)), np.nan)
         torques = unknown if torque is None else np.asarray(torque, np.float64)
+        if not records["position"].shape == torques.shape == unknown.shape:
+            raise ValueError(f"records and torques of {unknown.shape} are expected")
         cycles = records["cycle"]
         self._check_growth(cycles)
         if self._first is None:

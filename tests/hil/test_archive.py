@@ -220,7 +220,7 @@ class TestBadInput:
     def test_records_of_another_arm_or_session_are_refused(self, tmp_path, first):
         rows = records(100)
         with writer(tmp_path / NAME) as archive:
-            with pytest.raises(ValueError, match="expected"):
+            with pytest.raises(ValueError, match="are expected"):
                 archive.write(np.zeros(3, cycle_dtype(6)))
             archive.write(rows[:0])
             archive.write(rows, torques(rows))
@@ -253,7 +253,7 @@ class TestBadInput:
         with pytest.raises(ArchiveWriteError, match="No space left on device; what was flushed"):
             archive.write(rows[250:], torques(rows[250:]))
         monkeypatch.undo()
-        assert archive.closed
+        assert archive.file.closed
         back = open_archive(tmp_path / NAME)
         assert same(back.cycles(), rows[:200])
         assert back.damage is not None
