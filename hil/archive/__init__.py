@@ -10,7 +10,7 @@ from hil.archive.header import (
     ArchiveOutcome,
     Findings,
 )
-from hil.archive.reader import Archive, ArchiveDamage, open_archive
+from hil.archive.reader import Archive, open_archive
 from hil.archive.recorder import ArchiveSpec, Recorder
 from hil.archive.writer import ArchiveWriter, Samples, write_samples
 
@@ -19,7 +19,6 @@ __all__ = [
     "FORMAT_VERSION",
     "KINDS",
     "Archive",
-    "ArchiveDamage",
     "ArchiveHeader",
     "ArchiveName",
     "ArchiveOutcome",

@@ -360,7 +360,7 @@ def read_overview(path: str | PathLike[str]) -> Overview:
             if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
         },
         events=tuple((one.time, one.name, one.text) for one in archive.events[:_MOST_EVENTS]),
-        damage=None if archive.damage is None else str(archive.damage),
+        damage=archive.damage,
     )
 
 

@@ -106,13 +106,6 @@ class Serve:
     drive_train: DriveTrain
 
 
-@dataclass(frozen=True, eq=False)
-class _Batch:
-    records: Records
-    events: tuple[ExchangeEvent, ...]
-    drive_train: DriveTrain
-
-
 class LivePublisher:
     """Serves viewers until `close`; `drive_train` converts target currents to joint torques.
 
@@ -132,7 +125,8 @@ class LivePublisher:
         self._channels = [_channel(channel, self._context) for channel in cycles]
         self._events = _channel(EVENT_CHANNEL, self._context)
         self._clock = ViewerClock()
-        self._waiting: deque[_Batch] = deque(maxlen=QUEUE)
+        waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](maxlen=QUEUE)
+        self._waiting = waiting
         self._more, self._closed = threading.Event(), False
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
         self._thread.start()
@@ -142,7 +136,7 @@ class LivePublisher:
         if len(records):
             records = records[records["cycle"] % self._step == 0]
         if len(records) or events:
-            self._waiting.append(_Batch(records, tuple(events), self.drive_train))
+            self._waiting.append((records, tuple(events), self.drive_train))
             self._more.set()
 
     def close(self) -> None:
@@ -157,12 +151,13 @@ class LivePublisher:
             self._more.wait(POLL)
             self._more.clear()
             while self._waiting:
-                self._send(self._waiting.popleft())
+                self._send(*self._waiting.popleft())
 
-    def _send(self, batch: _Batch) -> None:
-        records = batch.records
+    def _send(
+        self, records: Records, events: Sequence[ExchangeEvent], drive_train: DriveTrain
+    ) -> None:
         if len(records):
-            torque = batch.drive_train.joint_torque(records["target_current"])
+            torque = drive_train.joint_torque(records["target_current"])
             encoded = cycle_messages(self._names, self._period, records, torque)
             times = [self._clock.at(int(stamp)) for stamp in encoded.stamp]
             for channel, rows in zip(self._channels, encoded.messages.values(), strict=True):
@@ -171,7 +166,7 @@ class LivePublisher:
                 for index, log_time in enumerate(times):
                     content = data[index * size : (index + 1) * size]
                     channel.log(content, log_time=log_time)
-        for event in batch.events:
+        for event in events:
             seconds = self._period * (getattr(event, "cycle", None) or 0)
             message = ArchivedEvent(seconds, type(event).__name__, describe(event), level_of(event))
             self._events.log(message.encode(), log_time=time.time_ns())

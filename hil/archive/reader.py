@@ -32,18 +32,6 @@ _REMEDIES: Final = {
 }
 
 
-@dataclass(frozen=True)
-class ArchiveDamage:
-    """Damage of an archive: from byte `offset` on, `bytes_dropped` bytes were not read."""
-
-    offset: int
-    bytes_dropped: int
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
-
-
 @dataclass(frozen=True, eq=False)
 class Archive:
     """The content of an archive.
@@ -55,7 +43,7 @@ class Archive:
             message, or ``position``, ``velocity``, ``torque`` and ``motor_current`` of an imported
             recording where recorded; and ``stamp`` (m,), ns.
         events: in the order of writing.
-        damage: what was lost, None when nothing was.
+        damage: what is wrong with the file and how much could be read; None if nothing.
     """
 
     path: Path
@@ -64,7 +52,7 @@ class Archive:
     attachments: Mapping[str, bytes]
     columns: Mapping[str, NDArray[Any]]
     events: tuple[ArchivedEvent, ...]
-    damage: ArchiveDamage | None
+    damage: str | None
 
     @property
     def complete(self) -> bool:
@@ -73,7 +61,7 @@ class Archive:
 
     @property
     def missing(self) -> str | None:
-        """Sentence about what is missing; None when the archive is complete."""
+        """Path and damage; None when the archive is complete."""
         return None if self.damage is None else f"{self.path}: {self.damage}"
 
     @property
@@ -97,25 +85,17 @@ class Archive:
         return len(self.columns["stamp"])
 
     def recorded(self, *names: str) -> Mapping[str, NDArray[Any]]:
-        """Return the columns of an archive that must have all of these.
-
-        Raises:
-            ArchiveError: one is missing, as in an imported recording.
-        """
+        """Return the columns; ArchiveError if one of these is missing, as in an import."""
         if missing := [name for name in names if name not in self.columns]:
             raise ArchiveError(
                 self.path,
                 f"is not a recording by hil: it has no column {missing[0]}",
-                remedy="remove it from the folder",
+                remedy="leave it out",
             )
         return self.columns
 
     def text(self, name: str) -> str:
-        """Return an attachment as text.
-
-        Raises:
-            ArchiveError: it is missing, or not UTF-8.
-        """
+        """Return an attachment as text; ArchiveError if it is missing, or not UTF-8."""
         if name not in self.attachments:
             raise ArchiveError(
                 self.path,
@@ -133,11 +113,7 @@ class Archive:
             ) from error
 
     def table(self, name: str) -> dict[str, Any]:
-        """Return an attachment that is a JSON object; empty where it is missing.
-
-        Raises:
-            ArchiveError: it is not a JSON object.
-        """
+        """Return an attachment that is a JSON object, empty if missing; else ArchiveError."""
         try:
             found = parse_json(self.attachments.get(name, b"{}"))
         except ValueError:
@@ -147,7 +123,7 @@ class Archive:
                 self.path,
                 "is not a JSON object",
                 field=name,
-                remedy="remove the archive, or use the attachment of another one of its campaign",
+                remedy="leave the archive out, or attach that of another one of its campaign",
             )
         return found
 
@@ -231,7 +207,7 @@ class _Content:
         return columns
 
     def _layout(self, scan: Scan, topic: str, messages: Messages, offset: int) -> MessageLayout:
-        """Return the layout of a topic's messages by its schema or by the first of them."""
+        """Return the layout of a topic's messages, known or by the first of them."""
         if topic in self._layouts:
             return self._layouts[topic]
         assert scan.header is not None
@@ -252,7 +228,7 @@ class _Content:
     def _append(
         self, topic: str, messages: Messages, at: int, chosen: NDArray[np.bool_] | None
     ) -> None:
-        """Copy messages, or those chosen of them (k,), into the columns from a place on."""
+        """Copy messages, or those chosen of them (k,), into the columns from `at` on."""
         fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
         columns = [(raw, fields[name][1]) for (own, name), raw in self._raw.items() if own == topic]
         begin = 0
@@ -277,9 +253,9 @@ def open_archive(
 ) -> Archive:
     """Read an archive.
 
-    A truncated or damaged file is read up to its last complete chunk before the damage, and
-    `Archive.damage` states what is missing. Where only some times are wanted and the index of the
-    file is intact, other chunks are not read, nor is their damage detected.
+    A damaged file is read up to its last complete chunk before the damage, and `Archive.damage`
+    states what is missing. Where only some times are wanted and the index of the file is intact,
+    other chunks are not read, nor is their damage detected.
 
     Args:
         path: the file.
@@ -321,7 +297,7 @@ def open_archive(
     if damage is None and recorded and unknown:
         remedy = f"it has {', '.join(recorded)}"
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
-    columns, lost = content.columns(), None
+    columns, text = content.columns(), None
     if damage is not None:
         dropped, stamp = scan.size - damage.offset, columns["stamp"]
         text = f"the record at byte {damage.offset} {damage.reason}"
@@ -330,7 +306,6 @@ def open_archive(
             duration = 1e-9 * float(stamp[-1] - stamp[0]) if len(stamp) else 0.0
             text += f"; {len(stamp)} samples ({duration:.6g} s) could be read"
         text += "; the outcome is missing" if scan.outcome is None else ""
-        lost = ArchiveDamage(damage.offset, dropped, text)
     return Archive(
         path=path,
         header=scan.header,
@@ -338,7 +313,7 @@ def open_archive(
         attachments=scan.attachments,
         columns=columns,
         events=tuple(content.events),
-        damage=lost,
+        damage=text,
     )
 
 

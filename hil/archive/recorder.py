@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,14 +119,6 @@ class ArchiveSpec:
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     durable: bool = True
     packets: bool = False
-
-    def with_more(self, metadata: Mapping[str, str], attachments: Mapping[str, bytes]) -> Self:
-        """Return a copy with further metadata and attachments, which replace earlier ones."""
-        return replace(
-            self,
-            metadata={**self.metadata, **metadata},
-            attachments={**self.attachments, **attachments},
-        )
 
     def open(self) -> ArchiveWriter:
         """Create the file.

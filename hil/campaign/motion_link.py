@@ -438,7 +438,11 @@ def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> 
             "accepted_init": "yes",
             "accepted_init.differences": "; ".join(connection.differences),
         }
-    return spec.with_more(metadata, attachments)
+    return replace(
+        spec,
+        metadata={**spec.metadata, **metadata},
+        attachments={**spec.attachments, **attachments},
+    )
 
 
 def active_drive_train(cell: Cell, connection: Connection) -> DriveTrain:

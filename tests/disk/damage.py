@@ -1,9 +1,9 @@
 """Damage archives of a finished campaign, many times: `python -m tests.disk.damage --rounds 1000`.
 
-Each round damages an archive or two as its number says (`draw`) and has everything that reads
-archives read them: `hil archive check`, `hil.open_recording`, `hil plot`, `hil identify` of
-archives or of the folder, every tenth round `hil reidentify` and `hil compare`. Each must give a
-named error, or what it gave before, or say in words what was left out (`tests/disk/laws.py`).
+Each round damages an archive or two by its number (`draw`) and runs all readers: `hil archive
+check`, `hil.open_recording`, `hil plot`, `hil identify` of archives or of the folder, every tenth
+round `hil reidentify` and `hil compare`. Each must raise a named error, or return what it returned
+before, or state what was left out (`tests/disk/laws.py`).
 
 Rounds in the journal are not run again. A failure is printed with the command that repeats it. The
 exit code is 1 if a law was broken in any round of the journal, 2 if the journal is none of these.
@@ -40,11 +40,10 @@ Files = Mapping[Path, bytes]
 
 
 def draw(rng: random.Random, files: Files, kind: str | None = None) -> tuple[Files, str]:
-    """One damage to one of these archives, or to two of them: new bytes by path, and in words.
+    """Return the files changed by one random damage, and its description.
 
-    What a disk, a cable or a careless copy may do. Nobody recomputes a checksum here: who does that
-    forges. What a file system may do to files beside each other, however, is done: sectors and
-    chunks of one archive that turn up in another, and files that swap their names.
+    Damage by disks, cables and file systems: also sectors and chunks of one archive in another, and
+    files that swap their names. No checksum is recomputed.
     """
     path = rng.choice(sorted(files))
     kind = kind or rng.choice(sorted(KINDS))
@@ -76,7 +75,7 @@ def _zeroed_sector(rng: random.Random, path: Path, files: Files) -> tuple[Files,
 
 
 def _copied_sector(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """From here or from another archive."""
+    """From this archive or another one."""
     source, size = rng.choice(sorted(files)), rng.choice(SECTORS)
     data, other = bytearray(files[path]), files[source]
     at, came = rng.randrange(0, len(data), size), rng.randrange(0, len(other), size)
@@ -91,7 +90,7 @@ def _cut(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
 
 
 def _zeroed_tail(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """What a power failure leaves on file systems that had set the length already."""
+    """As after a power failure on file systems that set the length first."""
     data = files[path]
     at = rng.randrange(0, len(data), rng.choice(SECTORS))
     return {path: data[:at] + bytes(len(data) - at)}, f" from {at} on"
@@ -122,7 +121,7 @@ def _missing_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files,
 
 
 def _strange_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """The same chunk of another archive in the place of ours, whole and with its checksum."""
+    """The same chunk of another archive instead, with its checksum."""
     source = rng.choice(sorted(set(files) - {path}))
     ours, theirs = chunks(files[path]), chunks(files[source])
     k = rng.randrange(min(len(ours), len(theirs)))
@@ -131,7 +130,7 @@ def _strange_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files,
 
 
 def _strange_tail(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """From some chunk on what another archive has."""
+    """The content of another archive from some chunk on."""
     source = rng.choice(sorted(set(files) - {path}))
     ours, theirs = chunks(files[path]), chunks(files[source])
     k = rng.randrange(min(len(ours), len(theirs)))
@@ -140,7 +139,7 @@ def _strange_tail(rng: random.Random, path: Path, files: Files) -> tuple[Files, 
 
 
 def _no_checksum(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """A chunk's checksum is 0, which MCAP takes for none, and a bit of it is another."""
+    """The checksum of a chunk is 0, which means none in MCAP, and one of its bits is flipped."""
     data, (begin, end) = bytearray(files[path]), rng.choice(chunks(files[path]))
     struct.pack_into("<I", data, begin + _CHUNK_CRC, 0)
     at = rng.randrange(begin + _CHUNK_CRC + 4, end)
@@ -149,7 +148,7 @@ def _no_checksum(rng: random.Random, path: Path, files: Files) -> tuple[Files, s
 
 
 def _index_unchecked(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """The checksum of the summary is 0, and a bit of the summary is another."""
+    """The checksum of the summary is 0, and one of its bits is flipped."""
     data = bytearray(files[path])
     footer = len(data) - len(container.MAGIC) - container.FOOTER_SIZE
     (summary,) = struct.unpack_from("<Q", data, footer + 9)
@@ -160,7 +159,7 @@ def _index_unchecked(rng: random.Random, path: Path, files: Files) -> tuple[File
 
 
 def _swapped_names(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """Two of a kind, so that nothing is wrong with either of them but its name."""
+    """Two archives of one kind, each intact."""
     kind = path.name.partition("_")[0]
     like = [one for one in sorted(files) if one.name.startswith(kind)]
     other = rng.choice(like)
@@ -199,7 +198,7 @@ def campaign(folder: Path, workers: Workers | None, repetitions: int = 3) -> Und
 def play(
     truth: Undamaged, number: int, workers: Workers | None, kind: str | None = None
 ) -> tuple[str, list[str]]:
-    """One round: what was damaged, and the laws it broke. The files are whole again after it."""
+    """Run one round; return the damage and the violated laws. The files are restored."""
     changed, words = draw(random.Random(f"{SEED}/{number}"), truth.files, kind)
     try:
         for path, data in changed.items():
@@ -213,18 +212,18 @@ def play(
 def run(
     given: argparse.Namespace, before: Mapping[int, dict[str, Any]]
 ) -> dict[int, dict[str, Any]]:
-    """The rounds that are asked for, without those that were run before."""
+    """Run the requested rounds, without those of `before`."""
     rounds: dict[int, dict[str, Any]] = {}
     left = [n for n in range(given.start, given.start + given.rounds) if n not in before]
     if not left:
         return rounds
-    tell = reporter(quiet=given.json)
+    progress = reporter(quiet=given.json)
     with (
         stop_on_interrupt() as stop,
         tempfile.TemporaryDirectory(dir=given.folder) as folder,
         LocalWorkers(1) as workers,
         Journal(given.journal) as journal,
-        tell.task("damaging archives (rounds)", len(left)) as task,
+        progress.task("damaging archives (rounds)", len(left)) as task,
     ):
         truth = campaign(Path(folder), workers)
         for number in left:

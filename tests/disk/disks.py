@@ -1,7 +1,7 @@
-"""Disks to be put under a campaign that are slow, hang or refuse on demand.
+"""Simulated disks that are slow, hang or fail on demand.
 
-They are planted under Python's own functions. Beside the folder lie a file of the rules in force
-and one of what they have struck, so that whoever writes below may be another process.
+Python's functions are patched. Files beside the folder contain the active rules and the operations
+they affected, so that other processes may write below it.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ class Disk:
         self.root, self._count = root, 0
 
     def do_wrong(self, *rules: Rule) -> list[str]:
-        """Put these rules in force, none: be well; what those before have struck."""
+        """Activate these rules (none: no faults); return the operations affected before."""
         log = self.root.parent / STRUCK
         struck = log.read_text().splitlines() if log.exists() else []
         log.unlink(missing_ok=True)
-        self._count += 1  # the same rules again begin anew
+        self._count += 1  # the same rules again start from zero
         text = json.dumps([self._count, *map(asdict, rules)])
         write_atomically(self.root.parent / RULES, text)
         return struck
 
 
 class Faults:
-    """The rules of a disk in a process that writes to it; any thread may ask."""
+    """The rules of a disk in a process that writes to it; thread-safe."""
 
     def __init__(self, root: Path) -> None:
         self.root, self._folder = root, root.parent
@@ -67,7 +67,7 @@ class Faults:
         self._until: dict[int, float] = {}
 
     def meet(self, operation: str, path: str) -> None:
-        """Be late, or raise OSError, if a rule says so."""
+        """Wait or raise OSError according to the rules."""
         with self._lock:
             self._read()
             delay, error = 0.0, 0
@@ -89,7 +89,7 @@ class Faults:
             raise OSError(error, os.strerror(error), path)
 
     def meet_at(self, operation: str, where: object) -> None:
-        """The same of a path or an open file, if it is on this disk."""
+        """Apply the rules to a path or an open file on this disk."""
         path = _path(where)
         if path is not None and path.is_relative_to(self.root):
             self.meet(operation, str(path))
@@ -104,7 +104,7 @@ class Faults:
 
 @contextmanager
 def planted_disk(folder: Path) -> Iterator[Disk]:
-    """One under the functions of this process."""
+    """Patch the functions of this process."""
     root = (folder / "planted").resolve()
     root.mkdir()
     with plant(Faults(root)):
@@ -113,7 +113,7 @@ def planted_disk(folder: Path) -> Iterator[Disk]:
 
 @contextmanager
 def processes_disk(folder: Path) -> Iterator[Disk]:
-    """One under the functions of every process that is started while this is open."""
+    """Patch the functions of every process that is started meanwhile."""
     root, code = (folder / "planted").resolve(), folder / "code"
     root.mkdir()
     code.mkdir()
@@ -123,7 +123,7 @@ def processes_disk(folder: Path) -> Iterator[Disk]:
         f"undo = plant(Faults(Path({str(root)!r})))\n"
     )
     path = os.pathsep.join([str(code), os.environ.get("PYTHONPATH", "")])
-    # The product hands on to its processes what this one can import.
+    # The product passes `sys.path` to its processes.
     with patch.dict(os.environ, PYTHONPATH=path), patch.object(sys, "path", [str(code), *sys.path]):
         yield Disk(root)
 
@@ -137,7 +137,7 @@ def _path(where: object) -> Path | None:
 
 
 def plant(faults: Faults) -> ExitStack:
-    """Put a disk under the functions of `os` that write, create, flush and rename, and `open`."""
+    """Patch `open` and the functions of `os` that write, create, flush and rename."""
 
     def met(
         name: str, operation: str, which: int = 0, when: Callable[..., bool] = lambda *_: True
@@ -167,12 +167,12 @@ def plant(faults: Faults) -> ExitStack:
 
 
 def _is_file(descriptor: int) -> bool:
-    """Not a folder: whose names are flushed where its file system can do that, and else not."""
+    """Return whether it is no folder, which not all file systems can flush."""
     return stat.S_ISREG(os.fstat(descriptor).st_mode)
 
 
 class _Raw(io.FileIO):
-    """A file that asks the disk before it writes: `FileIO` does not call `os.write`."""
+    """A file whose writes follow the rules: `FileIO` does not call `os.write`."""
 
     def __init__(self, faults: Faults, path: Path, mode: str) -> None:
         self._faults, self._path = faults, path
@@ -184,7 +184,7 @@ class _Raw(io.FileIO):
 
 
 def _opening(faults: Faults, true: Callable[..., Any]) -> Callable[..., Any]:
-    """As `open`: a file that is made on this disk, or written to, asks it before."""
+    """Return `open` that applies the rules to files created or written on this disk."""
 
     def function(file: Any, mode: str = "r", *arguments: Any, **named: Any) -> Any:
         path = None if isinstance(file, int) else _path(file)

@@ -1,6 +1,6 @@
-"""What must hold of an archive that was damaged, whatever reads it.
+"""Laws of damaged archives, for all readers.
 
-Each reader gives a named error, or the numbers that were written, or fewer of them and says so.
+Each reader raises a named error, or returns what was written, or less of it with a message.
 """
 
 from __future__ import annotations
@@ -31,27 +31,29 @@ Columns = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Undamaged:
-    """A finished campaign as it was before.
+    """A completed campaign before any damage.
 
     Attributes:
+        loose: the estimate from the archives without their folder.
         batch: estimates of the batch by archive, "" for all; values and standard deviations.
+        rows: every sample of all archives, see `_rows`.
     """
 
-    root: Path  # its folder
-    files: Mapping[Path, bytes]  # bytes of its archives
-    archives: Mapping[Path, Archive]  # what they hold, by path
-    loose: Identification  # the estimate from the archives by themselves
+    root: Path
+    files: Mapping[Path, bytes]
+    archives: Mapping[Path, Archive]
+    loose: Identification
     batch: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
-    rows: frozenset[bytes]  # every sample of all archives, see `_rows`
+    rows: frozenset[bytes]
 
     @property
     def paths(self) -> list[Path]:
-        """Archives as identification takes them."""
+        """Archives for identification."""
         return [p for p in sorted(self.files) if not p.name.startswith("move")]
 
 
 def undamaged(root: Path, workers: Workers | None) -> Undamaged:
-    """Read a campaign that is whole; without workers there is no batch of it."""
+    """Read a campaign; without workers, without a batch."""
     paths = sorted((root / "archives").glob("*.mcap"))
     fitted = [path for path in paths if not path.name.startswith("move")]
     archives = {path: open_archive(path) for path in paths}
@@ -68,16 +70,11 @@ def undamaged(root: Path, workers: Workers | None) -> Undamaged:
 def broken(
     truth: Undamaged, harmed: Sequence[Path], number: int, workers: Workers | None = None
 ) -> Iterator[str]:
-    """Each law that does not hold, in a sentence.
+    """Yield a sentence for each violated law, of the archives that were damaged.
 
-    Args:
-        truth: before the damage.
-        harmed: the archives that were damaged.
-        number: of the round: even ones identify the archives by themselves, odd ones the folder,
-            which knows their checksums.
-        workers: for a batch of the folder and its comparison with itself; None: without them.
+    Even rounds identify the archives, the others the folder, which has their checksums. With
+    workers there is a batch of the folder and a comparison with itself.
     """
-
     readers: list[Callable[[], Iterator[str]]] = [
         partial(law, truth, path) for path in harmed for law in (_reads, _checks, _looks)
     ]
@@ -97,7 +94,7 @@ def broken(
 
 
 def _blames(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
-    """Whether a sentence names a damaged archive, or their folder and no other archive."""
+    """Return whether a sentence names a damaged archive, or the folder and no other archive."""
     if any(path.name in text for path in harmed):
         return True
     return str(truth.root) in text and not any(path.name in text for path in truth.files)
@@ -109,30 +106,30 @@ def _reads(truth: Undamaged, path: Path) -> Iterator[str]:
         if not any(_same(archive, one) for one in truth.archives.values()):
             yield f"{path.name}: opened as complete with other content"
     elif not archive.missing:
-        yield f"{path.name}: incomplete without a word"
+        yield f"{path.name}: incomplete without a message"
     if not _written(archive.columns, truth):
-        yield f"{path.name}: holds a sample that was never written"
+        yield f"{path.name}: contains a sample that was never written"
 
 
 def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
     if check_archive(path).conforms and not _same(open_archive(path), truth.archives[path]):
-        yield f"{path.name}: keeps the profile with other content"
+        yield f"{path.name}: conforms with other content"
 
 
 def _looks(truth: Undamaged, path: Path) -> Iterator[str]:
-    """A part of the time, found through the index; then what `hil plot` shows."""
+    """Check a part of the time, found by the index, and what `hil plot` shows."""
     if path.read_bytes() in truth.files.values():
-        return  # whole, under another's name
+        return  # intact, under the name of another
     before = truth.archives[path].columns
     stamp = before["stamp"]
     start, stop = (float(np.quantile(stamp, share)) * 1e-9 for share in (0.3, 0.7))
     part = open_archive(path, fields=("position", "target_current"), start=start, stop=stop)
     if not _written(part.columns, truth):
-        yield f"{path.name}: a part of its time holds a sample that was never written"
+        yield f"{path.name}: a part of its time contains a sample that was never written"
     view = view_of(path)
     shown = float(stamp[-1] - stamp[0]) * 1e-9
     if not view.facts.damage and abs(view.stop - shown) > 1e-9:
-        yield f"{path.name}: {view.stop} s of {shown} s are drawn without a word"
+        yield f"{path.name}: {view.stop} s of {shown} s are shown without a message"
 
 
 def _identifies(truth: Undamaged, harmed: Sequence[Path], *, campaign: bool) -> Iterator[str]:
@@ -143,24 +140,21 @@ def _identifies(truth: Undamaged, harmed: Sequence[Path], *, campaign: bool) -> 
     before, now = truth.loose.estimate.pooled, found.estimate.pooled
     if _alike(before.values, now.values):
         return
-    said = [*found.results.notes, *found.results.verdict.warnings]
-    if not any(path.name in text for path in harmed for text in said):
-        yield f"{what}: another estimate, and nothing is said of {harmed[0].name}"
+    messages = [*found.results.notes, *found.results.verdict.warnings]
+    if not any(path.name in text for path in harmed for text in messages):
+        yield f"{what}: another estimate without a message about {harmed[0].name}"
     yield from _within(before.values, before.std, now.values, now.std, what)
 
 
 def _alike(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    """Whether two estimates are the same; of other parameters they are not."""
+    """Return whether two estimates are equal; those of other parameters are not."""
     return one.shape == other.shape and np.allclose(one, other, rtol=SAME, atol=0.0)
 
 
 def _within(
     before: NDArray[Any], std: NDArray[Any], now: NDArray[Any], other: NDArray[Any], what: str
 ) -> Iterator[str]:
-    """Damage takes samples away: what is left estimates the same parameters.
-
-    Too little may be left for all of them; that it is another estimate has to be said then, too.
-    """
+    """Compare two estimates; with too few samples left, the parameters may be others."""
     if before.shape != now.shape:
         return
     apart = np.abs(now - before) / np.hypot(std, other)
@@ -178,33 +172,33 @@ are correlated, so that 5 is generous, and a wrong sample moves an estimate by f
 def _by_archive(
     root: Path, workers: Workers
 ) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
-    """Estimates of a batch by archive or "" for all, and what it says."""
+    """Return estimates of a batch by archive or "" for all, and its messages."""
     result = reidentify([str(root)], FIXED, workers, Silent(), cache=CacheLocation(keep=False))
     found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
     found[""] = (result.pooled[0].values, result.pooled[0].std)
-    said = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]
+    messages = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]
     levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    said += [doubt for one in levels for doubt in one.warnings]
-    return found, said
+    messages += [warning for one in levels for warning in one.warnings]
+    return found, messages
 
 
 def _pools(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
-    found, said = _by_archive(truth.root, workers)
+    found, messages = _by_archive(truth.root, workers)
     same = found.keys() == truth.batch.keys() and all(
         _alike(found[name][0], truth.batch[name][0]) for name in found
     )
-    if not same and not any(path.name in text for path in harmed for text in said):
-        yield f"batch: another estimate, and nothing is said of {harmed[0].name}"
+    if not same and not any(path.name in text for path in harmed for text in messages):
+        yield f"batch: another estimate without a message about {harmed[0].name}"
     yield from _within(*truth.batch[""], *found[""], "batch")
 
 
 def _compares(truth: Undamaged, workers: Workers) -> Iterator[str]:
-    """Of one campaign alone `hil compare` makes nothing, says so, and names it."""
+    """A comparison of one campaign is refused with its name."""
     try:
         gather([str(truth.root)], workers, Silent())
     except InputError as error:
         if not str(error).startswith(f"{truth.root}: {ALONE}"):
-            yield f"compare: of one campaign it says: {error}"
+            yield f"compare: refused one campaign with: {error}"
     else:
         yield "compare: one campaign was compared"
 
@@ -221,7 +215,7 @@ def _same(one: Archive, other: Archive) -> bool:
 
 
 def _written(columns: Columns, truth: Undamaged) -> bool:
-    """Whether each sample is one of those that were written, with its own time."""
+    """Return whether each sample was written, at its time."""
     return _rows(columns) <= truth.rows
 
 

@@ -1,4 +1,4 @@
-"""Damaged archives of a finished campaign never give another estimate without a word."""
+"""Damaged archives of a completed campaign never change an estimate without a message."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from hil.archive import open_archive
-from hil.archive.check import check_archive
-from hil.archive.repair import repair
 from hil.batch.workers import LocalWorkers
 from hil.errors import ArchiveError, InputError
 from hil.identify import identify_archives
@@ -26,7 +24,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Undamaged:
     return campaign(tmp_path_factory.mktemp("damage"), None, repetitions=2)
 
 
-def test_a_damage_of_each_kind_is_named_or_harmless(truth: Undamaged) -> None:
+def test_each_kind_of_damage_is_named_or_harmless(truth: Undamaged) -> None:
     for number, kind in enumerate(sorted(KINDS)):
         words, laws = play(truth, number, None, kind)
         assert not laws, f"round {number}, {words}"
@@ -55,35 +53,7 @@ def restored(truth: Undamaged) -> Iterator[Undamaged]:
         path.write_bytes(data)
 
 
-@pytest.mark.parametrize("where", [0, 5, -1])
-def test_a_whole_chunk_of_another_repetition_is_noticed(restored: Undamaged, where: int) -> None:
-    # Its checksum is right and so is the number of its messages, but it is not the one written.
-    path, other = excitations(restored)[:2]
-    data, strange = restored.files[path], restored.files[other]
-    (begin, end), (first, last) = chunks(data)[where], chunks(strange)[where]
-    path.write_bytes(data[:begin] + strange[first:last] + data[end:])
-    archive = open_archive(path)
-    assert not archive.complete
-    assert "(chunk) is of another recording" in str(archive.missing)
-    assert archive.n_samples == 50 * (where % len(chunks(data))), "whole chunks before it"
-
-
-def test_the_content_of_another_recording_behind_a_whole_begin_is_noticed(
-    restored: Undamaged, tmp_path: Path
-) -> None:
-    # Every checksum and every count is right, and so is each cycle: they are another motion's.
-    path, other = excitations(restored)[:2]
-    data, strange = restored.files[path], restored.files[other]
-    path.write_bytes(data[: chunks(data)[0][0]] + strange[chunks(strange)[0][0] :])
-    archive = open_archive(path)
-    assert "another recording" in str(archive.missing)
-    assert archive.n_samples == 0, "nobody knows whose they are"
-    assert "outcome" in check_archive(path).faults
-    with pytest.raises(ArchiveError, match=r"two recordings.*copy"):
-        repair(path, tmp_path / "repaired.mcap")
-
-
-def test_a_repetition_torn_before_the_arm_moved_fast_is_named(restored: Undamaged) -> None:
+def test_repetition_truncated_before_fast_motion_is_named(restored: Undamaged) -> None:
     path = excitations(restored)[1]
     data = restored.files[path]
     refused = []
@@ -98,10 +68,8 @@ def test_a_repetition_torn_before_the_arm_moved_fast_is_named(restored: Undamage
     assert any("not one usable sample" in text for text in refused)
 
 
-def test_a_reader_that_believes_a_wrong_sample_is_found(
-    truth: Undamaged, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The laws can be broken: here by an archive that shows a current one step higher."""
+def test_wrong_sample_violates_a_law(truth: Undamaged, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An archive shows a current that is one step higher."""
     path = excitations(truth)[0]
 
     def wrong(where: Path, **how: object) -> object:
@@ -131,14 +99,14 @@ HARMED = "archives/excitation_000_a1.mcap"
 @pytest.mark.parametrize(
     ("text", "passes"),
     [
-        (f"/elsewhere/{HARMED}: the chunk at 3 is torn", True),
+        (f"/elsewhere/{HARMED}: the chunk at 3 is damaged", True),
         ("{root}: an archive has another checksum", True),
-        ("something in A/s is odd", False),
-        ("an .mcap file is odd", False),
-        ("{root}/archives/excitation_001_a1.mcap: the chunk at 3 is torn", False),
+        ("something in A/s is invalid", False),
+        ("an .mcap file is invalid", False),
+        ("{root}/archives/excitation_001_a1.mcap: the chunk at 3 is damaged", False),
     ],
 )
-def test_an_error_has_to_blame_what_was_damaged(
+def test_error_must_name_what_was_damaged(
     truth: Undamaged, monkeypatch: pytest.MonkeyPatch, text: str, passes: bool
 ) -> None:
     def refused(*_: object, **__: object) -> None:
@@ -151,7 +119,7 @@ def test_an_error_has_to_blame_what_was_damaged(
     assert bool(laws) is not passes
 
 
-def test_an_estimate_of_other_parameters_has_to_be_told_of(
+def test_estimate_of_other_parameters_must_be_reported(
     truth: Undamaged, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = identify_archives(truth.paths, Silent())
@@ -161,24 +129,24 @@ def test_an_estimate_of_other_parameters_has_to_be_told_of(
     monkeypatch.setattr("tests.disk.laws.identify_archives", lambda *_: found)
     path = excitations(truth)[0]
     (law,) = broken(truth, [path], 0)
-    assert law == f"identify: another estimate, and nothing is said of {path.name}"
+    assert law == f"identify: another estimate without a message about {path.name}"
 
 
 @pytest.mark.parametrize(
-    ("said", "found"),
+    ("message", "found"),
     [
         (None, "one campaign was compared"),
         ("{root}: is the only campaign given", ""),
-        ("{root}: is of another arm", "it says: "),
-        ("nothing was given", "it says: "),
+        ("{root}: is of another arm", "refused one campaign with: "),
+        ("nothing was given", "refused one campaign with: "),
     ],
 )
-def test_a_comparison_of_one_campaign_has_to_say_so(
-    truth: Undamaged, monkeypatch: pytest.MonkeyPatch, said: str | None, found: str
+def test_comparison_of_one_campaign_must_be_refused(
+    truth: Undamaged, monkeypatch: pytest.MonkeyPatch, message: str | None, found: str
 ) -> None:
     def gathered(*_: object) -> None:
-        if said is not None:
-            raise InputError(None, said.format(root=truth.root))
+        if message is not None:
+            raise InputError(None, message.format(root=truth.root))
 
     monkeypatch.setattr("tests.disk.laws.gather", gathered)
     monkeypatch.setattr("tests.disk.laws._pools", lambda *_: iter(()))

@@ -1,6 +1,6 @@
-"""The operator's day on a disk that is full: each command says so, and goes on once there is room.
+"""Commands on a full disk: each reports it, and works once there is room.
 
-The disk is a file system in memory of its own, which only root may mount.
+The disk is a file system in memory, which only root may mount.
 """
 
 from __future__ import annotations
@@ -84,11 +84,11 @@ def hil(*words: object) -> Result:
 
 
 def require_error(result: Result, disk: Disk, *places: str) -> None:
-    """An error of ours: what is wrong, below which of the places on that disk, and its status."""
+    """Check the error: cause, exit status, and a path below one of these places on the disk."""
     error = result.exception
-    if isinstance(error, SystemExit):  # of several files, said by the command itself
-        said = [line for line in result.output.splitlines() if line.startswith("error: ")]
-        text = said[0].removeprefix("error: ") if said else result.output
+    if isinstance(error, SystemExit):  # printed by a command for several files
+        errors = [line for line in result.output.splitlines() if line.startswith("error: ")]
+        text = errors[0].removeprefix("error: ") if errors else result.output
         assert error.code in (1, 2), text
     else:
         assert isinstance(error, HilError), f"{error!r}\n{result.output}"
@@ -100,7 +100,7 @@ def require_error(result: Result, disk: Disk, *places: str) -> None:
 
 
 def sums(campaign: Campaign) -> dict[str, str]:
-    """Of the archives that are entered in the manifest and whole."""
+    """Digests of the complete archives in the manifest."""
     folder = campaign.folder.archives
     return {
         entry.name: hashlib.sha256((folder / entry.name).read_bytes()).hexdigest()
@@ -110,10 +110,10 @@ def sums(campaign: Campaign) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("left", [0, 40, 400])
-def test_a_run_on_a_full_disk_keeps_what_is_whole_and_goes_on(
+def test_run_on_a_full_disk_leaves_complete_archives(
     disk: Disk, campaign: Campaign, left: int
 ) -> None:
-    # Of these fillings each lets the run come further than the one before.
+    """Each of these fillings lets the run come further than the one before."""
     before = sums(campaign)
     disk.fill(left)
     result = hil("run", campaign.folder.root, "--accept-dry-run", "--no-identify", "--quiet")
@@ -126,17 +126,17 @@ def test_a_run_on_a_full_disk_keeps_what_is_whole_and_goes_on(
         assert checked.exit_code == 0 or path.name not in after
 
 
-def test_with_room_again_the_run_completes(disk: Disk, campaign: Campaign) -> None:
+def test_run_completes_once_there_is_room(disk: Disk, campaign: Campaign) -> None:
     disk.empty()
-    whole = sums(campaign)
+    before = sums(campaign)
     result = hil("run", campaign.folder.root, "--accept-dry-run", "--no-identify", "--quiet")
     assert result.exit_code == 0, result.output
-    assert whole.items() <= sums(campaign).items()
+    assert before.items() <= sums(campaign).items()
     assert len(campaign.folder.completed("excitation")) == 3
 
 
 SHORT = {"population": 8, "generations": 1}
-"""Of a search that is only to write what a search writes."""
+"""Settings of the shortest search."""
 STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "design":
         ("design cell/cell.toml --settings short.toml -o designed --workers 1", ("designed",)),
@@ -150,13 +150,12 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "repair": ("archive repair excitation_000_a1.mcap", ("excitation_000_a1_repaired.mcap",)),
     "new": ("new --urdf campaign/robot.urdf --output new.toml --force", ("new.toml",)),
 }  # fmt: skip
-"""What else leaves something on the disk: the command, and where it writes; sums of archives are
-beside these."""
+"""Commands that write, and where."""
 
 
 @pytest.fixture(scope="module")
 def prepared(disk: Disk, campaign: Campaign) -> Campaign:
-    """The campaign done, a second one like it, a cell file, and settings of a short search."""
+    """Complete the campaign; add a second one, a cell file, and settings of a short search."""
     disk.empty()
     campaign.run(accept_dry_run=True)
     campaign.identify()
@@ -174,10 +173,10 @@ def prepared(disk: Disk, campaign: Campaign) -> Campaign:
 
 
 def as_before(disk: Disk, campaign: Campaign) -> None:
-    """A disk with room, a torn archive, and nothing of what the commands make."""
+    """Make room, write a truncated archive, and remove what the commands make."""
     disk.empty()
-    torn = disk.root / "excitation_000_a1.mcap"
-    torn.write_bytes((campaign.folder.archives / torn.name).read_bytes()[:100_000])
+    truncated = disk.root / "excitation_000_a1.mcap"
+    truncated.write_bytes((campaign.folder.archives / truncated.name).read_bytes()[:100_000])
     (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
     for made in ("designed", "pages", "batch"):
         shutil.rmtree(disk.root / made, ignore_errors=True)
@@ -186,33 +185,33 @@ def as_before(disk: Disk, campaign: Campaign) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("left", [0, 8])
 @pytest.mark.parametrize("stage", sorted(STAGES))
-def test_every_command_says_that_the_disk_is_full_and_works_once_it_is_not(
+def test_commands_report_a_full_disk_and_work_afterwards(
     disk: Disk, prepared: Campaign, stage: str, left: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = prepared
     monkeypatch.chdir(disk.root)
     as_before(disk, campaign)
-    whole = sums(campaign)
+    before = sums(campaign)
     disk.fill(left)
     command, written = STAGES[stage]
     full = hil(*command.split())
     disk.empty()
-    assert sums(campaign) == whole
+    assert sums(campaign) == before
     if full.exit_code or full.exception:
         require_error(full, disk, *written)
     else:
         assert left, "nothing can be written where nothing is left"
     begun = (disk.root / "designed" / "search.journal").exists()
-    if begun:  # a search that was begun is resumed by an option, which its error names
+    if begun:  # the error names the option that resumes the search
         assert "--resume" in f"{full.exception} {full.output}"
     again = hil(*command.split(), *(["--resume"] if begun else []))
-    expected = {"repair": 3}.get(stage, 0)  # what was torn off is lost
+    expected = {"repair": 3}.get(stage, 0)  # the end of the archive is lost
     assert again.exit_code == expected, f"{again.exception!r} {again.output}"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["run", *sorted(STAGES)])
-def test_every_command_says_that_a_folder_is_read_only_and_changes_nothing(
+def test_commands_report_a_read_only_folder(
     disk: Disk, prepared: Campaign, stage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(disk.root)
@@ -227,13 +226,13 @@ def test_every_command_says_that_a_folder_is_read_only_and_changes_nothing(
         subprocess.run(["mount", "-o", "remount,rw", str(disk.root)], check=True)
         victim.with_suffix(".away").rename(victim)
     error = refused.exception
-    said = str(error) if isinstance(error, HilError) else refused.output
-    assert "Read-only file system" in said or "cannot be written to" in said, f"{error!r} {said}"
+    text = str(error) if isinstance(error, HilError) else refused.output
+    assert "Read-only file system" in text or "cannot be written to" in text, f"{error!r} {text}"
     assert isinstance(error, HilError | SystemExit), f"{error!r}"
     assert refused.exit_code or error, "a command that leaves nothing has failed"
 
 
-def test_a_campaign_that_cannot_be_made_leaves_nothing(disk: Disk, campaign: Campaign) -> None:
+def test_campaign_that_cannot_be_created_leaves_nothing(disk: Disk, campaign: Campaign) -> None:
     disk.fill(4)
     with pytest.raises(OutputError, match=r"No space left on device.*make room"):
         Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
@@ -247,11 +246,11 @@ def test_a_campaign_that_cannot_be_made_leaves_nothing(disk: Disk, campaign: Cam
         ("{root}/campaign/archives/a.mcap: cannot be written further: {full}", True),
         ("/elsewhere/campaign/archives/a.mcap: cannot be written further: {full}", False),
         ("{root}/second: cannot be written to ({full})", False),
-        ("the campaign cannot go on: {full}", False),
+        ("the campaign cannot continue: {full}", False),
         ("{root}/campaign: cannot be written to", False),
     ],
 )
-def test_an_error_has_to_name_what_on_the_disk_cannot_be_written(
+def test_error_must_name_the_path_that_cannot_be_written(
     tmp_path: Path, text: str, passes: bool
 ) -> None:
     error = HilError(text.format(root=tmp_path, full="No space left on device"))
@@ -287,7 +286,7 @@ def remove_at(
 
 
 @pytest.mark.parametrize("parts", [("archives",), ("",)], ids=["the archives", "all of it"])
-def test_a_run_whose_folder_is_removed_says_so_with_the_arm_at_rest(
+def test_removed_folder_is_reported_with_the_arm_at_rest(
     small: Campaign, parts: Sequence[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = small.folder.root

@@ -1,4 +1,4 @@
-"""A real `hil run` over loopback UDP on a disk that hangs: borne, or the arm rests and says why."""
+"""A real `hil run` over loopback UDP on a disk that hangs: no loss, or a stop with its cause."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
-PATIENCE = 120.0  # s for a process to get on, on a machine that does other things as well
+PATIENCE = 120.0  # s for a process on a loaded computer
 RUN = (sys.executable, "-m", "hil", "run")
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 
@@ -36,10 +36,10 @@ def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run ended: its exit status, what it printed, and what the controller told."""
+    """Exit status and output of a run, and the summary of the simulated controller."""
 
     status: int
-    said: str
+    output: str
     arm: dict[str, object]
 
 
@@ -52,7 +52,7 @@ def made(disk: Disk, name: str, folder: Path) -> Campaign:
 
 
 def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
-    """Run it; once the file `after` was begun and holds something, the rule is in force."""
+    """Run a campaign; the rule applies once the file `after` has some content."""
     port = campaign.cell.controller.port
     simulator = subprocess.Popen(
         [*SIMULATE, str(campaign.folder.cell), "--udp", f"{LOOPBACK}:{port}", "--json",
@@ -72,66 +72,62 @@ def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
                 break
             assert time.monotonic() < deadline
             time.sleep(0.02)
-        said = process.communicate(timeout=PATIENCE)[0].decode()
+        output = process.communicate(timeout=PATIENCE)[0].decode()
     finally:
         process.kill()
         simulator.terminate()
         out, errors = simulator.communicate(timeout=PATIENCE)
     assert out, errors.decode()
-    return Ended(process.returncode, said, json.loads(out.decode().splitlines()[-1]))
+    return Ended(process.returncode, output, json.loads(out.decode().splitlines()[-1]))
 
 
 def lost(campaign: Campaign) -> dict[str, str]:
-    """Archives that lack a cycle between their first and their last that the link answered."""
+    """Archives that lack an answered cycle between their first and their last."""
     found = {}
     for path in sorted(campaign.folder.archives.glob("*.mcap")):
         archive = open_archive(path)
         missed = int(np.diff(archive.columns["cycle"]).sum()) - (archive.n_samples - 1)
-        said = archive.outcome or ArchiveOutcome()
-        if not archive.complete or said.records_lost != 0 or missed != said.lost_packets:
-            found[path.name] = str(archive.missing or said)
+        stated = archive.outcome or ArchiveOutcome()
+        if not archive.complete or stated.records_lost != 0 or missed != stated.lost_packets:
+            found[path.name] = str(archive.missing or stated)
     return found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("hang", [1.0, 4.0])
-def test_a_disk_that_hangs_for_seconds_is_borne_and_nothing_is_lost(
-    disk: Disk, tmp_path: Path, hang: float
-) -> None:
+def test_hang_of_seconds_loses_nothing(disk: Disk, tmp_path: Path, hang: float) -> None:
     campaign = made(disk, f"hang_{hang:g}", tmp_path)
     rule = Rule((WRITE, SYNC), "*.mcap", hang=hang)
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     assert "fsync dryrun_000_a1.mcap" in disk.do_wrong()
-    assert ended.status == 0, ended.said
-    assert "0 rejected" in ended.said
+    assert ended.status == 0, ended.output
+    assert "0 rejected" in ended.output
     assert not lost(campaign)
 
 
 @pytest.mark.slow
-def test_a_disk_that_hangs_for_longer_stops_the_arm_on_its_path_and_is_named(
-    disk: Disk, tmp_path: Path
-) -> None:
+def test_longer_hang_stops_the_arm_and_is_named(disk: Disk, tmp_path: Path) -> None:
     campaign = made(disk, "hang_7", tmp_path)
     rule = Rule((WRITE, SYNC), "*.mcap", hang=7.0)
     ended = run(campaign, disk, rule, "dryrun_000_a1.mcap")
     disk.do_wrong()
     assert ended.status == 4
     words = r"dryrun_000_a1\.mcap\) was stopped: .*\(it waited for its disk for [67]\.\d s"
-    assert re.search(words, " ".join(ended.said.split())), ended.said
+    assert re.search(words, " ".join(ended.output.split())), ended.output
     assert ended.arm["ended"], "open mode was left, and the session ended"
     dry_run = open_archive(campaign.folder.archives / "dryrun_000_a1.mcap")
     assert (dry_run.outcome or ArchiveOutcome()).outcome == "stopped"
-    assert not lost(campaign), "the ring held what the disk did not take"
+    assert not lost(campaign), "the ring stored what the disk did not accept"
     again = run(campaign, disk, None, "")
-    assert again.status == 0, again.said
+    assert again.status == 0, again.output
     assert not lost(campaign)
 
 
 @pytest.mark.slow
-def test_after_an_archive_that_opened_too_late_the_same_link_goes_on(
+def test_link_continues_after_an_archive_that_opened_too_late(
     disk: Disk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The file appears when the next run has looked for a free name, unless it waits for it.
+    """Otherwise the file would appear after the next run has chosen a free name."""
     campaign = made(disk, "late", tmp_path)
     with loopback_link(campaign.cell) as link:
         with monkeypatch.context() as short:

@@ -1,7 +1,7 @@
-"""A disk that refuses (EIO, EDQUOT, ENOSPC) at a drawn operation of a campaign.
+"""A disk that fails (EIO, EDQUOT, ENOSPC) at a random operation of a campaign.
 
-What was whole stays whole, the error names the file and what to do, and with the disk well again
-the same command completes.
+Complete archives stay complete, the error names file and remedy, and the same command completes
+once the disk works.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ DONE = {
     "*": {CREATE: 15, WRITE: 130, SYNC: 130, RENAME: 8},
     "*.mcap": {CREATE: 7, WRITE: 130, SYNC: 130},
     "manifest.json*": {CREATE: 6, WRITE: 6, SYNC: 6, RENAME: 6},
-}  # Operations by the names of files, of which a run does at least so many
+}  # Least number of operations of a run, by pattern of file names
 Designed = tuple[Cell, CampaignPlan]
 WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")
-REMEDIES = ("make room", "mend the disk", "another folder", "record again", "writable")
+REMEDIES = ("make room", "another folder", "record again", "writable")
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def disk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Disk]:
 
 
 @pytest.fixture(autouse=True)
-def well_again(disk: Disk) -> Iterator[None]:
+def reset_disk(disk: Disk) -> Iterator[None]:
     yield
     disk.do_wrong()
 
@@ -70,7 +70,7 @@ def rehearsed(disk: Disk, name: str, designed: Designed) -> Campaign:
     return campaign
 
 
-def drawn(rng: random.Random) -> Rule:
+def random_rule(rng: random.Random) -> Rule:
     """A refusal somewhere in a run: of one operation, or of all from there on."""
     names = rng.choice(sorted(DONE))
     operation = rng.choice(sorted(DONE[names]))
@@ -89,7 +89,7 @@ def entered(campaign: Campaign) -> dict[str, bytes]:
 
 
 def require_error(error: HilError, root: Path) -> None:
-    """A documented status, a path on that disk, what is wrong with it, and what to do."""
+    """Check documented status, path, cause and remedy."""
     text = str(error)
     assert error.exit_code in (1, 2, 4), text
     assert root.name in text
@@ -98,13 +98,13 @@ def require_error(error: HilError, root: Path) -> None:
 
 
 def require_readable(campaign: Campaign) -> None:
-    """Each file gives a prefix without gaps, or was torn before anything was in it."""
-    whole = {entry.name for entry in campaign.folder.manifest()}
+    """Check that each file has a prefix without gaps, or was truncated before its header."""
+    complete = {entry.name for entry in campaign.folder.manifest()}
     for path in campaign.folder.archives.glob("*.mcap"):
         try:
             cycles = open_archive(path).columns.get("cycle", ())
         except NotAnArchiveError:
-            assert path.name not in whole
+            assert path.name not in complete
         except ArchiveError as error:
             raise AssertionError(f"{path.name}: {error}") from error
         else:
@@ -112,7 +112,7 @@ def require_readable(campaign: Campaign) -> None:
 
 
 def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
-    """Run on a disk that refuses, then on a well one; what was refused."""
+    """Run on a disk that fails, then on one that works; return the failed operations."""
     before = entered(campaign)
     disk.do_wrong(rule)
     raised = None
@@ -127,7 +127,7 @@ def refused_run(disk: Disk, campaign: Campaign, rule: Rule) -> list[str]:
     if raised is not None:
         require_error(raised, campaign.folder.root)
     after = entered(campaign)
-    assert before.items() <= after.items(), "what was whole is whole"
+    assert before.items() <= after.items(), "complete archives are unchanged"
     require_readable(campaign)
     result = Campaign.open(campaign.folder.root).run(None, None, Silent(), accept_dry_run=True)
     assert result.complete
@@ -139,7 +139,7 @@ def rounds(disk: Disk, designed: Designed, seeds: range) -> int:
     count = 0
     for seed in seeds:
         campaign = rehearsed(disk, f"round_{seed}", designed)
-        rule = drawn(random.Random(f"refused/{seed}"))
+        rule = random_rule(random.Random(f"refused/{seed}"))
         try:
             count += bool(refused_run(disk, campaign, rule))
         except Exception as error:
@@ -150,12 +150,12 @@ def rounds(disk: Disk, designed: Designed, seeds: range) -> int:
     return count
 
 
-def test_a_disk_that_refuses_costs_the_motion_and_no_more(disk: Disk, designed: Designed) -> None:
+def test_failing_disk_costs_one_motion_only(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(2)) >= 1
 
 
 @pytest.mark.parametrize("operation", [CREATE, WRITE])
-def test_a_manifest_that_is_refused_in_mid_campaign_is_reported(
+def test_manifest_that_cannot_be_written_is_reported(
     disk: Disk, designed: Designed, operation: str
 ) -> None:
     campaign = rehearsed(disk, f"manifest_{operation}", designed)
@@ -163,7 +163,7 @@ def test_a_manifest_that_is_refused_in_mid_campaign_is_reported(
     assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
 
 
-def test_a_refusal_that_is_swallowed_is_found(
+def test_suppressed_error_is_detected(
     disk: Disk, designed: Designed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = rehearsed(disk, "swallowed", designed)
@@ -178,10 +178,8 @@ def test_a_refusal_that_is_swallowed_is_found(
         refused_run(disk, campaign, Rule((WRITE,), "*.mcap", error="EIO"))
 
 
-def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(
-    disk: Disk, designed: Designed
-) -> None:
-    # One that is left without a manifest would look like one whose cell file was edited.
+def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) -> None:
+    """Without a manifest it would look like one whose cell file was edited."""
     root = disk.root / "half"
     disk.do_wrong(Rule((RENAME,), "manifest.json", error="EDQUOT"))
     with pytest.raises(OutputError, match=r"manifest\.json.*quota exceeded.*make room"):
@@ -192,8 +190,8 @@ def test_a_campaign_whose_manifest_is_refused_is_not_left_half_made(
 
 
 @pytest.mark.slow
-def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(disk: Disk, designed: Designed) -> None:
-    # The last as a kill leaves it, in the middle of making the rehearsal's own campaign.
+def test_rehearsal_passes_after_a_disk_error(disk: Disk, designed: Designed) -> None:
+    """The last one without manifest, as after a kill while its campaign was created."""
     for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
         campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
         disk.do_wrong(Rule((operation,), after=after, error="EIO"))
@@ -206,7 +204,7 @@ def test_a_rehearsal_that_a_disk_refused_goes_on_and_passes(disk: Disk, designed
 
 
 @pytest.mark.slow
-def test_many_refusals_cost_the_motion_and_no_more(disk: Disk, designed: Designed) -> None:
+def test_many_failures_cost_one_motion_only(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(100, 140)) > 20
 
 
@@ -223,10 +221,10 @@ def names(folder: Path) -> list[str]:
 
 
 class TestStudy:
-    """What a study writes: whole or not at all, and made good by the next session."""
+    """Files of a study are written completely or not at all."""
 
     @pytest.mark.parametrize("rule", REFUSED)
-    def test_one_that_cannot_be_begun_leaves_an_empty_folder(
+    def test_failed_start_leaves_an_empty_folder(
         self, disk: Disk, tmp_path: Path, rule: Rule
     ) -> None:
         folder, settings = StudyFolder(disk.root / tmp_path.name), study_settings(quick=True)
@@ -240,7 +238,7 @@ class TestStudy:
         assert names(folder.root) == ["study.json"]
 
     @pytest.mark.parametrize("rule", REFUSED)
-    def test_a_record_is_written_whole_or_not_at_all(
+    def test_record_is_written_completely_or_not_at_all(
         self, disk: Disk, tmp_path: Path, rule: Rule
     ) -> None:
         path, record = disk.root / tmp_path.name / "a.json", Record(inputs="these archives")

@@ -1,7 +1,7 @@
-"""A stranger on the network of the controller: what is sent to the PC, from where, and how often.
+"""An attacker on the network of the controller, who sends packets to the PC.
 
 ``python -m tests.untrusted.attacker --to 10.0.0.1:1000 --as 10.0.0.2:4000 init`` sends init packets
-under another's address (raw sockets: root). Only for networks of one's own making.
+from a forged address (raw sockets: root). Only for test networks.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from pathlib import Path
 Address = tuple[str, int]
 LENGTH = struct.Struct("<I")
 _UDP = 17
-_EVERYTHING = 0x0003  # what leaves is shown to no narrower protocol
+_EVERYTHING = 0x0003  # outgoing packets are shown to this protocol only
 
 
 def checksum(data: bytes) -> int:
-    """That of RFC 1071."""
+    """Return the checksum of RFC 1071."""
     if len(data) % 2:
         data += b"\0"
     total: int = sum(struct.unpack(f"!{len(data) // 2}H", data))
@@ -37,7 +37,7 @@ def checksum(data: bytes) -> int:
 
 
 def datagram(source: Address, target: Address, body: bytes) -> bytes:
-    """An IPv4 datagram with a UDP packet in it."""
+    """Return an IPv4 datagram with a UDP packet in it."""
     udp = struct.pack("!4H", source[1], target[1], 8 + len(body), 0) + body
     addresses = socket.inet_aton(source[0]) + socket.inet_aton(target[0])
     head = struct.pack("!BBHHHBBH", 0x45, 0, 20 + len(udp), 7, 0, 64, _UDP, 0) + addresses
@@ -45,7 +45,7 @@ def datagram(source: Address, target: Address, body: bytes) -> bytes:
 
 
 def recorded(path: Path) -> list[bytes]:
-    """Packets of a recorded session: each with its length in front."""
+    """Return the packets of a recorded session, each stored after its length."""
     data, found, at = path.read_bytes(), [], 0
     while at < len(data):
         (size,) = LENGTH.unpack_from(data, at)
@@ -55,7 +55,7 @@ def recorded(path: Path) -> list[bytes]:
 
 
 def record(port: int, seconds: float, path: Path) -> int:
-    """Record what goes to a port past this host's network devices."""
+    """Record the packets to a port that pass this host's network devices."""
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     end = time.monotonic() + seconds
@@ -83,7 +83,7 @@ def record(port: int, seconds: float, path: Path) -> int:
     return count
 
 
-def odd(rng: random.Random) -> Iterator[bytes]:
+def random_lengths(rng: random.Random) -> Iterator[bytes]:
     """Datagrams of every length, the longest ones in fragments."""
     for size in itertools.cycle((0, 1, 11, 12, 48, 1200, 1471, 1472, 1500, 1501, 9000, 65507)):
         yield rng.randbytes(size)
@@ -91,20 +91,20 @@ def odd(rng: random.Random) -> Iterator[bytes]:
 
 def bodies(what: str, session: list[bytes], rng: random.Random) -> Iterator[bytes]:
     if what == "odd":
-        return odd(rng)
+        return random_lengths(rng)
     if what == "init":
         return itertools.cycle([next(body for body in session if len(body) == 1200)])
     if what == "sync":
         return itertools.cycle([session[0]])
     if what == "cyclic":
         return itertools.cycle([body for body in session[20:] if len(body) != 1200])
-    if what == "later":  # with numbers that a session that began just now has not come to
+    if what == "later":  # numbers that a new session has not reached
         return itertools.cycle(session[-1000:])
-    return itertools.cycle(session)  # "replay": the whole session, from its beginning
+    return itertools.cycle(session)  # "replay": the whole session
 
 
 class Sender:
-    """Sends from this host's own address, or under another's."""
+    """Sends from this host's address, or from a forged one."""
 
     def __init__(self, target: Address, source: Address | None) -> None:
         self._target, self._source = target, source
@@ -117,7 +117,7 @@ class Sender:
         self._socket.setblocking(False)
 
     def send(self, body: bytes) -> None:
-        """Send one packet; what the system does not take is lost, as on any network."""
+        """Send one packet; it is lost if the system does not accept it."""
         with suppress(OSError):
             if self._source is None:
                 self._socket.sendto(body, self._target)
@@ -127,7 +127,7 @@ class Sender:
             self.sent += 1
 
     def listen(self) -> None:
-        """Count what came back, if that can come to this host."""
+        """Count replies, if they can reach this host."""
         if self._source is None:
             with suppress(OSError):
                 while self._socket.recv(2048):
@@ -137,7 +137,7 @@ class Sender:
 def attack(
     sender: Sender, packets: Iterator[bytes], rate: float, seconds: float
 ) -> dict[str, float]:
-    """Send at a rate [1/s] for some seconds, or until told to end."""
+    """Send at a rate [1/s] for some seconds, or until SIGTERM."""
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
     begin = time.monotonic()
@@ -163,8 +163,8 @@ def main() -> int:
         "what", choices=("record", "init", "sync", "cyclic", "later", "replay", "odd")
     )
     parser.add_argument("--to", type=address, required=True, help="HOST:PORT of the PC")
-    parser.add_argument("--as", dest="source", type=address, help="HOST:PORT to send under")
-    parser.add_argument("--port", action="store_true", help="read the port to send under first")
+    parser.add_argument("--as", dest="source", type=address, help="HOST:PORT to send from")
+    parser.add_argument("--port", action="store_true", help="read that port from stdin")
     parser.add_argument("--session", type=Path, help="a recorded session (made by `record`)")
     parser.add_argument("--rate", type=float, default=500.0, help="packets per second")
     parser.add_argument("--seconds", type=float, default=5.0)
@@ -173,14 +173,14 @@ def main() -> int:
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     if asked.what == "record":
-        told: dict[str, float] = {"recorded": record(asked.to[1], asked.seconds, asked.session)}
+        result: dict[str, float] = {"recorded": record(asked.to[1], asked.seconds, asked.session)}
     else:
         session = recorded(asked.session) if asked.session is not None else []
         packets = bodies(asked.what, session, random.Random(asked.seed))
-        said = sys.stdin.readline()  # whoever started this says when
-        source = (asked.source[0], int(said)) if asked.port else asked.source
-        told = attack(Sender(asked.to, source), packets, asked.rate, asked.seconds)
-    sys.stdout.write(json.dumps(told) + "\n")
+        line = sys.stdin.readline()  # wait for the start
+        source = (asked.source[0], int(line)) if asked.port else asked.source
+        result = attack(Sender(asked.to, source), packets, asked.rate, asked.seconds)
+    sys.stdout.write(json.dumps(result) + "\n")
     return 0
 
 

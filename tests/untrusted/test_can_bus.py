@@ -1,7 +1,7 @@
-"""Others on the CAN bus: a node with identifiers of its own, and one with the controller's.
+"""Other nodes on the CAN bus: one with identifiers of its own, one with the controller's.
 
-No frame tells who sent it, so what the second says is taken for the controller's. It can end the
-run; it cannot have a set-point sent that is not of the motion.
+Frames have no sender, so the second is accepted as the controller. It can end the run; it cannot
+cause a set-point that is not of the motion.
 """
 
 from __future__ import annotations
@@ -21,108 +21,110 @@ from sim_fixtures import Phase
 from sim_fixtures.can_link import CanControllerLink
 from tests.drivers.can_bench import HOME, MOVE, PERIOD, PROFILES, Cycles, Run, UnstampedBus
 
-ANSWERS = {0x100, 0x120, 0x121, 0x122, 0x180}  # Identifiers of what the PC says (`docs/can.md`)
+REPLY_IDS = {0x100, 0x120, 0x121, 0x122, 0x180}  # Identifiers of the PC (`docs/can.md`)
 _channels = count()
 
-LAST_CYCLE = 600  # A session takes 484
+LAST_CYCLE = 600  # a session has 484
 
 Frames = list[can.Message]
-Meddle = Callable[["Overheard", int], None]
+Meddle = Callable[["SharedBus", int], None]
 
 
-class Overheard:
+class SharedBus:
     """The controller's end of a bus with a third node, which acts after each of its packets."""
 
     def __init__(self, profile: str, meddle: Meddle) -> None:
-        self._clock, channel = Cycles(), f"strangers-{next(_channels)}"
+        self._clock, channel = Cycles(), f"untrusted-{next(_channels)}"
         rates, clock = BusRates(profile), self._clock
-        self.near = CanTransport(UnstampedBus(channel), rates, clock=clock)
-        self._far = CanControllerLink(UnstampedBus(channel), rates, clock=clock, start_patience=0.0)
+        self.pc = CanTransport(UnstampedBus(channel), rates, clock=clock)
+        self._controller = CanControllerLink(
+            UnstampedBus(channel), rates, clock=clock, start_patience=0.0
+        )
         self.third = UnstampedBus(channel)
-        self.said: list[Frames] = []
+        self.frames: list[Frames] = []
         self._meddle = meddle
 
     def send(self, packet: bytes) -> None:
-        if len(self.said) == LAST_CYCLE:
-            raise TransportClosed("the bus is taken away")
-        self._heard()
+        if len(self.frames) == LAST_CYCLE:
+            raise TransportClosed("the bus is removed")
+        self._received()
         self._clock.time += PERIOD
-        self._far.send(packet)
-        self.said.append(self._heard())
-        self._meddle(self, len(self.said))
+        self._controller.send(packet)
+        self.frames.append(self._received())
+        self._meddle(self, len(self.frames))
 
     def receive(self, timeout: float) -> bytes | None:
-        return self._far.receive(0.0)  # whatever was sent is there
+        return self._controller.receive(0.0)  # sent frames have arrived
 
     def close(self) -> None:
-        self._far.close()
+        self._controller.close()
         self.third.shutdown()
 
-    def say(self, frames: Frames) -> None:
+    def send_frames(self, frames: Frames) -> None:
         for frame in frames:
             self.third.send(frame)
 
-    def _heard(self) -> Frames:
+    def _received(self) -> Frames:
         frames = []
         while (frame := self.third.recv(0.0)) is not None:
             frames.append(frame)
         return frames
 
 
-def nothing(bus: Overheard, cycle: int) -> None:
-    """Only listen."""
+def nothing(bus: SharedBus, cycle: int) -> None:
+    """Send nothing."""
 
 
 @cache
-def heard(profile: str) -> list[Frames]:
-    """Frames of the controller in a session with nobody else, by cycle."""
-    _, bus = played(profile, nothing)
-    return bus.said
+def frames_of(profile: str) -> list[Frames]:
+    """Return the frames of the controller in an undisturbed session, by cycle."""
+    _, bus = run_with(profile, nothing)
+    return bus.frames
 
 
-def played(profile: str, meddle: Meddle) -> tuple[Run, Overheard]:
-    far = Overheard(profile, meddle)
-    return Run(profile, ends=(far.near, far)), far
+def run_with(profile: str, meddle: Meddle) -> tuple[Run, SharedBus]:
+    bus = SharedBus(profile, meddle)
+    return Run(profile, ends=(bus.pc, bus)), bus
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_frames_of_another_node_are_counted_and_the_arm_goes_on(profile: str) -> None:
+def test_frames_of_another_node_are_ignored(profile: str) -> None:
     rng = np.random.default_rng(1)
-    own = {frame.arbitration_id for frames in heard(profile) for frame in frames}
-    others = [number for number in range(0x800) if number not in own | ANSWERS]
+    own = {frame.arbitration_id for frames in frames_of(profile) for frame in frames}
+    others = [number for number in range(0x800) if number not in own | REPLY_IDS]
 
-    def chat(bus: Overheard, _: int) -> None:
+    def chat(bus: SharedBus, _: int) -> None:
         for number in rng.choice(others, 3):
-            bus.say([can.Message(arbitration_id=number, data=rng.bytes(8), is_extended_id=False)])
+            bus.send_frames(
+                [can.Message(arbitration_id=number, data=rng.bytes(8), is_extended_id=False)]
+            )
 
-    run, bus = played(profile, chat)
+    run, bus = run_with(profile, chat)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed"
-    counted = [one.count for one in run.seen(PacketRejected) if one.kind == "foreign"]
-    assert sum(counted) == 3 * (len(bus.said) - 1), "what follows the last packet is not heard"
+    foreign = [one.count for one in run.seen(PacketRejected) if one.kind == "foreign"]
+    assert sum(foreign) == 3 * (len(bus.frames) - 1), "frames behind the last packet are not read"
 
 
 @pytest.mark.parametrize(
     ("at", "first", "outcome"),
     [
-        (5, 0, "completed"),  # a start beside the controller's own: the same, and answered as that
+        (5, 0, "completed"),  # a start beside the controller's own, with the same reply
         (5, 100, "lost"),  # packets of a session in which axes are open
         (250, 0, "lost"),  # a start while the arm moves
         (250, 4, "lost"),
-        (250, 100, "completed"),  # numbers that were answered long ago
-        (150, 200, "refused"),  # numbers to come, in which the arm is elsewhere
+        (250, 100, "completed"),  # numbers that were answered before
+        (150, 200, "refused"),  # later numbers, with the arm elsewhere
     ],
 )
-def test_a_recorded_session_under_the_controllers_identifiers_moves_nothing(
-    at: int, first: int, outcome: str
-) -> None:
-    recorded = heard("fd")
+def test_replayed_session_moves_nothing(at: int, first: int, outcome: str) -> None:
+    recorded = frames_of("fd")
 
-    def replay(bus: Overheard, cycle: int) -> None:
+    def replay(bus: SharedBus, cycle: int) -> None:
         if at <= cycle < at + len(recorded) - first:
-            bus.say(recorded[cycle - at + first])
+            bus.send_frames(recorded[cycle - at + first])
 
-    run, _ = played("fd", replay)
+    run, _ = run_with("fd", replay)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == outcome, ended.reason
     sent = run.records["commanded_position"]
@@ -134,18 +136,18 @@ def test_a_recorded_session_under_the_controllers_identifiers_moves_nothing(
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_frames_of_this_session_said_again_later_get_no_answer(profile: str) -> None:
-    said_again = []
+def test_repeated_frames_get_no_reply(profile: str) -> None:
+    repeated = []
 
-    def again(bus: Overheard, cycle: int) -> None:
+    def again(bus: SharedBus, cycle: int) -> None:
         if cycle > 200 and cycle % 40 == 0:
-            said_again.append(cycle)
-            bus.say(bus.said[-25])
+            repeated.append(cycle)
+            bus.send_frames(bus.frames[-25])
 
-    run, _ = played(profile, again)
+    run, _ = run_with(profile, again)
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed", ended.reason
     assert None not in run.link.replies
     rejected = {(one.kind, one.count) for one in run.seen(PacketRejected)}
     assert rejected == {("stale", 1)}
-    assert run.session.counters.stale == len(said_again)
+    assert run.session.counters.stale == len(repeated)

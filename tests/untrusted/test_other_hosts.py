@@ -1,8 +1,7 @@
-"""Others on the controller's network, while a real `hil move` moves a simulated arm.
+"""Attacks from the controller's network, while a real `hil move` moves a simulated arm.
 
-Three hosts on a network of their own: the PC, the controller, and a stranger, who sends what he
-likes, from his own address or under the controller's. Nobody but the controller is answered; an
-arm that moves goes on as if nobody else was there, or comes to rest.
+A network of three hosts: the PC, the controller, and an attacker, who sends packets from its own
+address or from the controller's. Only the controller gets replies; a moving arm continues or stops.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from hil.archive import Archive, open_archive
 from hil.cell import Cell
 from tests.hil.fast_cell import fast_cell
 
-HOSTS = {"pc": "10.77.0.1", "controller": "10.77.0.2", "stranger": "10.77.0.3"}
+HOSTS = {"pc": "10.77.0.1", "controller": "10.77.0.2", "attacker": "10.77.0.3"}
 SWITCH = "switch"
 BROADCAST = "10.77.0.255"
 
@@ -47,7 +46,7 @@ class Wire:
         return subprocess.Popen(self.command(host, *command), env=environment, **more)
 
     def ports(self, host: str) -> list[int]:
-        """UDP ports that programs on a host have."""
+        """Return the open UDP ports of a host."""
         done = subprocess.run(
             self.command(host, "cat", "/proc/net/udp"), capture_output=True, check=True
         )
@@ -55,7 +54,7 @@ class Wire:
         return [int(line.split()[1].rpartition(":")[2], 16) for line in lines]
 
     def await_port(self, host: str, port: int, seconds: float) -> bool:
-        """Wait until somebody on a host has a UDP port."""
+        """Wait until a UDP port of a host is open."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             if port in self.ports(host):
@@ -65,7 +64,7 @@ class Wire:
 
 
 def missing() -> str:
-    """What keeps this computer from making such a network; "" if nothing does."""
+    """Return why such a network cannot be created here, "" if it can."""
     if shutil.which("ip") is None:
         return "there is no command `ip` (iproute2)"
     name = f"hil{os.getpid()}try"
@@ -78,7 +77,7 @@ def missing() -> str:
 
 @contextmanager
 def wire() -> Iterator[Wire]:
-    """Make the network, and take it away again."""
+    """Create the network, and remove it at the end."""
     made = Wire(f"hil{os.getpid()}")
     try:
         _make(made.prefix)
@@ -117,30 +116,30 @@ PERIOD = 0.002
 CONTROLLER = HOSTS["controller"]
 WHERE = f"{HOSTS['pc']}:{PORT}"
 Process: TypeAlias = "subprocess.Popen[bytes]"
-PATIENCE = 240.0  # s for commands to end, on a machine that does other things as well
+PATIENCE = 240.0  # s for commands on a loaded computer
 
 
 @pytest.fixture(scope="module")
 def net() -> Iterator[Wire]:
-    if why := missing():
-        pytest.skip(why)
+    if reason := missing():
+        pytest.skip(reason)
     with wire() as made:
         yield made
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the three hosts say afterwards."""
+    """Results of the three hosts."""
 
     move: dict[str, Any]
     code: int
     controller: dict[str, Any]
-    stranger: dict[str, Any]
+    attacker: dict[str, Any]
     archive: Archive | None
 
     @property
     def rejected(self) -> Counter[str]:
-        """Packets without an answer, by kind, as the archive has them."""
+        """Packets without a reply by kind, from the archive."""
         assert self.archive is not None
         found: Counter[str] = Counter()
         for event in self.archive.events:
@@ -151,7 +150,7 @@ class Outcome:
 
 
 class Hosts:
-    """What runs on the three hosts; ended with the block."""
+    """The processes of the three hosts, ended with the block."""
 
     def __init__(self, net: Wire, folder: Path, attack: Sequence[str], session: Path | None):
         cell = fast_cell(folder)
@@ -175,44 +174,44 @@ class Hosts:
         self._started.append(process)
         return process
 
-    def stranger(self) -> Process:
-        """Waits to be told; on the controller's host if it records."""
-        host = "controller" if self._attack[0] == "record" else "stranger"
+    def attacker(self) -> Process:
+        """Start the attacker, on the controller's host if it records; it waits for a line."""
+        host = "controller" if self._attack[0] == "record" else "attacker"
         known = () if self._session is None else ("--session", str(self._session))
         target = ("--to", WHERE, "--seconds", "600")
         return self._start(host, "tests.untrusted.attacker", *target, *known, *self._attack)
 
     def controller(self) -> Process:
-        """With a simulated arm; for one motion."""
+        """Start the simulated controller, for one motion."""
         return self._start(
             "controller", "hil", "simulate", str(self._cell), "--udp", WHERE, "--intervals", "1",
             "--patience", "0.5", "--duration", "200", "--json",
         )  # fmt: skip
 
     def pc(self) -> Process:
-        """Moves the arm by 60 degrees in 7.6 s."""
+        """Start a move of the arm by 60 degrees in 7.6 s."""
         return self._start(
             "pc", "hil", "move", str(self._cell), "--joint", "1", "--by", "60", "--speed", "2",
             "--yes", "--json", "-o", str(self.archive),
         )  # fmt: skip
 
     def moves(self) -> bool:
-        """Whether the arm is about to move, or does."""
+        """Return whether the motion has begun or is about to."""
         return bool(list(self.archive.parent.glob("moved.mcap*")))
 
-    def start_attack(self, stranger: Process) -> None:
-        """Let him begin, under the controller's port if he was asked for that."""
+    def start_attack(self, attacker: Process) -> None:
+        """Start the attack, from the controller's port if requested."""
         port = 0
         if "--port" in self._attack:
             port = next(filter(None, self._net.ports("controller")))
-        assert stranger.stdin is not None
-        assert stranger.stdout is not None
-        assert stranger.stdout.readline() == b"ready\n"
-        stranger.stdin.write(f"{port}\n".encode())
-        stranger.stdin.flush()
+        assert attacker.stdin is not None
+        assert attacker.stdout is not None
+        assert attacker.stdout.readline() == b"ready\n"
+        attacker.stdin.write(f"{port}\n".encode())
+        attacker.stdin.flush()
 
 
-def said(process: Process) -> dict[str, Any]:
+def output_of(process: Process) -> dict[str, Any]:
     out, errors = process.communicate(timeout=PATIENCE)
     assert out, errors.decode()
     return json.loads(out)
@@ -228,37 +227,37 @@ def moved(
 ) -> Outcome:
     """Move the arm under an attack, which begins before there is a controller, or later."""
     with Hosts(net, folder, attack, session) as hosts:
-        stranger = hosts.stranger()
+        attacker = hosts.attacker()
         simulated = None if begins == "first" else hosts.controller()
         move = hosts.pc()
         assert net.await_port("pc", PORT, PATIENCE), move.communicate()
         while begins == "moving" and not hosts.moves() and move.poll() is None:
             time.sleep(0.02)
-        hosts.start_attack(stranger)
+        hosts.start_attack(attacker)
         simulated = simulated or hosts.controller()
-        move_said = said(move)
-        if begins == "first":  # it would go on asking
+        moved = output_of(move)
+        if begins == "first":  # it would continue to ask
             simulated.send_signal(signal.SIGINT)
-        simulated_said = said(simulated)
-        stranger.send_signal(signal.SIGTERM)
-        stranger_said = said(stranger)
+        controller = output_of(simulated)
+        attacker.send_signal(signal.SIGTERM)
+        attack_result = output_of(attacker)
     archive = open_archive(hosts.archive) if hosts.archive.exists() else None
-    return Outcome(move_said, move.returncode, simulated_said, stranger_said, archive)
+    return Outcome(moved, move.returncode, controller, attack_result, archive)
 
 
 @pytest.fixture(scope="module")
 def session(net: Wire, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session as it went over the wire: sync, init, cyclic packets, motion and end."""
+    """Record a session: sync, init, cyclic packets, motion and end."""
     folder = tmp_path_factory.mktemp("recorded")
     path = folder / "session.bin"
     found = moved(net, folder, ("record",), session=path)
     assert found.code == 0
-    assert found.stranger["recorded"] == pytest.approx(found.controller["cycles"], abs=50)
+    assert found.attacker["recorded"] == pytest.approx(found.controller["cycles"], abs=50)
     return path
 
 
-def went_on(found: Outcome) -> None:
-    """The controller got each answer once, and the arm went where it was to go."""
+def require_completed(found: Outcome) -> None:
+    """Check that the controller got each reply once, and the motion completed."""
     assert found.code == 0, found.move
     assert found.controller["replies"] == found.controller["cycles"]
     assert found.controller["missed"] == found.controller["surplus"] == 0
@@ -273,7 +272,7 @@ Attack = Callable[..., Outcome]
 
 @pytest.fixture
 def attacked(net: Wire, session: Path, tmp_path: Path) -> Attack:
-    """Moves the arm under an attack with the recorded session."""
+    """Move the arm under an attack with the recorded session."""
     return partial(moved, net, tmp_path, session=session)
 
 
@@ -282,59 +281,57 @@ OWN = {
     "sync packets": ("sync", "--rate", "200"),
     "cyclic packets in a flood": ("cyclic", "--rate", "20000"),
     "a recorded session": ("replay", "--rate", "1000"),
-    "packets from the address of all": ("init", "--rate", "200", "--as", f"{BROADCAST}:5555"),
-    "lengths that no packet has, and fragments": ("odd", "--rate", "500"),
+    "packets from the broadcast address": ("init", "--rate", "200", "--as", f"{BROADCAST}:5555"),
+    "invalid lengths and fragments": ("odd", "--rate", "500"),
 }
 UNDER_ANOTHER_PORT = ("--as", f"{CONTROLLER}:5555")
 
 
 @pytest.mark.parametrize("what", OWN)
-def test_another_host_is_ignored_and_gets_no_reply(what: str, attacked: Attack) -> None:
+def test_other_host_gets_no_reply(what: str, attacked: Attack) -> None:
     found = attacked(OWN[what])
-    went_on(found)
+    require_completed(found)
     assert found.rejected["foreign"] > 500
-    assert found.stranger["sent"] > 500
-    assert found.stranger["answered"] == 0
+    assert found.attacker["sent"] > 500
+    assert found.attacker["answered"] == 0
 
 
-def test_what_goes_to_everybody_does_not_arrive(attacked: Attack) -> None:
+def test_broadcast_does_not_arrive(attacked: Attack) -> None:
     found = attacked(("init", "--rate", "200", "--to", f"{BROADCAST}:{PORT}"))
-    went_on(found)
-    assert found.stranger["sent"] > 500
+    require_completed(found)
+    assert found.attacker["sent"] > 500
     assert not found.rejected
-    assert found.stranger["answered"] == 0
+    assert found.attacker["answered"] == 0
 
 
 @pytest.mark.parametrize("what", ["init", "replay"])
-def test_another_port_of_the_controllers_address_is_foreign_too(
-    what: str, attacked: Attack
-) -> None:
-    """A second controller that starts, or somebody who writes the controller's address."""
+def test_other_port_of_the_controller_is_foreign(what: str, attacked: Attack) -> None:
+    """A second controller, or a forged address."""
     found = attacked((what, "--rate", "200", *UNDER_ANOTHER_PORT), begins="moving")
-    went_on(found)
+    require_completed(found)
     assert found.rejected["foreign"] > 500
 
 
-def ended(found: Outcome) -> None:
-    """The command ends with exit status 4 and one sentence that says why."""
+def require_stopped(found: Outcome) -> None:
+    """Check exit status 4 and an error of one sentence."""
     assert found.code == 4, found.move
     assert found.move["error"]
     assert "\n" not in found.move["error"]
 
 
 class TestAsController:
-    """Under its own address and port, while the arm moves; nothing in the protocol shows that."""
+    """Packets from the controller's address and port while the arm moves, which look genuine."""
 
     @pytest.fixture
     def as_controller(self, attacked: Attack, tmp_path: Path) -> Callable[[str], Outcome]:
-        """Nothing is sent that a stop may not do; an arm that is not stopped does less."""
+        """Check that all set-points are within the limits of a stop."""
 
         def attack(what: str) -> Outcome:
             under = ("--as", f"{CONTROLLER}:1", "--port")
             found = attacked((what, "--rate", "100", *under), begins="moving")
             assert found.archive is not None, found.move
             assert found.archive.complete
-            assert found.stranger["sent"] > 20
+            assert found.attacker["sent"] > 20
             limits = Cell.load(tmp_path / "cell.toml").guard_limits
             sent = found.archive.cycles()["commanded_position"]
             assert np.nanmin(sent - limits.lower) >= 0.0
@@ -351,35 +348,35 @@ class TestAsController:
     @pytest.mark.parametrize("what", ["init", "replay"])
     def test_a_start_ends_the_run(self, what: str, as_controller: Attack) -> None:
         found = as_controller(what)
-        ended(found)
+        require_stopped(found)
         assert "the controller restarted" in found.move["error"]
 
     def test_an_arm_elsewhere_ends_the_run(self, as_controller: Attack) -> None:
-        """Numbers that the controller has not come to yet, of when the arm had arrived."""
+        """Later numbers, of when the arm had arrived."""
         found = as_controller("later")
-        ended(found)  # by the guard, by packets missed, or by a controller that had no reply
+        require_stopped(found)  # by the guard, missed packets, or missing replies
         assert found.move["outcome"] in ("refused", "stopped", "lost")
 
-    def test_what_is_no_packet_does_not_end_the_run(self, as_controller: Attack) -> None:
+    def test_invalid_packets_do_not_end_the_run(self, as_controller: Attack) -> None:
         found = as_controller("odd")
-        went_on(found)
+        require_completed(found)
         assert found.rejected["malformed"] > 100
 
-    def test_numbers_of_long_ago_get_no_reply(self, as_controller: Attack) -> None:
-        """The controller's own packets among them do, or too many missed stop the arm."""
+    def test_old_numbers_get_no_reply(self, as_controller: Attack) -> None:
+        """The controller's own packets get a reply, or the arm is stopped."""
         found = as_controller("cyclic")
         assert found.rejected["stale"] > 20
         if found.code == 0:
-            went_on(found)
+            require_completed(found)
         else:
-            ended(found)
+            require_stopped(found)
             assert found.move["outcome"] in ("stopped", "lost")
 
 
-def test_whoever_begins_first_under_the_controllers_address_excludes_it(attacked: Attack) -> None:
+def test_attacker_that_begins_first_excludes_the_controller(attacked: Attack) -> None:
     found = attacked(("init", "--rate", "200", *UNDER_ANOTHER_PORT), begins="first")
-    assert found.stranger["sent"] > 500
-    ended(found)
+    assert found.attacker["sent"] > 500
+    require_stopped(found)
     assert "the controller did not reach drive-on within" in found.move["error"]
     assert found.archive is None
     assert found.controller["replies"] == found.controller["intervals"] == 0

@@ -1,4 +1,4 @@
-"""Whoever reaches the port of the live view: he may look, and that is all he may."""
+"""Untrusted clients of the live view can read, and nothing else."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FRAMES = {
     "a control frame in parts": b"\x09\x80abcd",
     "text that is none": b"\x81\x82\0\0\0\0\xff\xfe",
 }
-WISHES = (
+REQUESTS = (
     {"op": "advertise", "channels": [{"id": 1, "topic": "/x", "encoding": "json"}]},
     {"op": "setParameters", "parameters": [{"name": "override", "value": 2.0}]},
     {"op": "fetchAsset", "uri": "file:///etc/passwd", "requestId": 1},
@@ -42,25 +42,25 @@ def publisher() -> Iterator[live.LivePublisher]:
         yield made
 
 
-def shaken(port: int) -> socket.socket:
-    """A connection past its handshake."""
-    there = socket.create_connection(("127.0.0.1", port), timeout=5.0)
+def connect(port: int) -> socket.socket:
+    """Connect, with handshake."""
+    connection = socket.create_connection(("127.0.0.1", port), timeout=5.0)
     key = base64.b64encode(os.urandom(16)).decode()
-    there.sendall(
+    connection.sendall(
         "GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
         f"Sec-WebSocket-Key: {key}\r\nSec-WebSocket-Version: 13\r\n"
         f"Sec-WebSocket-Protocol: {SUBPROTOCOL}\r\n\r\n".encode()
     )
-    assert there.recv(4096).startswith(b"HTTP/1.1 101")
-    return there
+    assert connection.recv(4096).startswith(b"HTTP/1.1 101")
+    return connection
 
 
-def ended(there: socket.socket) -> bool:
-    """Whether the other side ends a connection within seconds, whatever it says before."""
+def is_closed(connection: socket.socket) -> bool:
+    """Return whether the server closes the connection within seconds."""
     try:
-        while there.recv(4096):
+        while connection.recv(4096):
             continue
-    except ConnectionResetError:  # what was sent and never read is an end as well
+    except ConnectionResetError:  # unread data were left
         return True
     except TimeoutError:
         return False
@@ -77,31 +77,31 @@ def still_served(publisher: live.LivePublisher) -> None:
             except TimeoutError:
                 continue
             return
-    raise AssertionError("nothing comes any more")
+    raise AssertionError("no message arrives")
 
 
-def test_frames_that_are_none_end_their_own_connection(publisher: live.LivePublisher) -> None:
+def test_invalid_frame_ends_its_own_connection(publisher: live.LivePublisher) -> None:
     with ExitStack() as left:
         for what, frame in FRAMES.items():
-            there = left.enter_context(shaken(publisher.port))
-            there.sendall(frame)
-            assert ended(there), what
+            connection = left.enter_context(connect(publisher.port))
+            connection.sendall(frame)
+            assert is_closed(connection), what
         still_served(publisher)
 
 
-def test_nothing_can_be_sent_set_or_fetched(publisher: live.LivePublisher) -> None:
+def test_requests_are_refused(publisher: live.LivePublisher) -> None:
     with Viewer(publisher.port) as viewer:
         assert viewer.info["capabilities"] == []
-        for wish in WISHES:
-            viewer.socket.send(json.dumps(wish))
+        for request in REQUESTS:
+            viewer.socket.send(json.dumps(request))
         refused = 0
-        while refused < len(WISHES):
-            said = viewer.socket.recv(timeout=5.0)
-            refused += isinstance(said, str) and json.loads(said)["op"] == "status"
+        while refused < len(REQUESTS):
+            reply = viewer.socket.recv(timeout=5.0)
+            refused += isinstance(reply, str) and json.loads(reply)["op"] == "status"
     still_served(publisher)
 
 
-def test_many_that_say_nothing_keep_nobody_out(publisher: live.LivePublisher) -> None:
+def test_idle_connections_do_not_block_others(publisher: live.LivePublisher) -> None:
     with ExitStack() as left:
         for _ in range(100):
             address = ("127.0.0.1", publisher.port)
