@@ -2,12 +2,12 @@
 
 Targets: `codec` (packets, CAN frames), `session` (a controller that does anything), `cell_file`,
 `archive`, `importers`, `urdf`, `documents` (plans, settings, results). Needs atheris, which the
-extra ``fuzz`` brings. The command goes on where an earlier one with the same journal ended, after
-a kill too, until each target has been fuzzed for --minutes.
+extra ``fuzz`` brings. The command resumes where an earlier one with the same journal ended, also
+after a kill, until each target has been fuzzed for --minutes.
 
 Beside the journal lie FILE.files/TARGET/corpus and findings; a finding is a folder with the input,
 its shortest form and the traceback. ``python -m tests.fuzz.child TARGET --once INPUT`` repeats it.
-Told as deaths are processes that ended early and whose last input alone does not repeat that.
+Reported as deaths are processes that ended early and whose last input alone does not repeat that.
 
 Examples:
   python -m tests.fuzz session --minutes 5 --journal runs/fuzz.jsonl
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     option("--jobs", type=at_least_one, default=1, help="targets at a time")
     option("--journal", type=Path, required=True, help="JSON lines, added to")
     option("--json", action="store_true", help="print the figures as JSON")
-    option("--keep", action="store_true", help="make the repository's corpora anew")
+    option("--keep", action="store_true", help="choose the repository's corpora again")
     given = parser.parse_args(arguments)
     names = targets.NAMES if given.target == "all" else (given.target,)
     progress = reporter(quiet=given.json)
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         Run(names, 60.0 * given.minutes, until, given.journal).work(given.jobs, progress)
     except KeyboardInterrupt:
-        progress.say("stopped; the same command goes on from here")
+        progress.say("stopped; the same command continues from here")
     except JournalError as error:
         sys.stderr.write(f"error: {error}\n")
         return 2

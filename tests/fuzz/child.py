@@ -1,8 +1,8 @@
 """One process of a target: fuzzes it with libFuzzer, or runs one input without.
 
 ``python -m tests.fuzz.child TARGET --fuzz FINDINGS [libFuzzer's own options and folders]``
-``python -m tests.fuzz.child TARGET --once FILE`` runs one input in plain Python: exit status 0, or
-1 with the traceback, 3 where more than 1 GB was resident, or a signal: SIGPROF where it takes
+``python -m tests.fuzz.child TARGET --once FILE`` runs one input without libFuzzer: exit status 0,
+or 1 with the traceback, 3 where more than 1 GB was resident, or a signal: SIGPROF where it takes
 more than 5 s of processor time.
 ``python -m tests.fuzz.child TARGET --shorten FOLDER`` writes the shortest input with the same
 cause beside the one in a folder of findings.
@@ -28,7 +28,7 @@ _SHORTENING = 10.0  # s of processor time
 
 
 def main(arguments: list[str]) -> int:
-    """Do as the head of this module says."""
+    """Run the command line above."""
     name, act, place, *rest = arguments
     warnings.simplefilter("error")
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="rosbags")
@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _most_resident() -> int:
-    """MB; what `getrusage` tells begins with the process that started this one."""
+    """Return it in MB; `getrusage` includes the process that started this one."""
     status = Path("/proc/self/status").read_text("ascii")
     return int(status.partition("VmHWM:")[2].split()[0]) >> 10
 

@@ -1,4 +1,4 @@
-"""Bytes as decisions: what a fuzzer changes in them changes one decision, not all that follow."""
+"""Bytes as decisions: a changed byte changes one decision, not all that follow."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ NUMBERS = (0, 1, -1, 10, 11, 12, 0x7FFF, 0x8000, 2**31 - 1, -(2**31))
 
 
 def mutate_bytes(data: bytes, most: int, seed: int) -> bytes:
-    """One to four changes: bytes flipped, replaced, taken out, repeated, moved, cut off."""
+    """One to four changes: bytes flipped, replaced, removed, repeated, moved, cut off."""
     rng = random.Random(seed)
     changed = bytearray(data) or bytearray(1)
     for _ in range(rng.randint(1, 4)):

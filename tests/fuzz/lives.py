@@ -302,11 +302,10 @@ def plant(folder: Path, inputs: list[bytes]) -> None:
 
 
 def keep(name: str, journal: Path) -> str:
-    """Choose anew what lies in the repository for a target; says how much that is.
+    """Choose the corpus of a target in the repository again; return its size as text.
 
-    Inputs that once broke a law (found-*), or were put there on purpose (seed-*), stay; beside them
-    come those that by libFuzzer's own count reach more than these, short ones first, as far as
-    there is room.
+    Inputs that once violated a law (found-*) and given ones (seed-*) stay; others that reach more
+    by libFuzzer's count are added, short ones first, up to the limits.
     """
     own = CORPORA / name
     inputs = {path.name: path.read_bytes() for path in own.glob("*-*")}

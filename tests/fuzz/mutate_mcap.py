@@ -1,8 +1,7 @@
-"""Changes of MCAP files that get past their checksums: records are taken apart, changed, sealed.
+"""Changes of MCAP files (https://mcap.dev/spec) with valid checksums.
 
-Layout: https://mcap.dev/spec. A file is a list of records; a chunk is one that holds such a list.
-After the change lengths, checksums and (in most files) the index are made anew, so that a reader
-believes what it reads.
+A file is a list of records; a chunk is a record with such a list. After a change lengths, checksums
+and (in most files) the index are recomputed.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _PACKED = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 @dataclass
 class Record:
-    """One record; of a chunk what it holds, where that could be read."""
+    """One record; of a chunk also the records inside, where readable."""
 
     opcode: int
     body: bytes
@@ -38,27 +37,32 @@ class Record:
     compression: str = ""
     times: tuple[int, int] = field(default=(0, 0))
 
+    @property
+    def content(self) -> bytes:
+        """The records inside as bytes."""
+        return b"".join(record_of(each.opcode, each.body) for each in self.inside or ())
+
 
 def mutate_mcap(data: bytes, most: int, seed: int) -> bytes:
-    """One to three changes of records; a tenth of the inputs is changed blindly, seals and all."""
+    """Change one to three records; of a tenth of the inputs any bytes, without checksums."""
     rng = random.Random(seed)
-    records = taken_apart(data) if rng.random() > 0.1 else None
+    records = split_file(data) if rng.random() > 0.1 else None
     if not records:
         return mutate_bytes(data, most, seed)
     for _ in range(rng.choice((1, 1, 2, 3))):
         _change(records, rng)
-    with contextlib.suppress(Exception):  # what cannot be indexed goes without an index
-        sealed = put_together(records, index=rng.random() < 0.8)
+    with contextlib.suppress(Exception):  # without an index if none can be written
+        sealed = join_file(records, index=rng.random() < 0.8)
         return sealed if len(sealed) <= most else data
-    return put_together(records, index=False)[:most]
+    return join_file(records, index=False)[:most]
 
 
-def taken_apart(data: bytes) -> list[Record] | None:
-    """The records of the data section; None for bytes that are no MCAP at all."""
+def split_file(data: bytes) -> list[Record] | None:
+    """Return the records of the data section; None if it is no MCAP file."""
     if not data.startswith(container.MAGIC):
         return None
     records = []
-    for opcode, body in _split(data[len(container.MAGIC) :]):
+    for opcode, body in split_records(data[len(container.MAGIC) :]):
         if opcode in (container.DATA_END, container.FOOTER):
             break
         if opcode != container.MESSAGE_INDEX:
@@ -66,8 +70,8 @@ def taken_apart(data: bytes) -> list[Record] | None:
     return records
 
 
-def _split(data: bytes) -> list[tuple[int, bytes]]:
-    """Opcodes and bodies, up to where the bytes are no record any more."""
+def split_records(data: bytes) -> list[tuple[int, bytes]]:
+    """Return opcodes and bodies up to the first invalid record."""
     found: list[tuple[int, bytes]] = []
     with contextlib.suppress(Damage):
         found.extend((record.opcode, record.body) for record in container.split_records(data, 0))
@@ -75,18 +79,17 @@ def _split(data: bytes) -> list[tuple[int, bytes]]:
 
 
 def _opened(opcode: int, body: bytes) -> Record:
-    with contextlib.suppress(Damage):  # no chunk, or damaged beyond reading: as it is
+    with contextlib.suppress(Damage):  # another record, or an unreadable chunk
         if opcode == container.CHUNK:
             head = container.parse_chunk(container.Record(0, opcode, body))
-            plain = container.decompress(head, 0)
-            inside = [Record(*piece) for piece in _split(plain)]
+            inside = [Record(*piece) for piece in split_records(container.decompress(head, 0))]
             times = head.message_start_time, head.message_end_time
             return Record(opcode, body, inside, head.compression, times)
     return Record(opcode, body)
 
 
-def put_together(records: list[Record], *, index: bool) -> bytes:
-    """The file, with right lengths and checksums, and an index of it where that is wanted."""
+def join_file(records: list[Record], *, index: bool) -> bytes:
+    """Return the file with valid lengths and checksums, with or without index."""
     built = Indexed()
     file = built.data
     described = _described(records)
@@ -109,10 +112,10 @@ def put_together(records: list[Record], *, index: bool) -> bytes:
 
 
 def _described(records: list[Record]) -> str:
-    """The checksum of the description, which the outcome repeats."""
+    """Return the checksum of the description, which the outcome repeats."""
     for one in records:
-        with contextlib.suppress(Damage):  # damaged beyond reading: nothing to repeat
-            name, entries = _entries(one) if one.opcode == container.METADATA else ("", {})
+        with contextlib.suppress(Damage):  # unreadable
+            name, entries = entries_of(one) if one.opcode == container.METADATA else ("", {})
             if name == header.METADATA:
                 entries.pop("checksum", None)
                 return header.checksum(entries)
@@ -120,28 +123,28 @@ def _described(records: list[Record]) -> str:
 
 
 def _sealed(one: Record, seals: dict[str, str]) -> bytes:
-    """The body with the checksums that fit it, and entries of the outcome that fit the rest."""
+    """Return the body with valid checksums and entries of the outcome."""
     if one.inside is not None:
-        plain = b"".join(record_of(each.opcode, each.body) for each in one.inside)
-        packed = _PACKED.get(one.compression, bytes)(plain)
+        data = one.content
+        packed = _PACKED.get(one.compression, bytes)(data)
         start, end = one.times
-        return _body(Chunk(one.compression, packed, end, start, zlib.crc32(plain), len(plain)))
+        return body_of(Chunk(one.compression, packed, end, start, zlib.crc32(data), len(data)))
     if one.opcode == container.ATTACHMENT and len(one.body) > 4:
         return one.body[:-4] + zlib.crc32(one.body[:-4]).to_bytes(4, "little")
     if one.opcode == container.METADATA:
-        with contextlib.suppress(Damage):  # damaged beyond reading: as it is
-            name, entries = _entries(one)
+        with contextlib.suppress(Damage):  # unreadable
+            name, entries = entries_of(one)
             if entries.pop("checksum", None) is not None:
                 entries |= {key: seals[key] for key in seals if key in entries}
-                return _body(Metadata(name, header.with_checksum(entries)))
+                return body_of(Metadata(name, header.with_checksum(entries)))
     return one.body
 
 
-def _body(record: Attachment | Chunk | Metadata) -> bytes:
+def body_of(record: Attachment | Chunk | Metadata) -> bytes:
     return encode(record)[container.RECORD.size :]
 
 
-def _entries(one: Record) -> tuple[str, dict[str, str]]:
+def entries_of(one: Record) -> tuple[str, dict[str, str]]:
     return container.parse_metadata(container.Record(0, one.opcode, one.body))
 
 
@@ -215,7 +218,7 @@ def _of_a_message(message: Record, rng: random.Random) -> None:
 
 def _of_metadata(one: Record, rng: random.Random) -> None:
     try:
-        name, entries = _entries(one)
+        name, entries = entries_of(one)
     except Damage:
         one.body = mutate_bytes(one.body, len(one.body) + 64, rng.getrandbits(32))
         return
@@ -225,7 +228,7 @@ def _of_metadata(one: Record, rng: random.Random) -> None:
     else:
         changed = mutate_text(entries.get(key, "").encode() or b"0", 6000, rng.getrandbits(32))
         entries[key] = changed.decode("utf-8", "replace")
-    one.body = _body(Metadata(name, entries))
+    one.body = body_of(Metadata(name, entries))
 
 
 def _of_an_attachment(one: Record, rng: random.Random) -> None:
@@ -239,4 +242,4 @@ def _of_an_attachment(one: Record, rng: random.Random) -> None:
     else:
         change = mutate_bytes if found.name.endswith(".bin") else mutate_text
         found.data = change(found.data, len(found.data) + 500, rng.getrandbits(32))
-    one.body = _body(found)
+    one.body = body_of(found)

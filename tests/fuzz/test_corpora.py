@@ -1,4 +1,4 @@
-"""Every input that fuzzing kept, and some changes of each, break no law; atheris is not needed."""
+"""The corpora and some changes of them violate no law; atheris is not needed."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from tests.fuzz.lives import CORPORA, MOST_BYTES, MOST_FILES
 
 
 def inputs(name: str) -> list[bytes]:
-    """Those in the repository, in one order everywhere."""
+    """Return the corpus in the repository, sorted."""
     return [path.read_bytes() for path in sorted((CORPORA / name).iterdir())]
 
 
 @pytest.mark.parametrize("name", targets.NAMES)
-def test_the_corpus_is_small_and_breaks_no_law(name: str) -> None:
-    target, kept = targets.load(name), inputs(name)
-    assert 0 < len(kept) <= MOST_FILES
-    assert len(set(kept)) == len(kept)
-    assert sum(map(len, kept)) <= MOST_BYTES
-    for data in kept:
+def test_corpus_is_small_and_violates_no_law(name: str) -> None:
+    target, corpus = targets.load(name), inputs(name)
+    assert 0 < len(corpus) <= MOST_FILES
+    assert len(set(corpus)) == len(corpus)
+    assert sum(map(len, corpus)) <= MOST_BYTES
+    for data in corpus:
         target.run(data)
 
 
 @pytest.mark.parametrize("name", targets.NAMES)
-def test_what_is_well_formed_is_taken(name: str) -> None:
+def test_well_formed_input_is_accepted(name: str) -> None:
     target = targets.load(name)
     seeds = target.seeds()
     assert [at for at, data in enumerate(seeds) if not target.run(data)] == []
@@ -38,15 +38,15 @@ def test_what_is_well_formed_is_taken(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", targets.NAMES)
-def test_changes_of_it_break_none_either(name: str) -> None:
-    target, kept = targets.load(name), inputs(name)
+def test_changes_violate_no_law(name: str) -> None:
+    target, corpus = targets.load(name), inputs(name)
     for seed in range(target.replayed):
-        target.run(target.mutate(kept[seed % len(kept)], target.most, seed))
+        target.run(target.mutate(corpus[seed % len(corpus)], target.most, seed))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", targets.NAMES)
-def test_many_changes_of_changes_break_none(name: str) -> None:
+def test_many_changes_violate_no_law(name: str) -> None:
     target, rng = targets.load(name), random.Random(name)
     pool = inputs(name)
     for _ in range(20 * target.replayed):
@@ -56,15 +56,15 @@ def test_many_changes_of_changes_break_none(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", targets.NAMES)
-def test_a_change_is_the_same_whenever_it_is_made(name: str) -> None:
-    target, kept = targets.load(name), inputs(name)
-    made = [target.mutate(kept[0], target.most, seed) for seed in range(20)]
-    assert made == [target.mutate(kept[0], target.most, seed) for seed in range(20)]
-    assert len({*made, kept[0]}) > 10
-    assert all(len(data) <= max(target.most, len(kept[0])) for data in made)
+def test_change_depends_on_its_seed_only(name: str) -> None:
+    target, corpus = targets.load(name), inputs(name)
+    made = [target.mutate(corpus[0], target.most, seed) for seed in range(20)]
+    assert made == [target.mutate(corpus[0], target.most, seed) for seed in range(20)]
+    assert len({*made, corpus[0]}) > 10
+    assert all(len(data) <= max(target.most, len(corpus[0])) for data in made)
 
 
-def test_one_input_can_be_tried_by_hand(tmp_path: Path) -> None:
+def test_one_input_can_be_run_by_command(tmp_path: Path) -> None:
     path = tmp_path / "input"
     path.write_bytes(inputs("codec")[0])
     tried = subprocess.run(

@@ -62,7 +62,7 @@ def test_jump_of_the_clock_by_years_is_fast(tmp_path: Path) -> None:
     assert np.count_nonzero(np.isfinite(view.quantities[0].traces[0].value)) == 2
 
 
-def test_position_too_large_for_degrees_is_not_drawn(tmp_path: Path) -> None:
+def test_position_too_large_for_degrees_is_not_shown(tmp_path: Path) -> None:
     position = np.array([[0.1, 0.2], [1e307, -1e307], [0.3, 0.4]])
     large = Samples(np.arange(3) * 2_000_000, position=position, torque=np.ones((3, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", large))
@@ -112,7 +112,7 @@ def test_cell_whose_link_cannot_be_changed_is_refused(
 
 
 def log(path: Path, position: np.ndarray, time: np.ndarray) -> None:
-    """Import a log of these arrays, which leaves no archive."""
+    """Import a log of these arrays; check that no archive is left."""
     np.savez(path.with_name("log.npz"), q=position, t=time)
     output = path.with_name("o.mcap")
     try:
@@ -136,7 +136,7 @@ def log_with_signalling_nan(path: Path) -> None:
 
 
 def bag_whose_names_are_no_text(path: Path) -> None:
-    """What sqlite says of it quotes the byte as it stands there."""
+    """The message of sqlite quotes the invalid byte."""
     with closing(sqlite3.connect(path)) as database:
         database.execute("CREATE TABLE topics(id, name, type, serialization_format)")
         database.execute("CREATE TABLE messages(id, topic_id, timestamp, data)")

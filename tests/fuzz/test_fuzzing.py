@@ -1,4 +1,4 @@
-"""The harness itself: laws that are broken are found, distinguished, kept and counted once."""
+"""The harness: violated laws are found, distinguished, stored and counted once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.fuzz import __main__ as command
 from tests.fuzz import lives, targets
 from tests.fuzz.child import main as child
 from tests.fuzz.draw import Draw
-from tests.fuzz.mutate_mcap import put_together, taken_apart
+from tests.fuzz.mutate_mcap import join_file, split_file
 from tests.fuzz.test_corpora import inputs
 
 PIECE = lives.Piece("codec", 10.0, 100, 5, 7, 3, 80)
@@ -71,9 +71,9 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
         ("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
     "replies by CAN to another packet":
         ("codec", ends, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
-    "a PC that hears nothing by CAN":
+    "a PC that receives nothing by CAN":
         ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
-    "a controller that hears nothing":
+    "a controller that receives nothing":
         ("codec", ControllerEnd, "receive", lambda *_: None, IN_THE_CODEC),
     "a controller that sends nothing":
         ("codec", ControllerEnd, "packet", lambda *_: int("none"), "ValueError"),
@@ -103,18 +103,14 @@ def test_a_planted_defect_is_found(what: str, monkeypatch: pytest.MonkeyPatch) -
 
 
 class TestMcap:
-    def test_taken_apart_and_put_together_it_says_the_same(self) -> None:
+    def test_split_and_joined_file_is_unchanged(self) -> None:
         for data in targets.load("archive").seeds():
-            records = taken_apart(data) or []
+            records = split_file(data) or []
             assert records
-            again = taken_apart(put_together(records, index=False)) or []
+            again = split_file(join_file(records, index=False)) or []
             for one, other in zip(records, again, strict=True):
-                assert (one.opcode, one.inside, one.times) == (
-                    other.opcode,
-                    other.inside,
-                    other.times,
-                )
-                assert one.inside is not None or one.body == other.body
+                same = replace(other, body=one.body) if one.inside is not None else other
+                assert one == same
 
     def test_changes_get_past_the_checksums(self, tmp_path: Path) -> None:
         target = targets.load("archive")
@@ -137,13 +133,11 @@ class TestFindings:
         except ValueError as error:
             return error
 
-    def test_one_cause_is_one_folder_however_often_it_is_met(self, tmp_path: Path) -> None:
-        kept = lives.Findings(tmp_path)
+    def test_one_cause_has_one_folder(self, tmp_path: Path) -> None:
+        findings = lives.Findings(tmp_path)
         name = lives.signature(self.raised("x"))
         assert name == lives.signature(self.raised("y"))
-        assert [kept.keep(name, data, "story") for data in (b"1", b"2", b"3", b"4")].count(
-            True
-        ) == 1
+        assert sum(findings.keep(name, data, "story") for data in (b"1", b"2", b"3", b"4")) == 1
         assert lives.known(tmp_path) == {name: 4}
         assert (tmp_path / name / lives.INPUT).read_bytes() == b"1"
         assert not lives.Findings(tmp_path).keep(name, b"5", "story")
@@ -165,7 +159,7 @@ class TestFindings:
 
 
 class TestJournal:
-    def test_pieces_add_up_and_a_torn_line_costs_itself_only(self, tmp_path: Path) -> None:
+    def test_pieces_add_up_without_a_truncated_line(self, tmp_path: Path) -> None:
         path = tmp_path / "j.jsonl"
         lives.append(path, PIECE)
         with path.open("a") as stream:
@@ -175,7 +169,7 @@ class TestJournal:
         assert (total["pieces"], total["seconds"], total["inputs"]) == (2, 15.0, 150)
         assert (total["edges"], total["features"], total["not_reproduced"]) == (9, 7, 1)
 
-    def test_what_is_done_is_not_done_again(
+    def test_completed_work_is_not_repeated(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         path = tmp_path / "j.jsonl"
@@ -188,7 +182,7 @@ class TestJournal:
         assert command.main(arguments) == 1
 
     @pytest.mark.parametrize("ended", ["crash", "memory", "killed"])
-    def test_a_death_that_no_input_repeats_is_told(
+    def test_early_end_that_no_input_repeats_is_reported(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str], ended: str
     ) -> None:
         path = tmp_path / "j.jsonl"
@@ -200,7 +194,7 @@ class TestJournal:
         assert command.main([*arguments, "--json"]) == 1
         assert json.loads(capsys.readouterr().out)["not_reproduced"] == 1
 
-    def test_a_piece_that_was_stopped_is_no_death(
+    def test_stopped_piece_is_no_early_end(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         path = tmp_path / "j.jsonl"
@@ -209,7 +203,7 @@ class TestJournal:
         assert "deaths that" not in capsys.readouterr().out
 
 
-def test_of_what_is_found_short_inputs_that_reach_more_are_chosen(
+def test_short_inputs_that_reach_more_are_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own, corpus = tmp_path / "corpora" / "codec", tmp_path / "j.files" / "codec" / "corpus"
@@ -238,9 +232,7 @@ def test_of_what_is_found_short_inputs_that_reach_more_are_chosen(
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
-def test_a_real_process_of_libfuzzer_is_understood(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_of_libfuzzer_is_parsed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "j.jsonl"
     assert command.main(["codec", "--minutes", "0.15", "--journal", str(path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -250,7 +242,7 @@ def test_a_real_process_of_libfuzzer_is_understood(
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
-def test_a_run_that_is_interrupted_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
     path = tmp_path / "j.jsonl"
     run = subprocess.Popen(
         [sys.executable, "-m", "tests.fuzz", "codec", "--minutes", "3", "--journal", str(path)],
@@ -263,11 +255,11 @@ def test_a_run_that_is_interrupted_leaves_nothing_behind(tmp_path: Path) -> None
     while len([*corpus.glob("*")]) <= planted and time.monotonic() < until:
         time.sleep(0.2)
     run.send_signal(signal.SIGINT)
-    told, _ = run.communicate(timeout=60.0)
-    assert run.returncode == 0, told
+    output, _ = run.communicate(timeout=60.0)
+    assert run.returncode == 0, output
     (piece,) = lives.pieces(path)
     assert piece.ended == "stopped"
     assert piece.inputs > planted
     before = {one.name for one in corpus.iterdir()}
     time.sleep(2.0)
-    assert before == {one.name for one in corpus.iterdir()}, "something goes on"
+    assert before == {one.name for one in corpus.iterdir()}, "a process still runs"

@@ -27,9 +27,9 @@ class Target:
     """One of them.
 
     Attributes:
-        run: raises where a law is broken; else whether the input is taken, False where it is
-            refused as documented.
-        seeds: inputs to begin with, made by the product's own writers; all of them are taken.
+        run: raises where a law is violated; else returns whether the input is accepted, False
+            where it is refused as documented.
+        seeds: first inputs, made by the product's own writers; all of them are accepted.
     """
 
     run: Callable[[bytes], bool]

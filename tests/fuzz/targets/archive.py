@@ -1,4 +1,4 @@
-"""Archives of strangers: read, checked, repaired, drawn and recorded from, or refused by name."""
+"""Untrusted archives: read, checked, repaired and shown, or refused by name."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ folder = lru_cache(partial(place_of, "archive"))
 
 
 def run(data: bytes) -> bool:
-    """Everything that commands do with an archive that somebody sent; whether it can be opened."""
+    """Run all commands on an archive; return whether it can be opened."""
     path = folder() / "excitation_003_a1.mcap"
     path.write_bytes(data)
     try:
@@ -40,18 +40,19 @@ def run(data: bytes) -> bool:
     except ArchiveError as error:
         assert error.path == path
         assert error.problem
-        as_told(path)
+        check_and_info(path)
         return False
-    as_read(archive)
-    as_told(path)
-    as_drawn(path)
-    as_repaired(path, archive)
-    as_a_cell_is_begun(path, archive)
+    read_parts(archive)
+    check_and_info(path)
+    with suppress(InputError):
+        view_of(path)  # without drawing, which takes seconds
+    repair_and_compare(path, archive)
+    new_cell(path, archive)
     return True
 
 
-def as_read(archive: Archive) -> None:
-    """Columns fit one another; what is missing is said."""
+def read_parts(archive: Archive) -> None:
+    """Check that columns fit one another, and that missing content is reported."""
     for name, column in archive.columns.items():
         assert len(column) == archive.n_samples, name
         assert not (column.size and column.flags.writeable)
@@ -63,7 +64,7 @@ def as_read(archive: Archive) -> None:
         except ArchiveError as error:
             assert error.remedy
     part = open_archive(archive.path, fields=("position",), start=0.0, stop=1e9)
-    # Of a damaged file a part may be whole where the whole is not.
+    # A part of a damaged file may be intact.
     assert part.n_samples <= archive.n_samples or archive.damage is not None
     try:
         recording = recording_of(archive)
@@ -76,7 +77,7 @@ def as_read(archive: Archive) -> None:
     assert ("missing" in recording.provenance) == (archive.damage is not None)
 
 
-def as_told(path: Path) -> None:
+def check_and_info(path: Path) -> None:
     """`hil archive check` and `info`."""
     with suppress(ArchiveError):
         check_archive(path)
@@ -84,16 +85,8 @@ def as_told(path: Path) -> None:
         json.dumps(read_overview(path).to_dict())
 
 
-def as_drawn(path: Path) -> None:
-    """`hil plot`, without the seconds that drawing itself takes."""
-    try:
-        view_of(path)
-    except InputError:
-        return
-
-
-def as_repaired(path: Path, archive: Archive) -> None:
-    """`hil archive repair`: what it writes is whole, and what it leaves out is said."""
+def repair_and_compare(path: Path, archive: Archive) -> None:
+    """`hil archive repair`: its output is intact, and losses are reported."""
     target = path.with_name("repaired.mcap")
     target.unlink(missing_ok=True)
     try:
@@ -112,7 +105,7 @@ def as_repaired(path: Path, archive: Archive) -> None:
         assert again.columns["position"].tobytes() == before.tobytes()
 
 
-def as_a_cell_is_begun(path: Path, archive: Archive) -> None:
+def new_cell(path: Path, archive: Archive) -> None:
     """`hil new --from-archive`."""
     try:
         known = from_archive(path, archive.joint_names)
@@ -132,7 +125,7 @@ def _urdf() -> Path:
 
 
 def seeds() -> list[bytes]:
-    """Cycles with events and all attachments; an imported one; one torn, one repaired."""
+    """Return a recorded archive, an imported, a truncated and a repaired one."""
     rows = np.zeros(CYCLES, cycle_dtype(2))
     cycle = np.arange(CYCLES)
     rows["cycle"], rows["number"] = 5000 + cycle, 10 + cycle
@@ -145,8 +138,8 @@ def seeds() -> list[bytes]:
     }  # fmt: skip
     place = folder() / "seeds"
     place.mkdir(exist_ok=True)
-    names = ("excitation_000_a1", "imported", "torn", "mended")
-    whole, bare, torn, mended = (place / f"{name}.mcap" for name in names)
+    names = ("excitation_000_a1", "imported", "truncated", "repaired")
+    whole, bare, truncated, repaired = (place / f"{name}.mcap" for name in names)
     with ArchiveWriter(
         whole, joint_names=JOINTS, period=0.01, metadata={"campaign": "c", "simulated": "yes"},
         attachments=attachments, durable=False,
@@ -157,9 +150,9 @@ def seeds() -> list[bytes]:
     samples = Samples(cycle * 2_000_000, position=rows["position"], torque=rows["position"])
     urdf = {"robot.urdf": URDF.encode()}
     write_samples(bare, samples, joint_names=JOINTS, attachments=urdf, metadata={})
-    torn.write_bytes(whole.read_bytes()[: whole.stat().st_size * 3 // 4])
-    repair(torn, mended)
-    made = [path.read_bytes() for path in (whole, bare, torn, mended)]
+    truncated.write_bytes(whole.read_bytes()[: whole.stat().st_size * 3 // 4])
+    repair(truncated, repaired)
+    made = [path.read_bytes() for path in (whole, bare, truncated, repaired)]
     shutil.rmtree(place)
     return made
 

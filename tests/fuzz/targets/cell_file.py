@@ -1,4 +1,4 @@
-"""Cell files: refused with a `CellError` that says where and what to do, or usable in all parts."""
+"""Cell files: refused with a `CellError` with place and remedy, or usable in all parts."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def folder() -> Path:
 
 
 def run(data: bytes) -> bool:
-    """Load the file, if it can be; use everything that a command would."""
+    """Load the file if possible; use everything that commands use."""
     path = folder() / "cell.toml"
     path.write_bytes(data)
     try:
@@ -103,7 +103,7 @@ def used(cell: Cell) -> None:
             explained(error, cell.path)
             continue
         if isinstance(made, np.ndarray):
-            assert np.isfinite(made).all(), "a figure that is none"
+            assert np.isfinite(made).all(), "numbers that are not finite"
     try:
         limits = cell.joint_limits
     except CellError:
@@ -113,7 +113,7 @@ def used(cell: Cell) -> None:
 
 
 def changed(cell: Cell) -> None:
-    """A cell on another link, or with other repetitions, is the same in everything else."""
+    """Check that a change of link or repetitions leaves the rest unchanged."""
     changes: tuple[Callable[[], Cell], ...] = (
         lambda: cell.with_link(transport="udp", host="127.0.0.1", port=4000, cycle_ms=2),
         lambda: cell.with_link(transport="simulated"),

@@ -36,7 +36,7 @@ HELD = {0: 2, 501: 2, 10: 5}
 
 
 class Talk:
-    """One conversation; `play` says whether every packet of it had its answer."""
+    """One conversation; `play` returns whether every packet had its reply."""
 
     def __init__(self, draw: Draw, rates: BusRates) -> None:
         self._draw, self._rates = draw, rates
@@ -99,7 +99,7 @@ class Talk:
         return got[-1] if got else None
 
     def _as_sent(self, got: CyclicPacket, sent: CyclicPacket) -> None:
-        """Every field is what was sent, or as old as is said."""
+        """Every field is what was sent, or as old as stated."""
         self._sent[sent.number] = sent
         assert (got.number, got.status) == (sent.number, sent.status)
         assert (got.axes["mode"] == sent.axes["mode"]).all()
@@ -198,7 +198,7 @@ class Talk:
     ) -> None:
         """What is given back comes from the controller's own packet, the rest from the answer."""
         classic = self._rates.profile == "classic"
-        # Classic frames have no room for a status: the controller's end says what it sent itself.
+        # Classic frames have no room for a status: compare what its end sent itself.
         back = (answer.status[0], sent.status[0]) if classic else (answer.status[0],)
         assert reply.status[0] in back, "status"
         for slot in range(self._n):
@@ -255,7 +255,7 @@ RATES = (BusRates("classic", 1_000_000, 1_000_000), BusRates("fd", 1_000_000, 5_
 
 
 def run(data: bytes) -> bool:
-    """The first byte says what the others are; whether they can be read."""
+    """The first byte is the kind of the others; return whether they can be read."""
     draw = Draw(data)
     kind = draw.below(4)
     if kind == 0:
@@ -283,7 +283,7 @@ def cyclic(draw: Draw) -> bool:
 
 
 def init(packet: bytes) -> bool:
-    """An init packet gives back its bytes; what it says of axes is a map or refused."""
+    """An init packet gives back its bytes; its axes are a map or refused."""
     packet = packet.ljust(INIT_LENGTH, b"\0") if len(packet) > 64 else packet
     try:
         decoded = InitPacket.decode(packet)

@@ -1,4 +1,4 @@
-"""Files of our own that somebody may have edited: read as what they say, or refused by name."""
+"""Own files that may have been edited: read as written, or refused by name."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def run(data: bytes) -> bool:
 
 
 def explained(error: InputError) -> None:
-    """An error says of which file it is and what is wrong there."""
+    """Check that an error names file and problem."""
     assert error.path is not None, error
     assert error.problem, error
 
@@ -91,7 +91,7 @@ def results(path: Path) -> None:
 
 
 def moves(path: Path) -> None:
-    """A file of moves, in either of its forms, says the same in the other."""
+    """A file of moves has the same content in both of its formats."""
     found = read_plan_file(path)
     again = path.with_name("again.toml")
     again.write_text(found.to_toml())

@@ -1,4 +1,4 @@
-"""Foreign recordings: an archive that keeps the profile, or a `SourceError`, in bounded memory."""
+"""Foreign recordings: a conforming archive or a `SourceError`, in bounded memory."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ column = "t"
 LINES = "t,q1,q2,tau1,tau2\n" + "".join(
     f"{0.002 * k:.3f},{0.1 * k},{-0.2 * k},{k}.5,-{k}\n" for k in range(8)
 )
-ODD_MAP = """joints = ["ankle", "hip"]
+FULL_MAP = """joints = ["ankle", "hip"]
 [position]
 columns = [1, 2]
 unit = "deg"
@@ -81,7 +81,7 @@ def robot() -> Robot:
 
 
 def run(data: bytes) -> bool:
-    """Import it, if it can be; look at what was written."""
+    """Import it if possible; check what was written."""
     kind = data[0] % len(SUFFIXES) if data else TEXT
     source, output = folder() / SUFFIXES[kind], folder() / "out.mcap"
     source.write_bytes(data[1:])
@@ -89,14 +89,14 @@ def run(data: bytes) -> bool:
     try:
         _imported(kind, source, output)
     except (SourceError, ArchiveWriteError) as error:
-        assert not output.exists(), "refused, and left behind"
+        assert not output.exists(), "an archive is left"
         assert isinstance(error, InputError)
         assert error.path is not None and error.problem, error
         return False
     archive = open_archive(output)
     assert archive.complete
-    kept = check_archive(output)
-    assert kept.conforms, kept.faults
+    check = check_archive(output)
+    assert check.conforms, check.faults
     assert archive.kind == "imported"
     assert np.isfinite(archive.columns["position"]).all()
     return True
@@ -125,7 +125,7 @@ def _map() -> ColumnMap:
 
 
 def seeds() -> list[bytes]:
-    """One of each kind, well formed."""
+    """Return one valid input of each kind."""
     q, t = np.arange(16.0).reshape(8, 2), np.arange(8) * 0.002
     arrays, packed, one, typed = (io.BytesIO() for _ in range(4))
     np.savez(arrays, q=q, t=t)
@@ -149,7 +149,7 @@ def seeds() -> list[bytes]:
     (folder() / "seed.mcap").unlink()
     made = {
         TEXT: (LINES.encode(), LINES.replace(",", "\t").encode()),
-        MAP: (COLUMNS.encode(), ODD_MAP.encode()), NPZ: (arrays.getvalue(), packed.getvalue()),
+        MAP: (COLUMNS.encode(), FULL_MAP.encode()), NPZ: (arrays.getvalue(), packed.getvalue()),
         NPY: (one.getvalue(),), FIELDS: (typed.getvalue(),),
         MATLAB: (matlab.encode(),), SQLITE: (sqlite,),
         BAG: (foreign,), MESSAGES: (foreign,), PACKED: (zstandard.compress(sqlite),),
@@ -158,7 +158,7 @@ def seeds() -> list[bytes]:
 
 
 def mutate(data: bytes, most: int, seed: int) -> bytes:
-    """As the kind of file wants it."""
+    """Change text or bytes, by the kind of file."""
     kind = data[0] % len(SUFFIXES) if data else TEXT
     if kind in (TEXT, MAP, MATLAB):
         change = mutate_text

@@ -87,7 +87,7 @@ class Controller:
         return oracle.build(oracle.Packet(self.number, bytes(self.status), bytes(4), axes))
 
     def obey(self, reply: bytes, mode: int) -> None:
-        """Go where the answer says; close the axes if it asks for that."""
+        """Follow the reply; close the axes on its request."""
         answer = oracle.parse(reply, self._n_axes)
         refused = any(axis.mode in (505, 508) for axis in answer.axes)
         if refused or answer.status[self._arm - 1] == 1:
@@ -233,7 +233,7 @@ class Conversation(Judged):
             draw.choice(ACTS)(self)
 
     def run(self, cycles: int) -> None:
-        """Cycles of a controller that goes on."""
+        """Cycles of a controller that continues."""
         for _ in range(cycles):
             reply = self.deliver(self.controller.packet())
             cyclic = reply is not None and len(reply) >= oracle.length(len(self.arm.axes))
@@ -289,12 +289,12 @@ class Conversation(Judged):
         draw = self._draw
         slot, column = draw.below(len(self.arm.axes)), draw.below(8)
         value = draw.float32() if draw.chance(64) else draw.choice((*WILD, 0.19, 0.21, 1.9, 2.1))
-        kept = self.controller.d[slot, column]
+        before = self.controller.d[slot, column]
         with np.errstate(all="ignore"):
-            added = kept + np.float32(value) if draw.chance(128) else np.float32(value)
+            added = before + np.float32(value) if draw.chance(128) else np.float32(value)
             self.controller.d[slot, column] = added
         self.run(draw.between(1, 2))
-        self.controller.d[slot, column] = kept
+        self.controller.d[slot, column] = before
 
     def miss(self) -> None:
         count = self._draw.choice((1, 2, 3, 4, 5, 6, 8, 400))
@@ -365,7 +365,9 @@ class Conversation(Judged):
         except RequestError:
             return
         of_positions = isinstance(source, ScriptedMotion)
-        assert of_positions == (self.mode in POSITION_MODES), "the wrong kind of source was taken"
+        assert of_positions == (self.mode in POSITION_MODES), (
+            "a source of the wrong kind was accepted"
+        )
         assert self.conduct.usable or self.session.init is None
         self.conduct.entitled = True
         self.conduct.stopping = self.conduct.overridden = False
@@ -438,7 +440,7 @@ def run(data: bytes) -> bool:
 
 
 def seeds() -> list[bytes]:
-    """Conversations that begin with a motion in each mode, and go on at random."""
+    """Conversations that begin with a motion in each mode, and continue at random."""
     found = []
     for seed in range(24):
         rng = random.Random(seed)

@@ -48,19 +48,19 @@ folder = lru_cache(partial(place_of, "urdf"))
 
 
 def run(data: bytes) -> bool:
-    """Read it as every command does that takes one; whether all of them do."""
+    """Read it as all commands do; return whether all accept it."""
     path = folder() / "robot.urdf"
     path.write_bytes(data)
-    taken = [as_a_cell_is_begun(path), as_an_import_takes_it(path)]
+    accepted = [new_cell(path), import_robot(path)]
     try:
         text = data.decode()
     except UnicodeDecodeError:
         return False
-    taken.append(as_a_model(text))
-    return all(taken)
+    accepted.append(model_of(text))
+    return all(accepted)
 
 
-def as_a_cell_is_begun(path: Path) -> bool:
+def new_cell(path: Path) -> bool:
     """`hil new`."""
     try:
         made = cell_of_urdf(path, {})
@@ -69,12 +69,12 @@ def as_a_cell_is_begun(path: Path) -> bool:
         assert error.remedy, error
         return False
     assert made.joint_names
-    assert unknown, "nobody has said all of a new cell"
+    assert unknown, "a new cell has entries to complete"
     assert text
     return True
 
 
-def as_an_import_takes_it(path: Path) -> bool:
+def import_robot(path: Path) -> bool:
     """`hil import`."""
     try:
         Robot.from_urdf(path)
@@ -84,7 +84,7 @@ def as_an_import_takes_it(path: Path) -> bool:
     return True
 
 
-def as_a_model(text: str) -> bool:
+def model_of(text: str) -> bool:
     """Chain, model, shapes and collisions."""
     try:
         chain = chain_from_urdf(text)
@@ -94,7 +94,7 @@ def as_a_model(text: str) -> bool:
         return False
     n = chain.n_joints
     for values in (chain.rotation, chain.translation, chain.axis, chain.inertial):
-        assert np.isfinite(values).all(), "a chain with numbers that are none"
+        assert np.isfinite(values).all(), "numbers that are not finite"
     assert np.allclose(np.linalg.norm(chain.axis, axis=1), 1.0)
     if n > 12:  # only slower
         return True
@@ -107,7 +107,7 @@ def as_a_model(text: str) -> bool:
         assert np.isfinite(model.regressor(motion, motion, motion).dense(model.n_parameters)).all()
     arm = Arm.from_urdf(text)
     assert all(np.isfinite(corners).all() for corners in arm.corners(np.zeros((1, n))))
-    assert all(len(solid.faces) for solid in arm.solids), "a body that nobody sees"
+    assert all(len(solid.faces) for solid in arm.solids), "a body without faces"
     with suppress(CollisionModelError, ModelError):
         CollisionChecker(text, Workspace(floor=0.0))
     return model is not None
