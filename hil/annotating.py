@@ -81,8 +81,6 @@ def _prediction(found: Identification, source: Source, samples: Samples) -> dict
 def annotated(archive: Archive, prediction: Mapping[str, Array]) -> bytes:
     """Return an MCAP file with the channels for viewers and the predicted torque.
 
-    Times are those of the day where the archive states it.
-
     The prediction has ``time`` since the first sample (m,) [s], and ``effort`` (m, n).
     """
     columns, names = archive.columns, archive.joint_names

@@ -28,13 +28,7 @@ _STICK = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A convex body that moves with a joint.
-
-    Attributes:
-        name: of its link.
-        joint: the joint that moves it, -1 for the base.
-        vertices: corners in the frame of that joint (v, 3) [m].
-    """
+    """A convex body that moves with a joint (-1: base), with corners in its frame (v, 3) [m]."""
 
     name: str
     joint: int
@@ -42,10 +36,7 @@ class Solid:
 
     @cached_property
     def faces(self) -> NDArray[np.intp]:
-        """Triangles of the surface as indices of corners (f, 3), anticlockwise from outside.
-
-        Of a flat body those of both its sides; of fewer than four corners none.
-        """
+        """Triangles as corner indices (f, 3), anticlockwise from outside; both sides if flat."""
         hull = _hull(self.vertices)
         if hull is None:
             return np.zeros((0, 3), dtype=np.intp)
@@ -58,14 +49,9 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """An arm made of convex bodies.
+    """An arm made of convex bodies, or of sticks from joint to joint without `has_shapes`.
 
-    Attributes:
-        chain: its joints.
-        solids: its bodies.
-        tip: point that shows where its end is, in the frame of the last joint (3,) [m].
-        has_shapes: whether the bodies are those of the description; sticks from joint to joint
-            otherwise.
+    `tip` is its displayed end in the frame of the last joint (3,) [m].
     """
 
     chain: Chain
@@ -75,12 +61,10 @@ class Arm:
 
     @classmethod
     def from_urdf(cls, urdf: str, *, mesh_folders: Sequence[str] = ()) -> Self:
-        """Build it from URDF text: its collision shapes, meshes as their convex hulls.
-
-        An arm without collision shapes, or whose meshes cannot be read, becomes sticks.
+        """Build it from URDF text: its collision shapes, meshes as their convex hulls, else sticks.
 
         Raises:
-            ModelError: the description is no open chain.
+            ModelError: the URDF is not that of an open chain.
         """
         chain = chain_from_urdf(urdf)
         model = pin.buildModelFromXML(urdf)
@@ -108,10 +92,7 @@ class Arm:
         return np.asarray(translations[-1] + rotations[-1] @ self.tip, dtype=np.float64)
 
     def bones(self, q: Array) -> Array:
-        """Return lines from each joint to the next ones and to the end at postures (m, n).
-
-        Shape (m, b, 2, 3): beginning and end of each [m].
-        """
+        """Return lines from each joint to the next and the end at postures (m, n): (m, b, 2, 3)."""
         origins = self.poses(q)[1].transpose(1, 0, 2)
         moved = [k for k, parent in enumerate(self.chain.parents) if parent >= 0]
         begin = np.concatenate((origins[:, self.chain.parents[moved] + 1], origins[:, -1:]), axis=1)
@@ -193,10 +174,7 @@ def _sphere() -> Array:
 
 
 def _tip(model: pin.Model, solids: Sequence[Solid]) -> Array:
-    """Return the point of the last joint's link that is farthest from the joint's axis origin.
-
-    A frame fixed there (a flange) if there is one, otherwise the middle of its outermost corners.
-    """
+    """Return a flange frame of the last link, else the middle of its farthest corners."""
     last = model.njoints - 1
     points = [f.placement.translation for f in model.frames if f.parentJoint == last]
     farthest = max(points, key=np.linalg.norm, default=np.zeros(3))

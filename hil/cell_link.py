@@ -22,14 +22,9 @@ def cell_link(
 ) -> Iterator[MotionLink]:
     """Open the link of a cell; leaving the context stops the arm and closes the link.
 
-    With transport "simulated" the controller is simulated in this process, in virtual time.
-
-    Args:
-        cell: with the settings of the link.
-        accept_init: use the controller's gear ratios, calibration and coupling if they differ
-            from the cell's.
-        only_axis: the only axis to be open, from 1; None for all.
-        live: settings of a live view.
+    With transport "simulated" the controller is simulated in this process, in virtual time. With
+    `accept_init` the controller's gear ratios, calibration and coupling replace the cell's;
+    `only_axis`, from 1, is the only one to be open.
 
     Raises:
         ControllerFault: the link cannot be opened.

@@ -98,12 +98,8 @@ def loopback_link(
 ) -> Iterator[LiveLink]:
     """Start a simulated controller in another process and connect a `LiveLink` to it.
 
-    Args:
-        cell: its transport, "udp" or "can", is used: a free UDP port of the loopback device, or
-            the CAN bus of the cell.
-        simulated_by: cell file of the controller, by default that of `cell`.
-        options: further options of `hil simulate`.
-        live: settings of the live view.
+    UDP uses a free port of the loopback device, CAN the bus of the cell. `simulated_by` is the cell
+    file of the controller (default: that of `cell`); `options` are further ones of `hil simulate`.
     """
     spec: TransportSpec
     if cell.controller.can is not None and cell.controller.transport == "can":

@@ -44,9 +44,7 @@ DISK_REFUSES: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ER
 class HilError(Exception):
     """Base class of the errors of `hil`; the message is for the operator.
 
-    Attributes:
-        exit_code: exit status of the command line.
-        figures: JSON data about the work done before the error.
+    `exit_code` is that of the command line; `figures` are JSON data about the work done before.
     """
 
     exit_code: ClassVar[int] = 1
@@ -59,14 +57,7 @@ class HilError(Exception):
 
 
 class InputError(HilError):
-    """Invalid input of the user.
-
-    Attributes:
-        path: of the file, None if it is not a file.
-        field: part of it (table and key, column, topic, record), "" for all of it.
-        problem: what is wrong, with the value.
-        remedy: "" for none.
-    """
+    """Invalid input of the user: file (or None), field in it, problem with the value, remedy."""
 
     exit_code: ClassVar[int] = 2
 
@@ -108,12 +99,7 @@ class SourceError(InputError):
 
 
 class OutputError(HilError):
-    """A folder that cannot be written to; nothing in it was changed.
-
-    Attributes:
-        path: of the folder.
-        problem: what is wrong.
-    """
+    """A folder that cannot be written to; nothing in it was changed."""
 
     def __init__(self, path: Path, problem: str) -> None:
         self.path = path

@@ -98,11 +98,7 @@ class Exported:
 
 
 def consistent_of(found: Identification) -> ConsistentEstimate:
-    """Return the physically consistent parameters of an identification.
-
-    Raises:
-        InputError: there are none.
-    """
+    """Return the physically consistent parameters of an identification, or raise InputError."""
     if isinstance(found.consistency, str):
         raise InputError(
             found.paths[0],
@@ -128,8 +124,8 @@ def export_model(
 ) -> Exported:
     """Write an identified arm, read it back and compare; with `ensemble`, write variants too.
 
-    The variants are `ensemble.npz` and a file each in the folder ``NAME_ensemble``, NAME being
-    `output` without its suffix.
+    The variants are `ensemble.npz` and files in ``NAME_ensemble``, NAME being `output` without
+    suffix.
 
     Raises:
         InputError: there are no physically consistent parameters.

@@ -20,11 +20,7 @@ from hil.reading import open_file
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder and its parents if missing.
-
-    Raises:
-        InputError: it cannot be created, or is not writable.
-    """
+    """Create a folder and its parents if missing; InputError if it is not writable."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -37,13 +33,10 @@ def make_folder(path: Path) -> None:
 
 @contextmanager
 def lock_folder(root: Path, work: str, option: str) -> Iterator[None]:
-    """Create a folder and lock it against other processes with the same work.
+    """Create a folder and lock it against other processes with the same work, or raise InputError.
 
     The lock is on the folder itself and ends with this process. `work` is a noun for the work,
     `option` the command-line option that names another folder.
-
-    Raises:
-        InputError: it is locked, or cannot be created or locked.
     """
     make_folder(root)
 
@@ -81,11 +74,7 @@ def replace_file(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 
 
 def write_output(path: Path, content: str | bytes) -> None:
-    """Write as `write_atomically`.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
+    """Write as `write_atomically`; errors become OutputError."""
     try:
         write_atomically(path, content)
     except OSError as error:
@@ -105,16 +94,9 @@ def convert_write_errors(folder: Path) -> Iterator[None]:
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
-    """Replace several files of a folder, or none of them.
+    """Replace files of an existing folder (None removes one), or none of them: OutputError.
 
     New files are written first; old ones are moved back if one cannot be replaced.
-
-    Args:
-        folder: it exists.
-        contents: by file name; None removes a file.
-
-    Raises:
-        OutputError: one could not be written; the folder is unchanged.
     """
     try:
         in_the_way = next((name for name in contents if (folder / name).is_dir()), None)
@@ -167,8 +149,7 @@ def _keep(path: Path, copy: Path) -> None:
 def _write_through(path: Path, content: str | bytes) -> None:
     """Write a new file and wait until it is on the disk.
 
-    An existing one is removed first: in an untrusted folder it may be a link to another file, or a
-    pipe.
+    An existing one is removed first: in an untrusted folder it may be a link or a pipe.
     """
     path.unlink(missing_ok=True)
     with path.open("xb") as file:
@@ -178,11 +159,7 @@ def _write_through(path: Path, content: str | bytes) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Wait until the names in a folder are on the disk.
-
-    Raises:
-        OSError: its file system does not support that.
-    """
+    """Wait until the names in a folder are on the disk; OSError if that is not supported."""
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -212,11 +189,7 @@ def json_digest(value: Any) -> str:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    Raises:
-        OSError: there is none, it is not a regular file, or it cannot be read.
-    """
+    """Return the SHA-256 of a regular file, or raise OSError."""
     with open_file(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
@@ -225,13 +198,10 @@ def file_digest(path: Path) -> str:
 def file_lock(
     path: Path, refusal: Callable[[OSError], Exception], *, patience: float = 0.0
 ) -> Iterator[None]:
-    """Hold an exclusive lock.
+    """Hold an exclusive lock on a folder or a file (created if missing); wait `patience` s.
 
-    Args:
-        path: a folder, or a file, which is created if missing.
-        refusal: returns the error to raise: for a BlockingIOError where another process holds the
-            lock, else for the error of the disk.
-        patience: longest wait for another process [s].
+    `refusal` returns the error to raise for a BlockingIOError (another process) or an error of the
+    disk.
     """
     kind = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT
     try:

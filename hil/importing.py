@@ -14,10 +14,7 @@ from typing import Any, NoReturn
 
 @contextmanager
 def leave_if_interrupted() -> Iterator[None]:
-    """Exit on Ctrl-C during an import, which could otherwise fail with any exception.
-
-    Other signal handlers are not changed.
-    """
+    """Exit on Ctrl-C during an import, which could otherwise fail with any exception."""
     before: Any = signal.getsignal(signal.SIGINT)
     is_default = (
         before is signal.default_int_handler

@@ -82,16 +82,10 @@ error of the servo. Before a motion is sent, the full limit counts."""
 
 @dataclass(frozen=True, eq=False)
 class MotionChecks:
-    """Checks of every motion of a cell before it is sent.
+    """Checks of every motion of a cell before it is sent: limits, contacts, currents, torques.
 
-    Attributes:
-        limits: joint limits.
-        checker: floor, walls and the arm itself.
-        currents: motor currents by the nominal model, with its uncertainty, and joint torques
-            where the cell limits them.
-        frame: of the angles in messages.
-        cell_limit: (n,) A, the cell's current limits if the controller has narrower ones; else
-            None.
+    `frame` is of the angles in messages; `cell_limit` (n,) [A] are the cell's limits if the
+    controller has narrower ones, else None.
     """
 
     limits: JointLimits
@@ -111,10 +105,7 @@ class MotionChecks:
         )
 
     def within(self, controller_limits: Array) -> Self:
-        """Return the checks with the narrower of these and a controller's current limits (n,) [A].
-
-        Returns `self` if the controller has no narrower ones.
-        """
+        """Return the checks with the narrower of these and a controller's current limits (n,) A."""
         below = is_narrower(controller_limits, self.currents.current_limit)
         if not below.any():
             return self
@@ -172,11 +163,7 @@ class MotionChecks:
 
 
 def collision_checker(cell: Cell) -> CollisionChecker:
-    """Return the check of contacts with floor, walls and the arm itself.
-
-    Raises:
-        CellError: the URDF has no collision shapes, or a mesh is missing.
-    """
+    """Return the check of contacts with floor, walls and the arm; CellError without shapes."""
     folders, urdf = cell.mesh_folders, cell.file.cell.urdf
     try:
         return CollisionChecker(

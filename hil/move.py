@@ -31,15 +31,7 @@ THERE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class CheckedMove:
-    """A straight motion that passed all checks.
-
-    Attributes:
-        start: (n,) rad.
-        target: (n,) rad.
-        interval: the motion with its plan.
-        speed: fraction of the joints' speeds.
-        checks: that it passed.
-    """
+    """A straight motion that passed all `checks`, from `start` to `target` (n,) [rad]."""
 
     start: Array
     target: Array
@@ -64,14 +56,7 @@ class CheckedMove:
 
 
 def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
-    """Return home (or the middle of the limits) and random points in the limits (1 + m, n) [rad].
-
-    Args:
-        cell: with the limits.
-        frame: angles in which the points are rounded.
-        count: number m of points.
-        seed: of the random numbers.
-    """
+    """Return home (or mid-range) and random points in the limits (1 + m, n) [rad]."""
     limits = cell.joint_limits
     ends = np.sort([frame.shown(limits.lower), frame.shown(limits.upper)], axis=0)
     shares = np.random.default_rng(seed).random((count, limits.n_joints))
@@ -82,16 +67,10 @@ def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> A
 
 
 def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Array:
-    """Parse a posture (n,) [rad, URDF angles].
+    """Parse a posture (n,) [rad, URDF angles], else raise InputError.
 
-    Args:
-        cell: of the arm.
-        text: "home"; "start" (start of the excitation, home without one); or degrees in the frame
-            of the cell's [limits], separated by commas or blanks.
-        excitation_start: (n,) rad, of a campaign.
-
-    Raises:
-        InputError: the text is not a posture.
+    It is "home", "start" (of the excitation, (n,) rad, or home), or degrees in the frame of the
+    cell's [limits], separated by commas or blanks.
     """
     if text == "home" or (text == "start" and excitation_start is None):
         return cell.home
@@ -114,11 +93,7 @@ def posture(cell: Cell, text: str, excitation_start: Array | None = None) -> Arr
 
 
 def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
-    """Return `start` (n,) [rad] with one joint turned by `degrees` in the frame of [limits].
-
-    Raises:
-        InputError: `joint` is neither a name nor a number from 1.
-    """
+    """Return `start` (n,) [rad] with one joint turned by `degrees` in the frame of [limits]."""
     target = start.copy()
     index = joint_index(cell, joint, "--joint")
     target[index] += np.radians(degrees) * AngleFrame.of(cell).sign[index]
@@ -126,11 +101,7 @@ def turned(cell: Cell, start: Array, joint: str, degrees: float) -> Array:
 
 
 def joint_index(cell: Cell, joint: str, field: str) -> int:
-    """Return the index of a joint given by name, or by number from 1.
-
-    Raises:
-        InputError: there is no such joint.
-    """
+    """Return the index of a joint given by name, or by number from 1; else InputError."""
     names = cell.joint_names
     numbers = {str(number): index for index, number in enumerate(range(1, len(names) + 1))}
     index = numbers.get(joint, names.index(joint) if joint in names else None)
@@ -145,11 +116,7 @@ def joint_index(cell: Cell, joint: str, field: str) -> int:
 
 
 def axis_alone(cell: Cell, joint: str | None) -> int:
-    """Return the number, from 1, of the only axis that moves a joint.
-
-    Raises:
-        InputError: no joint is given, or several motors move it.
-    """
+    """Return the number, from 1, of the only axis that moves a joint; else InputError."""
     if joint is None:
         raise InputError(None, "needs a joint", field="--only-axis", remedy="give --joint and --by")
     index = joint_index(cell, joint, "--joint")
@@ -172,15 +139,11 @@ def plan_move(
     speed: float | None = None,
     checks: MotionChecks | None = None,
 ) -> CheckedMove:
-    """Plan and check a straight motion in joint space between two postures.
+    """Plan and check a straight motion in joint space between two postures (n,) [rad].
 
-    Args:
-        cell: limits, workspace and nominal model.
-        start: (n,) rad.
-        target: (n,) rad.
-        speed: fraction of the joints' speeds; by default the cell's `approach_speed`.
-        checks: by default the cell's; `active_checks` are those with the limits of a connected
-            controller, which `send` applies again.
+    `speed` is a fraction of the joints' speeds, by default the cell's `approach_speed`; `checks`
+    are by default the cell's; `send` applies those with the limits of the connected controller
+    again.
 
     Raises:
         MotionRefusedError: it violates a limit, collides or needs too much current.
@@ -203,16 +166,10 @@ def send(
     watch: MotionWatch = unwatched_motion,
     durable: bool = True,
 ) -> MotionEnded:
-    """Execute a motion on a connected link and archive every cycle.
+    """Execute a motion on a connected link and archive every cycle at the new file `path`.
 
-    Args:
-        planned: the motion.
-        cell: stored in the archive.
-        link: connected.
-        path: of the archive, which must not exist.
-        stop: stops the arm on its path.
-        watch: shows the motion, and may slow and hold it.
-        durable: whether each flush waits for the disk.
+    `stop` stops the arm on its path; `watch` shows the motion, and may slow and hold it; with
+    `durable` each flush waits for the disk.
 
     Raises:
         MotionRefusedError: the motion needs more current than the controller's limit.

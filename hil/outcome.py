@@ -32,11 +32,7 @@ _LARGEST: Final = 1 << 30
 
 
 def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Results:
-    """Write exports, `results.json` and report together, and report their names.
-
-    Raises:
-        OutputError: the folder cannot be written to; nothing in it was changed.
-    """
+    """Write exports, `results.json` and report together; OutputError if impossible."""
     consistency, essential = found.consistency, found.essential
     exports = exports_of(
         found.cell,
@@ -61,12 +57,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
 
 
 def rewrite_report(folder: Path) -> Results:
-    """Create the report again from the results and series in a folder.
-
-    Raises:
-        InputError: they are missing, or cannot be read.
-        OutputError: the folder cannot be written to.
-    """
+    """Create the report again from results and series in a folder; InputError, OutputError."""
     results = Results.load(folder / RESULTS)
     series = _load_series(folder / SERIES, len(results.joint_names))
     try:
@@ -86,12 +77,7 @@ def report_replay(
     replay: Callable[[ReportSeries], ReportSeries],
     reporter: Reporter,
 ) -> None:
-    """Add a replay to the report in a folder, if it has the same parameters.
-
-    Raises:
-        InputError: results or series cannot be read.
-        OutputError: the folder cannot be written to.
-    """
+    """Add a replay of the same parameters to the report in a folder; InputError, OutputError."""
     existing = Results.load(folder / RESULTS)
     if [p.estimate for p in existing.parameters] != [p.estimate for p in results.parameters]:
         reporter.say(f"note: {folder / REPORT} is of another identification and was not changed")
@@ -161,10 +147,7 @@ def exports_of(
     """Return the exports of an identified model; `provenance` see :func:`provenance_of`.
 
     URDF and standard parameters need a physically consistent estimate (else `consistent` is the
-    reason why there is none).
-
-    Raises:
-        IdentificationError: the estimate is not of the cell's model.
+    reason why there is none). IdentificationError: the estimate is of another model.
     """
     model = cell.model
     # Single printable lines: names of archives may contain anything.

@@ -65,11 +65,7 @@ _ABSENT: Final = frozenset(
 
 
 def open_file(path: Path) -> BufferedReader:
-    """Open a file for reading bytes.
-
-    Raises:
-        OSError: there is none, or it is a folder, a pipe or a device.
-    """
+    """Open a regular file for reading bytes, or raise OSError."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
     except ValueError as error:  # a zero byte in its name
@@ -89,9 +85,7 @@ def open_file(path: Path) -> BufferedReader:
 def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
     """Return the text of a file, with line feeds as line ends.
 
-    Raises:
-        OSError: as `open_file`; or it has more bytes than `longest`.
-        UnicodeDecodeError: it is not UTF-8.
+    OSError: as `open_file`, or more bytes than `longest`. UnicodeDecodeError: it is not UTF-8.
     """
     with open_file(path) as stream:
         if os.fstat(stream.fileno()).st_size > longest:
@@ -118,11 +112,7 @@ def _remedy(error: OSError | UnicodeDecodeError, otherwise: str) -> str:
 
 
 def read_input(path: Path, otherwise: str = "name another file") -> str:
-    """Return the text of a file named by the user.
-
-    Raises:
-        InputError: it cannot be read; the remedy is `otherwise` unless the reason suggests one.
-    """
+    """Return the text of a file named by the user, or raise InputError."""
     try:
         return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -133,11 +123,7 @@ def read_input(path: Path, otherwise: str = "name another file") -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        ValueError: it is not JSON, or nested too deep.
-    """
+    """Return the value of a JSON text; ValueError if it is invalid, or nested too deep."""
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -145,11 +131,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the tables of a TOML text.
-
-    Raises:
-        ValueError: it is not TOML, or nested too deep.
-    """
+    """Return the tables of a TOML text; ValueError if it is invalid, or nested too deep."""
     try:
         found = tomllib.loads(text)
     except RecursionError as error:

@@ -34,10 +34,9 @@ def open_recording(
     start: float | None = None,
     stop: float | None = None,
 ) -> Recording:
-    """Read an archive, recorded or imported, as a recording.
+    """Read an archive, recorded or imported, as a recording that is not yet checked.
 
-    A truncated archive gives its intact part; the provenance then has an entry ``missing``. The
-    recording is not checked; `Recording.checked` decides whether it can be identified from. Only
+    A truncated archive gives its intact part; the provenance then has an entry ``missing``. Only
     the wanted columns are decoded, and the chunks of the wanted times where the index is intact.
 
     Args:
@@ -70,13 +69,10 @@ def open_recording(
 
 
 def recording_of(archive: Archive) -> Recording:
-    """Return the recording of an opened archive; see `open_recording`.
+    """Return the recording of an opened archive, time from zero; ArchiveError without a sample.
 
-    Time begins at zero and is counted in cycles of the controller (in samples of an imported
-    recording at a fixed rate), not in times of arrival.
-
-    Raises:
-        ArchiveError: the archive has no sample.
+    Time is counted in cycles of the controller (in samples of an imported recording at a fixed
+    rate), not in times of arrival.
     """
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
@@ -120,10 +116,7 @@ def _time(archive: Archive) -> Array:
 
 
 def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
-    """Return where motion may jump: cycles lost or not archived, replies not accepted.
-
-    Of several such replies within 0.1 s the first and the last are known.
-    """
+    """Return where motion may jump: lost cycles, replies not accepted (first and last in 0.1 s)."""
     if "cycle" not in archive.columns:
         return None
     skipped = np.diff(archive.columns["cycle"], prepend=archive.columns["cycle"][0] - 1) > 1

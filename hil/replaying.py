@@ -117,9 +117,7 @@ def _figures(error: Array) -> tuple[Array, Array]:
 
 
 def replay_motions(found: Identification, reporter: Reporter, ensemble: int = ENSEMBLE) -> Replayed:
-    """Simulate the predicted motions by the identified and by the nominal model.
-
-    With `ensemble` of two or more, variants of the identified arm are simulated as well.
+    """Simulate the predicted motions by identified, nominal and `ensemble` variants of the model.
 
     Raises:
         InputError: there are no physically consistent parameters to simulate.

@@ -1,7 +1,6 @@
 """Screen of a run: its progress, the keys of its operator, and lines without a terminal.
 
-The picture is a pure function of the state and the size of the terminal (`lines`). A thread of its
-own draws it: a terminal that blocks delays neither motion nor stop.
+A thread draws it: a terminal that blocks delays neither motion nor stop.
 """
 
 from __future__ import annotations
@@ -118,12 +117,7 @@ def single_keys(fd: int) -> Iterator[None]:
 
 
 class Keyboard:
-    """Reads keys of the terminal in a thread of its own.
-
-    Attributes:
-        attached: whether keys are read; only if standard input is a terminal.
-        failure: why they are no longer read, or None.
-    """
+    """Reads keys of the terminal in a thread; `failure` is why they are no longer read, or None."""
 
     def __init__(self, take: Callable[[str], None]) -> None:
         self._take = take
@@ -189,20 +183,7 @@ WARNING: Final = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """State of the screen.
-
-    Attributes:
-        title: of the run.
-        joint_names: of the n joints.
-        status: progress of the run; None before the first.
-        request: of the operator.
-        stopping: whether a stop was requested.
-        age: of the status, s.
-        messages: lines of the run, oldest first.
-        keys: whether keys are read.
-        controller: "SIMULATED", or the controller's address.
-        left: waiting time to the end; by default that of motion.
-    """
+    """State of the screen; `age` of the status and waiting time `left` in s."""
 
     title: str
     joint_names: tuple[str, ...]
@@ -609,11 +590,7 @@ class Screen:
         self._print_messages_at_end()
 
     def show(self, status: RunStatus) -> None:
-        """Show the progress of the run; return at once.
-
-        Raises:
-            ScreenError: nothing is drawn any more.
-        """
+        """Show the progress of the run at once. ScreenError: the drawing thread has ended."""
         self._came = time.monotonic()
         self._pace.update(status, self._came, held=self._request.held)
         waiting = self._pace.left(status)
@@ -625,11 +602,7 @@ class Screen:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
 
     def request(self) -> OperatorRequest:
-        """Return the present request.
-
-        Raises:
-            ScreenError: keys are no longer read.
-        """
+        """Return the present request. ScreenError: keys are no longer read."""
         failure = None if self._keyboard is None else self._keyboard.failure
         if failure is not None:
             raise ScreenError(f"{type(failure).__name__}: {failure}")

@@ -27,13 +27,7 @@ _PR_SET_TIMERSLACK: Final = 29
 def open_controller_link(
     udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
 ) -> serve.ControllerLink:
-    """Open the controller's end of a link.
-
-    Args:
-        udp: "HOST:PORT" of the PC program.
-        can: "INTERFACE:CHANNEL", optionally with ":fd" or ":classic".
-        settings: of the controller; cycle and mode must fit a CAN bus.
-        n_axes: of the arm.
+    """Open the controller's end: UDP ("HOST:PORT") or CAN ("INTERFACE:CHANNEL[:fd|classic]").
 
     Raises:
         InputError: neither or both links, or an invalid one.
@@ -71,11 +65,7 @@ def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.Controll
 
 
 class Buttons:
-    """Requests of the operator at the controller, by signals and a time limit.
-
-    Attributes:
-        interrupted: whether a signal requested the end.
-    """
+    """Requests of the operator at the controller, by signals and a time limit."""
 
     def __init__(self, duration: float | None = None) -> None:
         self.interrupted = self._at_once = False
@@ -122,11 +112,7 @@ def buttons(duration: float | None) -> Iterator[Buttons]:
 
 @contextmanager
 def realtime_process(priority: int | None) -> Iterator[None]:
-    """Run without garbage collection, with exact timers and, if given, a real-time priority.
-
-    Raises:
-        InputError: the system refuses the priority.
-    """
+    """Run without garbage collection, with exact timers and, if given, a real-time priority."""
     if priority is not None:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -169,14 +155,9 @@ def serve_session(
 ) -> Served:
     """Serve until a session has ended; a start aborted by the PC is repeated after a second.
 
-    Args:
-        build: creates a controller that was just switched on.
-        link: its end of the link.
-        pressed: buttons.
-        faults: of the link, by cycle of each start.
-        patience: time for the arm to come to rest at the end, s.
-        stretch: longest extension of a cycle to wait for its reply, s.
-        watch: called every cycle with controller and counts.
+    `build` creates a controller that was just switched on; `faults` are of the link, by cycle of
+    each start; `patience` is the time for the arm to come to rest at the end, s; `stretch` the
+    longest extension of a cycle to wait for its reply, s; `watch` is called every cycle.
 
     Raises:
         InputError: the link cannot carry the session.

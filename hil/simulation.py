@@ -76,11 +76,7 @@ def simulated_link(
 
 
 def carrying(cell: Cell) -> Cell:
-    """Return the cell with `[simulation.payload]` as a link of its URDF.
-
-    Raises:
-        CellError: there is no such table, or no such link.
-    """
+    """Return the cell with `[simulation.payload]` as a link of its URDF, or raise CellError."""
     payload = cell.simulation.payload
     if payload is None:
         raise CellError(
@@ -120,17 +116,10 @@ def simulated_controller(
     session: int = 0,
     faults: Sequence[ControllerFault] = (),
 ) -> SimulatedController:
-    """Return controller and arm of a cell with any link.
+    """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
 
-    Args:
-        cell: with the true parameters in `[simulation]`.
-        effects: whether to simulate unmodelled effects.
-        drive: true drive train; the init packet states that of the cell.
-        truth: true parameters, by default those of the cell.
-        settings: of the controller, by default `controller_settings(cell)`.
-        seed: of noise and model errors, by default that of the cell.
-        session: number of earlier sessions of the controller.
-        faults: of controller and arm.
+    `settings` are by default `controller_settings(cell)`, `seed` is that of the cell; the init
+    packet states the drive train of the cell, not `drive`.
     """
     nominal_drive = simulated_drive(cell)
     return SimulatedController(
@@ -164,8 +153,8 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
 def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
     """Return postures (joint angles, rad) of the controller's own program, home at the end.
 
-    Random within half of each joint's range (at most a turn) around home, by the cell's seed, and
-    connected by collision-free straight motions; there may be fewer than `count`.
+    Random within half of each joint's range around home, by the cell's seed, with collision-free
+    straight motions in between; there may be fewer than `count`.
     """
     rng = np.random.default_rng(cell.simulation.seed)
     limits, home = cell.joint_limits, cell.home
@@ -191,10 +180,7 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
 
 
 def simulated_drive(cell: Cell) -> SimulatedDrive:
-    """Return the true drive train, by the formulas of the simulated cell.
-
-    `[simulation.drive_train]` has priority, so that errors in `[drive_train]` can be simulated.
-    """
+    """Return the true drive train: `[simulation.drive_train]` over that of the cell."""
     simulation = cell.file.simulation
     known = {} if simulation is None else simulation.drive_train.model_dump(exclude_none=True)
     table = cell.drive_table.model_copy(update=known)
@@ -214,11 +200,7 @@ def simulated_drive(cell: Cell) -> SimulatedDrive:
 
 
 def planted_truth(cell: Cell) -> PlantTruth:
-    """Return the true rotor inertias, friction and link inertias.
-
-    Raises:
-        CellError: joints with a third friction term differ in its law.
-    """
+    """Return the true rotor inertias, friction and link inertias, or raise CellError."""
     settings = cell.simulation
     return PlantTruth(
         rotor_inertia=np.array(settings.rotor_inertia),

@@ -10,12 +10,7 @@ def plural(number: int, noun: str) -> str:
 
 
 def printable(text: str, *, keep: str = "\n") -> str:
-    """Return the text with nonprintable characters as Python escapes.
-
-    Args:
-        text: may contain control characters, or surrogates of bytes that are not UTF-8.
-        keep: characters that are not escaped.
-    """
+    """Return the text with nonprintable characters, except those in `keep`, as Python escapes."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() or c in keep else escape(c) for c in text)

@@ -73,16 +73,10 @@ def weigh(
 ) -> Weighed:
     """Record pairs until the intervals are narrow enough, and estimate after each of them.
 
-    The recordings are two campaigns below the folder of the campaign, with its cell, its plan and,
-    where passed, its rehearsal. Existing recordings are not repeated. The campaign's repetitions
-    limit the number of pairs.
-
-    Args:
-        campaign: with the motion.
-        name: of the payload and of the folder.
-        run: runs a campaign.
-        mount: asks whether the payload was mounted (True) or removed (False); False ends.
-        reporter: of progress.
+    The recordings are two campaigns `name` below the folder of the campaign, with its cell, plan
+    and passed rehearsal. Existing recordings are not repeated; the campaign's repetitions limit the
+    number of pairs. `mount` asks whether the payload was mounted (True) or removed (False); False
+    ends.
 
     Raises:
         InputError: the name is not a valid folder name.

@@ -89,10 +89,7 @@ def as_json(error: BaseException) -> dict[str, Any]:
 
 @contextmanager
 def errors_as_json(asked: bool) -> Iterator[None]:
-    """Print an exception of the block as JSON if requested, and raise it again.
-
-    Ctrl-C becomes an `OperatorStopError`.
-    """
+    """Print an exception of the block as JSON if `asked`; Ctrl-C is an `OperatorStopError`."""
     try:
         yield
     except typer.Exit:  # the command has printed its result
@@ -113,11 +110,7 @@ def _print(error: Exception, asked: bool) -> None:
 
 
 class LazyCommands(UserDict[str, Any]):
-    """Commands by name, imported on first use from the module of the same name.
-
-    A module has a function of that name, or an `app` of several commands; its docstring begins
-    with the purpose shown in the help.
-    """
+    """Commands by name, imported on first use: the function of that name or `app` of a module."""
 
     def __getitem__(self, name: str) -> Any:
         """Return the command, importing it on first use."""
@@ -151,10 +144,7 @@ def _command(name: str) -> Any:
 
 
 def presented(command: Any) -> Any:
-    """Return the command with the help of its options from `Options:` in its docstring.
-
-    Flags have no value in the help, and no negative form if they are off by default.
-    """
+    """Return the command with the help of its options from `Options:` in its docstring."""
     if isinstance(commands := getattr(command, "commands", {}), LazyCommands):
         commands = {}
     for one in commands.values():

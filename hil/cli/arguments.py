@@ -78,11 +78,7 @@ def with_options(
 
 
 def at_most_one(**given: object) -> None:
-    """Refuse options that exclude each other, by their Python names.
-
-    Raises:
-        InputError: more than one was given.
-    """
+    """Raise InputError if options that exclude each other were given; by their Python names."""
     typed = [_option(name) for name, value in given.items() if value not in (None, False, [])]
     if len(typed) > 1:
         problem = "exclude each other"
@@ -90,11 +86,7 @@ def at_most_one(**given: object) -> None:
 
 
 def exactly_one(**given: object) -> None:
-    """Require one of several options, by their Python names.
-
-    Raises:
-        InputError: none was given, or more than one.
-    """
+    """Raise InputError unless one of several options was given; by their Python names."""
     at_most_one(**given)
     if all(value in (None, False, []) for value in given.values()):
         names = " or ".join(map(_option, given))
@@ -113,11 +105,7 @@ def print_json(document: object) -> None:
 def figures(
     texts: Sequence[str], option: str, example: str, *, bare: bool = True
 ) -> dict[str, float]:
-    """Parse NAME=NUMBER values of an option; with `bare`, NAME alone is 0.
-
-    Raises:
-        InputError: a value is not a number.
-    """
+    """Parse NAME=NUMBER values of an option (else InputError); with `bare`, NAME alone is 0."""
     found = {}
     for text in texts:
         name, equals, number = text.partition("=")

@@ -280,11 +280,7 @@ def design(
 def _campaign(
     folder: DesignFolder, cell: Cell, done: Designed
 ) -> tuple[str | None, tuple[str, ...]]:
-    """Create a campaign of the design, or trajectory files if the cell has no controller.
-
-    Returns:
-        reason why there is neither, or None; and the trajectory files.
-    """
+    """Create a campaign, or trajectory files; return why neither, and the files."""
     unchecked = done.result.settings.unchecked
     if not done.design.complete:
         return "the search was stopped", ()

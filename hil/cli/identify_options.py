@@ -75,11 +75,7 @@ class Identifying:
     ] = "auto"
 
     def options(self, **more: Any) -> Options:
-        """Return the options of an identification; `more` are those of one command.
-
-        Raises:
-            InputError: an option is invalid.
-        """
+        """Return the options of an identification; `more` are those of one command."""
         low_pass, friction = self.torque_bandwidth, self.friction
         return Options(
             friction=friction_from(friction) if friction != "auto" else "auto",
@@ -95,11 +91,7 @@ class Identifying:
 
 
 def delay_from(text: str | None) -> float | Literal["auto", "stated"] | None:
-    """Parse the value of `--delay`, s.
-
-    Raises:
-        InputError: it is not a delay.
-    """
+    """Parse the value of `--delay`, s; InputError if it is not one."""
     if text is None or text in ("auto", "stated"):
         return cast('Literal["auto", "stated"] | None', text)
     value = _number(text)

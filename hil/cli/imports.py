@@ -100,11 +100,7 @@ class Described:
     ] = False
 
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
-        """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names.
-
-        Raises:
-            InputError: not exactly one of these was given, or a value is invalid.
-        """
+        """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
         exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
         if self.gravity is not None and not all(map(math.isfinite, self.gravity)):
             problem, remedy = f"{self.gravity} is not a vector", "give m/s², as in 0 0 -9.81"

@@ -165,11 +165,7 @@ class _Shown:
 
 @contextmanager
 def _reserved(campaign: Campaign | None) -> Iterator[None]:
-    """Lock the folder of a campaign before the controller is connected.
-
-    Raises:
-        CampaignFolderError: the folder is in use, or was changed.
-    """
+    """Lock the folder of a campaign before connecting, or raise CampaignFolderError."""
     with nullcontext() if campaign is None else campaign.folder.locked():
         if campaign is not None:
             campaign.folder.require_unchanged()
@@ -177,12 +173,7 @@ def _reserved(campaign: Campaign | None) -> Iterator[None]:
 
 
 def _confirm(cell: Cell, link: MotionLink, *, yes: bool, json: bool) -> None:
-    """Ask for confirmation, which an arm that may be real needs.
-
-    Raises:
-        UnsafeError: there is no terminal to confirm at.
-        OperatorStopError: the operator declined.
-    """
+    """Ask for confirmation, or raise UnsafeError (no terminal), OperatorStopError (declined)."""
     if yes:
         return
     if json or not sys.stdin.isatty():

@@ -41,11 +41,7 @@ PLAN_FILES = (".toml", ".json")
 
 
 def read_plan_file(path: Path) -> PlanFile:
-    """Read a plan file, TOML or JSON.
-
-    Raises:
-        InputError: it cannot be read, or is not a plan.
-    """
+    """Read a plan file, TOML or JSON; InputError if it is not one."""
     text = read_input(path).removeprefix("\ufeff")
     try:
         if path.suffix.lower() == ".toml":
@@ -60,10 +56,8 @@ def read_plan_file(path: Path) -> PlanFile:
 def planned_again(path: Path, cell: Cell) -> MotionPlan:
     """Plan the moves of a file for the limits of a cell.
 
-    Raises:
-        InputError: the file cannot be read, is for another arm, or holds a motion that breaks
-            its limits or is not what its moves plan to.
-        PlannerError: the moves cannot be planned for this cell.
+    InputError: the file cannot be read, is for another arm, or its motion breaks its limits or
+    differs from its moves. PlannerError: the moves cannot be planned for this cell.
     """
     file = read_plan_file(path)
     if file.joint_names != cell.joint_names:
@@ -80,11 +74,7 @@ def planned_again(path: Path, cell: Cell) -> MotionPlan:
 
 
 def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a planning function in a child process.
-
-    Raises:
-        InputError: the child crashed or timed out; else what the function raised.
-    """
+    """Call a planning function in a child process; InputError if that crashed or timed out."""
     try:
         return in_child(function, *args, **kwargs)
     except (PlannerCrashed, PlanningTimedOut) as error:
@@ -93,13 +83,10 @@ def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
 
 
 def read_via_points(path: Path, frame: AngleFrame) -> Array:
-    """Read via points (m, n) [rad] from a table of degrees.
+    """Read via points (m, n) [rad] from a table of degrees, one row per point.
 
-    One row per point; commas, semicolons or blanks separate values; # begins a comment; a first
-    row without numbers is a header.
-
-    Raises:
-        InputError: a row is not one finite number per joint.
+    Commas, semicolons or blanks separate values; # begins a comment; a first row without numbers is
+    a header.
     """
     lines = enumerate(read_input(path).removeprefix("\ufeff").splitlines(), 1)
     rows = [(k, re.findall(r"[^\s,;]+", line.split("#")[0])) for k, line in lines]

@@ -51,9 +51,9 @@ _REPEATED: Final = {Phase.CLOSED, Phase.OPENING, Phase.OPEN}
 class Status:
     """Progress display: a line for each change of phase, on a terminal also a status line.
 
-    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. Lines that the
-    terminal or pipe cannot accept at once are dropped, so that the cycle is never delayed.
-    `stretch` is the largest extension of a cycle, s.
+    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. Lines that cannot be
+    written at once are dropped, so that the cycle is never delayed. `stretch` is the largest
+    extension of a cycle, s.
     """
 
     def __init__(

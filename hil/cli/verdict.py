@@ -20,10 +20,7 @@ _LEVELS: Final = {"wrong": "WRONG", "doubtful": "warning", "information": "info"
 
 
 def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
-    """Print table and findings to stderr, then the verdict; exit 5 if the model is not good.
-
-    With `json` print one JSON object; with `quiet` only the verdict and its warnings.
-    """
+    """Print table and findings to stderr, then the verdict or JSON; exit 5 if it is not good."""
     if json:
         typer.echo(as_json(results))
     else:

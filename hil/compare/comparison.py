@@ -389,14 +389,7 @@ def _axis_finding(axis: Axis, friction: Tested, j: int, k: int, names: list[str]
 
 
 def figure(value: float, variance: float, freedom: float, repetitions: Array) -> Figure:
-    """Combine a pooled estimate with those of single repetitions.
-
-    Args:
-        value: pooled.
-        variance: of the pooled estimate; infinite if undetermined.
-        freedom: degrees of freedom of the variance.
-        repetitions: (m,) in order, NaN if undetermined.
-    """
+    """Combine a pooled estimate (variance infinite if undetermined) with repetitions (m,)."""
     if not np.isfinite(variance):
         return Figure(float("nan"), float("nan"), 1.0)
     own = repetitions[np.isfinite(repetitions)]
@@ -425,12 +418,9 @@ def effective_count(repetitions: Array) -> float:
 
 
 def against_first(figures: ArrayLike, share: float, least: ArrayLike = 0.0) -> Tested:
-    """Test all campaigns against the first.
+    """Test all campaigns against the first: a `Figure` per row and campaign (k, c, 3).
 
-    Args:
-        figures: a :class:`Figure` per row and campaign (k, c, 3).
-        share: family-wise error rate.
-        least: smallest relevant change (k,).
+    `share` is the family-wise error rate, `least` (k,) the smallest relevant change.
     """
     value, variance, freedom = np.moveaxis(np.asarray(figures, dtype=np.float64), 2, 0)
     change, total = value - value[:, :1], variance + variance[:, :1]

@@ -118,13 +118,10 @@ class Change:
 def projection(
     model: RobotModel, known: NDArray[np.bool_], information: Array, rows: int
 ) -> Projection | None:
-    """Return the projection, None if no determined parameter depends on a body at the last link.
+    """Return the projection; None if no determined parameter depends on a body at the last link.
 
-    Args:
-        model: of the arm.
-        known: (p,) parameters determined by all campaigns.
-        information: (p, p) weighted Gram matrix, sum over all campaigns.
-        rows: samples of all joints in that sum.
+    `known` (p,) are determined by all campaigns; `information` (p, p) is the weighted Gram matrix
+    over all campaigns and `rows` the samples of all joints in it.
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]

@@ -153,11 +153,7 @@ def trends(result: BatchResult) -> Trends:
 
 
 def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) -> ArmTrend:
-    """Compute the trends of one arm.
-
-    Campaigns without a recording time are excluded, unless none has one: then the order is that of
-    their folders' names.
-    """
+    """Compute the trends of one arm; campaigns without a recording time only if all lack it."""
     known = [(at.timestamp(), one) for one in campaigns if (at := parse_time(one.when)) is not None]
     if known:
         known.sort(key=lambda pair: (pair[0], pair[1].campaign))
@@ -224,10 +220,9 @@ def axes_of(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> list[Axis]
 
 
 def friction_weights(model: RobotModel, axes: Sequence[Axis]) -> Array:
-    """Return G (n, p): ``G @ values`` is the friction of each axis at its speed [N·m, N].
+    """Return G (n, p): ``G @ values`` is the friction of each axis, mean of directions [N·m, N].
 
-    The mean of both directions excludes offsets and direction-dependent friction; friction of the
-    axis' own motor is included.
+    Friction of the axis' own motor is included.
     """
     weights = np.zeros((model.n_joints, model.n_parameters))
     for k, term in enumerate(model.friction.terms):
@@ -239,11 +234,7 @@ def friction_weights(model: RobotModel, axes: Sequence[Axis]) -> Array:
 
 
 def friction_in(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
-    """Return the friction of each axis and its standard deviation, each (n,) [N·m, N].
-
-    NaN for an axis without friction or with an undetermined coefficient; `weights` (n, p) see
-    :func:`friction_weights`.
-    """
+    """Return friction and its standard deviation of each axis, (n,) each [N·m, N]; may be NaN."""
     covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
     known = np.isfinite(np.diag(covariance))
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
@@ -351,7 +342,7 @@ def limits(
     """Return centre, lower and upper limit of a level for a value of standard deviation `std`.
 
     NaN with fewer than `MIN_CAMPAIGNS` values; `members` are the indices of the values (n,) of each
-    level. The scatter is the same at all levels.
+    level, whose scatter is common.
     """
     own, every = members[level], np.concatenate(members).astype(np.intp)
     if len(own) < MIN_CAMPAIGNS:

@@ -24,15 +24,7 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check.
-
-    Attributes:
-        name: of the check.
-        status: ok, warn, bad or unknown.
-        found: the facts.
-        remedy: shell commands, one a line.
-        why: reason of the check.
-    """
+    """The result of one check: status, facts, shell commands as remedy, and its reason."""
 
     name: str
     status: Status
@@ -106,12 +98,7 @@ def run_command(command: Sequence[str]) -> Answer | None:
 
 @dataclass(frozen=True)
 class System:
-    """Source of facts.
-
-    Attributes:
-        root: prefix of every path.
-        run: runs a command, see `run_command`.
-    """
+    """Source of facts: `root` is the prefix of every path, `run` runs a command."""
 
     root: Path = Path("/")
     run: Callable[[Sequence[str]], Answer | None] = run_command

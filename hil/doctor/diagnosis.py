@@ -1,7 +1,4 @@
-"""All checks and measurements of a PC; output as text and as JSON.
-
-Latencies are measured by `probe` in separate processes; one that hangs is killed.
-"""
+"""All checks and measurements of a PC; output as text and as JSON."""
 
 from __future__ import annotations
 
@@ -57,10 +54,7 @@ class Latency:
         return float(np.percentile(self.samples, percent, method="inverted_cdf"))
 
     def late_cycles(self, period: float) -> int:
-        """Return the number of cycles of `period` s without a reply in time.
-
-        A latency of several cycles counts for each of them.
-        """
+        """Return the number of cycles of `period` s without a reply in time."""
         return int(np.floor((self.samples + RESERVE) / period).sum())
 
     def histogram(self) -> dict[str, int]:
@@ -94,10 +88,8 @@ _CONFIDENCE: Final = 0.95
 class Fitness:
     """The verdict on one cycle by `CRITERIA`; numbers are None if nothing was measured.
 
-    Attributes:
-        share_used: largest 99.9 % latency plus reserve, as a share of the cycle.
-        late_per_hour_upper_95: one-sided upper bound of the rate with 95 % confidence, for
-            independent late cycles (Poisson), which those of one stall are not.
+    `share_used` is the largest 99.9 % latency plus reserve over the cycle; `late_per_hour_upper_95`
+    is a one-sided 95 % bound for independent late cycles (Poisson).
     """
 
     cycle_ms: int
@@ -165,13 +157,7 @@ def measure(name: str, period: float, seconds: float, reporter: Reporter) -> Lat
 def run_probe(
     arguments: Sequence[str], seconds: float, advance: Callable[[float], None] = lambda _: None
 ) -> dict[str, Any] | None:
-    """Run `hil.doctor.probe` for `seconds`; None if it failed or took `_GRACE` s longer.
-
-    `advance` is called with the seconds elapsed since its last call.
-
-    Returns:
-        Its JSON output.
-    """
+    """Return the JSON of `hil.doctor.probe` run for `seconds`; None if it failed or was killed."""
     probe = subprocess.Popen(
         [sys.executable, "-m", "hil.doctor.probe", *arguments],
         stdin=subprocess.DEVNULL,
@@ -253,10 +239,7 @@ def examine(
     place: Path,
     reporter: Reporter,
 ) -> Diagnosis:
-    """Run all checks, and measure for twice `seconds`; archives will be written to `place`.
-
-    The wake-up timer runs at `cycle_ms`, the required cycle.
-    """
+    """Run all checks, and measure for twice `seconds`; archives will be written to `place`."""
     system = System()
     reporter.say("checking this PC; no packet is sent to the controller")
     given = realtime_permissions()

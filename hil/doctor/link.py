@@ -20,11 +20,7 @@ if TYPE_CHECKING:
 
 
 def controller_in(path: Path) -> ControllerTable:
-    """Return `[controller]` of a cell file, which may be incomplete elsewhere.
-
-    Raises:
-        CellError: the file is invalid, or `[controller]` is incomplete.
-    """
+    """Return `[controller]` of a cell file, otherwise perhaps incomplete, or raise CellError."""
     from hil.cell import Cell
     from hil.cell.errors import UnknownFieldsError
     from hil.cell.schema import ControllerTable
@@ -81,10 +77,7 @@ def can_check(bus: CanTable, system: System) -> Check:
 
 
 def try_port(bind: str, port: int) -> int:
-    """Bind the address and release it; returns the number of the error, 0 without one.
-
-    A running exchange that uses the port is not disturbed.
-    """
+    """Bind the address, release it, and return the error number, 0 without one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
         try:
             trial.bind((bind, port))

@@ -100,10 +100,7 @@ _MOVE = "# or put the campaign folder on another, local disk"
 
 @dataclass(frozen=True)
 class DiskTrial:
-    """Result of writing to the folder of the archives: free bytes, times of the writes [s].
-
-    `seconds` is empty if writing failed with `error`.
-    """
+    """Free bytes and write times [s] of the archives' folder; none if writing failed."""
 
     folder: str
     free: int
@@ -283,10 +280,7 @@ def virtualisation(system: System) -> Check:
 
 
 def stolen_share(stat: str, since: str = "") -> float | None:
-    """Return the share of processor time used by the host, from two texts of /proc/stat.
-
-    Without the earlier one it is the share since boot.
-    """
+    """Return the share of processor time used by the host, from texts of /proc/stat."""
     lines = (re.search(r"^cpu +((?:\d+ +){7}\d+)", text, re.MULTILINE) for text in (stat, since))
     now, before = ([int(word) for word in line[1].split()] if line else [0] * 8 for line in lines)
     spent = [late - early for late, early in zip(now, before, strict=True)]

@@ -31,10 +31,7 @@ _WRITES = 20
 
 
 def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
-    """Return the delays of a timer, s, at absolute deadlines `period` apart.
-
-    Deadlines that passed during a delay are skipped.
-    """
+    """Return the delays of a timer, s, at absolute deadlines; missed ones are skipped."""
     late = np.empty(max(round(seconds / period), 1), dtype=np.float32)
     count, clock, sleep = 0, time.perf_counter, time.sleep
     deadline = clock() + period
@@ -48,10 +45,7 @@ def wake_ups(period: float, seconds: float) -> NDArray[np.float32]:
 
 
 def round_trips(port: int, period: float, seconds: float) -> NDArray[np.float32]:
-    """Return the times from packet to reply, s; `TIMEOUT` for a lost one.
-
-    The next packet waits for the reply, so a stall is one long time.
-    """
+    """Return the times from packet to reply, s; `TIMEOUT` for a lost one, others waited for."""
     took = np.empty(max(round(seconds / period), 1), dtype=np.float32)
     count, clock, sleep = 0, time.perf_counter, time.sleep
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
@@ -111,10 +105,7 @@ def turnaround(period: float, seconds: float) -> NDArray[np.float32]:
 
 
 def disk(place: Path) -> dict[str, object]:
-    """Measure free space and times of writes, s, at `place` or its nearest existing parent.
-
-    A write is 64 KiB with `fdatasync`, as for an archive.
-    """
+    """Measure free space and times of 64 KiB writes with `fdatasync`, s, at or above `place`."""
     folder = nearest_folder(place)
     answer: dict[str, object] = {"folder": str(folder), "free": shutil.disk_usage(folder).free}
     took: list[float] = []

@@ -66,11 +66,7 @@ def mimics(urdf: str) -> dict[str, tuple[str, float]]:
 
 
 def with_fixed(urdf: str, positions: Mapping[str, float]) -> str:
-    """Return the URDF with joints fixed at positions [rad or m]; comments are preserved.
-
-    Raises:
-        KeyError: there is no such joint.
-    """
+    """Return the URDF with joints fixed at positions [rad or m]; KeyError for unknown joints."""
     root = urdf_tree(urdf, comments=True)
     joints = {joint.get("name"): joint for joint in root.findall("joint")}
     for name, position in positions.items():
@@ -119,23 +115,13 @@ _ROUND: Final = 3
 
 @dataclass(frozen=True)
 class NewCell:
-    """Content of a new cell file.
-
-    Attributes:
-        name: name of the cell.
-        joint_names: moving joints.
-        urdf: changed URDF text, None if the given file is used.
-        urdf_path: URDF (or table of DH parameters) that was read.
-        meshes: `package://` mesh paths of the collision shapes.
-        known: known values.
-        design_only: omit drive train and controller.
-    """
+    """Content of a new cell file."""
 
     name: str
     joint_names: tuple[str, ...]
-    urdf: str | None
-    urdf_path: Path
-    meshes: tuple[str, ...]
+    urdf: str | None  #: changed URDF text, None if the given file is used
+    urdf_path: Path  #: URDF or table of DH parameters that was read
+    meshes: tuple[str, ...]  #: `package://` mesh paths of the collision shapes
     known: Known
     design_only: bool = False
 
@@ -243,11 +229,7 @@ class NewCell:
 
 
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
-    """Return the cell of a table of DH parameters, with a URDF to write.
-
-    Raises:
-        InputError: the table cannot be read or is invalid, or a fixed joint does not exist.
-    """
+    """Return the cell of a table of DH parameters, with a URDF to write, or raise InputError."""
     text = urdf_of_dh(path, convention)
     note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
     made = _cell_of(path, text, fixed)
@@ -255,13 +237,10 @@ def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -
 
 
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
-    """Return the cell of a URDF.
+    """Return the cell of the URDF of an open chain (else InputError).
 
     Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
     nearest position in their range), mimic joints at their offset; notes report this.
-
-    Raises:
-        InputError: the URDF cannot be read, or is not that of an open chain.
     """
     return _cell_of(path, read_input(path, "name a URDF"), fixed)
 
@@ -329,8 +308,8 @@ _TURNED: Final = 3
 def with_clear_home(text: str, new: NewCell, path: Path) -> str:
     """Return the text of a cell file with a home posture free of collision.
 
-    It is the first such posture with at most three joints turned by 90° from the present one; that
-    is used if there is none, or the URDF has no collision shapes.
+    It is the first with at most three joints turned by 90° from the present one, else the present
+    one.
     """
     urdf = new.urdf if new.urdf is not None else read_text(new.urdf_path)
     cell = Cell.from_texts(text, urdf, path)

@@ -36,13 +36,7 @@ ASSUMED: Final = "assumed"
 
 @dataclass(frozen=True)
 class Known:
-    """Values of a cell file by dotted field, and their origin.
-
-    Attributes:
-        values: numbers, texts, lists with an entry per joint (`"?"` if unknown).
-        origin: origin of each field, such as "from the URDF".
-        notes: notes for the user.
-    """
+    """Values of a cell file by dotted field (`"?"` if unknown), their origins, and notes."""
 
     values: Mapping[str, Any] = field(default_factory=dict)
     origin: Mapping[str, str] = field(default_factory=dict)
@@ -75,10 +69,7 @@ class Known:
 
 
 def from_urdf(urdf: str, joint_names: Sequence[str]) -> Known:
-    """Return the limits of a URDF in degrees in its own frame; `"?"` if not stated.
-
-    Torque limits are used only if every joint has one.
-    """
+    """Return the limits of a URDF in degrees, `"?"` if unknown; all torque limits or none."""
     limits = urdf_limits(urdf, joint_names)
     nowhere = limits.lower >= limits.upper
     values: dict[str, Any] = {
@@ -96,8 +87,7 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
     """Return assumed values for a cell without controller.
 
     Home is zero, or the middle of a range without zero; continuous joints are limited to ±180°;
-    acceleration to full speed takes 0.3 s, to full acceleration 0.1 s; no friction; floor at the
-    base.
+    full speed takes 0.3 s, full acceleration 0.1 s; no friction; floor at the base.
     """
     lower, upper, speed = (
         known.values.get(f"limits.{name}_deg", [UNKNOWN] * n_joints)
@@ -159,11 +149,7 @@ def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:
 
 
 def from_archive(path: str | PathLike[str], joint_names: Sequence[str]) -> Known:
-    """Return the values of the cell and the init packet in an archive.
-
-    Raises:
-        ArchiveError: it cannot be read, is of another arm, or contains neither.
-    """
+    """Return the values of the cell and the init packet in an archive, or raise ArchiveError."""
     archive = open_archive(path, fields=())
 
     def refusal(problem: str, field: str = "", remedy: str = "") -> ArchiveError:

@@ -1,7 +1,4 @@
-"""Plots of an archive, joint by joint, as a page or a picture.
-
-Long archives are read in windows and reduced to minimum and maximum per interval.
-"""
+"""Plots of an archive as a page or a picture, reduced to minimum and maximum per interval."""
 
 from __future__ import annotations
 
@@ -230,10 +227,9 @@ class _Scales:
         return f"angles, speeds and torques {whose}"
 
     def shown(self, columns: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Array]]:
-        """Yield quantities (m, n) of a window in displayed units.
+        """Yield quantities (m, n) of a window in displayed units; torque signs follow the angles.
 
-        Torques have the sign of the displayed angle. Following errors are in motor revolutions if
-        the drive train is known.
+        Following errors are in motor revolutions if the drive train is known.
         """
         position = columns.get("position")
         if position is not None:
@@ -346,10 +342,7 @@ def _share(recorded: Trace) -> str:
 
 
 def even(recorded: Trace, grid: Array) -> Array:
-    """Resample a line (k,) to an even grid of time (m,), m even; NaN interrupts it.
-
-    Each pair of grid points has minimum and maximum of its samples, in their order.
-    """
+    """Resample a line (k,) to an even grid (m,) with pairs of minimum and maximum; NaN: gap."""
     found = np.full(grid.shape, np.nan)
     step = (grid[-1] - grid[0]) / (len(grid) - 1)
     for times, values in _stretches(recorded):

@@ -65,10 +65,10 @@ _TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
 def draw_front(
     axes: Axes, front: Front | None, marks: Mapping[str, Measures], *, together: bool
 ) -> None:
-    """Draw the front and single motions, the first of them chosen, with a legend.
+    """Draw the front and single motions with a legend; `marks` (log10 det, I_c), chosen first.
 
-    References outside the range of the front, and motions with infinite criteria, are only in the
-    legend. `marks` are (log10 det, I_c) by name; with `together` they include earlier archives.
+    References outside the range of the front are only in the legend. With `together` all values
+    include earlier archives.
     """
     if front is not None and len(front) > 1:
         points = np.column_stack([front.measure(name) for name in ("coupling_index", "log10_det")])
@@ -109,10 +109,7 @@ _JOINT = re.compile(r"\d+")
 
 
 def draw_correlation(axes: Axes, matrix: Array, names: Sequence[str]) -> None:
-    """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)`` (b, b), black for 1 and white for 0, by joint.
-
-    Friction is excluded; entries are NaN if a parameter is not excited.
-    """
+    """Draw ``|psi_ij| / sqrt(psi_ii psi_jj)`` (b, b) by joint, 0 white, 1 black."""
     b = len(names)
     if np.all(np.isfinite(matrix)):
         axes.imshow(np.abs(matrix), cmap="gray_r", vmin=0.0, vmax=1.0, interpolation="none")
@@ -218,15 +215,15 @@ def draw_design(
     """Draw a designed motion.
 
     Args:
-        excitation: the motion with its criteria.
+        excitation: the motion with its criteria, which with `together` include earlier archives.
         cell: the cell to run it on.
-        front: Pareto front of the search.
-        chosen: index of this motion on the front, None if it is not on it.
+        front: Pareto front of the search; `chosen` is the index of this motion on it.
+        chosen: None if the motion is not on the front.
         knee: (log10 det, I_c) of the point of the front that it was polished from.
         references: (log10 det, I_c) of other motions to compare with, by name.
         unchecked: what the search did not check ("floor", "the arm itself", ...).
         complete: whether the search was completed.
-        together: whether the criteria, except the matrix, include earlier archives.
+        together: see `excitation`.
         margins: text on the distance to the limits.
         title: title of the page. Default: name of the cell.
     """

@@ -41,9 +41,9 @@ def draw_motion(
     frame: AngleFrame,
     postures: Sequence[float] | Array = (),
 ) -> None:
-    """Draw one row per joint: position, velocity and, in a third column if any, acceleration.
+    """Draw a row per joint: position, velocity and, if there is a third column, acceleration.
 
-    Limits are URDF angles, displayed in the frame; the times of `postures` (k,) [s] are numbered.
+    Limits are URDF angles, displayed in `frame`; the times of `postures` (k,) [s] are numbered.
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
@@ -174,11 +174,7 @@ def draw_plan(
 
 
 def check_format(path: Path, *others: str) -> None:
-    """Check that the suffix of a path is that of a picture, or one of `others`.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise InputError unless the suffix of a path is that of a picture, or one of `others`."""
     formats = (*FORMATS, *others)
     if path.suffix.lower() not in formats:
         problem = f"{path.suffix!r} is not a picture format"
@@ -186,11 +182,7 @@ def check_format(path: Path, *others: str) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture atomically, in the format of its suffix.
-
-    Raises:
-        InputError: the format is unknown, or the file cannot be written.
-    """
+    """Write a picture atomically, in the format of its suffix, or raise InputError."""
     check_format(path)
     metadata = {"Date": None} if path.suffix.lower() == ".svg" else {}
     try:

@@ -55,25 +55,17 @@ _HEAD: Final = {"arrowstyle": "-|>,head_width=0.22,head_length=0.4", "color": _P
 
 
 def outlines(points: Array) -> Array:
-    """Return the convex outline of each set of points (m, v, 2), anticlockwise: (m, k, 2).
-
-    Corners are the points farthest in k directions, with repetitions.
-    """
+    """Return the points of sets (m, v, 2) farthest in k directions, anticlockwise: (m, k, 2)."""
     angle = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
     farthest = np.argmax(points @ np.stack((np.cos(angle), np.sin(angle))), axis=1)
     return np.take_along_axis(points, farthest[:, :, None], axis=1)
 
 
 def covered(bodies: Sequence[Array], window: Array, columns: int) -> Array:
-    """Rasterise the area that bodies sweep between samples.
+    """Rasterise the area that bodies (m, v, 2) sweep: 1 inside, (rows, columns), lowest first.
 
-    Args:
-        bodies: points of each at all samples (m, v, 2).
-        window: lower and upper end of the grid, horizontally and vertically (2, 2).
-        columns: horizontal grid points; the vertical spacing is the same.
-
-    Returns:
-        1 in the swept area, else 0, (rows, columns), lowest row first.
+    `window` (2, 2) has the ends of the grid, horizontally and vertically; the spacing is that of
+    `columns`.
     """
     low, high = window.T
     pitch = (high[0] - low[0]) / (columns - 1)
@@ -114,10 +106,7 @@ class Strip:
 
     @cached_property
     def extents(self) -> Array:
-        """Displayed range of each base axis with floor and near obstacles (3, 2) [m].
-
-        The aspect ratio of the views is bounded.
-        """
+        """Displayed range of each base axis with floor and near obstacles (3, 2) [m]."""
         low, high = reach(self.corners)
         if self.workspace.floor is not None:
             low[2], high[2] = min(low[2], self.workspace.floor), max(high[2], self.workspace.floor)

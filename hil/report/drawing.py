@@ -286,10 +286,9 @@ class Plot:
 def traces_text(
     time: Array, plots: Sequence[Plot], *, points: int = MOST_POINTS, marks: Sequence[float] = ()
 ) -> str:
-    """Return plots over time (m,) [s] as JSON for the script of the page.
+    """Return plots over time (m,) [s] as JSON for the page's script; "" for under two samples.
 
-    Lines are resampled evenly to at most `points`; "" for fewer than two samples. Vertical lines
-    are drawn at `marks` [s].
+    Lines are resampled evenly to at most `points`; vertical lines are drawn at `marks` [s].
     """
     if time.size < 2 or not time[-1] > time[0]:
         return ""

@@ -59,10 +59,7 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
 
 
 def every_row_errors(results: Results) -> list[float]:
-    """Return the error of each joint over all rows, as a fraction; [] for older results.
-
-    It is the median of the held-out runs, or the error on fitted motion.
-    """
+    """Return the median error of each joint over all rows; [] for older results."""
     known = [run.all_rows_joint_errors for run in results.validation]
     if not known and results.fitted is not None:
         known = [results.fitted.all_rows_joint_errors]

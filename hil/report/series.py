@@ -110,11 +110,7 @@ class ReportSeries:
         return int(self.excitation_position.shape[1])
 
     def checked_for(self, n_joints: int) -> ReportSeries:
-        """Check the number of joints.
-
-        Raises:
-            SeriesError: it differs.
-        """
+        """Return the series, or raise SeriesError unless they have `n_joints`."""
         if self.n_joints != n_joints:
             raise SeriesError(f"excitation_position has {self.n_joints} columns, not {n_joints}")
         return self

@@ -109,11 +109,7 @@ def variant_key(name: Literal["via", "weight", "fly"], value: float) -> str:
 def run_searches(
     folder: StudyFolder, cell: Cell, wanted: Sequence[Search], reporter: Reporter, workers: int
 ) -> dict[str, Search]:
-    """Run the searches that are not complete; an interrupted search resumes from its journal.
-
-    Raises:
-        HilError: see :func:`hil.design.run.run_design`, except if a search finds nothing.
-    """
+    """Run the searches that are not complete; an interrupted search resumes from its journal."""
     found = {}
     for number, one in enumerate(wanted, 1):
         place = DesignFolder(folder.design(one.key))
@@ -143,11 +139,7 @@ def best_sines(found: Mapping[str, Search], keys: Collection[str] = tuple(SINES)
 
 
 def with_fly(cell: Cell, excitation: Excitation, fly: float, checks: MotionChecks) -> Excitation:
-    """Plan the via points of an excitation with another fly-by share.
-
-    Raises:
-        NoExcitationError: the motion cannot be planned or violates a constraint.
-    """
+    """Plan the via points of an excitation with another fly share, or raise NoExcitationError."""
     points, speed = excitation.via_points, excitation.speed
     assert points is not None and speed is not None
     try:
@@ -212,11 +204,7 @@ class Plans:
         return sorted(every, key=lambda one: (one.motions, one.effects), reverse=True)
 
     def without(self, ended: Mapping[Path, str]) -> Plans:
-        """Return the plans without campaigns that the controller ended, given by folder.
-
-        Raises:
-            StudyError: A, B or B with fly 0 was ended.
-        """
+        """Return the plans without ended campaigns, by folder; StudyError for A, B and B0."""
         missing = list(self.missing)
         for condition, some in self.executions.items():
             for key, one in some.items():
@@ -243,11 +231,7 @@ def noise_key(method: str, factor: float) -> str:
 def plan_study(
     folder: StudyFolder, cell: Cell, settings: StudySettings, found: Mapping[str, Search]
 ) -> Plans:
-    """Plan all campaigns of a study, each with held-out motions of its own class.
-
-    Raises:
-        NoExcitationError: no feasible excitation or held-out motion of a method.
-    """
+    """Plan all campaigns, each with held-out motions of its class, or raise NoExcitationError."""
     checks, printed = MotionChecks.of(cell), best_sines(found, PRINTED_SINES)
     sines = best_sines(found) or next(key for key in SINES if key in found)
     searched = {A: sines, B: B, B0: B0}
@@ -362,13 +346,9 @@ def _sine_motions(
 def execute_all(
     executions: Sequence[Execution], reporter: Reporter, workers: LocalWorkers
 ) -> dict[Path, str]:
-    """Run what is missing of several campaigns, side by side.
+    """Run the incomplete campaigns side by side; return by folder why the controller ended one.
 
-    Returns:
-        By folder, why the controller ended a campaign; what is not in it was completed.
-
-    Raises:
-        StudyError: a campaign was refused, or its process ended before it.
+    StudyError: a campaign was refused, or its process ended.
     """
     missing = [one for one in executions if not one.complete]
     calls = [(one.root, (one,)) for one in missing]
@@ -377,11 +357,7 @@ def execute_all(
 
 
 def execute(execution: Execution) -> str | None:
-    """Run or resume one campaign.
-
-    Returns:
-        Reason if the controller ended it.
-    """
+    """Run or resume one campaign; return the reason if the controller ended it."""
     root = execution.root
     if (root / "manifest.json").exists():
         campaign = Campaign.open(root)
@@ -413,10 +389,8 @@ def in_children(
 ) -> list[T]:
     """Call a function in child processes with the arguments of each place; results in order.
 
-    `of` is the number of calls for the progress bar, including those already done.
-
-    Raises:
-        StudyError: a call failed, crashed or timed out.
+    `of` counts the calls including those already done. StudyError: a call failed, crashed or timed
+    out.
     """
     tasks = [ArchiveTask(str(place), function, own) for place, own in calls]
     found: list[T] = []

@@ -22,17 +22,13 @@ _VARIABLES: Final = ("--first", "--second", "--route-3", "--route-0")
 
 
 def write_outcome(root: Path, results: StudyResults, reporter: Reporter) -> None:
-    """Write `results.json` and `report.html` together, and say where they are.
-
-    Raises:
-        OutputError: they cannot be written.
-    """
+    """Write `results.json` and `report.html` together, or raise OutputError."""
     write_files(root, {"results.json": results.to_json(), "report.html": study_page(results)})
     reporter.say(f"report: {root / 'report.html'}")
 
 
 def study_page(results: StudyResults) -> bytes:
-    """The page as one HTML file; the same results give the same bytes."""
+    """Return the page as one HTML file; the same results give the same bytes."""
     first, n = results.conditions[0], results.n_base
     labels = [f"{one.printed_id or ''} {one.name}".strip() for one in results.parameters[:n]]
     template = environment().get_template("study.html.j2")
@@ -58,7 +54,7 @@ def study_page(results: StudyResults) -> bytes:
 
 
 def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """Position of each joint in each excitation, on scales in common (Fig. 1)."""
+    """Draw the position of each joint in each excitation, on common scales (Fig. 1)."""
     panels: list[drawing.Panel] = []
     for j, name in enumerate(joint_names):
         spans = [
@@ -75,7 +71,7 @@ def _trajectories(condition: ConditionResult, joint_names: list[str]) -> list[dr
 
 
 def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """Mean |e| on fly-by motions, a box for each estimate and a panel for each joint (Fig. 3)."""
+    """Draw mean |e| on fly-by motions, a box per estimate and a panel per joint (Fig. 3)."""
     found = next(one for one in condition.classes if one.motion_class == "fly-by")
     errors = [np.array(found.mean_abs[one.key]) for one in condition.methods]
     labels = [one.label.replace(" ", "\n") for one in condition.methods]
@@ -94,7 +90,7 @@ def _boxes(condition: ConditionResult, joint_names: list[str]) -> list[drawing.P
 
 
 def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawing.Panel]:
-    """One held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
+    """Draw one held-out motion in time: measured, predicted by each, and the errors (Fig. 4)."""
     (example,) = condition.examples
     time, panels = np.array(example.time), []
     for j, name in enumerate(joint_names):

@@ -140,10 +140,7 @@ class ClassForms(NamedTuple):
         return cls(slow, whole, np.array([one.torque_squared for one in forms]))
 
     def torque_kernels(self, values: Array) -> Array:
-        """Return the inner products (m, r, r) of the low-passed errors of r estimates (r, p).
-
-        The error of a weighted mean of estimates is the same mean of their errors.
-        """
+        """Return the inner products (m, r, r) of the low-passed errors of r estimates (r, p)."""
         left = np.column_stack([-values, np.ones(len(values))])
         return np.asarray(left @ self.slow @ left.T)
 
@@ -153,10 +150,7 @@ class ClassForms(NamedTuple):
         return np.asarray(away @ self.whole @ away.T)
 
     def relative(self, kernels: Array, weights: Array) -> Array:
-        """Return the relative errors (m, s) of weighted means of estimates, weights (s, r).
-
-        `kernels` (m, r, r) are those of `torque_kernels` or `own_kernels`.
-        """
+        """Return relative errors (m, s) of weighted means: kernels (m, r, r), weights (s, r)."""
         squared = np.maximum(((weights @ kernels) * weights).sum(axis=2), 0.0)
         return np.asarray(np.sqrt(squared / self.torque_squared[:, None]))
 
@@ -232,11 +226,8 @@ def score(
 ) -> ScoreRecord:
     """Predict the held-out motions of a campaign by several estimates (p,).
 
-    Args:
-        inputs: digest.
-        archives: of the held-out motions and the standstill.
-        key: of the campaign.
-        estimates: by name; the first two also as time series of the motion of median error.
+    `archives` are of the held-out motions and the standstill; series are of the motion of median
+    error.
     """
     prepared = _prepared(archives)
     names = [f"{key}/{source.name}" for source in prepared.sources.training]
@@ -261,7 +252,7 @@ def score(
 
 
 def _errors(model: RobotModel, table: Array, run: Samples) -> tuple[Array, Array]:
-    """Return low-passed errors of estimates (k, p) on one motion.
+    """Return low-passed errors of estimates on one motion.
 
     These are mean |e| per joint over usable rows (k, n) and the relative error over all rows (k,).
     """
@@ -364,10 +355,7 @@ class Reader:
         tasks: Sequence[tuple[str, Path, str, object, tuple[Any, ...]]],
         title: str,
     ) -> list[R]:
-        """Return the records of tasks: name, root, kind of archives, other inputs, arguments.
-
-        Archives of the standstill are included, for the noise of positions.
-        """
+        """Return the records of tasks: name, root, kind of archives, other inputs, arguments."""
         calls = []
         for name, root, kind, others, arguments in tasks:
             sums, place = archives_of(root, kind, "standstill"), self.fits / f"{name}.json"

@@ -1,7 +1,7 @@
-"""What a study leaves behind: `results.json`.
+"""Results of a study: `results.json`.
 
 SI units; lists per joint follow `joint_names`, lists per parameter `parameters`. Torque errors are
-low-passed at 30 Hz unless they say otherwise.
+low-passed at 30 Hz unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse"
 
 
 class StudyParameter(Frozen):
-    """One parameter, and what the paper prints about it (null for another arm)."""
+    """One parameter with the values that the paper prints (null for another arm)."""
 
     name: str
     unit: str
@@ -42,7 +42,7 @@ class StudyParameter(Frozen):
 
 
 class SearchResult(Frozen):
-    """One search, and the motion it found; null figures where it found none."""
+    """One search and its motion; null figures if it found none."""
 
     key: str
     words: str
@@ -69,7 +69,7 @@ class MotionRow(Frozen):
 
 
 class MethodResult(Fitted):
-    """What one excitation gave under one condition."""
+    """Estimates of one excitation under one condition."""
 
     key: str
     label: str
@@ -82,7 +82,7 @@ class MethodResult(Fitted):
 class ComparisonResult(Frozen):
     """Two estimates on the same motions: errors with `second` over errors with `first`.
 
-    The interval treats motions and repetitions as random samples; the verdict rests on it.
+    The interval treats motions and repetitions as random samples; the verdict follows from it.
     """
 
     motion_class: str
@@ -110,8 +110,7 @@ class ComparisonResult(Frozen):
 class ClassResult(Frozen):
     """The motions of one class, and relative errors ||e|| / ||tau|| of every estimate on each.
 
-    They are low-passed at 30 Hz as the paper's Fig. 4 is: what remains is the error of the model,
-    and not the noise of the currents, which is the same for every estimate.
+    They are low-passed at 30 Hz as in the paper's Fig. 4, which removes the noise of the currents.
     """
 
     motion_class: str
@@ -134,7 +133,7 @@ class ClassResult(Frozen):
 
 
 class ClosenessResult(Frozen):
-    """How many parameters of a group the second of two estimates brings closer to a reference."""
+    """Number of parameters of a group that are closer to a reference with the second estimate."""
 
     group: str
     reference: str
@@ -146,7 +145,7 @@ class ClosenessResult(Frozen):
 
 
 class EqualDataResult(Frozen):
-    """The first two methods with as much motion of each: the longer one cut."""
+    """Comparison of the first two methods with equal motion time: the longer one is shortened."""
 
     cut: str  #: Key of the method of which only the first repetitions are used
     name: str  #: Of that estimate in the cross table
@@ -159,7 +158,7 @@ class EqualDataResult(Frozen):
 
 
 class ConditionResult(Frozen):
-    """Everything under one condition: with or without effects."""
+    """Results of one condition: with or without effects."""
 
     key: str
     words: str
@@ -179,14 +178,14 @@ class ConditionResult(Frozen):
         return {one.key: one.label for one in self.methods}
 
     def compared(self, motion_class: str, first: str, second: str) -> ComparisonResult | None:
-        """One pair of methods, in this order, on one class."""
+        """Return one pair of methods, in this order, on one class."""
         wanted = (motion_class, first, second)
         rows = (c for c in self.comparisons if (c.motion_class, c.first, c.second) == wanted)
         return next(rows, None)
 
 
 class AblationPoint(Frozen):
-    """One setting of what is varied."""
+    """One setting of an ablation."""
 
     value: float
     label: str = ""  #: Where the setting is not a number, which `value` then only counts
@@ -220,7 +219,7 @@ class ChanceRange(Frozen):
 
 
 class AblationResult(Frozen):
-    """One thing varied, everything else unchanged."""
+    """Results with one setting varied."""
 
     key: str
     title: str
@@ -232,7 +231,7 @@ class AblationResult(Frozen):
 
 
 class Paragraph(Frozen):
-    """What the numbers say."""
+    """One conclusion."""
 
     key: str
     heading: str
@@ -241,7 +240,7 @@ class Paragraph(Frozen):
 
 
 class StudyResults(Frozen):
-    """One study, whole."""
+    """Content of the `results.json` of a study."""
 
     schema_version: int = SCHEMA_VERSION
     name: str
@@ -265,11 +264,7 @@ class StudyResults(Frozen):
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read and check a study's `results.json`.
-
-        Raises:
-            InputError: the file is none.
-        """
+        """Read a study's `results.json`; InputError if it is not one."""
         return load_json(cls, path, "is not the result of a study", "run the study again")
 
 
@@ -280,14 +275,14 @@ _OUTCOMES: Final = {
 
 
 def conclusions(results: StudyResults) -> list[Paragraph]:
-    """All paragraphs, the paper's question first."""
+    """Return all paragraphs, the paper's question first."""
     found = [_prediction(results), _classes(results), _effects(results)]
     found += [_ablation(one, results.ranges) for one in results.ablations]
     return [one for one in found if one is not None]
 
 
 def summary_of(results: StudyResults) -> dict[str, Any]:
-    """The conclusions for a script, and in one line: `line`, and the ratios that it rests on."""
+    """Return the conclusions as JSON data: `line`, and the ratios that it is based on."""
     fields = {"motion_class", "first", "second", "ratio", "level", "verdict"}
     return {
         "name": results.name,
@@ -309,7 +304,7 @@ def summary_of(results: StudyResults) -> dict[str, Any]:
 
 
 def _prediction(results: StudyResults) -> Paragraph:
-    """The first two methods on the robot's own motions: the paper's Fig. 3."""
+    """Compare the first two methods on the robot's own motions: the paper's Fig. 3."""
     conditions = results.conditions
     pairs = [(one, _main(one)) for one in conditions]
     printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
@@ -328,7 +323,7 @@ def _prediction(results: StudyResults) -> Paragraph:
 
 
 def _classes(results: StudyResults) -> Paragraph | None:
-    """Whether estimates predict their own class of motion best: the paper's main argument."""
+    """Check whether estimates predict their own class of motion best: the paper's main argument."""
     upheld = {
         condition.words: [_best(condition, key, name) for key, name in OWN_CLASS.items()]
         for condition in results.conditions
@@ -347,7 +342,7 @@ def _classes(results: StudyResults) -> Paragraph | None:
 
 
 def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
-    """Whether an estimate is significantly better on a class than all others."""
+    """Return whether an estimate is significantly better on a class than all others."""
     rows = [
         one.verdict.endswith("better" if one.second == key else "worse")
         for one in condition.comparisons
@@ -357,7 +352,7 @@ def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
 
 
 def _effects(results: StudyResults) -> Paragraph | None:
-    """How the conclusion depends on what the model leaves out."""
+    """Check whether the conclusion depends on the unmodelled effects."""
     if len(results.conditions) < 2:
         return None
     rigid, effects = results.conditions
@@ -377,7 +372,7 @@ def _effects(results: StudyResults) -> Paragraph | None:
 
 
 def _ablation(ablation: AblationResult, ranges: Sequence[ChanceRange]) -> Paragraph | None:
-    """Which settings lie beyond what other repetitions of the study's own motion would give."""
+    """List the settings outside the range over other repetitions of the study's own motion."""
     known = [one for one in ranges if (one.method, one.motion_class) == (B, "fly-by")]
     if not known or ablation.key not in ("fly", "n_via", "weight"):
         return None
@@ -398,14 +393,14 @@ def _ablation(ablation: AblationResult, ranges: Sequence[ChanceRange]) -> Paragr
 
 
 def _main(condition: ConditionResult) -> ComparisonResult:
-    """A and B on the robot's own motions."""
+    """Return the comparison of A and B on fly-by motions."""
     row = condition.compared("fly-by", A, B)
     assert row is not None  # every study has them
     return row
 
 
 def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
-    """The conclusion under each condition; once where it is the same."""
+    """Format the conclusion of each condition; once if they are equal."""
     texts = [_outcome(condition, row) for condition, row in pairs]
     if len(set(texts)) > 1:
         named = zip(pairs, texts, strict=True)
@@ -414,7 +409,7 @@ def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
 
 
 def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
-    """Whose error is smaller, by how much, and whether more motion is all there is to it."""
+    """Format whose error is smaller, by how much, and whether equal motion time changes that."""
     if not row.differs:
         return _OUTCOMES[row.verdict]
     better = condition.labels[row.second if row.ratio < 1.0 else row.first]

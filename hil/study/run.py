@@ -39,17 +39,10 @@ def run_study(
     workers: int = 2,
     cell: Cell | None = None,
 ) -> StudyResults:
-    """Reproduce the paper on a simulated cell, and write results and page into a folder.
+    """Reproduce the paper on a simulated cell (default: the NS 16), and write results and page.
 
     An interrupted study resumes; of a complete one only the results are written again. Results do
     not depend on the number of workers, except for the times.
-
-    Args:
-        root: new or empty folder, or that of a study with the same settings.
-        settings: of the study.
-        reporter: of progress.
-        workers: number of processes.
-        cell: a simulated cell; by default the paper's NS 16.
 
     Raises:
         CellError: the cell is not simulated.

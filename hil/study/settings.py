@@ -97,11 +97,7 @@ def study_settings(
 
 
 def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
-    """Read a file of the study's folder.
-
-    Raises:
-        InputError: it cannot be read or parsed.
-    """
+    """Read a file of the study's folder; InputError if it cannot be read or parsed."""
     try:
         return kind.model_validate_json(read_text(path))
     except (OSError, ValueError) as error:
@@ -137,11 +133,7 @@ class StudyFolder:
         return lock_folder(self.root, "study", "--output")
 
     def begin(self, settings: StudySettings) -> None:
-        """Write the settings, or check that they are those of the existing study.
-
-        Raises:
-            InputError: the folder contains other files, or a study with other settings.
-        """
+        """Write the settings, or raise InputError unless they are those of the existing study."""
         remedy = "use another folder (--output)"
         if not self.settings.exists():
             if any(self.root.iterdir()):

@@ -45,11 +45,8 @@ def compared_on(
 ) -> ComparisonResult:
     """Compare the errors of two estimates on the motions of one class.
 
-    Args:
-        motion_class: name.
-        keys: of the two estimates.
-        inner: inner products (m, r, r) of the errors of the r repetitions of each estimate.
-        drifts: whether successive repetitions may be correlated.
+    `inner` are the inner products (m, r, r) of the errors of the r repetitions of each estimate;
+    with `drifts` successive repetitions may be correlated.
     """
     # Squared error of the mean estimate: weights 1 / r.
     before, after = (np.sqrt(one.mean(axis=(1, 2))) for one in inner)
@@ -95,15 +92,9 @@ def spread(first: Array, second: Array, *, drifts: bool, seed: int) -> tuple[flo
     repetitions (the paper's Table 2). Of n units n - 1 are sampled, since a mean of n would scatter
     by (n - 1) / n too little. With `drifts` blocks of successive repetitions are resampled.
 
-    Args:
-        first: inner products of the errors of the repetitions, by motion (m, r, r).
-        second: likewise (m, s, s).
-        drifts: whether successive repetitions may be correlated.
-        seed: of the bootstrap.
-
-    Returns:
-        The standard error and its degrees of freedom; None with fewer than `MIN_REPETITIONS`
-        repetitions, or one motion.
+    `first` (m, r, r) and `second` (m, s, s) are inner products of the errors of the repetitions, by
+    motion. Returned with its degrees of freedom; None with fewer than `MIN_REPETITIONS`
+    repetitions, or one motion.
     """
     motions = len(first)
     if motions < 2 or min(first.shape[1], second.shape[1]) < MIN_REPETITIONS:
@@ -136,8 +127,8 @@ def _resampled(
 ) -> tuple[Array, float, int]:
     """Return log errors (draws, m) of resampled means, a jackknife variance, the number of units.
 
-    Where the error is mostly noise, the bootstrap underestimates the scatter by an eighth and the
-    jackknife variance is larger; otherwise they agree.
+    The jackknife variance is larger where the error is mostly noise, which the bootstrap
+    underestimates.
     """
     count = kernels.shape[1]
     # Block length: cube root of the number, 1 for fewer than eight.
@@ -184,15 +175,9 @@ def ranges_of(
     truth: Array,
     reference: Array,
 ) -> list[ChanceRange]:
-    """Return the ranges of errors over subsets of the repetitions of one motion.
+    """Return the ranges of errors over subsets of `size` of the repetitions (r, p) of one motion.
 
-    Args:
-        method: key.
-        values: estimates of its repetitions (r, p).
-        size: of the subsets; no ranges unless 1 <= size < r.
-        forms: of the held-out motions, by class.
-        truth: (p,) true parameters.
-        reference: (p,) estimate with a parameter error of 1.
+    None unless 1 <= size < r; `reference` (p,) is the estimate with a parameter error of 1.
     """
     if not 1 <= size < len(values):
         return []

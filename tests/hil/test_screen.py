@@ -385,7 +385,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
         end.await_seen(b"repetition 3 of 30")  # the screen is back
         end.press("s")
         assert end.end() == 0
-        assert [reported["accepted"] for reported in end.reported()[:3]] == [False, False, True]
+        assert [line["accepted"] for line in end.reported()[:3]] == [False, False, True]
 
 
 def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
