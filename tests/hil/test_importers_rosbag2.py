@@ -1,8 +1,4 @@
-"""rosbag2 recordings and other people's MCAP files become archives: joint states of ROS 2 by their
-names, stamps to the nanosecond; other messages by a column map; clear refusals.
-
-Files that are damaged or hostile: one sentence, in bounded memory and time.
-"""
+"""Import of rosbag2 recordings and MCAP files: joint states, other messages, untrusted files."""
 
 from __future__ import annotations
 
@@ -62,7 +58,7 @@ STAMPS = EPOCH + 8_000_000 * np.arange(COUNT)
 RANDOM = np.random.default_rng(11)
 POSITION, VELOCITY, EFFORT = RANDOM.normal(size=(3, COUNT, 2))
 DRIVES = """\
-# What a vendor's driver says of each drive.
+# State of each drive.
 std_msgs/Header header
 uint8 OK = 0
 bool enabled
@@ -141,12 +137,11 @@ def states(count: int = 5, **changes: Any) -> list[tuple[int, bytes]]:
 
 
 Messages = list[tuple[int, bytes]]
-Import = Callable[..., Archive]
 
 
 @pytest.fixture
-def imported(tmp_path: Path, robot: Robot) -> Import:
-    """Imports a bag of these messages."""
+def imported(tmp_path: Path, robot: Robot) -> Callable[..., Archive]:
+    """Return a function that imports a bag of messages."""
 
     def run(messages: Messages, **options: Any) -> Archive:
         for name in ("b.db3", "a.mcap"):
@@ -158,14 +153,13 @@ def imported(tmp_path: Path, robot: Robot) -> Import:
 
 
 class TestRobot:
-    def test_its_cell_file_gives_the_model_that_was_asked_for(self, tmp_path, robot):
-        """Without a law: a term in v² makes the prediction of other motions worse on average."""
+    def test_default_friction_law_has_no_third_term(self, tmp_path, robot):
         for one in (robot, Robot.from_urdf(tmp_path / "two.urdf")):
             cell = Cell.from_texts(one.cell, one.urdf, Path("cell.toml"))
             assert set(cell.model.friction.laws) == {FrictionLaw(third=None, offset=True)}
             assert cell.joint_names == one.joint_names == ("hip", "ankle")
 
-    def test_a_cell_file_serves_as_well(self, tmp_path, robot):
+    def test_from_cell_file(self, tmp_path, robot):
         (tmp_path / "robot.urdf").write_text(robot.urdf)
         (tmp_path / "cell.toml").write_text(robot.cell)
         again = Robot.from_cell(tmp_path / "cell.toml")
@@ -175,7 +169,7 @@ class TestRobot:
         assert model.gravity.tolist() == [0, 0, 1.62]
 
     def test_joints_that_were_not_recorded_are_locked(self, tmp_path):
-        """At zero, or in the middle of a range without it; what is locked by name stays there."""
+        """At the given position, or at zero, or in the middle of a range without zero."""
         more = "".join(
             f"<link name='{name}'/><joint name='{name}' type='{kind}'><parent link='lower'/>"
             f"<child link='{name}'/><axis xyz='0 0 1'/>"
@@ -202,15 +196,15 @@ class TestRobot:
     @pytest.mark.parametrize(
         "more", ["", '<transmission name="t"><joint name="ankle"/></transmission>']
     )
-    def test_a_fixed_joint_is_no_joint_any_more(self, tmp_path, more):
-        """Nor where a transmission has its name."""
+    def test_locked_joints_are_not_in_the_model(self, tmp_path, more):
+        """Also if a transmission has the name of the joint."""
         (tmp_path / "two.urdf").write_text(URDF.replace("</robot>", f"{more}</robot>"))
         held = Robot.from_urdf(tmp_path / "two.urdf", locked={"ankle": 0.0})
         assert held.joint_names == ("hip",)
         with pytest.raises(InputError, match=r"'knee'.*hip, ankle"):
             Robot.from_urdf(tmp_path / "two.urdf", locked={"knee": 0.0})
 
-    def test_files_and_urdfs_that_are_none_are_named(self, tmp_path):
+    def test_invalid_and_missing_urdfs_are_refused(self, tmp_path):
         (tmp_path / "bad.urdf").write_text("<robot")
         with pytest.raises(InputError, match=r"bad\.urdf: the robot description .* is not XML"):
             Robot.from_urdf(tmp_path / "bad.urdf")
@@ -219,14 +213,12 @@ class TestRobot:
 
 
 class TestImport:
-    def test_joints_and_stamps_are_those_of_the_messages(self, imported):
-        """Joints in the order of the URDF; stamps of the headers, to the nanosecond."""
+    def test_joints_by_name_and_stamps_of_the_headers(self, imported):
         archive = imported(states())
         assert archive.complete
         assert archive.joint_names == ("hip", "ankle")
         assert archive.columns["position"].tolist() == [[-i, 0.1 * i] for i in range(5)]
         assert archive.columns["torque"].tolist() == [[20.0 + i, 10.0 + i] for i in range(5)]
-        archive = imported(states())
         start = 1_700_000_000 * 10**9 + 123
         assert archive.columns["stamp"].tolist() == [start + 8_000_001 * i for i in range(5)]
         assert archive.header.entries["clock"] == "header"
@@ -234,19 +226,19 @@ class TestImport:
             [8.000001e-3 * i for i in range(5)], abs=1e-15
         )
 
-    def test_empty_headers_leave_the_bags_stamps(self, imported):
+    def test_stamps_of_the_bag_if_headers_are_empty(self, imported):
         archive = imported([(5 + 8 * i, state(0, [i, i])[1]) for i in range(3)])
         assert archive.columns["stamp"].tolist() == [5, 13, 21]
         assert archive.header.entries["clock"] == "bag"
 
     @pytest.mark.parametrize("velocity", [(), (np.nan, np.nan)])
-    def test_what_was_not_recorded_is_not_invented(self, imported, velocity):
+    def test_nan_and_empty_quantities_are_left_out(self, imported, velocity):
         """ros2_control publishes NaN for what the hardware does not measure."""
         archive = imported([state(8_000_000 * i, [1, i], velocity=velocity) for i in range(3)])
         assert set(archive.columns) == {"stamp", "position"}
         assert open_recording(archive.path).torque is None
 
-    def test_other_messages_on_the_topic_are_passed_over(self, imported, tmp_path):
+    def test_messages_without_these_joints_are_ignored(self, imported, tmp_path):
         assert imported([*states(3), state(5, [0.01], names=["finger"])]).n_samples == 3
         messages = [state(5, [0.01], names=["finger"]), *states(2)]
         file = bag(tmp_path / "c.db3", {"/js": (STATE, messages)})
@@ -256,7 +248,7 @@ class TestImport:
         with pytest.raises(SourceError, match="has no message with joints"):
             recorded_joints(empty)
 
-    def test_effort_names_and_held_joints_are_as_declared(self, tmp_path, robot):
+    def test_options_effort_joint_names_and_held_joints(self, tmp_path, robot):
         file = bag(tmp_path / "b.db3", {"/js": (STATE, states(names=["j2", "j1"]))})
         before = file.read_bytes()
         archive = open_archive(
@@ -272,7 +264,7 @@ class TestImport:
         assert recording.held_joints == ("hip",)
         expected = {"kind": "imported", "importer": "rosbag2", "topic": "/js", "archive": "a.mcap"}
         assert expected.items() <= recording.provenance.items()
-        assert file.read_bytes() == before, "the bag is left alone"
+        assert file.read_bytes() == before
         assert {path.suffix for path in tmp_path.iterdir()} == {".db3", ".mcap", ".urdf"}
 
 
@@ -280,28 +272,14 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("topics", "asked", "sentence"),
         [
-            (
-                {"/a": (STATE, []), "/b": (STATE, [])},
-                None,
-                r"2 topics carry .*/a \(sensor_msgs.*/b",
-            ),
-            (
-                {"/plan": ("x/msg/Plan", [])},
-                None,
-                r"no topics carry .*name one.*/plan \(x/msg/Plan",
-            ),
-            (
-                {"/a": (STATE, [])},
-                "/joints",
-                r"topic: there is no topic /joints; name one of its topics: /a",
-            ),
+            ({"/a": (STATE, []), "/b": (STATE, [])}, None, r"2 topics carry .*/a \(sensor_m.*/b"),
+            ({"/plan": ("x/msg/Plan", [])}, None, r"no topics .*name one.*/plan \(x/msg/Plan"),
+            ({"/a": (STATE, [])}, "/joints", "topic: there is no topic /joints; name one.*: /a"),
             ({"/plan": ("x/msg/Plan", []), "/a": (STATE, [])}, "/plan", "/plan carries x/msg/Plan"),
             ({"/a": (STATE, [])}, None, "none of the joints hip, ankle was recorded; it is empty"),
         ],
     )
-    def test_a_topic_that_does_not_fit_gets_the_list(
-        self, tmp_path, robot, topics, asked, sentence
-    ):
+    def test_refused_topics_are_listed(self, tmp_path, robot, topics, asked, sentence):
         file = bag(tmp_path / "b.db3", topics)
         with pytest.raises(SourceError, match=sentence):
             import_rosbag2(file, tmp_path / "a.mcap", robot=robot, topic=asked)
@@ -310,34 +288,29 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("messages", "sentence"),
         [
-            (
-                [state(1, [1.0], names=["hip"])],
-                "ankle was not recorded; recorded are hip.*--lock-others",
-            ),
+            ([state(1, [1.0], names=["hip"])], "ankle was not .*recorded are hip.*--lock-others"),
             ([state(1, [1.0], names=["x"])], "none of the joints hip, ankle .* recorded are x"),
             ([state(1, [1.0])], "position: message 0 has 1 values for 2 joints"),
             ([*states(2), state(9, [1, 2])], "effort: only 2 of 3 messages have it"),
             ([*states(2), state(9, [np.nan, 2], effort=[1, 1])], "ankle is nan in sample"),
-            (
-                [state(9 * 10**9, [1, 2]), (10**10, state(1, [1, 3])[1])],
-                "time: sample 1 is 9 s older than",
-            ),
+            ([state(9 * 10**9, [1, 2]), (10**10, state(1, [1, 3])[1])], "time: sample 1 is 9 s ol"),
             ([(3, b"\x00\x01\x00\x00rubbish")], "message 0 cannot be decoded"),
         ],
     )
-    def test_messages_that_cannot_be_used_are_named(self, imported, messages, sentence):
+    def test_unusable_messages_are_refused(self, imported, messages, sentence):
         with pytest.raises(SourceError, match=sentence):
             imported(messages)
 
-    def test_files_that_are_no_bag_are_named(self, tmp_path, robot):
+    def test_files_other_than_bags_are_refused(self, tmp_path, robot):
         (tmp_path / "x.db3").write_text("time,q1")
-        with pytest.raises(SourceError, match=r"x\.db3: is not a rosbag2 in sqlite3 storage"):
-            import_rosbag2(tmp_path / "x.db3", tmp_path / "a.mcap", robot=robot)
-        with pytest.raises(SourceError, match="No such file"):
-            import_rosbag2(tmp_path / "y.db3", tmp_path / "a.mcap", robot=robot)
         (tmp_path / "empty").mkdir()
-        with pytest.raises(SourceError, match=r"has no \.db3 and no \.mcap file"):
-            import_rosbag2(tmp_path / "empty", tmp_path / "a.mcap", robot=robot)
+        for name, sentence in [
+            ("x.db3", r"x\.db3: is not a rosbag2 in sqlite3 storage"),
+            ("y.db3", "No such file"),
+            ("empty", r"has no \.db3 and no \.mcap file"),
+        ]:
+            with pytest.raises(SourceError, match=sentence):
+                import_rosbag2(tmp_path / name, tmp_path / "a.mcap", robot=robot)
 
     def test_a_repeated_clock_or_an_unknown_joint_is_refused(self, imported):
         archive = imported([state(8, [1, 2]), state(16, [1, 3]), state(16, [1, 4])])
@@ -347,8 +320,7 @@ class TestBadInput:
             imported(states(), held_joints=["knee"])
 
 
-def test_franka_with_other_names_and_a_gripper_that_was_not_recorded(tmp_path, shared_data):
-    """A real recording."""
+def test_real_franka_with_other_names_and_locked_gripper(tmp_path, shared_data):
     share = Path(np.__file__).parents[1] / "cmeel.prefix/share/example-robot-data/robots"
     fingers = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
     robot = Robot.from_urdf(share / "panda_description/urdf/panda.urdf", locked=fingers)
@@ -364,7 +336,7 @@ DEFINITION, _ = STORE.generate_msgdef(STATE, ros_version=2)
 
 
 def many() -> Messages:
-    """Joint states with all quantities, the joints in another order than the robot's."""
+    """Return joint states with all quantities, joints in another order than the robot's."""
     return [
         state(int(stamp), q, velocity=qd, effort=tau)
         for stamp, q, qd, tau in zip(
@@ -439,32 +411,29 @@ def test_bags_of_either_storage_compressed_or_not(
     assert_imported(import_rosbag2(tmp_path / "bag", tmp_path / "out.mcap", robot=robot))
 
 
-def test_the_parts_of_a_split_bag_follow_each_other_by_number(tmp_path: Path, robot: Robot) -> None:
+def test_parts_of_a_split_bag_are_ordered_by_number(tmp_path: Path, robot: Robot) -> None:
     folder = tmp_path / "bag"
     folder.mkdir()
     everything = many()
     for part in range(12):
         some = everything[part * 25 : (part + 1) * 25]
         mcap(folder / f"bag_{part}.mcap", {"/joint_states": (STATE, DEFINITION, "cdr", some)})
-    # A part in which no joint state was recorded.
-    mcap(
-        folder / "bag_12.mcap", {"/note": ("std_msgs/msg/String", "string data", "cdr", [(1, b"")])}
-    )
+    # A part without joint states.
+    note = ("std_msgs/msg/String", "string data", "cdr", [(1, b"")])
+    mcap(folder / "bag_12.mcap", {"/note": note})
     packed = zstandard.compress((folder / "bag_3.mcap").read_bytes())
     (folder / "bag_3.mcap.zstd").write_bytes(packed)
     (folder / "bag_3.mcap").unlink()
     assert_imported(import_rosbag2(folder, tmp_path / "out.mcap", robot=robot))
 
 
-def test_an_archive_of_ours_can_be_imported_like_any_other(tmp_path: Path, robot: Robot) -> None:
+def test_archives_of_hil_can_be_imported(tmp_path: Path, robot: Robot) -> None:
     first = import_rosbag2(joint_states(tmp_path / "x.mcap"), tmp_path / "a.mcap", robot=robot)
     assert_imported(import_rosbag2(first, tmp_path / "b.mcap", robot=robot))
 
 
 @pytest.mark.parametrize("encoding", ["protobuf", "json"])
-def test_joint_states_in_another_encoding_are_refused_by_its_name(
-    tmp_path: Path, robot: Robot, encoding: str
-) -> None:
+def test_other_encodings_are_refused(tmp_path: Path, robot: Robot, encoding: str) -> None:
     topics = {"/joints": ("foxglove.JointStates", "", encoding, [(1, b"{}")])}
     source = mcap(tmp_path / "x.mcap", topics)
     with pytest.raises(SourceError, match=f"/joints \\(foxglove.JointStates in {encoding}\\)"):
@@ -474,9 +443,7 @@ def test_joint_states_in_another_encoding_are_refused_by_its_name(
 
 
 @pytest.mark.parametrize("length", [0, 3, 40, 5000, -1, None])
-def test_files_that_are_cut_off_or_damaged_are_refused(
-    tmp_path: Path, robot: Robot, length: int | None
-) -> None:
+def test_truncated_files_are_refused(tmp_path: Path, robot: Robot, length: int | None) -> None:
     source = joint_states(tmp_path / "x.mcap", compression=CompressionType.NONE)
     data = bytearray(source.read_bytes())
     if length is None:
@@ -504,7 +471,7 @@ def by_map(**more: Any) -> ColumnMap:
 
 
 def drives(path: Path, *, firmware: str = "2.1", with_states: bool = False) -> Path:
-    """A vendor's own messages, serialised by rosbags."""
+    """Write messages of a vendor's own type, serialised by rosbags."""
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(DRIVES, "vendor_msgs/msg/Drives"))
     types = store.types
@@ -530,10 +497,9 @@ def drives(path: Path, *, firmware: str = "2.1", with_states: bool = False) -> P
     return mcap(path, topics, chunk_size=10_000)
 
 
-def test_messages_of_any_type_are_imported_with_a_column_map(tmp_path: Path, robot: Robot) -> None:
-    out = import_log(
-        drives(tmp_path / "x.mcap"), tmp_path / "out.mcap", robot=robot, columns=by_map()
-    )
+def test_messages_of_any_type_are_imported_with_a_map(tmp_path: Path, robot: Robot) -> None:
+    source = drives(tmp_path / "x.mcap")
+    out = import_log(source, tmp_path / "out.mcap", robot=robot, columns=by_map())
     found = open_archive(out).columns
     assert found["stamp"].tolist() == STAMPS.tolist()
     np.testing.assert_allclose(found["position"], POSITION, rtol=0, atol=1e-12)
@@ -549,7 +515,7 @@ def test_messages_of_any_type_are_imported_with_a_column_map(tmp_path: Path, rob
     assert archive.columns["motor_current"].tobytes() == EFFORT[:, ::-1].tobytes()
 
 
-def test_every_number_of_a_message_is_an_array_named_by_its_path(tmp_path: Path) -> None:
+def test_numbers_of_messages_are_arrays_by_path(tmp_path: Path) -> None:
     found = read_mcap(drives(tmp_path / "x.mcap"))
     assert set(found) == {
         "/drives/stamp", "/drives/enabled", "/drives/temperature",
@@ -562,17 +528,17 @@ def test_every_number_of_a_message_is_an_array_named_by_its_path(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("firmware", "why"), [("2.2", "differ in names"), ("2.10-beta", "differ in length")]
+    ("firmware", "reason"), [("2.2", "differ in names"), ("2.10-beta", "differ in length")]
 )
-def test_a_topic_whose_messages_are_not_alike_is_refused_with_the_reason(
-    tmp_path: Path, robot: Robot, firmware: str, why: str
+def test_topics_of_variable_messages_are_refused(
+    tmp_path: Path, robot: Robot, firmware: str, reason: str
 ) -> None:
     source = drives(tmp_path / "x.mcap", firmware=firmware)
-    with pytest.raises(SourceError, match=f"/drives: its messages {why}"):
+    with pytest.raises(SourceError, match=f"/drives: its messages {reason}"):
         import_log(source, tmp_path / "o.mcap", robot=robot, columns=by_map())
 
 
-def test_on_the_command_line_it_goes_by_the_name_of_the_file_s_kind(tmp_path: Path) -> None:
+def test_command_has_an_alias(tmp_path: Path) -> None:
     (tmp_path / "two.urdf").write_text(URDF)
     source = joint_states(tmp_path / "x.mcap")
     for name in ("mcap", "rosbag2"):
@@ -590,50 +556,57 @@ def refused(source: Path, robot: Robot, match: str) -> None:
 
 
 class TestSqlite:
-    def test_pages_damaged_behind_a_sound_beginning(self, tmp_path: Path, robot: Robot) -> None:
-        path = bag(tmp_path / "x.db3", {TOPIC: (STATE, states(400))})
+    @pytest.fixture
+    def path(self, tmp_path: Path) -> Path:
+        return bag(tmp_path / "x.db3", {TOPIC: (STATE, states(400))})
+
+    def run(self, path: Path, *statements: str) -> None:
+        with closing(sqlite3.connect(path)) as database:
+            for statement in statements:
+                database.execute(statement)
+            database.commit()
+
+    def test_damaged_pages(self, path: Path, robot: Robot) -> None:
         data = bytearray(path.read_bytes())
         data[4 * 4096 :] = b"\xa5" * (len(data) - 4 * 4096)
         path.write_bytes(data)
         refused(path, robot, "damaged")
 
     @pytest.mark.parametrize("column", ["timestamp", "data"])
-    def test_a_row_without_time_or_data(self, column: str, tmp_path: Path, robot: Robot) -> None:
-        path = bag(tmp_path / "x.db3", {TOPIC: (STATE, states())})
-        with closing(sqlite3.connect(path)) as database:
-            database.execute("CREATE TABLE loose AS SELECT * FROM messages")
-            database.execute("DROP TABLE messages")
-            database.execute("ALTER TABLE loose RENAME TO messages")
-            database.execute(f"UPDATE messages SET {column} = NULL WHERE id = 3")
-            database.commit()
+    def test_rows_without_time_or_data(self, column: str, path: Path, robot: Robot) -> None:
+        self.run(
+            path,
+            "CREATE TABLE loose AS SELECT * FROM messages",
+            "DROP TABLE messages",
+            "ALTER TABLE loose RENAME TO messages",
+            f"UPDATE messages SET {column} = NULL WHERE id = 3",
+        )
         refused(path, robot, f"{TOPIC}: message . has no time or no data")
 
-    def test_a_view_that_makes_rows_without_end(self, tmp_path: Path, robot: Robot) -> None:
-        path = bag(tmp_path / "x.db3", {TOPIC: (STATE, states())})
-        with closing(sqlite3.connect(path)) as database:
-            database.execute("DROP TABLE messages")
-            database.execute(
-                "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1"
-                " FROM n) SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n"
-            )
-            database.commit()
+    def test_views_with_endless_rows(self, path: Path, robot: Robot) -> None:
+        self.run(
+            path,
+            "DROP TABLE messages",
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1"
+            " FROM n) SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM n",
+        )
         refused(path, robot, "no table messages")
 
 
-class TestCompressedMessages:
-    def test_one_that_cannot_be_decompressed_or_becomes_gigabytes(
-        self, tmp_path: Path, robot: Robot
+class TestCompression:
+    @pytest.mark.parametrize(
+        ("data", "sentence"),
+        [
+            (zstandard.compress(bytes(100))[:-5], "cannot be decompressed"),
+            (zstandard.compress(bytes(1 << 27)), "has a message of 134217728 bytes"),
+        ],
+    )
+    def test_truncated_and_huge_messages(
+        self, data: bytes, sentence: str, tmp_path: Path, robot: Robot
     ) -> None:
-        torn = [(time, zstandard.compress(data)[:-5]) for time, data in states()]
-        path = bag(tmp_path / "x.db3", {TOPIC: (STATE, torn)})
-        refused(path, robot, "cannot be decompressed")
-        bomb = zstandard.compress(bytes(1 << 27))
-        path = bag(tmp_path / "y.db3", {TOPIC: (STATE, [(1, bomb)])})
-        refused(path, robot, "has a message of 134217728 bytes")
+        refused(bag(tmp_path / "x.db3", {TOPIC: (STATE, [(1, data)])}), robot, sentence)
 
-    def test_a_file_that_becomes_a_disk(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_huge_files(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(rosbag2, "_SLACK", 1000)
         path = tmp_path / "x.db3.zstd"
         path.write_bytes(zstandard.compress(bytes(1 << 26)))
@@ -641,9 +614,7 @@ class TestCompressedMessages:
             pass
 
 
-class TestTypes:
-    """Definitions of ros2msg that lead nowhere."""
-
+class TestDefinitions:
     @pytest.mark.parametrize(
         "definition",
         [
@@ -655,14 +626,14 @@ class TestTypes:
                                      for i in range(30)), "===\nMSG: pkg/T30\n"]),
         ],
     )  # fmt: skip
-    def test_one_that_holds_itself_or_nothing(self, definition: str) -> None:
+    def test_recursive_and_empty_types_are_refused(self, definition: str) -> None:
         message = ENCAPSULATION + b"\xff\xff\xff\xff" * 100
         with pytest.raises(LayoutError, match="nests pkg/"):
             layout_of("pkg/A", definition, message)
 
-    def test_the_rest_of_the_file_is_read_all_the_same(self, tmp_path: Path) -> None:
+    def test_other_topics_of_the_file_are_read(self, tmp_path: Path) -> None:
         message = [(1, ENCAPSULATION + struct.pack("<d", 2.5))]
-        texts = {"/odd": "pkg/A again", "/good": "float64 x"}
+        texts = {"/recursive": "pkg/A again", "/good": "float64 x"}
         topics = {topic: ("pkg/A", text, "cdr", message) for topic, text in texts.items()}
         assert read_mcap(mcap(tmp_path / "x.mcap", topics))["/good/x"].tolist() == [2.5]
 
@@ -674,13 +645,13 @@ def chunked(path: Path) -> Path:
 
 
 def with_chunk(path: Path, body: bytes) -> None:
-    """Put another chunk before the first one, whose index is gone then."""
+    """Put another chunk before the first one; the index is invalid then."""
     data = path.read_bytes()
     first, _ = mcap_bytes.chunks(data)[0]
     path.write_bytes(data[:first] + mcap_bytes.record(container.CHUNK, body) + data[first:])
 
 
-class TestMcap:
+class TestChunks:
     @pytest.mark.parametrize(
         ("name", "packed", "claimed"),
         [
@@ -692,7 +663,7 @@ class TestMcap:
             ("", bytes(10), 4 << 30),
         ],
     )
-    def test_a_chunk_that_is_not_what_it_claims(
+    def test_wrong_sizes_are_refused(
         self, name: str, packed: bytes, claimed: int, tmp_path: Path
     ) -> None:
         path = chunked(tmp_path / "x.mcap")
@@ -701,9 +672,7 @@ class TestMcap:
         with pytest.raises(SourceError, match=r"claims|cannot be decompressed"):
             read_mcap(path)
 
-    def test_more_numbers_than_fit_into_memory(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_size_is_limited(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(mcap_messages, "MOST_BYTES", 600)
         path = chunked(tmp_path / "x.mcap")
         with pytest.raises(SourceError, match="too large to be read"):
