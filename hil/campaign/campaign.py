@@ -124,11 +124,7 @@ class Campaign:
         return cls(there, Cell.load(there.cell), CampaignPlan.load(there.plan))
 
     def _require_same(self, cell: Cell, wanted: Excitation | CampaignPlan) -> Campaign:
-        """Return this campaign if it has this cell and excitation.
-
-        Raises:
-            CampaignFolderError: it has another one.
-        """
+        """Return this campaign if it has this cell and excitation (CampaignFolderError if not)."""
         own = cell.with_urdf(self.folder.cell, self.folder.urdf.name)
         same = (own.text, own.urdf) == (self.cell.text, self.cell.urdf)
         if isinstance(wanted, CampaignPlan):
@@ -303,11 +299,7 @@ not a campaign."""
 
 
 def require_replaceable(root: Path) -> None:
-    """Refuse to replace a campaign that something was recorded in.
-
-    Raises:
-        CampaignFolderError: there is one in the folder.
-    """
+    """Refuse to replace a campaign with recordings (CampaignFolderError)."""
     if CampaignFolder(root).manifest():
         raise CampaignFolderError(
             root, "holds a campaign with recordings", "name another folder (-o)"

@@ -66,8 +66,7 @@ def agreement(gravity: Array, torque: Array, velocity: Array, moving: NDArray[np
 
     At 20 % of full speed inertial torques are negligible. Coulomb and viscous friction are removed
     from both by regression, without a constant: the sign of a constant load counts as well. A
-    torque of the wrong sign, or a `joint_sign` or zero position that mirrors the arm, makes the
-    correlation negative.
+    wrong sign of torque, joint or zero position makes the correlation negative.
 
     Args:
         gravity: by the model (m, n) [N·m].
@@ -116,16 +115,13 @@ class DryRun:
     """A completed dry run; `dry_run.json`.
 
     Attributes:
-        plan_hash: of the plan that was run.
         override: largest share of the planned speed.
         archives: file names, one for each motion of the plan.
         duration: of the motions [s].
         simulated: whether only a simulated arm can have moved.
-        joint_names: of the n joints.
         current_share: (n) largest current as a share of its limit.
         following_error: (n) largest [rad].
-        missed: packets that never arrived.
-        late: packets whose reply was late.
+        missed, late: packets that never arrived, and whose reply was late.
         accepted: None until it is.
         against_gravity: joints whose torque has the opposite sign of the model's gravity.
         gravity_not_seen: joints with too little gravity to be compared.
@@ -173,9 +169,6 @@ class DryRun:
         """Return the dry run of a plan on this kind of arm whose archives are all there, or None.
 
         A dry run of a simulated arm does not cover the surroundings of a real one.
-
-        Raises:
-            CampaignFolderError: the file is damaged, or of another version.
         """
         found = cls.load(folder, plan_hash)
         if found is None or found.simulated is not simulated:
@@ -195,11 +188,7 @@ class DryRun:
         plan_hash: str,
         simulated: bool,
     ) -> Self:
-        """Return the dry run from its archives.
-
-        Raises:
-            ArchiveError: one of them cannot be read.
-        """
+        """Return the dry run from its archives."""
         limit, step = cell.drive_train.current_limit, max(1, round(_STEP / cell.period))
         current, following = np.zeros(len(limit)), np.zeros(len(limit))
         missed = late = cycles = 0
@@ -248,11 +237,7 @@ class DryRun:
         return tuple(f"{joint}: {AGAINST}" for joint in self.against_gravity)
 
     def save(self, path: Path) -> None:
-        """Write the file.
-
-        Raises:
-            OutputError: the disk refuses.
-        """
+        """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, FORMAT_VERSION)
 
     def accepted_now(self) -> DryRun:
@@ -263,9 +248,7 @@ class DryRun:
 class DryRunStage:
     """Runs every motion that is to be sent at full speed once slowly, and has it accepted.
 
-    Attributes:
-        intervals: the slow motions.
-        state: "accepted", "to be accepted", or "left out" where the caller did without.
+    `state` is "accepted", "to be accepted", or "left out" where the caller did without.
     """
 
     def __init__(self, run: Run) -> None:
@@ -297,11 +280,7 @@ class DryRunStage:
         return [one for one in intervals if self._complete(one) is None]
 
     def run(self, runner: Runner) -> None:
-        """Run what is missing slowly, and have it accepted.
-
-        Raises:
-            DryRunError, OperatorStopError: see `accept`.
-        """
+        """Run what is missing slowly, and have it accepted; see `accept`."""
         missing = self.missing()
         for slow in missing:
             name = runner.run_motion(slow, slow.index + 1, len(self.intervals), OVERRIDE)

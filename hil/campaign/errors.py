@@ -43,7 +43,6 @@ class MotionFailedError(ControllerFault):
     Attributes:
         motion: its name, counted from 1: "repetition 1".
         outcome: "stopped", "refused" or "lost".
-        reason: of the outcome.
         sentence: motion, archive, outcome and reason.
         flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to a refusal, or None.
     """
@@ -81,11 +80,7 @@ class DryRunError(UnsafeError):
 
 
 class AgainstGravityError(DryRunError):
-    """A dry run with torques that contradict the model; each joint must be accepted by name.
-
-    Attributes:
-        joints: whose torque has the opposite sign of the model's gravity.
-    """
+    """A dry run with torques against gravity of the model; `joints` must be accepted by name."""
 
     def __init__(self, campaign: Path, joints: Sequence[str], problem: str) -> None:
         self.joints = tuple(joints)
@@ -113,11 +108,9 @@ class RepetitionsRejectedError(HilError):
 
 
 class ArmChangedError(RepetitionsRejectedError):
-    """Later attempts at a motion agree with each other, and not with the accepted repetitions.
+    """Later attempts agree with each other, and not with the accepted repetitions.
 
-    Attributes:
-        reference: file names of the accepted archives.
-        later: of the rejected ones that agree with each other.
+    `reference` and `later` are file names of the accepted and of the later, rejected archives.
     """
 
     def __init__(

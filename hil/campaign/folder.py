@@ -1,8 +1,7 @@
 """The campaign folder: its files, and its manifest of complete archives.
 
 `manifest.json` has the checksums of cell, URDF and plan, and every closed archive with its checksum
-and outcome. It is replaced atomically after each archive, so that a killed run loses at most the
-archive being written, which the manifest does not name.
+and outcome. It is replaced atomically after each archive: a killed run loses at most the last one.
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ _RESTORE: Final = "restore it, or begin a new campaign"
 def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
     """Return an object of a dataclass or model from its JSON.
 
-    Args:
-        kind: of the object.
-        text: the JSON.
-        strict: whether texts are refused as numbers; a model may write infinite numbers as texts.
+    With `strict` texts are refused as numbers; a model may write infinite numbers as texts.
 
     Raises:
         ValueError: it is not JSON, or a field is invalid; names the first one.
@@ -74,16 +70,8 @@ def load_record(
 ) -> T | None:
     """Read the file of a campaign's step; return None where there is none.
 
-    Args:
-        kind: of the object.
-        path: of the file.
-        problem: of a file that cannot be read.
-        remedy: for it.
-        version: the only `format_version` that is read; 0 for any.
-        strict: see `read_back`.
-
-    Raises:
-        CampaignFolderError: it cannot be read.
+    A file that cannot be read, or of another `format_version` than `version` (0 for any), is a
+    CampaignFolderError with this problem and remedy; see `read_back` for `strict`.
     """
     if not path_exists(path):
         return None
@@ -99,11 +87,7 @@ def load_record(
 
 
 def save_record(path: Path, record: Any, version: int) -> None:
-    """Write a dataclass for `load_record`.
-
-    Raises:
-        OutputError: the disk refuses.
-    """
+    """Write a dataclass for `load_record` (OutputError if the disk refuses)."""
     content = {"format_version": version, **asdict(record)}
     write_output(path, json.dumps(content, indent=1) + "\n")
 
@@ -111,9 +95,8 @@ def save_record(path: Path, record: Any, version: int) -> None:
 def checksums(contents: Mapping[str, bytes], root: Path) -> dict[str, str]:
     """Return the checksums of the inputs of a plan and of its collision meshes, by file name.
 
-    Args:
-        contents: of `cell.toml`, `robot.urdf` and `plan.json`, as far as they exist.
-        root: folder of relative paths in them; a mesh that cannot be read is "missing".
+    `contents` are of `cell.toml`, `robot.urdf` and `plan.json`, as far as they exist; paths in them
+    are relative to `root`. A mesh that cannot be read is "missing".
     """
     sums = {name: digest(content) for name, content in contents.items()}
     try:
@@ -148,13 +131,9 @@ def _sum(path: Path) -> str | None:
 
 @dataclass(frozen=True)
 class Entry:
-    """One closed archive.
+    """One closed archive: file name, outcome of its motion, SHA-256, and reason of the outcome.
 
-    Attributes:
-        name: of the file.
-        outcome: of its motion; "rejected" for a completed one that failed its quality check.
-        sha256: checksum of the file.
-        reason: of the outcome; "" for "completed".
+    The outcome is "rejected" for a completed motion that failed its quality check.
 
     Raises:
         ValueError: `name` is a path to another folder.
@@ -191,14 +170,7 @@ class CampaignFolder:
     """Paths below one campaign folder, and its manifest.
 
     Attributes:
-        archives: folder of the MCAP files.
-        cell, urdf: the campaign's own copies.
-        plan: excitation and validation motions.
-        results, report: of the identification.
-        rehearsal: result of the rehearsal.
         rehearsed: folder of the rehearsal's own campaigns.
-        dry_run: the dry run and its acceptance.
-        warmup: friction during the warm-up.
         digests: cached checksums of archives by name; None to compute them each time.
     """
 
@@ -224,11 +196,7 @@ class CampaignFolder:
 
     @property
     def motion_hash(self) -> str:
-        """SHA-256 as `plan_hash`, without the number of repetitions.
-
-        Raises:
-            CampaignFolderError: one of them cannot be read.
-        """
+        """SHA-256 as `plan_hash`, without the number of repetitions."""
         contents = self._contents()
         sums = self._checksums(contents)
         try:
@@ -289,11 +257,7 @@ class CampaignFolder:
         self._save(_Manifest(self._inputs(), []))
 
     def accept_changes(self) -> None:
-        """Accept changes of cell, URDF and plan if there are no recordings yet.
-
-        Raises:
-            CampaignFolderError: there are recordings, and one of the files was changed since.
-        """
+        """Accept changes of cell, URDF and plan; CampaignFolderError if there are recordings."""
         manifest = self._manifest()
         if not manifest.archives:
             if manifest.inputs != self._inputs():
@@ -302,30 +266,18 @@ class CampaignFolder:
             raise CampaignFolderError(self.root, _ANOTHER.format(changed), _RESTORE)
 
     def require_unchanged(self) -> None:
-        """Check that cell, URDF and plan are those of the manifest.
-
-        Raises:
-            NotRehearsedError: names the file that was changed.
-        """
+        """Require cell, URDF and plan of the manifest; NotRehearsedError names a changed file."""
         if changed := self._changed():
             again = f"restore it, or rehearse again (`hil rehearse {self.root}`)"
             remedy = _RESTORE if self.manifest() else again
             raise NotRehearsedError(self.root, f"was edited: {_ANOTHER.format(changed)}", remedy)
 
     def manifest(self) -> list[Entry]:
-        """Return the closed archives in the order of their recording.
-
-        Raises:
-            CampaignFolderError: the manifest cannot be read.
-        """
+        """Return the closed archives in order (CampaignFolderError if it cannot be read)."""
         return self._manifest().archives
 
     def add(self, name: str, outcome: str, reason: str = "") -> None:
-        """Enter a closed archive in the manifest, or change the outcome of one.
-
-        Raises:
-            CampaignFolderError: the disk refuses.
-        """
+        """Enter a closed archive in the manifest, or change the outcome of one."""
         manifest = self._manifest()
         new = Entry(name, outcome, file_digest(self.archives / name), reason)
         entries = [new if one.name == name else one for one in manifest.archives]
@@ -349,11 +301,7 @@ class CampaignFolder:
         ]
 
     def next_name(self, kind: str, index: int) -> ArchiveName:
-        """Return the name of the next attempt at an interval; no name is used twice.
-
-        Raises:
-            CampaignFolderError: the manifest cannot be read.
-        """
+        """Return the name of the next attempt at an interval; no name is used twice."""
         used, attempt = {entry.name for entry in self.manifest()}, 1
         while (name := ArchiveName(kind, index, attempt).filename) in used or (
             self.archives / name
@@ -400,11 +348,7 @@ class CampaignFolder:
             ) from error
 
     def _contents(self) -> dict[str, bytes]:
-        """Return the contents of cell, plan and URDF by file name.
-
-        Raises:
-            CampaignFolderError: one cannot be read.
-        """
+        """Return the contents of cell, plan and URDF by file name."""
         contents = {}
         for file in (self.cell, self.plan, self.urdf):
             try:

@@ -26,7 +26,7 @@ _ADDRESS: Final = {"transport", "host", "port", "bind", "can", "packets"}
 
 
 def require_gates(run: Run, dry_run: DryRunStage) -> None:
-    """Require a passed rehearsal, and a dry run that is accepted or can be; nothing has moved yet.
+    """Require a passed rehearsal, and a dry run that is accepted or can be, before anything moves.
 
     Raises:
         NotRehearsedError, DryRunError: with the remedy.
@@ -56,7 +56,7 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
         return
     if found is None:
         remedy = f"{first} and watch the arm"
-        raise DryRunError(root, "was not done, and nobody can accept it here", remedy)
+        raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
     if found.accepted is None:
         raise not_accepted(run.folder, found.against_gravity)
 
@@ -83,10 +83,10 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
 
 
 def _require_one_kind_of_arm(run: Run) -> None:
-    """Refuse to mix a simulated and a real arm in one campaign.
+    """Refuse to mix a simulated and a real arm; unreadable archives are recorded again.
 
     A dry run of a simulated arm does not cover the surroundings of a real one, and their archives
-    must not be pooled. Archives that cannot be read are recorded again.
+    must not be pooled.
     """
     own = yes_or_no(run.simulated)
     for entry in run.folder.manifest():
@@ -107,10 +107,7 @@ def _require_one_kind_of_arm(run: Run) -> None:
 
 
 def _require_own_link(run: Run) -> None:
-    """Refuse a link that was opened for another arm than the campaign's.
-
-    The address and the simulated arm may differ; a link without a cell is not checked.
-    """
+    """Refuse a link opened for another arm; the address and the simulated arm may differ."""
     other = getattr(run.link, "cell", None)
     if not isinstance(other, Cell) or other is run.cell:
         return
@@ -139,8 +136,8 @@ def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None)
     """Refuse a controller whose figures are not those of the rehearsal and the checks.
 
     Raises:
-        NotRehearsedError: names the differences, or each joint whose following-error threshold is
-            narrower in the controller, and both thresholds.
+        NotRehearsedError: names the differences, or joints with a narrower following-error
+            threshold in the controller, and both thresholds.
     """
     root, cell = run.folder.root, run.cell
     if connection.adopted and connection.differences:

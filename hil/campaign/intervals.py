@@ -1,4 +1,4 @@
-"""The motions of a campaign in order, with the ways between them, checked before they are sent."""
+"""The motions of a campaign in order, with the moves between them, checked before they are sent."""
 
 from __future__ import annotations
 
@@ -47,9 +47,7 @@ class Interval:
     Attributes:
         kind: "standstill", "excitation", "validation", "move", "dryrun" or "warmup".
         index: which of its kind, from 0.
-        trajectory: the motion.
-        moves: that it was planned from, None without any.
-        from_arm: whether it is a way from or to the first position of the arm.
+        from_arm: whether it is a move from or to the first position of the arm.
     """
 
     kind: str
@@ -63,7 +61,7 @@ class Interval:
 
     @property
     def ends(self) -> tuple[Array, Array]:
-        """Its first and last position, (n,) [rad] each."""
+        """First and last position, (n,) [rad] each."""
         start, end = self.trajectory.sample(np.array([0.0, self.trajectory.duration]))[0]
         return start, end
 
@@ -74,10 +72,7 @@ class Interval:
         return bool(apart <= AT_REST_TOLERANCE)
 
     def places(self, home: Array) -> tuple[Array, Array]:
-        """Return the position of the arm before and after it (n,) [rad], usually at home.
-
-        Excitations and Fourier series may begin and end elsewhere.
-        """
+        """Return the position of the arm before and after it (n,) [rad]: home, or its own ends."""
         own = self.kind in (*REPEATED, "dryrun") or isinstance(self.trajectory, FourierSeries)
         return self.ends if own else (home, home)
 
@@ -107,12 +102,9 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
 def planned_intervals(
     cell: Cell, plan: CampaignPlan, repetitions: int | None = None
 ) -> list[Interval]:
-    """Return all motions of a plan, without the ways between them.
+    """Return all motions of a plan, without the moves between them.
 
-    Args:
-        cell: its `[campaign]`.
-        plan: the motions.
-        repetitions: of the excitation, without validation motions; None for all of both.
+    With a number of `repetitions` of the excitation the validation motions are left out.
     """
     validation = plan.validation if repetitions is None else ()
     repetitions = cell.campaign.repetitions if repetitions is None else repetitions
@@ -125,7 +117,7 @@ def planned_intervals(
 
 
 class StraightMoves:
-    """Straight ways between postures, each planned and checked once."""
+    """Straight moves between postures, each planned and checked once."""
 
     def __init__(self, cell: Cell, checks: MotionChecks) -> None:
         self._cell, self._checks = cell, checks
@@ -134,11 +126,7 @@ class StraightMoves:
     def between(
         self, start: Array, end: Array, index: int, *, from_arm: bool = False
     ) -> Interval | None:
-        """Return the motion from `start` to `end` (n,) [rad]; None where they are the same.
-
-        Raises:
-            MotionRefusedError: it failed its check.
-        """
+        """Return the checked motion from `start` to `end` (n,) [rad]; None if they are the same."""
         if np.max(np.abs(end - start)) <= AT_REST_TOLERANCE:
             return None
         found = next((one for one in self._known if one.leads(start, end)), None)
@@ -149,10 +137,10 @@ class StraightMoves:
         return replace(found, index=index)
 
     def joining(self, intervals: Sequence[Interval], where: Array) -> list[Interval]:
-        """Return these motions with the ways between them, from `where` (n,) [rad] and back.
+        """Return these motions with the moves between them, from `where` (n,) [rad] and back.
 
         Raises:
-            MotionRefusedError: a way failed its check, or a motion begins where no way leads.
+            MotionRefusedError: a move failed its check, or a motion does not begin where one ends.
         """
         at, home, joined = where, self._cell.home, list[Interval]()
 
@@ -177,11 +165,7 @@ class StraightMoves:
 
 
 def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None:
-    """Check motions, each once.
-
-    Raises:
-        MotionRefusedError: one must not be sent.
-    """
+    """Check motions, each once; raise MotionRefusedError for one that must not be sent."""
     different: dict[int, Interval] = {}
     for one in intervals:
         different.setdefault(id(one.trajectory), one)
@@ -190,14 +174,10 @@ def require_allowed(intervals: Sequence[Interval], checks: MotionChecks) -> None
 
 
 def require_runnable(cell: Cell, plan: CampaignPlan, checks: MotionChecks | None = None) -> None:
-    """Check that a plan can run on a cell, from any position of its arm.
-
-    Raises:
-        MotionRefusedError: it cannot.
-    """
+    """Check that a plan can run on a cell, from any position of its arm (MotionRefusedError)."""
     checks = checks or MotionChecks.of(cell)
     intervals = planned_intervals(cell, plan)
-    require_allowed(intervals, checks)  # before ways to them are planned
+    require_allowed(intervals, checks)  # before moves to them are planned
     StraightMoves(cell, checks).joining(intervals, cell.home)
 
 
@@ -227,14 +207,10 @@ def hold(position: Array, duration: float) -> PiecewiseCubic:
 def straight_move(cell: Cell, start: Array, end: Array, speed: float | None = None) -> Interval:
     """Return the straight motion between two postures (n,) [rad], planned in a child process.
 
-    Args:
-        cell: its limits.
-        start: first posture.
-        end: last posture.
-        speed: fraction of the joints' speeds; by default the cell's `approach_speed`.
+    Its speed is a fraction of the joints' speeds, by default the cell's `approach_speed`.
 
     Raises:
-        MotionRefusedError: one of them is outside the limits.
+        MotionRefusedError: a posture is outside the limits.
     """
     limits = cell.joint_limits
     if (problem := beyond(cell, start)) is not None:

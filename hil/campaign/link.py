@@ -1,8 +1,4 @@
-"""Link to a simulated controller in virtual time.
-
-Exchange and archive share one thread: the simulated controller waits for the PC. On a real link
-(`hil.campaign.live_link`) a slow disk must not delay a reply.
-"""
+"""Link to a simulated controller in virtual time; exchange and archive share one thread."""
 
 from __future__ import annotations
 
@@ -54,9 +50,6 @@ class Link(MotionLink):
     """Session, transport and recorder of one connection in virtual time.
 
     Attributes:
-        transport: moves bytes and virtual time.
-        session: replies to every packet.
-        ring: the session's records.
         guard: the session's, with the active limits.
         finish: asks the controller to end the session.
         packets: the raw packets, where archives store them.
@@ -88,11 +81,7 @@ class Link(MotionLink):
         accept_init: bool = False,
         only_axis: int | None = None,
     ) -> Link:
-        """Return a link to the simulated controller of `cell` over `transport`.
-
-        Raises:
-            TypeError: the transport is a real one.
-        """
+        """Return a link to the simulated controller of `cell` (TypeError for a real transport)."""
         if not isinstance(transport, SimulatedTransport):
             raise TypeError(
                 f"{type(transport).__name__} is not virtual time: on a real link the exchange "
@@ -111,7 +100,7 @@ class Link(MotionLink):
     def close(self) -> None:
         """Ask the controller to end the session, and reply until it does, at most `END_TIMEOUT` s.
 
-        A controller that was restarted meanwhile was not asked, and continues with closed axes.
+        A restarted controller was not asked, and continues with closed axes.
 
         Raises:
             ControllerFault: an axis is still open after that time.
@@ -198,9 +187,9 @@ class Link(MotionLink):
         return ended
 
     def _steer(self, steering: Steering, stop: Stop) -> None:
-        """Show the motion and pass requests on; return when no hold is active.
+        """Show the motion and apply requests; return when no hold is active.
 
-        A simulated controller waits for its reply, so that a hold takes no simulated time.
+        The simulated controller waits for its reply: a hold takes no simulated time.
         """
         while True:
             motion_time, rate = progress_of(steering.source)
@@ -239,7 +228,7 @@ class Link(MotionLink):
             restarted=recorder.restarted,
             complete=recorder.records >= limit,
             ended=self.session.state is State.ENDED,
-            lost="nothing was heard from the controller any more" if recorder.link_lost else "",
+            lost="no packet arrives from the controller any more" if recorder.link_lost else "",
             stopped=stop.requested,
             limited=duration is not None,
             refused=recorder.refused,

@@ -1,9 +1,7 @@
 """Link over a real transport: exchange and archive in processes of their own.
 
-This process requests motions and archives, sends a heartbeat every 50 ms while the loop that
-supervises a motion runs, and reports. The exchange process replies to the controller, the archive
-process writes what the exchange leaves in shared memory. Each of the three detects the death of
-the others, and then the arm comes to rest on its path.
+This process requests motions and sends a heartbeat while its supervising loop runs. Each of the
+three detects the death of the others, and then the arm comes to rest on its path.
 """
 
 from __future__ import annotations
@@ -108,8 +106,7 @@ LARGE: Final = 128 * 1024
 def return_large_arrays() -> None:
     """Have arrays of `LARGE` bytes and more returned to the system when they are freed.
 
-    Otherwise glibc takes ever larger ones from its heap once such have been freed, and over hours
-    the heap grows around the holes between small ones.
+    Otherwise glibc takes them from its heap once one was freed, and the heap grows over hours.
     """
     with suppress(OSError, AttributeError, TypeError):  # another C library
         ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)
@@ -189,9 +186,7 @@ class ExchangeView:
     """State of the exchange process and of the motion requested last, from its events.
 
     Attributes:
-        exchange: the process.
         with_cause: adds its cause to a reason of the process.
-        connection: state of the controller.
         lost: the last loss of the link.
         ended: the end of the motion, if its event came.
         inits: init packets so far.
@@ -294,14 +289,10 @@ class LiveLink(MotionLink):
     ends both processes.
 
     Attributes:
-        exchange: the process that replies.
-        archive: the process that writes.
         heart: heartbeat of this process.
         finish: asks the controller to end the session; only a simulated one can be asked.
-        view: state of the exchange.
         inits: init packets until the controller was connected.
-        late: replies so far that were late or left out for a newer one's.
-        not_accepted: replies so far that the controller did not accept.
+        late, not_accepted: replies so far that were late or left out, and not accepted.
         job: number of the archive opened last.
         open_path: of the archive that is open; "" if none is.
         live: where viewers connect, None if nowhere.
@@ -363,8 +354,7 @@ class LiveLink(MotionLink):
         Raises:
             LiveViewError: the live view cannot be served.
             CellError: the cell names no real link.
-            ControllerFault: the link cannot be opened (port in use, not permitted, no adapter), or
-                the system refuses a process.
+            ControllerFault: the link cannot be opened, or the system refuses a process.
         """
         return_large_arrays()
         spec = transport if transport is not None else cell.transport_spec()
@@ -436,12 +426,7 @@ class LiveLink(MotionLink):
 
     @contextmanager
     def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
-        """See `MotionLink.open_archive`; what is still open at an error is closed with the link.
-
-        Raises:
-            ArchiveWriteError: it cannot be created.
-            ControllerFault: the archive process does not answer.
-        """
+        """See `MotionLink.open_archive`; what is still open at an error is closed with the link."""
         drives = active_drive_train(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
         spec = replace(spec, packets=self.cell.controller.packets)
@@ -461,12 +446,7 @@ class LiveLink(MotionLink):
         yield
 
     def complete(self, outcome: str, reason: str) -> Recorded:
-        """See `MotionLink.complete`.
-
-        Raises:
-            ArchiveWriteError: the disk refuses.
-            ControllerFault: the archive process does not answer.
-        """
+        """See `MotionLink.complete`; ArchiveWriteError if the disk refuses."""
         self.heart.rest()  # the motion has ended, or never began
         path = self.open_path
         incomplete = f"{path} is not complete ({outcome}: {reason})"
@@ -496,9 +476,7 @@ class LiveLink(MotionLink):
     def _request(self, command: Command, answer: type[T], consequence: str) -> T | None:
         """Return the answer to a command to the archive process; None after `OPEN_TIMEOUT` s.
 
-        Raises:
-            ArchiveWriteError: the disk refuses.
-            ControllerFault: the process is gone, or hangs.
+        ArchiveWriteError if the disk refuses, ControllerFault if the process is gone or hangs.
         """
         self.archive.send(command)
         deadline = time.monotonic() + OPEN_TIMEOUT
@@ -751,8 +729,8 @@ class LiveLink(MotionLink):
         what = "no init packet" if some else "nothing"
         also = f"; {self.view.not_understood}" if self.view.not_understood else ""
         return (
-            f"{what} heard from {who} within {wait:g} s ({status.foreign} packets from "
-            f"elsewhere{also})"
+            f"{what} received from {who} within {wait:g} s ({status.foreign} packets from "
+            f"other addresses{also})"
         )
 
     def _record(
@@ -784,12 +762,10 @@ class LiveLink(MotionLink):
                 raise ControllerFault(f"{failure}; {spec.path} is readable up to its last part")
 
     def _reply_until_rest(self, stop: Stop, watch: Watch, reason: str) -> None:
-        """Let the exchange continue to reply until the arm rests.
+        """Let the exchange reply until the arm has rested for a second or no session is left.
 
-        The controller's own program continues when a recording ends, and its reaction to a PC that
-        becomes silent in the middle of a motion is not known. So replies continue until the arm
-        has rested for a second, the drive is off, the session has ended or no packet arrives; or
-        until the operator insists.
+        The controller's own program continues after a recording, and its reaction to a silent PC
+        during a motion is not known. The operator may insist on an earlier end.
         """
         stopped, still = stop.requested, Standstill(self.cell.period)
         drive_on, received = time.monotonic(), 1
@@ -821,7 +797,7 @@ class LiveLink(MotionLink):
                 late=status.late,
                 not_accepted=status.unanswered,
                 foreign=status.foreign,
-                heard=status.answered > 0,
+                connected=status.answered > 0,
                 not_understood=self.view.not_understood,
                 over=over,
             )
@@ -843,11 +819,7 @@ OFF: Final = 1.0
 
 
 class Standstill:
-    """Detects that target and arm are at rest; a joint of unknown position counts as moving.
-
-    Args:
-        period: cycle of the controller, s.
-    """
+    """Detects rest of target and arm, with `period` s; unknown positions count as moving."""
 
     def __init__(self, period: float) -> None:
         self._cycles = round(REST / period)

@@ -1,7 +1,6 @@
 """Connections to a controller: run motions on it, or record those of its own program.
 
-`MotionLink` has the stages of a connection, a motion and a recording. `hil.campaign.link`
-implements them in virtual time, `hil.campaign.live_link` in real time.
+`hil.campaign.link` implements `MotionLink` in virtual time, `hil.campaign.live_link` in real time.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ Array = NDArray[np.float64]
 START_TIMEOUT: Final = 60.0
 """s within which an accepted motion must have started."""
 OFF_TIMEOUT: Final = 2.0
-"""s with the drive off after which an accepted motion is given up."""
+"""s with the drive off after which an accepted motion is dropped."""
 END_TIMEOUT: Final = 30.0
 """s within which a session must end after that was requested."""
 NOT_STARTED: Final = "it had not begun"
@@ -50,11 +49,7 @@ _WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED,
 
 
 class StartTimeout:
-    """Detects that an accepted motion will not start.
-
-    Args:
-        now: time of the request [s of any monotonic clock].
-    """
+    """Detects that a motion accepted at `now` [s of any monotonic clock] will not start."""
 
     def __init__(self, now: float) -> None:
         self._requested = self._drive_on = now
@@ -77,13 +72,10 @@ class Progress:
 
     Attributes:
         cycles: archived so far.
-        missed: packets that never arrived.
-        state: of the session.
+        missed, late, not_accepted: see `Recorded`.
         position: (n,) rad, measured last; None before the first record.
-        late: packets whose reply was late, or left out for a newer one.
-        not_accepted: replies that the controller did not accept.
         foreign: packets from other addresses; they get no reply.
-        heard: whether any packet of the controller was replied to yet.
+        connected: whether any packet of the controller was replied to yet.
         not_understood: number and cause of packets without a reply; "" for none.
         over: why nothing is recorded any more while replies continue; "" during the recording.
     """
@@ -95,7 +87,7 @@ class Progress:
     late: int = 0
     not_accepted: int = 0
     foreign: int = 0
-    heard: bool = True
+    connected: bool = True
     not_understood: str = ""
     over: str = ""
 
@@ -108,7 +100,6 @@ class Connection:
     """State of the controller since the link was opened.
 
     Attributes:
-        init: its init packet.
         unusable: why the arm cannot be moved, None if it can.
         differences: figures in which it differs from the cell.
         adopted: whether its figures are used instead of the cell's.
@@ -169,8 +160,6 @@ class MotionLink(ABC):
     """Connection to a controller: runs motions and archives every cycle of them.
 
     Attributes:
-        cell: its controller is connected.
-        connection: state of the controller.
         cycles: records archived so far.
         only_simulated: whether only a simulated controller can be connected.
     """
@@ -226,10 +215,8 @@ class MotionLink(ABC):
             source: the motion.
             spec: its archive.
             stop: requests a stop on the path.
-            override: the largest fraction of the planned speed. From its first cycle on the motion
-                runs at the smaller of this and the operator's request.
-            watch: is shown the motion, and may slow, hold and release it. No motion starts while
-                its request is a hold.
+            override: the largest fraction of the planned speed, from the first cycle on.
+            watch: is shown the motion, and may slow, hold and release it; none starts in a hold.
 
         Raises:
             ControllerFault: the motion was not accepted (nothing moved), or the link broke; or it
@@ -240,7 +227,7 @@ class MotionLink(ABC):
         steering.begin(stop, self._poll)  # no archive is open during a hold
         self._poll()
         with self.open_archive(spec, own_motion=False):
-            # Opening it may have taken seconds: the requests are read again.
+            # Opening it may last seconds: the requests are read again.
             while self._may_start(steering, stop):
                 self._new_records()
                 try:
@@ -264,9 +251,7 @@ class MotionLink(ABC):
         wait: float | None = None,
         watch: Watch = lambda _: None,
     ) -> Recorded:
-        """Reply without commanding anything, and archive every cycle from the first one on.
-
-        In real time replies continue after the recording until the arm rests.
+        """Reply without commanding anything, in real time until rest; archive every cycle.
 
         Raises:
             ControllerFault: the controller cannot be read, or began no session within `wait` s.
@@ -286,11 +271,7 @@ class MotionLink(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection; nothing moves any more.
-
-        Raises:
-            ControllerFault: it did not end properly.
-        """
+        """End the connection; ControllerFault if it did not end properly."""
 
     @abstractmethod
     def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> AbstractContextManager[None]:
@@ -399,14 +380,8 @@ def recording_end(
 ) -> tuple[str, str] | None:
     """Return outcome and reason of a recording that is to end now, None while it continues.
 
-    Args:
-        restarted: whether the controller began a new session.
-        complete: whether it lasts as long as requested.
-        ended: whether the controller ended the session.
-        lost: how the link was lost; "" if it was not.
-        stopped: whether the operator requested the end.
-        limited: whether a duration was requested.
-        refused: the last refusal; it becomes the reason of any end.
+    `lost` is how the link was lost, or ""; `limited` whether a duration was requested; the last
+    refusal `refused` becomes the reason of any end.
     """
     ends = (
         (restarted, "stopped", "the controller began a new session"),
@@ -420,10 +395,7 @@ def recording_end(
 
 
 def described(spec: ArchiveSpec, connection: Connection, drives: DriveTrain) -> ArchiveSpec:
-    """Return the archive with the controller's init packet, and with the active drive train.
-
-    Its `drive_train.json`, the cell's, gets the ratios, calibration and coupling of `drives`.
-    """
+    """Return the archive with the init packet and the active gears, calibration and coupling."""
     if connection.init is None:
         return spec
     attachments, metadata = {"init_packet.bin": connection.init.encode()}, {}
@@ -464,10 +436,9 @@ def active_guard(cell: Cell, drives: DriveTrain, init: InitPacket | None) -> Gua
 def active_checks(
     cell: Cell, connection: Connection, checks: MotionChecks | None = None
 ) -> MotionChecks:
-    """Return the checks of motions to a connected controller.
+    """Return checks with the narrower current limits of cell and controller, and adopted gears.
 
-    They have the narrower current limits of the cell and the controller, and gears that were
-    accepted from it; `checks` itself is returned where both are the cell's.
+    `checks` itself is returned where both are the cell's.
     """
     checks = MotionChecks.of(cell) if checks is None else checks
     if connection.adopted:
@@ -484,8 +455,7 @@ Limit = Literal["current_limit", "following_error"]
 def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[str, ...]:
     """Return a sentence for each limit of the controller that is below the cell's.
 
-    No model predicts the following error of a servo, so that motions cannot be checked against
-    its thresholds.
+    No model predicts the following error of a servo: motions cannot be checked against it.
     """
     if connection.init is None:
         return ()

@@ -29,9 +29,7 @@ REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class Stop:
     """Request to stop; the link then brings the arm to rest on its path.
 
-    Attributes:
-        requested: whether a stop was requested.
-        insisted: whether it was requested a second time.
+    `insisted` is set by a second request.
     """
 
     requested: bool = False
@@ -66,15 +64,7 @@ def stop_on_interrupt(*, twice: bool = False) -> Iterator[Stop]:
 
 @dataclass(frozen=True)
 class OperatorRequest:
-    """Override and hold that the operator requests.
-
-    Attributes:
-        override: fraction (0 to 1) of the planned speed.
-        held: whether the arm is to rest on its path.
-
-    Raises:
-        ValueError: the override is not in 0..1.
-    """
+    """Override, a fraction of the planned speed (ValueError outside 0..1), and hold on the path."""
 
     override: float = 1.0
     held: bool = False
@@ -101,15 +91,12 @@ class MotionProgress:
         motion_time, duration: s of the planned motion, done and in total; None if unknown.
         cycles, missed, late, not_accepted: packets of this motion that were answered, never
             arrived, were answered late or left out, and whose reply was not accepted.
-        state: of the session.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
-        following_share: magnitude of that as a share of the active threshold.
         current: A at the motors, the controller's target; no current is measured.
-        current_share: magnitude of that as a share of the active limit.
+        following_share, current_share: their magnitudes as shares of the active limits.
         override: the fraction requested last.
         rate: present fraction of the planned speed; None if unknown.
-        held: whether a hold is requested.
         latency: None in virtual time, and before the first reply.
         events: the last events of this motion, oldest first.
     """
@@ -136,9 +123,8 @@ class MotionProgress:
 class MotionWatch(Protocol):
     """Observer of a motion that may slow, hold and release it.
 
-    Both methods are called by the loop that supervises the motion and must return at once: no stop
-    or hold is passed on meanwhile. On a real link the arm is brought to rest on its path when one
-    of them takes longer than a second.
+    Its methods must return at once: the arm is brought to rest on its path when one takes longer
+    than a second on a real link.
     """
 
     def show(self, progress: MotionProgress) -> None:
@@ -159,7 +145,6 @@ class DriftCurve:
     """Change of friction from motion to motion while the joints warm up.
 
     Attributes:
-        joint_names: of the n joints.
         friction: (k, n) friction of each motion so far [N·m], by the measure of `warmup`.
         change: (k,) largest change of any joint from the motion before, as a share of its
             friction; NaN for the first.
@@ -177,7 +162,6 @@ class RunStatus:
     """Progress of a run, about ten times a second while the arm moves.
 
     Attributes:
-        phase: purpose of the motion.
         number: which of its kind, from 1.
         total: number of its kind; of a warm-up, the largest number.
         time_left: of motion to the end of the run, the present one at its override [s]; of a
@@ -249,12 +233,10 @@ NOTES = 4
 class RunWatch:
     """A `MotionWatch` that shows the progress of the whole run to its operator.
 
-    Errors of the operator's screen are reported and end no motion: it continues at the speed
-    requested last. A hold that nobody can release any more becomes a stop.
+    Errors of the operator's screen are reported and end no motion, which continues at the speed
+    requested last. A hold that cannot be released any more becomes a stop.
 
     Attributes:
-        operator: of the run.
-        stop: brings the arm to rest on its path.
         time_left: s of motion after the present one, each at its largest override.
         began: when the present or the last motion began [s since 1970], after any hold.
         status: shown last, except for its time left.

@@ -44,12 +44,7 @@ READ = (1, 2, 3, FORMAT_VERSION)
 
 @dataclass(frozen=True, eq=False)
 class PlannedMotion:
-    """A motion with its moves.
-
-    Attributes:
-        trajectory: the motion.
-        moves: start, moves and limits, without the motion; None if they were not stored.
-    """
+    """A motion, and the start, moves and limits that it was planned from, if they were stored."""
 
     trajectory: PiecewiseCubic | FourierSeries
     moves: PlanFile | None = None
@@ -60,11 +55,7 @@ class PlannedMotion:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Restore what `to_dict` returned.
-
-        Raises:
-            KeyError, TypeError, ValueError: the data are not a planned motion.
-        """
+        """Restore what `to_dict` returned (KeyError, TypeError, ValueError for other data)."""
         return cls(trajectory_from_dict(data["trajectory"]), moves_from_dict(data))
 
 
@@ -82,10 +73,7 @@ def moves_from_dict(data: Mapping[str, Any]) -> PlanFile | None:
 class CampaignPlan:
     """The excitation, and motions that are predicted and never fitted.
 
-    Attributes:
-        excitation: the motion to fit, and how it was found.
-        validation: the motions to predict.
-        moves: of the excitation, with its limits; None for Fourier series, and if not stored.
+    `moves` are of the excitation, with its limits; None for Fourier series, and if not stored.
     """
 
     excitation: Excitation
@@ -116,11 +104,7 @@ class CampaignPlan:
 
     @classmethod
     def load(cls, path: Path) -> CampaignPlan:
-        """Read a plan.
-
-        Raises:
-            InputError: the file is not a plan.
-        """
+        """Read a plan (InputError if the file is not one)."""
         try:
             return cls.from_text(read_text(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
@@ -130,11 +114,7 @@ class CampaignPlan:
 
     @classmethod
     def from_text(cls, text: str) -> CampaignPlan:
-        """Return the plan from its JSON.
-
-        Raises:
-            ValueError, KeyError, TypeError, AttributeError: it is not a plan.
-        """
+        """Return the plan from its JSON (ValueError, KeyError, TypeError, AttributeError)."""
         content: dict[str, Any] = parse_json(text)
         version = content["format_version"]
         if version not in READ:
@@ -182,12 +162,7 @@ def quick_settings(cell: Cell) -> DesignSettings:
 def plan_around(
     cell: Cell, excitation: Excitation, checks: MotionChecks | None = None
 ) -> CampaignPlan:
-    """Return a plan with this excitation and random validation motions.
-
-    Args:
-        cell: its `[campaign]` has number and seed of the validation motions.
-        excitation: designed for this cell.
-        checks: of the cell, if available.
+    """Return a plan with this excitation and random validation motions as in `[campaign]`.
 
     Raises:
         MotionRefusedError: the excitation must not be sent to this cell's arm.

@@ -1,8 +1,7 @@
 """Quality check of a completed motion, when its archive is closed.
 
 Repetitions are compared set-point by set-point, not by time: the motion waits for a missed packet.
-They differ by noise and by slow changes of friction; a larger difference means that something
-touched the arm, slipped, or was changed.
+Beyond noise and slow changes of friction a difference means that the arm was disturbed or changed.
 """
 
 from __future__ import annotations
@@ -70,11 +69,10 @@ class Problem:
     """Why a motion is rejected.
 
     Attributes:
-        sentence: the reason.
         by_hand: whether the operator held or slowed it.
         differs: whether its only problem is a difference from the repetitions before it.
-        reference, later: if enough attempts agree with it that the arm may have changed: file names
-            of the repetitions that count, and of those attempts.
+        reference, later: if the arm may have changed: file names of the repetitions that count, and
+            of the attempts that agree with it.
     """
 
     sentence: str
@@ -89,9 +87,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Executed:
-    """Part of an archive in which the arm was commanded; row k is set-point k.
-
-    A set-point that was sent again because the controller had not accepted it is there once.
+    """Part of an archive in which the arm was commanded; row k is set-point k, sent once or again.
 
     Attributes:
         position: (m, n) measured [rad].
@@ -280,8 +276,7 @@ class Rejected:
 class ArchiveReview:
     """Judges completed archives and enters them in a campaign's manifest.
 
-    A rejection is written to the archive before the manifest: the file alone, or one in a folder
-    whose run was killed, must not be used either.
+    A rejection is written to the archive before the manifest: the file alone must not be used.
 
     Attributes:
         rejected: archives that failed their check.
@@ -342,8 +337,7 @@ class ArchiveReview:
         """Return the problem of a repetition, None for none.
 
         Where enough later attempts agree with each other and not with the only accepted one, that
-        one is rejected instead. Where two or more accepted ones agree, the arm may have changed:
-        the operator has to decide.
+        one is rejected instead. Where two or more accepted ones agree, the operator has to decide.
         """
         problem = self._check.problem(executed)
         if problem is None or not problem.differs:

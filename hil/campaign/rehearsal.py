@@ -86,19 +86,11 @@ class Rehearsal(Frozen):
         )
 
     def save(self, path: Path) -> None:
-        """Write the file.
-
-        Raises:
-            OutputError: the disk refuses.
-        """
+        """Write the file (OutputError if the disk refuses)."""
         write_output(path, self.model_dump_json(indent=1) + "\n")
 
     def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
-        """Return whether it is of this plan, up to the number of repetitions.
-
-        Raises:
-            CampaignFolderError: cell, URDF or plan cannot be read.
-        """
+        """Return whether it is of this plan, up to the number of repetitions."""
         if self.plan_hash == plan_hash:
             return True
         return folder.plan_hash == plan_hash and folder.motion_hash == self.motion_hash

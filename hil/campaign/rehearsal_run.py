@@ -1,8 +1,7 @@
 """Rehearsal: runs the plan of a campaign on a simulated arm close to the nominal one.
 
-The simulated arm has the links, gears and limits of the cell. Masses, inertias, rotors and friction
-are varied within `SPREAD` of their nominal values. A cell without `[simulation]` gets one from
-`[nominal]` and the defaults below.
+Masses, inertias, rotors and friction are varied within `SPREAD` of their nominal values. A cell
+without `[simulation]` gets one from `[nominal]` and the defaults below.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
 """Slowest current loop, s; a slower one makes the simulated arm oscillate."""
 _HORIZON: Final = 4.0
-"""Period of link faults as a multiple of the motions' duration: ways take time, too."""
+"""Period of link faults as a multiple of the motions' duration: moves take time, too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,7 @@ class Twin:
     """A simulated arm for a rehearsal.
 
     Attributes:
-        cell: the cell with a simulated controller; its `[simulation]` has the varied parameters.
+        cell: with a simulated controller; its `[simulation]` has the varied parameters.
         truth: simulated parameters (p,) in the order of the model.
         assumed: assumed properties, in sentences.
         seed: of the variation.
@@ -144,13 +143,7 @@ class Twin:
 
 
 def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
-    """Return faults of an ordinary network: single packets that are lost, doubled or late.
-
-    Args:
-        cell: packets are lost only with a `max_gap` above 0.
-        seconds: period of the controller's time with faults.
-        seed: of the random numbers.
-    """
+    """Return single packets lost (if `max_gap` allows), doubled or late within `seconds`."""
     rng = np.random.default_rng([seed, 7])
     cycles = round(seconds / cell.period)
     count = max(1, round(seconds / FAULT_EVERY))
@@ -223,8 +216,8 @@ def _simulation(
 def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
     """Return effects of default sizes, with springs that suit the arm.
 
-    No resonance exceeds `FASTEST` in any of `POSTURES` random postures within the limits. Where
-    axes are almost parallel, the effective inertia beyond a spring is much below that of its link.
+    No resonance exceeds `FASTEST` in any of `POSTURES` random postures. Where axes are almost
+    parallel, the effective inertia beyond a spring is much below that of its link.
     """
     n, limits = len(rotors), cell.joint_limits
     model = pinocchio.buildModelFromXML(cell.urdf)
@@ -263,12 +256,7 @@ _NAMED: Final = 3
 def criterion(name: str, value: float | None, bound: float, good: str, bad: str = "") -> Criterion:
     """Return a criterion that is met by a finite value up to `bound`.
 
-    Args:
-        name: of the criterion.
-        value: None where it cannot be determined.
-        bound: the largest value that passes.
-        good: sentence of the result.
-        bad: sentence of a result that does not pass, if another.
+    `bad` is the sentence of a result that does not pass, if not `good`.
     """
     known = value is not None and np.isfinite(value)
     passed = value is not None and known and value <= bound
@@ -385,14 +373,7 @@ def rehearse(
     """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
 
     Changes of the cell file are accepted until the campaign has recordings, but not during the
-    rehearsal.
-
-    Raises:
-        MotionRefusedError: a motion breaks a limit of the cell; nothing was rehearsed.
-        OperatorStopError: it was stopped; its recordings remain.
-        CampaignFolderError: the folder was changed after the first archive or during the
-            rehearsal, or is in use.
-        OutputError: the result cannot be written.
+    rehearsal (CampaignFolderError).
     """
     folder, stop = campaign.folder, stop or Stop()
     with folder.locked():

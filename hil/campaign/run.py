@@ -1,8 +1,7 @@
 """One run of a campaign: the motions that are missing, in order, behind the gates.
 
-Everything that is sent has been checked before the first motion. Each motion is archived, judged
-and entered in the manifest before the next one begins, so that a run that is killed at any moment
-is resumed with the first motion that is missing.
+Everything is checked before the first motion. Each motion is archived, judged and entered in the
+manifest before the next one begins: a killed run is resumed with the first motion that is missing.
 """
 
 from __future__ import annotations
@@ -61,8 +60,6 @@ class RunResult:
     """What a run has done, and the progress of the campaign after it.
 
     Attributes:
-        campaign: its folder.
-        plan_hash: of the plan that was run.
         simulated: whether only a simulated arm can have moved.
         archives: file names made by this run, in order, whatever their outcome.
         rejected: of these, the motions that failed their quality check.
@@ -70,8 +67,7 @@ class RunResult:
         dry_run: whether the operator has accepted it; "left out" where the caller did without.
         against_gravity: joints whose torque had the opposite sign of gravity in the dry run.
         warm_up: "warm", "not warm", "going on", or "none" where none was wanted.
-        repetitions: of the excitation that are complete now, and how many there are to be.
-        validations: the same of the validation motions.
+        repetitions, validations: how many are complete now, and how many there are to be.
         complete: whether no motion is missing.
         cycles: archived by this run.
         notes: what a reader must know.
@@ -102,9 +98,7 @@ class Run:
     """One run of a campaign, with the arguments of `Campaign.run`.
 
     Attributes:
-        given_provenance: of archives, by the caller.
         archives: file names so far, whatever their outcome.
-        notes: what a reader must know.
         plan_hash: of this cell, URDF and plan, in memory and on the disk; "" at first.
         cycles: archived so far.
     """
@@ -181,13 +175,7 @@ class Run:
         slow: Sequence[Interval],
         full: Sequence[Interval],
     ) -> Iterator[Runner]:
-        """Connect the controller, check all motions with its limits, and close the link at the end.
-
-        Raises:
-            MotionRefusedError: a motion, or a way between two, must not be sent; nothing was.
-            NotRehearsedError: the controller's figures are not those that were rehearsed.
-            ControllerFault: it was not ready, or the connection did not end properly.
-        """
+        """Connect the controller, check all motions with its limits, and close the link after."""
         from hil.cell_link import cell_link  # which opens links of campaigns
 
         cell, reporter = self.cell, self.reporter
@@ -214,7 +202,7 @@ class Run:
                 self.notes.append(
                     f"the controller's own current limits counted ({'; '.join(below)})"
                 )
-            # Dry run and warm-up use the ways of the motions that they are made of.
+            # Dry run and warm-up use the moves of the motions that they are made of.
             straight = StraightMoves(cell, narrowed)
             joined = straight.joining([*slow, *full], start)
             runner = Runner(self, link, straight, start)
@@ -307,7 +295,7 @@ class Run:
 def provenance_of(run: Run) -> dict[str, str]:
     """Return the origin of a run's archives; a date only in real time.
 
-    Only the caller knows what a link simulates, but the link decides whether an arm can move.
+    The caller knows what a link simulates; the link decides whether a real arm can move.
     """
     own: Mapping[str, str] = {}
     if not run.virtual:
@@ -320,16 +308,9 @@ def provenance_of(run: Run) -> dict[str, str]:
 
 
 class Runner:
-    """Runs motions of a run on a connected link, and the straight ways to them.
+    """Runs motions of a run on a connected link, and the straight moves to them.
 
-    Args:
-        run: whose motions are run.
-        link: to its controller; connected.
-        straight: ways between the motions.
-        start: (n,) [rad], the first position of the arm, to which it returns.
-
-    Attributes:
-        task: receives the seconds of motion done.
+    The arm returns to its first position `start` (n,) [rad]; `task` receives the seconds of motion.
     """
 
     task: Task
@@ -358,9 +339,7 @@ class Runner:
         return times
 
     def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
-        """Go to the start of a motion, run it, and return the name of its archive.
-
-        The archive is complete, and not yet entered in the manifest.
+        """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
 
         Raises:
             MotionFailedError: it ended otherwise than planned, or was not begun after a stop.
@@ -375,21 +354,11 @@ class Runner:
     def run_until_accepted(
         self, interval: Interval, number: int, total: int, warm_up: WarmUpStage | None = None
     ) -> str:
-        """Run a motion, judge it and enter it; repeat it where it fails its check.
+        """Run motion `number` (from 1) of `total` until it passes its check; return its archive.
 
         An attempt that the operator held or slowed counts as failed only if less than full speed is
-        still requested: the next one would be slowed as well. The others are limited separately,
-        for a script that slows each attempt would otherwise never end.
-
-        Args:
-            interval: the motion.
-            number: which of its kind, from 1.
-            total: number of its kind.
-            warm_up: warms the arm up before each attempt, and judges whether it was warm at its
-                start; None for a motion that a cold arm may run.
-
-        Returns:
-            Name of the accepted archive.
+        still requested; the others are limited separately, for a script that slows each attempt.
+        `warm_up` warms the arm up before each attempt, and judges whether it was warm at its start.
 
         Raises:
             RepetitionsRejectedError: it failed too often.
@@ -443,10 +412,9 @@ class Runner:
         return min(1.0, share / self._run.cell.campaign.approach_speed)
 
     def _unseen(self, way: Interval) -> bool:
-        """Return whether the operator should have seen this way in the dry run, and has not.
+        """Return whether the operator should have seen this move in the dry run, and has not.
 
-        A way from or to the first position of the arm counts as unseen: whoever jogged the arm
-        there may have done so for a reason.
+        A move from or to the first position of the arm counts as unseen: the arm was jogged there.
         """
         if self._seen is None:
             return False
@@ -474,11 +442,7 @@ class Runner:
 
 
 def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
-    """Return start and end (n,) [rad] of the ways of a dry run, by its archives.
-
-    Raises:
-        CampaignFolderError: the manifest cannot be read.
-    """
+    """Return start and end (n,) [rad] of the moves of a dry run, by its archives."""
     entries = [one for one in folder.manifest() if one.outcome == "completed"]
     kinds = [name.kind if (name := ArchiveName.parse(one.name)) else "" for one in entries]
     last = max((k for k, kind in enumerate(kinds) if kind == "dryrun"), default=0)

@@ -57,14 +57,7 @@ class Step:
 
 @dataclass(frozen=True)
 class CampaignStatus:
-    """Progress of a campaign.
-
-    Attributes:
-        root: its folder.
-        plan_hash: of its present cell, URDF and plan.
-        steps: in their order.
-        notes: truncated, damaged or rejected archives with the reason, in sentences.
-    """
+    """Progress of a campaign: its steps in order, and archives that are not used, in sentences."""
 
     root: str
     plan_hash: str
@@ -87,11 +80,7 @@ class CampaignStatus:
 
 
 def status_of(campaign: Campaign) -> CampaignStatus:
-    """Return the progress of a campaign from the files in its folder; nothing is changed.
-
-    Raises:
-        CampaignFolderError: its manifest cannot be read.
-    """
+    """Return the progress of a campaign from the files in its folder; nothing is changed."""
     folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
     at = shlex.quote(str(folder.root))
@@ -292,9 +281,7 @@ def _left_behind(folder: CampaignFolder, name: str) -> str:
 
 
 def conduct_of(folder: CampaignFolder) -> ConductResult:
-    """Return the conduct of a campaign from the files in its folder; nothing is changed.
-
-    A file that cannot be read is reported in its step.
+    """Return the conduct of a campaign from its files; one that cannot be read is in its step.
 
     Raises:
         CampaignFolderError: the manifest cannot be read.

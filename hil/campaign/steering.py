@@ -1,4 +1,4 @@
-"""A motion that is being run: passes the operator's requests on to it, and shows its progress."""
+"""Steering of a running motion: requests of the operator, and its display."""
 
 from __future__ import annotations
 
@@ -47,17 +47,15 @@ class PacketCounts:
 
 
 class Steering:
-    """Passes the requests of a motion's watch on to the motion, and shows the motion to it.
+    """Applies the requests of a motion's watch to the motion, and shows the motion to it.
 
     Args:
-        source: the motion; an attribute.
-        watch: shows the motion, and has the requests.
         most: largest fraction of the planned speed, whatever is requested.
         counts: returns the present packet counts.
 
     Attributes:
-        fraction: passed on to the motion last.
-        held: whether a hold was passed on last.
+        fraction: applied to the motion last.
+        held: whether a hold was applied last.
 
     Raises:
         ValueError: `most` is not in 0..1.
@@ -82,10 +80,7 @@ class Steering:
         self._due = -math.inf
 
     def begin(self, stop: Stop, meanwhile: Callable[[], object]) -> bool:
-        """Set the requested speed; wait while a hold is requested.
-
-        Returns:
-            Whether the motion may be requested now; False once a stop is requested.
+        """Set the requested speed and wait while a hold is requested; return False after a stop.
 
         Raises:
             ControllerFault: it is to be slower than planned and supports no override.
@@ -115,7 +110,7 @@ class Steering:
         return not (stop.requested or request.held or request.override < self.fraction)
 
     def follow(self, motion: Session | ExchangeProcess) -> None:
-        """Pass on the present request. A motion held before it began begins at rest."""
+        """Apply the present request. A motion held before it began begins at rest."""
         request = self._watch.request()
         fraction = min(self._most, request.override)
         commands: list[Callable[[], None]] = []
@@ -148,14 +143,9 @@ class Steering:
     def show(
         self, drives: DriveTrain, guard: Guard, state: State, motion_time: float, rate: float
     ) -> None:
-        """Show the motion.
+        """Show the motion at `motion_time` s, at `rate` of the planned speed (NaN if unknown).
 
-        Args:
-            drives: the active drive train, for the shares.
-            guard: with the active limits.
-            state: of the session.
-            motion_time: s of the planned motion done, NaN if unknown.
-            rate: fraction of the planned speed, NaN if unknown.
+        Shares are of the active limits of `drives` and `guard`.
         """
         self._due = time.monotonic() + SHOW_PERIOD
         counts, before = self._counts(), self._before

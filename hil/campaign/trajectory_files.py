@@ -1,7 +1,7 @@
 """Designed motions as files for controllers that `hil` does not drive.
 
-Each motion as a table (CSV), as ROS 2's `trajectory_msgs/JointTrajectory` and, for arms of six
-turning joints, as URScript; and a player of the tables for a Universal Robots arm by ur_rtde.
+Tables (CSV), ROS 2's `trajectory_msgs/JointTrajectory` and, for arms of six turning joints,
+URScript; and a player of the tables for a Universal Robots arm by ur_rtde.
 """
 
 from __future__ import annotations

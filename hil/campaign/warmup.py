@@ -1,14 +1,12 @@
 """Warm-up: the excitation is repeated until friction hardly changes from motion to motion.
 
-**Measure.** Mean friction torque of a joint along a motion that begins and ends at rest:
+The measure is the mean friction torque of a joint along a motion that begins and ends at rest:
 
     F_j = (∫ tau_j qd_j dt - ∫ tau_rigid,j qd_j dt) / ∫ |qd_j| dt.
 
-The rigid part is that of the nominal model on the planned motion: it is the same in each
-repetition, so that its error cancels in every change.
-
-**Criterion.** The change per motion is the Theil-Sen slope of the last motions (the median of all
-slopes between two of them), as a share of the friction.
+The rigid part is that of the nominal model on the planned motion, the same in each repetition: its
+error cancels in every change. The change per motion is the Theil-Sen slope of the last motions (the
+median of all slopes between two of them), as a share of the friction.
 """
 
 from __future__ import annotations
@@ -56,9 +54,7 @@ _LEAST_WAY: Final = 1e-2
 def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:
     """Return the change per motion below which the arm is warm; 0 for no warm-up.
 
-    Args:
-        cell: its `[campaign]`.
-        only_simulated: whether only a simulated arm can move; by default as the cell's own link.
+    It depends on whether only a simulated arm can move, by default as the cell's own link.
     """
     wanted = cell.campaign.warmup_drift
     if wanted is not None:
@@ -80,8 +76,6 @@ class WarmUp:
     """Warm-up of a campaign; `warmup.json`.
 
     Attributes:
-        plan_hash: of its plan.
-        joint_names: of the n joints.
         threshold: change per motion below which the arm is warm.
         motions: of the present warm-up, in order.
         outcome: "going on", "warm", or "not warm" after the largest number of motions.
@@ -103,20 +97,12 @@ class WarmUp:
 
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
-        """Read the file; return None without one for this plan.
-
-        Raises:
-            CampaignFolderError: the file is damaged.
-        """
+        """Read the file; return None without one for this plan (CampaignFolderError if damaged)."""
         found = load_record(cls, path, "is damaged", "remove that file")
         return found if found is not None and found.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:
-        """Write the file.
-
-        Raises:
-            OutputError: the disk refuses.
-        """
+        """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, FORMAT_VERSION)
 
     @property
@@ -127,7 +113,7 @@ class WarmUp:
     def cold(self, now: float) -> bool:
         """Return whether the joints have cooled down by `now` [s since 1970].
 
-        They have if the time of the last motion is unknown, or in the future (a clock was reset).
+        They have if the last motion has no time, or one in the future (a clock was reset).
         """
         return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER
 
@@ -175,13 +161,9 @@ class WarmUp:
 
 
 def change_per_motion(friction: Sequence[Array] | Array) -> float:
-    """Return the largest change per motion of any joint over the last motions, as a share.
+    """Return the largest change of friction (k, n) [N·m] per motion of any joint, as a share.
 
-    Args:
-        friction: (k, n) [N·m].
-
-    Returns:
-        NaN for fewer than two motions, or if no joint moves.
+    NaN for fewer than two motions, or if no joint moves.
     """
     last = np.asarray(friction, dtype=np.float64)[-WINDOW:]
     moves = np.isfinite(last).all(axis=0) if len(last) else np.zeros(0, bool)
@@ -208,11 +190,7 @@ class FrictionMeter:
         self._way = np.abs(qd).sum(axis=0) * cell.period
 
     def measure(self, path: Path) -> Array:
-        """Return the mean friction torque of each joint (n,) [N·m]; NaN where it is unknown.
-
-        Raises:
-            ArchiveError: the archive cannot be read.
-        """
+        """Return the mean friction torque of each joint (n,) [N·m]; NaN where it is unknown."""
         columns = open_archive(path, fields=_FIELDS).recorded(*_FIELDS)
         rows = ~np.isnan(columns["commanded_position"]).any(axis=1)
         torque = columns["torque"][rows]
@@ -262,11 +240,7 @@ class WarmUpStage:
         return [motion.trajectory.duration for motion in motions] * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
-        """Run motions until the arm is warm.
-
-        Raises:
-            RepetitionsRejectedError: each attempt at a motion was slowed.
-        """
+        """Run motions until the arm is warm (RepetitionsRejectedError: each attempt was slowed)."""
         if not self._threshold:
             return
         run, state = self._run, self._present()
@@ -282,19 +256,12 @@ class WarmUpStage:
         run.reporter.say(state.sentence)
 
     def rewarm(self, runner: Runner) -> None:
-        """Warm up again if the joints have cooled down.
-
-        Raises:
-            RepetitionsRejectedError: see `run`.
-        """
+        """Warm up again if the joints have cooled down."""
         if self._cold(time.time()) is not None:
             self.run(runner)
 
     def cold_start(self, began: float) -> Problem | None:
-        """Return the problem of a repetition that began cold [s since 1970]; None if it was warm.
-
-        The operator may hold the arm for any time before it.
-        """
+        """Return the problem of a repetition that began cold [s since 1970], as after a hold."""
         found = self._cold(began)
         if found is None:
             return None
@@ -336,8 +303,7 @@ class WarmUpStage:
     def _present(self) -> WarmUp:
         """Return the warm-up to continue; a new one if the joints have cooled down.
 
-        A motion in the manifest that is not in `warmup.json` was the last one of a run that was
-        killed between writing the two.
+        A motion in the manifest only was the last one of a run that was killed.
         """
         run, state = self._run, self._state()
         name = run.folder.whole("warmup", state.next_index)

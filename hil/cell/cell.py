@@ -106,11 +106,7 @@ class Cell:
         )
 
     def with_friction(self, **changes: Any) -> Cell:
-        """Return the cell with changed entries of `[robot.friction]` for all joints.
-
-        Raises:
-            CellError: the friction law is invalid.
-        """
+        """Return the cell with changed entries of `[robot.friction]` for all joints."""
         table = self.file.robot.friction
         joints = {
             name: JointFrictionTable(**one.model_dump(exclude_unset=True, exclude={*changes}))
@@ -486,11 +482,7 @@ _TURNING_ONLY = ("limits", "drive_train", "campaign", "simulation")
 
 
 def _check(cell: Cell) -> None:
-    """Check fields against each other and against the URDF.
-
-    Raises:
-        CellError: they are inconsistent.
-    """
+    """Check fields against each other and against the URDF (CellError)."""
     file = cell.file
     _check_assumed(cell)
     tables = [name for name in _TURNING_ONLY if getattr(file, name) is not None]

@@ -1,7 +1,4 @@
-"""Errors of cell files, with file, field, value and remedy.
-
-`"?"` marks unknown values; a file that contains one is refused.
-"""
+"""Errors of cell files; `"?"` marks unknown values, and a file with one is refused."""
 
 from __future__ import annotations
 
@@ -15,13 +12,7 @@ from hil.errors import InputError
 
 
 class CellError(InputError):
-    """The cell file is invalid.
-
-    Attributes:
-        path: the file.
-        field: dotted name of the field, or "" for the whole file.
-        value: invalid value, None if missing.
-    """
+    """The cell file is invalid: path, dotted `field` ("" for the whole file), invalid `value`."""
 
     def __init__(self, path: Path, field: str, value: object, problem: str, remedy: str) -> None:
         self.value = value
@@ -37,14 +28,7 @@ def first_error(
     *,
     documentation: str = "docs/cell-file.md",
 ) -> CellError:
-    """Convert the first error of pydantic.
-
-    Args:
-        path: the file.
-        error: of pydantic.
-        schema: of the file.
-        documentation: named in the remedy if the schema does not describe the field.
-    """
+    """Convert the first error of pydantic; `documentation` is named for undescribed fields."""
     detail = error.errors(include_url=False)[0]
     place, value, kind = _place(schema, detail["loc"]), detail["input"], detail["type"]
     if kind.startswith("union_tag"):
@@ -151,11 +135,7 @@ WHERE: Final[Mapping[str, str]] = {
 
 
 class UnknownFieldsError(CellError):
-    """The cell file contains unknown values.
-
-    Attributes:
-        fields: their dotted names.
-    """
+    """The cell file contains unknown values in `fields`, their dotted names."""
 
     def __init__(self, path: Path, fields: Mapping[str, str]) -> None:
         self.fields = tuple(fields)
@@ -165,11 +145,7 @@ class UnknownFieldsError(CellError):
 
 
 def require_known(path: Path, raw: Mapping[str, Any], schema: type[BaseModel]) -> None:
-    """Refuse a file with unknown values (`"?"`).
-
-    Raises:
-        UnknownFieldsError: lists all such fields with their source.
-    """
+    """Refuse a file with unknown values (`"?"`): UnknownFieldsError with all of them."""
     fields: dict[str, str] = {}
     for location, places in _unknown(raw, ()):
         name = ".".join(location)

@@ -47,12 +47,9 @@ _GEARED: Final = 10.0  # turns of the motor per turn of the joint
 def robot_model(
     path: Path, urdf_name: str, urdf: str, robot: RobotTable, drive_train: Callable[[], Array]
 ) -> RobotModel:
-    """Build the model; `path` and `urdf_name` are for errors.
+    """Build the model; `path` and `urdf_name` are for errors (CellError).
 
     `drive_train` returns the motor angles per joint angle (n, n) of `[drive_train]`.
-
-    Raises:
-        CellError: a field is invalid.
     """
     friction = robot.friction
     with _cell_errors(path, "cell.urdf", urdf_name, "correct the URDF"):

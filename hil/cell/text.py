@@ -52,10 +52,7 @@ def replaced_value(text: str, table: str, key: str, value: float | str) -> str:
 def with_values(text: str, values: Mapping[str, Any]) -> str:
     """Set values in a TOML text, such as ``{"campaign.repetitions": 3}``; None changes nothing.
 
-    Comments and order are preserved; missing tables are added.
-
-    Raises:
-        NoTableError: a table exists without a header line.
+    Comments and order are preserved; missing tables are added (NoTableError without a header line).
     """
     for name, value in values.items():
         table, _, key = name.rpartition(".")

@@ -177,7 +177,7 @@ class View:
             self.say(line)
 
     def _line(self, progress: Progress) -> str:
-        if not progress.heard:
+        if not progress.connected:
             table = self._cell.controller
             who = table.host if table.transport == "udp" else "the controller"
             what = f"no packet from {who}"

@@ -65,10 +65,7 @@ def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
 def faulty_link(cell: Cell, *lines: str, controller: SimulatedController | None = None) -> Link:
     """Return a link in virtual time to a simulated controller, not yet connected.
 
-    `controller` is by default `faulty_controller` of the same lines.
-
-    Raises:
-        FaultScriptError: a line is not a fault.
+    `controller` is by default `faulty_controller` of the same lines (FaultScriptError).
     """
     controller = controller or faulty_controller(cell, *lines)
     of_link, _ = split_faults(map(parse_fault, lines))
@@ -140,8 +137,7 @@ class UdpController:
     def finish(self) -> dict[str, Any]:
         """End the session: arm at rest, drive off, then mode 504.
 
-        Returns:
-            its summary, see `docs/simulate.md`; {} if it had to be killed.
+        Returns its summary, see `docs/simulate.md`; {} if it had to be killed.
         """
         if self._summary is None:
             self._simulator.finish()

@@ -92,7 +92,7 @@ def written(cell: Cell, old: str, new: str) -> Cell:
 class TestArchives:
     """What a finished campaign leaves."""
 
-    def test_every_interval_of_motion_is_one_whole_in_itself(self, campaign: Campaign) -> None:
+    def test_every_interval_of_motion_is_one_complete_archive(self, campaign: Campaign) -> None:
         names = [ArchiveName.parse(path) for path in campaign.folder.archives.glob("*.mcap")]
         assert sorted((name.kind, name.index) for name in names if name is not None) == [
             *(("excitation", i) for i in range(3)),
@@ -114,7 +114,7 @@ class TestArchives:
         commanded = commanded[~np.isnan(commanded).any(axis=1)]
         trajectory, period = campaign.plan.excitation.trajectory, campaign.cell.period
         planned, _, _ = trajectory.sample(np.arange(len(commanded)) * period)
-        # The first set-point is the controller's own float32 target, and its offset is kept.
+        # The first set-point is the controller's float32 target; its rounding offset remains.
         assert commanded == pytest.approx(planned, abs=2e-6)
         velocity = np.abs(np.diff(commanded, axis=0)) / period
         assert np.all(velocity <= campaign.cell.joint_limits.velocity * (1 + 1e-6))
@@ -126,7 +126,7 @@ class TestArchives:
         assert last.columns["position"][-1] == pytest.approx(after, abs=5e-3)
 
     def test_cycles_from_closed_to_closed_without_a_gap(self, campaign: Campaign) -> None:
-        """Each holds one interval in open mode, and they follow each other."""
+        """Each archive holds one interval in open mode; no cycle is missing between two."""
         files = [open_archive(campaign.folder.archives / e.name).columns
                  for e in campaign.folder.manifest()]  # fmt: skip
         for columns in files:
@@ -138,20 +138,20 @@ class TestArchives:
         for before, after in pairwise(files):
             assert after["cycle"][0] == before["cycle"][-1] + 1
 
-    def test_what_is_torn_is_done_again(
+    def test_a_damaged_archive_is_recorded_again(
         self, tmp_path: Path, cell: Cell, plan: CampaignPlan, run: Run
     ) -> None:
-        campaign = run(tmp_path / "torn", *one_repetition(cell, plan))
-        (kept,), (torn,) = (campaign.folder.completed(k) for k in ("excitation", "validation"))
-        before, content = kept.read_bytes(), bytearray(torn.read_bytes())
+        campaign = run(tmp_path / "damaged", *one_repetition(cell, plan))
+        (intact,), (damaged,) = (campaign.folder.completed(k) for k in ("excitation", "validation"))
+        before, content = intact.read_bytes(), bytearray(damaged.read_bytes())
         content[len(content) // 2] ^= 1
-        torn.write_bytes(content)
+        damaged.write_bytes(content)
         assert campaign.folder.completed("validation") == []
         execute(Campaign.open(campaign.folder.root))
-        assert kept.read_bytes() == before
+        assert intact.read_bytes() == before
         again = [path.name for path in campaign.folder.completed("validation")]
         assert again == ["validation_000_a2.mcap"]
-        assert torn.exists(), "nothing is ever overwritten"
+        assert damaged.exists(), "nothing is overwritten"
 
 
 class TestStop:
@@ -242,7 +242,7 @@ def test_what_the_arm_does_after_a_refusal_is_recorded(
 @pytest.mark.parametrize(
     "error", [MemoryError("none left"), ArchiveWriteError(None, "no space left on device")]
 )
-def test_whatever_archiving_meets_the_arm_comes_to_rest(
+def test_the_arm_comes_to_rest_when_archiving_fails(
     arm: Arm, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     write, speeds = ArchiveWriter.write, list[float]()
@@ -298,7 +298,7 @@ def shifted(motion: PiecewiseCubic, joint: int | None, by: float) -> PiecewiseCu
     ],
     ids=["jump", "another arm", "beyond limits", "into the floor", "weak motors"],
 )
-def test_what_can_never_run_becomes_no_folder(
+def test_a_plan_that_can_never_run_becomes_no_folder(
     tmp_path: Path,
     cell: Cell,
     plan: CampaignPlan,
@@ -313,7 +313,7 @@ def test_what_can_never_run_becomes_no_folder(
     assert not list(tmp_path.iterdir())
 
 
-def test_an_older_folder_that_must_not_be_run_is_refused(
+def test_an_older_folder_with_a_collision_is_refused(
     tmp_path: Path, cell: Cell, plan: CampaignPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     raised = written(cell, "floor = 0.0", "floor = 1.0")
@@ -325,11 +325,11 @@ def test_an_older_folder_that_must_not_be_run_is_refused(
     assert not list(campaign.folder.archives.iterdir())
 
 
-def test_only_a_way_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan) -> None:
+def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPlan) -> None:
     low = cell.home + np.array([0.0, 1.6, -1.5, 0.0, 0.0, 0.0])
     intervals = planned_intervals(cell, plan)
-    ways = StraightMoves(cell, MotionChecks.of(cell)).joining(intervals, low)
-    assert [way.from_arm for way in ways if way.kind == "move"] == [True, True]
+    moves = StraightMoves(cell, MotionChecks.of(cell)).joining(intervals, low)
+    assert [one.from_arm for one in moves if one.kind == "move"] == [True, True]
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
     with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
         StraightMoves(cell, buried).joining(intervals, low)
@@ -388,7 +388,7 @@ class TestPlan:
         stored = json.loads(validation.attachments["plan.json"])
         assert stored == {"trajectory": motions.validation[0].trajectory.to_dict()}
 
-    def test_version_2_knew_no_method(self, tmp_path: Path, plan: CampaignPlan) -> None:
+    def test_version_2_without_method_is_read(self, tmp_path: Path, plan: CampaignPlan) -> None:
         """Excitations came from a random search, without condition numbers."""
         path = tmp_path / "plan.json"
         old = json.loads(plan.to_text()) | {"format_version": 2}
@@ -411,7 +411,7 @@ class TestPlan:
             ({"moves": {"format": "other"}}, "is not a campaign plan"),
         ],
     )
-    def test_what_is_none_is_refused(
+    def test_other_content_is_refused(
         self, tmp_path: Path, plan: CampaignPlan, change: dict[str, object], words: str
     ) -> None:
         path = tmp_path / "plan.json"

@@ -1,4 +1,4 @@
-"""A campaign as its document, a script and its folder have it."""
+"""A campaign: commands of its document, its script interface, conduct and status."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
     The search is shorter than the default one.
     """
-    folder, said = tmp_path_factory.mktemp("day"), {}
+    folder, printed = tmp_path_factory.mktemp("day"), {}
     fast_cell(folder)
     (folder / "quick.toml").write_text(QUICK)
     with pytest.MonkeyPatch.context() as here:
@@ -83,11 +83,11 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
             more = ["--settings", "quick.toml"] if arguments[0] == "design" else []
             result = CliRunner().invoke(app, [*arguments, *more])
             assert result.exit_code == 0, (arguments, result.output, result.exception)
-            said[" ".join(arguments)] = result.stdout
-    return said | {"folder": str(folder)}
+            printed[" ".join(arguments)] = result.stdout
+    return printed | {"folder": str(folder)}
 
 
-def test_every_command_of_the_document_does_what_it_says(day: dict[str, str]) -> None:
+def test_every_command_of_the_document_runs(day: dict[str, str]) -> None:
     assert "next: hil rehearse runs/mine" in day["design cell.toml -o runs/mine"]
     assert "passed all" in day["rehearse runs/mine"]
     assert day["run runs/mine --accept-dry-run"].rstrip().splitlines()[-1].startswith("The model")
@@ -113,7 +113,7 @@ def test_the_python_of_the_document_runs_too(
     assert "report done" in capsys.readouterr().out
 
 
-def test_status_names_what_is_torn_rejected_and_next(
+def test_status_names_incomplete_and_rejected_archives(
     day: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(day["folder"])
@@ -124,7 +124,7 @@ def test_status_names_what_is_torn_rejected_and_next(
     assert [step.state for step in status.steps[:3]] == ["done", "next", "blocked"]
     folder = campaign.folder
     for name in ("excitation_000_a1.mcap", "excitation_001_a1.mcap"):
-        (folder.archives / name).write_bytes(b"torn")
+        (folder.archives / name).write_bytes(b"truncated")
     folder.add("excitation_000_a1.mcap", "rejected", "a jam")
     with folder.locked():
         notes = campaign.status().notes
@@ -136,7 +136,7 @@ def test_status_names_what_is_torn_rejected_and_next(
     )
 
 
-def test_a_design_replaces_its_own_campaign_and_never_a_recorded_one(
+def test_a_design_replaces_no_recorded_campaign(
     day: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(day["folder"])
@@ -156,12 +156,9 @@ def test_a_design_replaces_its_own_campaign_and_never_a_recorded_one(
     second = campaign_of_design(root, other, excitation)
     assert (len(first.plan.validation), len(second.plan.validation)) == (1, 2)
     (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "cell.toml").write_text("somebody's")
+    (tmp_path / "own" / "cell.toml").write_text("# other")
     with pytest.raises(CampaignFolderError, match="is not empty"):
         campaign_of_design(tmp_path / "own", cell, excitation)
-
-
-# --- What the process that supervised a run still holds afterwards: it may supervise for days
 
 
 class Impatient(Unattended):
@@ -238,7 +235,7 @@ def test_every_archive_and_what_was_left_out_is_in_the_conduct(ran: Campaign) ->
     assert found.results.conduct == conduct_of(ran.folder)
 
 
-def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolder) -> None:
+def test_rehearsal_dry_run_warm_up_and_rejections_are_reported(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     DryRun(
         folder.plan_hash, 0.2, ("dryrun_000_a1.mcap",), 9.0, True, ("shoulder", "elbow"),
@@ -265,7 +262,7 @@ def test_rehearsal_dry_run_warm_up_and_rejections_are_told(folder: CampaignFolde
     assert (found.recorded[-1].outcome, found.recorded[-1].why) == ("rejected", "it was held")
 
 
-def test_what_is_of_another_plan_or_unreadable_does_not_count(folder: CampaignFolder) -> None:
+def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     folder.cell.write_text(folder.cell.read_text() + "\n# another\n")
     (step,) = (one for one in conduct_of(folder).steps if one.step == "rehearsal")
@@ -285,11 +282,11 @@ def test_what_is_of_another_plan_or_unreadable_does_not_count(folder: CampaignFo
 def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     cell = Cell.load(CELL_PATH)
     assert "recorded_at" not in origin_of(cell)
-    said = origin_of(cell, virtual=False)
-    assert said["simulated"] == "yes"
-    assert datetime.fromisoformat(said["recorded_at"]).tzinfo is not None
-    earlier = {**said, "recorded_at": "2026-03-01T08:00:00+00:00"}
-    assert with_present_date(earlier)["recorded_at"] >= said["recorded_at"]
+    origin = origin_of(cell, virtual=False)
+    assert origin["simulated"] == "yes"
+    assert datetime.fromisoformat(origin["recorded_at"]).tzinfo is not None
+    earlier = {**origin, "recorded_at": "2026-03-01T08:00:00+00:00"}
+    assert with_present_date(earlier)["recorded_at"] >= origin["recorded_at"]
     assert "recorded_at" not in with_present_date({"simulated": "yes"})
     recorded = conduct_of(ran.folder).recorded
     assert when(recorded).startswith("No date")
@@ -300,7 +297,7 @@ def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     assert when(dated).startswith("2026-03-01 08:01 to 10:05 ")
 
 
-def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
+def test_a_motion_is_numbered_from_one_with_its_archive() -> None:
     stopped = MotionFailedError(
         motion_name("excitation", 0), "stopped", "stopped by the operator", None,
         "excitation_000_a1.mcap",
@@ -312,7 +309,7 @@ def test_a_motion_is_named_as_a_person_counts_and_with_its_archive() -> None:
     assert lost.sentence == "dry run 2 was lost: the link went silent"
 
 
-# A campaign as a script has it: what it may be given, what it says of itself, and its bytes.
+# --- a campaign in a script: arguments, status, bytes of its archives
 
 
 @pytest.fixture(scope="module")
@@ -336,9 +333,6 @@ def campaign(tmp_path: Path, planned: Campaign) -> Campaign:
     return Campaign.create(tmp_path / "campaign", planned.cell, planned.plan)
 
 
-# --- what it may be given
-
-
 def test_folders_may_be_text_and_arguments_have_their_names(
     tmp_path: Path, planned: Campaign
 ) -> None:
@@ -357,7 +351,7 @@ def test_folders_may_be_text_and_arguments_have_their_names(
         ({"excitation": 3.0}, "excitation: is an object of type float"),
     ],
 )
-def test_what_is_of_another_type_is_refused_as_a_type_error(
+def test_an_argument_of_another_type_is_a_type_error(
     wrong: dict[str, object], sentence: str, tmp_path: Path, planned: Campaign
 ) -> None:
     given = {"folder": tmp_path / "c", "cell": planned.cell, "excitation": planned.plan, **wrong}
@@ -416,19 +410,17 @@ def checksums(campaign: Campaign) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in archives}
 
 
-def test_one_seed_gives_the_same_bytes_whatever_the_folder_is_called(
-    tmp_path: Path, done: Campaign
-) -> None:
+def test_one_seed_gives_the_same_bytes_in_any_folder(tmp_path: Path, done: Campaign) -> None:
     again = Campaign.create(tmp_path / "another name", done.cell, done.plan)
     again.run(unrehearsed=True, durable=False)
     assert checksums(again) == checksums(done)
     assert len(checksums(done)) >= 4
 
 
-# --- ways
+# --- moves
 
 
-def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(planned: Campaign) -> None:
+def test_an_arm_at_its_limit_by_rounding_may_leave_it(planned: Campaign) -> None:
     cell, limits = planned.cell, planned.cell.joint_limits
     start = limits.lower - 4e-7 * (limits.upper - limits.lower)
     assert np.array_equal(at_limit(start, limits), limits.lower)
@@ -440,9 +432,9 @@ def test_an_arm_that_rounding_takes_across_its_limit_may_leave_it(planned: Campa
     assert np.abs(first - start).max() < 1e-3
 
 
-@pytest.mark.parametrize("plan_way", [straight_move, plan_move])
-def test_an_arm_beyond_its_limit_is_told_so_in_degrees(
-    plan_way: Callable[..., object], planned: Campaign
+@pytest.mark.parametrize("plan_of_move", [straight_move, plan_move])
+def test_an_arm_beyond_its_limit_is_reported_in_degrees(
+    plan_of_move: Callable[..., object], planned: Campaign
 ) -> None:
     cell, start = planned.cell, planned.cell.joint_limits.lower.copy()
     start[1] -= np.radians(0.5)
@@ -450,7 +442,7 @@ def test_an_arm_beyond_its_limit_is_told_so_in_degrees(
     with pytest.raises(
         MotionRefusedError, match=f"elbow stands at {elbow:.6g}°, its limits are .*jog the arm"
     ):
-        plan_way(cell, start, cell.home)
+        plan_of_move(cell, start, cell.home)
 
 
 # --- status
@@ -479,7 +471,7 @@ def test_a_status_asks_for_gates_as_the_run_does(done: Campaign, campaign: Campa
 def test_status_never_names_itself_where_a_file_is_damaged(
     name: str, command: str, campaign: Campaign, done: Campaign
 ) -> None:
-    """Following it leads to an end: to the step's own command, or to a sentence for a person."""
+    """The next command is that of the step, or none with a sentence."""
     folder = campaign.folder
     for entry in done.folder.manifest():
         (folder.archives / entry.name).write_bytes((done.folder.archives / entry.name).read_bytes())
@@ -493,14 +485,14 @@ def test_status_never_names_itself_where_a_file_is_damaged(
     assert name in stuck.sentence or command
 
 
-def test_a_torn_archive_that_was_replaced_is_nothing_to_run_again(
+def test_an_incomplete_archive_that_was_replaced_is_not_needed(
     campaign: Campaign, done: Campaign
 ) -> None:
-    whole = done.folder.completed("excitation")[0]
+    complete = done.folder.completed("excitation")[0]
     folder = campaign.folder
-    (folder.archives / "excitation_000_a1.mcap").write_bytes(b"torn")
-    (folder.archives / "move_000_a1.mcap").write_bytes(b"torn")
-    (folder.archives / "excitation_000_a2.mcap").write_bytes(whole.read_bytes())
+    (folder.archives / "excitation_000_a1.mcap").write_bytes(b"truncated")
+    (folder.archives / "move_000_a1.mcap").write_bytes(b"truncated")
+    (folder.archives / "excitation_000_a2.mcap").write_bytes(complete.read_bytes())
     folder.add("excitation_000_a2.mcap", "completed")
     assert campaign.status().notes == (
         "excitation_000_a1.mcap was left by a run that was killed; it is not needed",

@@ -63,10 +63,10 @@ def test_the_quick_search_keeps_the_cell_and_begins_and_ends_at_home(
     assert np.isfinite(excitation.criteria.fitness)
 
 
-def test_motions_are_planned_with_the_share_of_the_currents_that_a_rehearsal_allows(
+def test_motions_are_planned_within_a_share_of_the_currents(
     tmp_path: Path,
 ) -> None:
-    """Motors are weakened until a plan that knows no share would be at 90 % of their limits."""
+    """Motors are weakened until a plan without that share would reach 90 % of their limits."""
     cell = fast_cell(tmp_path)
     strong = design(cell, Silent())
     worst = max(_largest_shares(cell, strong))
@@ -91,7 +91,7 @@ def _largest_shares(cell: Cell, plan: CampaignPlan) -> list[float]:
     ]
 
 
-def test_a_plan_tells_the_criteria_of_the_motion_by_itself(tiny: Cell, plan: CampaignPlan) -> None:
+def test_a_plan_states_the_criteria_of_its_motion_alone(tiny: Cell, plan: CampaignPlan) -> None:
     """Whatever a design was judged by: some parameters, or what it adds to earlier archives."""
     foreign = replace(plan.excitation.criteria, log10_det=1.0, coupling_index=1.0)
     again = plan_around(tiny, replace(plan.excitation, criteria=foreign))
@@ -139,7 +139,7 @@ def test_the_demo_runs_a_design_and_identifies_from_its_archives(
     assert results["n_via"] == (None if method == "a" else 6)
 
 
-def test_a_design_that_cannot_be_read_is_named_before_anything_is_made(tmp_path: Path) -> None:
+def test_a_design_that_cannot_be_read_is_named_first(tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     done = demo(folder, "--excitation", str(CELL_PATH), "--quiet")
     assert done.returncode == 2
@@ -200,7 +200,7 @@ def found(finished: Campaign) -> Identification:
     return identify_campaign(finished.folder.root, Silent())
 
 
-def test_the_arm_is_taken_to_where_the_sines_begin_and_home_again(finished: Campaign) -> None:
+def test_the_arm_moves_to_the_start_of_the_sines_and_home(finished: Campaign) -> None:
     names = [ArchiveName.parse(entry.name) for entry in finished.folder.manifest()]
     done = [(name.kind, name.index) for name in names if name is not None]
     assert done == [
@@ -278,7 +278,7 @@ def test_motions_out_of_bounds_are_refused(
 
 @pytest.mark.parametrize("ramp", [1e-9, 1e-6, 1e-4, 1e-3, 3e-3, 0.02, 0.1])
 @pytest.mark.parametrize("size", [1e-9, 1e-5, 0.01])
-def test_short_ramps_are_told_in_no_time(quick: Cell, ramp: float, size: float) -> None:
+def test_short_ramps_are_checked_within_seconds(quick: Cell, ramp: float, size: float) -> None:
     series = FourierSeries(
         quick.home, np.full((6, 1), size), np.full((6, 1), np.pi), length=5.0, ramp=ramp
     )
@@ -318,7 +318,7 @@ def test_the_demo_runs_over_a_real_link_and_its_model_is_good(tmp_path: Path, li
         assert archive.outcome.entries["records_lost"] == "0"
 
 
-def test_a_simulated_controller_that_fails_says_why() -> None:
+def test_a_simulated_controller_that_fails_gives_its_reason() -> None:
     simulator = SimulatorProcess.start(CELL_PATH, "--udp", "127.0.0.1:1", "--fault", "rain@10")
     try:
         assert simulator.process.wait(60) == 2
@@ -328,7 +328,7 @@ def test_a_simulated_controller_that_fails_says_why() -> None:
         simulator.end()
 
 
-# --- `hil demo --excitation`: what may not run removes nothing, and what a design lacks is said
+# --- `hil demo --excitation`
 
 
 @pytest.fixture
@@ -337,7 +337,7 @@ def wild(cell: Cell) -> Excitation:
     return Excitation(series, UNKNOWN, method="a", seed=7, tried=1, rejected={})
 
 
-def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
+def test_an_earlier_campaign_is_not_removed_for_a_bad_motion(
     tmp_path: Path, wild: Excitation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever an earlier one left, with the files that identification writes for other tools."""
@@ -358,7 +358,7 @@ def test_an_earlier_campaign_is_not_removed_for_a_motion_that_may_not_run(
         ({"current": False}, False, ("motor currents not checked", "interrupted")),
     ],
 )
-def test_what_a_design_was_searched_without_is_said(
+def test_checks_that_a_design_left_out_are_printed(
     cell: Cell,
     wild: Excitation,
     monkeypatch: pytest.MonkeyPatch,
@@ -378,9 +378,9 @@ def test_what_a_design_was_searched_without_is_said(
     monkeypatch.setattr(
         demo_module, "DesignResult", SimpleNamespace(load=lambda path: result), raising=True
     )
-    said: list[str] = []
-    reporter = SimpleNamespace(say=said.append)
+    printed: list[str] = []
+    reporter = SimpleNamespace(say=printed.append)
     demo_module._designed(Path("x"), cell, reporter)
-    assert len(said) == bool(words)
+    assert len(printed) == bool(words)
     for word in words:
-        assert word in said[0]
+        assert word in printed[0]

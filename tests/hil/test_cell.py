@@ -1,4 +1,4 @@
-"""A cell file is checked once; every complaint names file, field, value and remedy."""
+"""A cell file is checked once; every error names file, field, value and remedy."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def edited(folder: Path, *edits: tuple[str, str]) -> Path:
     return path
 
 
-def complaint(folder: Path, *edits: tuple[str, str]) -> str:
+def error_of(folder: Path, *edits: tuple[str, str]) -> str:
     """What a cell file gets in which the first match of each regex was replaced."""
     path = edited(folder, *edits)
     with pytest.raises(CellError) as caught:
@@ -163,7 +163,7 @@ FAULTS = [
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault[2])
 def test_a_bad_field_gets_a_sentence(folder: Path, fault: tuple[str, ...]) -> None:
     old, new, *words = fault
-    sentence = complaint(folder, (old, new))
+    sentence = error_of(folder, (old, new))
     for word in words:
         assert word in sentence
 
@@ -181,10 +181,10 @@ def test_radians_where_degrees_belong_are_guessed(
     """A narrow range in degrees is none, unless the home posture leaves it."""
     limits = {field: np.radians(getattr(ns16.file.limits, field)).round(4) for field in fields}
     edits = [(rf"^{field} = .*", f"{field} = {limits[field].tolist()}") for field in fields]
-    assert f"has the {words}" in complaint(folder, *edits)
+    assert f"has the {words}" in error_of(folder, *edits)
     (folder / "cell.toml").write_text(ns16.text)
     loaded(folder, (r"^velocity_deg = .*", "velocity_deg = [3, 3, 3, 3, 3, 3]"))
-    assert "which are at most 3°; are they in rad? 1 rad is 57.2958°" in complaint(
+    assert "which are at most 3°; are they in rad? 1 rad is 57.2958°" in error_of(
         folder,
         (r"^lower_deg = .*", "lower_deg = [-3, -0.8, -2.9, -3, -2, -3]"),
         (r"^upper_deg = .*", "upper_deg = [3.0, 1.6, 1.9, 3.0, 2.0, 3.0]"),
@@ -204,7 +204,7 @@ def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folde
     urdf = folder / "ns16.urdf"
     again = '<transmission name="t"><joint name="joint_2"/></transmission></robot>'
     urdf.write_text(urdf.read_text("utf-8").replace("</robot>", again), "utf-8")
-    assert "exceeds the" in complaint(
+    assert "exceeds the" in error_of(
         folder, (r"^upper_deg = \[180.0, 95.0", "upper_deg = [180.0, 165.0")
     )
 
@@ -289,7 +289,7 @@ def test_a_sliding_joint_is_refused_by_name_where_degrees_are_given(folder: Path
     sliding = re.sub(r'(name="joint_3"\s+type=)"revolute"', r'\1"prismatic"', text)
     assert sliding != text
     (folder / "ns16.urdf").write_text(sliding, "utf-8")
-    sentence = complaint(folder, ("^margin = 0.05", "margin = 0.04"))
+    sentence = error_of(folder, ("^margin = 0.05", "margin = 0.04"))
     for words in ("cell.toml: limits: is in degrees", "joint_3 is prismatic", 'type = "fixed"'):
         assert words in sentence
     (folder / "cell.toml").write_text('[cell]\nname = "x"\nurdf = "ns16.urdf"\n', "utf-8")
@@ -300,7 +300,7 @@ def test_a_joint_may_have_friction_of_its_own(folder: Path) -> None:
     own = '[robot.friction.joints.joint_5]\nthird = "none"\nstribeck = 0.1\nzone = "linear"'
     laws = loaded(folder, ("$", own)).model.friction.laws
     assert (laws[4].symbols, laws[4].stribeck) == (("f0", "f1", "fs"), 0.1)
-    # What is not said there is what holds for all.
+    # Other fields are those of all joints.
     assert laws[4].standstill == laws[0].standstill
     assert laws[0].symbols == ("f0", "f1", "f2")
 
@@ -416,7 +416,7 @@ def test_the_document_and_the_schema_name_the_same_fields_and_defaults() -> None
 
 @pytest.fixture
 def ur10(tmp_path: Path) -> Path:
-    """The cell file of the worked example beside its URDF; meshes are where it says."""
+    """The cell file of the worked example beside its URDF and meshes."""
     try:
         package = metadata.distribution("example-robot-data")
     except metadata.PackageNotFoundError:

@@ -42,7 +42,7 @@ from tests.hil.fast_cell import fast_cell
 from tests.hil.test_supervision import spec as spec_of
 
 PATIENT = ("--patience", "2")
-"""A test asks what happens, not how fast: the controller waits where this machine pauses."""
+"""The controller waits while this computer pauses."""
 
 
 def on_loopback(cell: Cell, **changes: float) -> Cell:
@@ -57,7 +57,7 @@ def campaign_of(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
     return Campaign.create(folder, short, CampaignPlan(plan.excitation, plan.validation[:1]))
 
 
-def test_a_campaign_over_real_sockets_leaves_whole_gap_free_archives(tmp_path: Path) -> None:
+def test_a_campaign_over_sockets_leaves_gap_free_archives(tmp_path: Path) -> None:
     fast = fast_cell(tmp_path)
     campaign = campaign_of(tmp_path / "campaign", on_loopback(fast), design(fast, Silent()))
     with loopback_link(campaign.cell, options=PATIENT) as link:
@@ -108,7 +108,7 @@ def test_a_real_controller_is_not_driven_without_a_rehearsal(
     assert not list(campaign.folder.archives.iterdir())
 
 
-def test_each_difference_of_the_init_packet_is_named_before_anything_moves(
+def test_each_difference_of_the_init_packet_is_named(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
     wrong = on_loopback(cell, k65=0.045, k54=0.02)
@@ -138,14 +138,14 @@ def test_an_archive_that_cannot_be_created_moves_nothing(
 
 
 def test_a_port_in_use_is_named(cell: Cell) -> None:
-    with taken_port() as port:
+    with port_in_use() as port:
         local = on_loopback(cell).with_link(port=port)
         with pytest.raises(ControllerFault, match=str(port)):
             LiveLink.open(local)
 
 
 @contextmanager
-def taken_port() -> Iterator[int]:
+def port_in_use() -> Iterator[int]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         yield other.getsockname()[1]
@@ -154,8 +154,7 @@ def taken_port() -> Iterator[int]:
 def test_a_refusal_comes_with_its_flight_recorder(
     tmp_path: Path, cell: Cell, plan: CampaignPlan
 ) -> None:
-    # So slow a way to the first posture, and the fault so late, that it strikes on that way even
-    # where a loaded computer takes seconds to begin.
+    # The first move is so slow that the fault occurs during it on a loaded computer too.
     slow = cell.with_values({"campaign.approach_speed": 0.01})
     campaign = campaign_of(tmp_path / "refused", on_loopback(slow), plan)
     fault = ("--fault", "following-error@5000x1000:axis=2:slip")
@@ -173,11 +172,8 @@ def test_a_refusal_comes_with_its_flight_recorder(
     assert recorder["cycle"][-1] in archive.columns["cycle"]
 
 
-# --- A motion on a real link that is watched, steered and looked at by a viewer from elsewhere
-
-
-class Person:
-    """Slows the motion, holds it, has it go on, holds it again and stops it there."""
+class Operator:
+    """Slows the motion, holds it, releases it, holds it again and stops it there."""
 
     def __init__(self, stop: Stop) -> None:
         self.seen: list[MotionProgress] = []
@@ -194,9 +190,7 @@ class Person:
         return OperatorRequest(0.5 if time > 0.2 else 1.0, held=first or second)
 
 
-def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
-    cell: Cell, tmp_path: Path
-) -> None:
+def test_a_motion_is_slowed_held_and_stopped_with_a_viewer(cell: Cell, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
     pytest.importorskip("websockets", reason="websockets is not installed")
     from tests.hil.live_viewer import Viewer
@@ -211,7 +205,7 @@ def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
         motion = plan_moves(where, moves, cell.joint_limits).trajectory
         player = player_of(cell, motion)
         spec = spec_of(cell, path)
-        person = Person(stop)
+        person = Operator(stop)
         with Viewer(link.live.port) as viewer:
             viewer.subscribe("/hil/cycle", "/hil/events")
             ended = link.run(player, spec, stop, override=0.7, watch=person)
@@ -225,7 +219,7 @@ def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
     assert ended.outcome == "stopped"
     archive = open_archive(path)
     assert archive.complete
-    require_seen(person.seen)
+    require_shown(person.seen)
 
     # What the viewer saw is what the archive has, in those cycles that both have.
     columns = archive.columns
@@ -247,8 +241,8 @@ def test_a_motion_is_slowed_held_and_stopped_in_a_hold_while_a_viewer_looks(
         assert np.abs(planned - point).max(axis=1).min() < 2e-4
 
 
-def require_seen(seen: list[MotionProgress]) -> None:
-    """All that a person is to see of such a motion."""
+def require_shown(seen: list[MotionProgress]) -> None:
+    """Check what the operator is shown of such a motion."""
     assert {progress.override for progress in seen} == {0.7, 0.5}
     moving = [progress for progress in seen if progress.state is State.OPEN]
     times = [progress.motion_time for progress in moving if progress.motion_time is not None]
@@ -261,12 +255,12 @@ def require_seen(seen: list[MotionProgress]) -> None:
     assert last.cycles > 500
     assert 0.0 < last.latency.median <= last.latency.p99 <= last.latency.worst
     assert 0.0 < last.current_share.max() < 1.0
-    told = {event for progress in seen for event in progress.events}
-    assert any("first set-point" in event for event in told)  # later ones take its place
+    texts = {event for progress in seen for event in progress.events}
+    assert any("first set-point" in event for event in texts)  # later ones take its place
 
 
 class Pressed:
-    """Wishes what it is set to."""
+    """Requests what it is set to."""
 
     def __init__(self) -> None:
         self.now = OperatorRequest()
@@ -277,7 +271,7 @@ class Pressed:
         return self.now
 
 
-def test_what_is_pressed_before_a_motion_begins_comes_in_time(
+def test_a_request_before_a_motion_begins_is_applied(
     cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stop or hold while the archive is created, hold while the motion is handed over."""
@@ -325,14 +319,13 @@ def test_what_is_pressed_before_a_motion_begins_comes_in_time(
             assert "MotionStarted" not in [event.name for event in archive.events]
 
         monkeypatch.undo()
-        link.view.inits += 1  # as by another init packet, whose limits nobody has seen
+        link.view.inits += 1  # another init packet, whose limits were not checked
         player = player_of(cell, motion)
-        path = tmp_path / "anew.mcap"
+        path = tmp_path / "next.mcap"
         spec = spec_of(cell, path)
         with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
             link.run(player, spec, Stop())
-        told = open_archive(path).outcome
-        assert told.outcome == "void"
+        assert open_archive(path).outcome.outcome == "void"
 
 
 @pytest.mark.parametrize(
@@ -354,14 +347,14 @@ def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:
         assert not link.only_simulated
 
 
-def test_a_live_view_that_cannot_be_served_is_refused_before_anything_moves(cell: Cell) -> None:
+def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell) -> None:
     pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
     cell = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1", port=free_port())
     with pytest.raises(LiveViewError, match="name an address of this computer"):
         LiveLink.open(cell, live=LiveView("192.0.2.1", 8765))
 
 
-def test_a_live_view_that_is_no_address_is_refused_by_the_command(tmp_path: Path) -> None:
+def test_a_live_view_without_an_address_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")
     assert not list(tmp_path.iterdir())

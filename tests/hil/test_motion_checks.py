@@ -1,4 +1,4 @@
-"""What a motion may not break: told in the angles of the cell's own limits; torque like current."""
+"""Limits of motions: messages in the angles of the cell file; torque, current, collision."""
 
 from __future__ import annotations
 
@@ -58,18 +58,20 @@ def cell() -> Cell:
 
 
 def test_postures_are_in_the_angles_of_the_teach_pendant(cell: Cell) -> None:
-    told = AngleFrame.of(cell).text_of_angles(cell.home)
-    assert told == "J1 0.0, J2 0.0, J3 -90.0, J4 0.0, J5 90.0, J6 0.0 deg, teach pendant angles"
-    plain = AngleFrame("urdf", np.ones(2), np.zeros(2))
-    assert plain.text_of_angles((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
+    text = AngleFrame.of(cell).text_of_angles(cell.home)
+    assert text == "J1 0.0, J2 0.0, J3 -90.0, J4 0.0, J5 90.0, J6 0.0 deg, teach pendant angles"
+    frame = AngleFrame("urdf", np.ones(2), np.zeros(2))
+    assert frame.text_of_angles((0.5, -1.0)) == "J1 28.6, J2 -57.3 deg, angles of the URDF"
     high = cell.text.replace("floor = 0.0", "floor = 1.0")
     raised = Cell.from_texts(high, cell.urdf, cell.path)
-    with pytest.raises(NoExcitationError, match=r"J3 -90\.0, .* deg, teach pendant angles") as told:
+    with pytest.raises(
+        NoExcitationError, match=r"J3 -90\.0, .* deg, teach pendant angles"
+    ) as refused:
         problem_of(raised, preset("b"))
-    assert " rad" not in str(told.value)
+    assert " rad" not in str(refused.value)
 
 
-def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
+def test_a_joint_limit_is_in_the_angles_of_the_file(cell: Cell) -> None:
     frame, limits = AngleFrame.of(cell), cell.joint_limits
     # joint_sign of J3 is -1: the URDF's upper limit is the file's lower one, -170 deg.
     beyond = limits.upper.copy()
@@ -82,11 +84,11 @@ def test_a_joint_limit_is_told_in_the_angles_of_the_file(cell: Cell) -> None:
     assert "J3 -175.0" in text
     fast = Violation("joint limit", "velocity of joint 1", 3.0, np.radians(155.0), 0.5)
     assert "velocity of J2: 171.9 deg/s, must be at most 155 deg/s" in violation_text(fast, frame)
-    # A rate is told as its size, also of J3, which the teach pendant counts the other way round.
+    # A rate is positive for J3 too, whose sign is reversed on the teach pendant.
     assert frame.sign[2] == -1.0
     backwards = Violation("joint limit", "velocity of joint 2", 6.9726, np.radians(155.0), 0.5)
-    told = violation_text(backwards, frame)
-    assert "velocity of J3: 399.5 deg/s, must be at most 155 deg/s" in told
+    text = violation_text(backwards, frame)
+    assert "velocity of J3: 399.5 deg/s, must be at most 155 deg/s" in text
     assert str(fast) == "joint limit of velocity of joint 1: 3, must be at most 2.705, at 0.500 s"
 
 
@@ -102,7 +104,7 @@ def test_advice_on_a_margin_is_for_what_no_posture_parts(cell: Cell) -> None:
         wrist(BALL.format(radius=0.1), "", BALL.format(radius=0.437)),
         Workspace(floor=None, margin=0.0),
     )
-    assert deep.pairs == ()  # left out, and told as built in
+    assert deep.pairs == ()  # left out: always in contact
     assert always_so(contact, deep) is None
     checker = collision_checker(cell)
     contact = Violation("collision", "link_5 and floor", -0.1, 0.05, None, tuple(cell.home))
@@ -147,7 +149,7 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     assert collision_checker(moved).pairs == collision_checker(found).pairs
 
 
-def test_validation_motions_that_nothing_allows_are_told_in_these_angles(
+def test_infeasible_validation_motions_are_in_these_angles(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     contact = Violation("collision", "link_2 and floor", 0.01, 0.05, 2.0, tuple(cell.home))
@@ -193,19 +195,19 @@ def test_what_is_no_limit_is_refused(cell: Cell, torque: list[float], words: lis
 
 
 @pytest.mark.parametrize(("share", "refused"), [(1.02, False), (0.98, True)])
-def test_standing_at_home_is_refused_where_gravity_is_beyond_the_limit(
+def test_home_is_refused_where_gravity_is_beyond_the_limit(
     cell: Cell, share: float, refused: bool
 ) -> None:
     torque = [1e4] * 6
     torque[HELD] = share * held_torque(cell)
-    told = MotionChecks.of(limited(cell, torque)).refusal(hold(cell.home, 1.0))
-    assert (told is not None) == refused
-    if told is not None:
-        assert told.startswith("torque of joint_3: ")
-        assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in told
+    refusal = MotionChecks.of(limited(cell, torque)).refusal(hold(cell.home, 1.0))
+    assert (refusal is not None) == refused
+    if refusal is not None:
+        assert refusal.startswith("torque of joint_3: ")
+        assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in refusal
 
 
-def test_a_design_keeps_the_limit_too(cell: Cell) -> None:
+def test_a_design_satisfies_the_limit_too(cell: Cell) -> None:
     torque = [1e4] * 6
     torque[HELD] = 0.5 * held_torque(cell)
     with pytest.raises(NoExcitationError, match=r"torque of joint_3: .* N·m"):
@@ -224,11 +226,11 @@ def test_a_known_payload_counts_in_what_gravity_demands(cell: Cell) -> None:
     model.appendBodyToJoint(model.njoints - 1, body, pin.SE3.Identity())
     gravity = pin.computeGeneralizedGravity(model, model.createData(), cell.home)
     still = np.zeros((1, 6))
-    standing = Motion(np.zeros(1), cell.home[np.newaxis], still, still)
-    torque = MotionChecks.of(laden).currents.torque(standing)[0]
+    at_rest = Motion(np.zeros(1), cell.home[np.newaxis], still, still)
+    torque = MotionChecks.of(laden).currents.torque(at_rest)[0]
     # The NS 16's model has no offset: at standstill there is nothing but gravity.
     np.testing.assert_allclose(
         torque, (1.0 + cell.nominal.uncertainty) * gravity, rtol=1e-9, atol=1e-9
     )
-    bare = MotionChecks.of(cell).currents.torque(standing)[0]
+    bare = MotionChecks.of(cell).currents.torque(at_rest)[0]
     assert abs(torque[HELD] - bare[HELD]) > 50.0

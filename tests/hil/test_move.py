@@ -127,15 +127,13 @@ def test_where_the_arm_is_already_nothing_is_sent(tmp_path: Path) -> None:
         ("0,95,-170,0,60,0", r"collision of link_1 and link_6"),
     ],
 )
-def test_a_way_that_may_not_be_gone_is_refused_before_anything_is_sent(
-    target: str, reason: str, ns16: Cell
-) -> None:
+def test_an_infeasible_move_is_refused(target: str, reason: str, ns16: Cell) -> None:
     with pytest.raises(MotionRefusedError, match=reason):
         plan_move(ns16, ns16.initial, posture(ns16, target))
 
 
-def test_the_way_itself_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
-    """Between two free postures a wall stands in the way."""
+def test_the_path_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
+    """A wall between two free postures."""
     text = ns16.text.replace(
         "walls = []", "walls = [{ lower = [0.9, -0.1, 0.0], upper = [1.6, 0.1, 1.8] }]"
     )
@@ -162,7 +160,7 @@ def test_one_target_of_six_angles_is_asked_for(arguments: list[str]) -> None:
         assert "one target is needed" in str(result.exception)
 
 
-def test_a_real_controller_is_not_driven_unless_a_person_confirms(
+def test_a_real_controller_is_not_driven_without_confirmation(
     ns16: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The link is declared real; the controller is still simulated."""
@@ -178,7 +176,7 @@ def test_a_real_controller_is_not_driven_unless_a_person_confirms(
     assert not (tmp_path / "m").exists()  # nothing moves without an archive
 
 
-def test_nothing_is_connected_while_a_run_is_at_work_on_the_campaign(
+def test_nothing_is_connected_during_a_run_of_the_campaign(
     campaign: Campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "campaign"
@@ -192,7 +190,7 @@ def test_nothing_is_connected_while_a_run_is_at_work_on_the_campaign(
 
 
 @pytest.mark.parametrize("answer", ["n\n", "\x03"], ids=["no", "Ctrl-C"])
-def test_on_a_terminal_the_way_is_shown_and_no_means_no(tmp_path: Path, answer: str) -> None:
+def test_on_a_terminal_a_move_is_shown_and_can_be_declined(tmp_path: Path, answer: str) -> None:
     with on_terminal("-m", "hil", "move", CELL_PATH, "--to", "home", "-o", tmp_path) as end:
         end.await_seen(b"[y/N]")
         # Pressed in the moment between question and reading, Python forgets it: pressed again.

@@ -55,7 +55,7 @@ def recording_of(
 
 
 def after(cycles: int) -> dict[str, Any]:
-    """A person who ends the recording after so many cycles."""
+    """An operator who ends the recording after so many cycles."""
     stop = Stop()
 
     def enough(progress: Progress) -> None:
@@ -100,7 +100,7 @@ def test_every_cycle_is_archived_with_its_source(recorded: Path) -> None:
     assert coverage.within_3 >= 0.9 * coverage.total
 
 
-def test_recordings_are_numbered_and_know_their_kind(tmp_path: Path, cell: Cell) -> None:
+def test_recordings_are_numbered_and_have_their_kind(tmp_path: Path, cell: Cell) -> None:
     first = archive_path(tmp_path / "records", "validation")
     assert first.name == "validation_000_a1.mcap"
     first.touch()
@@ -131,9 +131,7 @@ def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> N
     assert archive.outcome.entries["lost_packets"] == "1"
 
 
-def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
-    tmp_path: Path, cell: Cell
-) -> None:
+def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: Cell) -> None:
     """One packet of mode 3: cause, axis and remedy stand on one line and in the archive."""
     link = own_motion_link(cell, Corrupt(600, offset=12, mask=3))
     lines: list[str] = []
@@ -152,9 +150,7 @@ def test_a_refusal_is_shown_at_once_and_ends_the_recording_as_refused(
     ]
 
 
-def test_a_controller_of_another_arm_is_not_recorded_unless_its_figures_are_accepted(
-    tmp_path: Path, cell: Cell
-) -> None:
+def test_a_controller_of_another_arm_is_recorded_if_accepted(tmp_path: Path, cell: Cell) -> None:
     wrong = Cell.from_texts(cell.text.replace("k65 = 0.035", "k65 = 0.045"), cell.urdf, cell.path)
     settings = replace(controller_settings(cell), own_motion=own_postures(cell))
 
@@ -206,7 +202,7 @@ def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
     return tmp_path / "cell.toml", port
 
 
-def until_heard(recorder: subprocess.Popen[str]) -> str:
+def line_on_packets(recorder: subprocess.Popen[str]) -> str:
     """The line on the packets received; notes on what the system refused come before it."""
     assert recorder.stdout is not None
     return next(line for line in recorder.stdout if "packets from" in line)
@@ -240,7 +236,7 @@ def wait_until_recorded(archive: Path, recorder: subprocess.Popen[str], cycles: 
         time.sleep(0.1)
 
 
-def test_after_a_recording_a_moving_arm_is_answered_until_the_session_ends(
+def test_a_moving_arm_is_replied_to_until_the_session_ends(
     on_udp: tuple[Path, int],
 ) -> None:
     path, port = on_udp
@@ -367,14 +363,14 @@ def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
     assert open_archive(archive).n_samples > 500
 
 
-def test_a_controller_that_never_comes_is_waited_for_as_long_as_was_asked(
+def test_a_missing_controller_is_waited_for_as_stated(
     on_udp: tuple[Path, int],
 ) -> None:
     path, _ = on_udp
     with recorder_of(path, "--wait", "0.5") as recorder:
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
-    assert "nothing heard from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
+    assert "nothing received from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
 
 
 def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Path, int]) -> None:
@@ -383,7 +379,9 @@ def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Pat
         record_command(CELL_PATH, output=path.parent / "a.mcap")
     with recorder_of(path) as recorder:
         assert "waiting for the controller" in recorder.stdout.readline()
-        assert "no packet from 127.0.0.1 (0 packets from other addresses)" in until_heard(recorder)
+        assert "no packet from 127.0.0.1 (0 packets from other addresses)" in line_on_packets(
+            recorder
+        )
         recorder.send_signal(signal.SIGINT)
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 130

@@ -89,7 +89,7 @@ def test_only_another_number_of_repetitions_needs_no_rehearsal(
         require_rehearsed(folder)
 
 
-def test_exactly_the_plan_is_run_noisy_and_with_a_faulty_link(designed: Campaign) -> None:
+def test_the_plan_is_run_with_noise_and_a_faulty_link(designed: Campaign) -> None:
     twin = Campaign.open(designed.folder.rehearsed / "plain")
     assert twin.plan.to_text() == designed.plan.to_text()
     assert len(twin.folder.completed("excitation")) == 3
@@ -100,7 +100,7 @@ def test_exactly_the_plan_is_run_noisy_and_with_a_faulty_link(designed: Campaign
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_what_is_planted_lies_within_a_tenth_of_the_nominal(designed: Campaign, seed: int) -> None:
+def test_simulated_parameters_are_within_a_tenth_of_nominal(designed: Campaign, seed: int) -> None:
     twin = Twin.of(designed.cell, seed=seed, repetitions=3)
     nominal = designed.cell.nominal_values()
     known = nominal != 0.0
@@ -116,8 +116,8 @@ def test_what_is_planted_lies_within_a_tenth_of_the_nominal(designed: Campaign, 
 def moving(designed: Campaign, degrees: tuple[float, float], speed: float) -> CampaignPlan:
     """A plan whose excitation goes to a posture and back."""
     cell, home = designed.cell, designed.cell.home
-    ways = (Move(home + np.radians(degrees), speed=speed), Move(home, speed=speed))
-    trajectory = plan_moves(home, ways, cell.joint_limits).trajectory
+    moves = (Move(home + np.radians(degrees), speed=speed), Move(home, speed=speed))
+    trajectory = plan_moves(home, moves, cell.joint_limits).trajectory
     excitation = replace(designed.plan.excitation, trajectory=trajectory)
     return replace(designed.plan, excitation=excitation, moves=None)
 
@@ -135,7 +135,7 @@ def moving(designed: Campaign, degrees: tuple[float, float], speed: float) -> Ca
         ("current_limit = [20.0, 12.0]", "nearly too weak"),
     ],
 )
-def test_what_is_wrong_fails(
+def test_a_wrong_cell_or_plan_fails(
     tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
 ) -> None:
     """The simulated arm shares no conversion with the PC, so that a sign cannot cancel."""
@@ -184,7 +184,7 @@ def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(
     assert campaign.cell.controller.transport == "udp"
 
 
-def test_what_was_planted_is_in_a_report_of_the_archives(
+def test_a_report_of_the_archives_has_the_true_parameters(
     designed: Campaign,
 ) -> None:
     found = identify_campaign(designed.folder.rehearsed / "plain", Silent())
@@ -197,10 +197,10 @@ class StopsAfter:
     """A reporter that asks for a stop as soon as something was recorded."""
 
     def __init__(self, stop: Stop) -> None:
-        self.stop, self.said = stop, list[str]()
+        self.stop, self.printed = stop, list[str]()
 
     def say(self, text: str) -> None:
-        self.said.append(text)
+        self.printed.append(text)
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
@@ -221,11 +221,11 @@ def test_a_stopped_rehearsal_resumes_and_a_passed_one_stays(
     with pytest.raises(OperatorStopError, match="rehearse again to resume it"):
         campaign.rehearse(stop=stop, reporter=StopsAfter(stop))
     assert Rehearsal.load(campaign.folder) is None
-    plain = CampaignFolder(campaign.folder.rehearsed / "plain")
-    before = {entry.name: entry.sha256 for entry in plain.manifest()}
+    unmodified = CampaignFolder(campaign.folder.rehearsed / "plain")
+    before = {entry.name: entry.sha256 for entry in unmodified.manifest()}
     assert before
     assert campaign.rehearse().passed
-    after = {entry.name: entry.sha256 for entry in plain.manifest()}
+    after = {entry.name: entry.sha256 for entry in unmodified.manifest()}
     assert before.items() <= after.items()
     written = campaign.folder.rehearsal.stat().st_mtime_ns
     assert campaign.rehearse().passed
@@ -242,9 +242,9 @@ def test_the_command_is_the_method_with_exit_codes(designed: Campaign, tmp_path:
     Campaign.create(tmp_path / "campaign", cell, designed.plan)
     bad = runner.invoke(app, ["rehearse", str(tmp_path / "campaign"), "--json"])
     assert bad.exit_code == 5
-    said = json.loads(bad.stdout)
-    assert not said["passed"]
-    assert "gear ratio" in said["criteria"][0]["sentence"]
+    printed = json.loads(bad.stdout)
+    assert not printed["passed"]
+    assert "gear ratio" in printed["criteria"][0]["sentence"]
 
 
 # --- A rehearsal of an arm with seven joints, two of whose main axes are almost parallel
@@ -255,7 +255,7 @@ FOUR, THREE = [2.0] * 4, [1.0] * 3
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
-    """The Panda, as `hil new` writes it, with the figures that nobody published."""
+    """The Panda as `hil new` writes it, with assumed unpublished values."""
     path = tmp_path_factory.mktemp("seven") / "cell.toml"
     urdf = described_robot("panda_description/urdf/panda.urdf")
     CliRunner().invoke(app, ["new", "--urdf", str(urdf), "-o", str(path)], catch_exceptions=False)

@@ -1,4 +1,4 @@
-"""A run: gates, dry run, warm-up, quality checks, and what it does not take for granted."""
+"""A run: gates, dry run, quality checks, warm-up, disk and lock."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ Array = NDArray[np.float64]
 Make = Callable[..., Campaign]
 
 
-class Person:
-    """Somebody at the screen.
+class Operator:
+    """Operator at the screen.
 
     Args:
-        requests: override and hold by what is being run.
-        accepts: what is answered to a dry run.
+        requests: override and hold, by the status of the run.
+        accepts: whether a dry run is accepted.
     """
 
     can_answer = True
@@ -145,7 +145,7 @@ def make(tmp_path: Path, designed: Campaign) -> Make:
 
 
 class Push:
-    """Somebody leans against the upper arm for 0.1 s."""
+    """A load on the upper arm for 0.1 s."""
 
     def __init__(self, cycle: int, load: float = 0.15) -> None:
         self.cycle, self._load = cycle, load
@@ -180,7 +180,7 @@ def test_a_plan_is_not_run_before_it_was_rehearsed(make: Make) -> None:
 @pytest.mark.parametrize(
     ("real", "words"),
     [
-        (False, r"was not done, and nobody .*--dry-run`"),
+        (False, r"was not done, and there is no .*--dry-run`"),
         (True, "cannot be accepted before it was done"),
     ],
 )
@@ -224,25 +224,25 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
     assert campaign.run().archives == (), "accepted once, and nothing is missing"
 
 
-def test_a_person_is_asked_and_a_no_ends_the_run(make: Make) -> None:
+def test_the_operator_is_asked_and_a_no_ends_the_run(make: Make) -> None:
     campaign = make()
-    nobody = Person(accepts=False)
+    refusing = Operator(accepts=False)
     with pytest.raises(DryRunError, match="is not accepted"):
-        campaign.run(operator=nobody)
+        campaign.run(operator=refusing)
     assert [entry.name.split("_")[0] for entry in campaign.folder.manifest()] == [
         "move", "dryrun", "dryrun"
     ]  # fmt: skip
-    (summary,) = nobody.asked
+    (summary,) = refusing.asked
     assert summary.plan_hash == campaign.folder.plan_hash
     assert summary.simulated
     assert 0.0 < max(summary.current_share) < 1.0
-    somebody = Person()
-    assert "dryrun" not in kinds(campaign.run(operator=somebody)), "what is done is not done again"
-    assert len(somebody.asked) == 1
-    phases = [status.phase for status in somebody.seen]
+    accepting = Operator()
+    assert "dryrun" not in kinds(campaign.run(operator=accepting)), "what is done is not done again"
+    assert len(accepting.asked) == 1
+    phases = [status.phase for status in accepting.seen]
     assert list(dict.fromkeys(phases)) == ["move", "standstill", "repetition", "validation"]
-    assert somebody.seen[0].time_left > somebody.seen[-1].time_left
-    assert any(status.motion is not None for status in somebody.seen)
+    assert accepting.seen[0].time_left > accepting.seen[-1].time_left
+    assert any(status.motion is not None for status in accepting.seen)
 
 
 class TestTimeLeft:
@@ -262,11 +262,11 @@ class TestTimeLeft:
                 return OperatorRequest()
 
             with pytest.raises(MotionFailedError, match="stopped"):
-                campaign.run(stop=stop, operator=Person(requests=stopping), durable=False)
+                campaign.run(stop=stop, operator=Operator(requests=stopping), durable=False)
         link = simulated_link(campaign.cell)
         pace, estimates = Pace(virtual=False), list[tuple[float, float]]()
 
-        class Clock(Person):
+        class Clock(Operator):
             def show(self, status: RunStatus) -> None:
                 now = link.cycles * 0.002
                 pace.update(status, now, held=False)
@@ -284,7 +284,6 @@ class TestTimeLeft:
         assert np.diff(left[known]).max() < 0.1 * true[0] + learned
 
 
-# --- what slow torques say
 def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed: Campaign) -> None:
     cell, against = mirrored(designed.cell, "[-1, -1]"), ("shoulder",)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
@@ -292,7 +291,7 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     with pytest.raises(AgainstGravityError, match="runs against the model's gravity") as refused:
         campaign.run(accept_dry_run=True, accept_torque=cell.joint_names)
     assert refused.value.exit_code == 3
-    assert refused.value.joints == against, "what nobody had seen is not accepted beforehand"
+    assert refused.value.joints == against, "not accepted before it was measured"
     assert f"--accept-torque {against[0]}" in str(refused.value)
     step = campaign.status().steps[2]
     assert "runs against the model's gravity" in step.sentence
@@ -300,7 +299,7 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     for wrong in ((), ("nothing",)):
         with pytest.raises(AgainstGravityError):
             campaign.run(accept_dry_run=True, accept_torque=wrong)
-    asked = Person(accepts=False)
+    asked = Operator(accepts=False)
     with pytest.raises(DryRunError):
         campaign.run(operator=asked, accept_dry_run=True)
     assert asked.asked[0].against_gravity == against
@@ -310,7 +309,7 @@ def test_a_mirrored_joint_is_accepted_by_its_name_only(tmp_path: Path, designed:
     assert done.against_gravity == against
 
 
-def test_a_torque_is_judged_by_the_weight_beside_friction() -> None:
+def test_a_torque_is_judged_by_weight_beside_friction() -> None:
     time_ = np.linspace(0.0, 20.0, 2000)
     speed = np.column_stack([np.cos(time_)] * 4)
     weight = np.column_stack(
@@ -322,7 +321,7 @@ def test_a_torque_is_judged_by_the_weight_beside_friction() -> None:
     for sign in (1.0, -1.0):
         found = agreement(weight, sign * 1.3 * weight + friction, speed, moving)
         assert np.all(sign * found[:2] > 0.9)
-        assert np.isnan(found[2:]).all(), "too light beside friction, and without weight"
+        assert np.isnan(found[2:]).all(), "light beside friction, and without weight"
     assert np.isnan(agreement(weight, friction, speed, np.zeros_like(moving))).all()
 
 
@@ -330,16 +329,16 @@ def test_a_torque_is_judged_by_the_weight_beside_friction() -> None:
 def test_a_slowed_repetition_is_rejected_and_run_again(
     make: Make,
 ) -> None:
-    """The person slows the second repetition once it is under way."""
+    """The operator slows the second repetition after it has begun."""
     campaign = make(repetitions=2)
     slowed: list[RunStatus] = []
 
-    def wish(status: RunStatus) -> OperatorRequest:
+    def slow(status: RunStatus) -> OperatorRequest:
         if status.phase == "repetition" and status.number == 2 and status.motion is not None:
             slowed.append(status)
         return OperatorRequest(override=0.5 if len(slowed) in range(1, 4) else 1.0)
 
-    result = campaign.run(operator=Person(requests=wish), unrehearsed=True)
+    result = campaign.run(operator=Operator(requests=slow), unrehearsed=True)
     (rejected,) = result.rejected
     assert rejected.archive == "excitation_001_a1.mcap"
     assert "held or slowed" in rejected.reason
@@ -356,16 +355,14 @@ def test_a_slowed_repetition_is_rejected_and_run_again(
     loose = sorted(campaign.folder.archives.glob("excitation_*"))
     sources = gather_sources(loose, split=0.5)
     assert rejected.archive not in {one.name for one in (*sources.training, *sources.held_out)}
-    assert any(
-        "rejected and left out: it was held or slowed" in doubt for doubt in sources.warnings
-    )
+    assert any("rejected and left out: it was held or slowed" in text for text in sources.warnings)
 
 
-def test_a_motion_that_is_never_of_use_ends_the_run(
+def test_a_motion_that_is_always_rejected_ends_the_run(
     make: Make,
 ) -> None:
     campaign = make(bad_repetitions=2)
-    slow = Person(
+    slow = Operator(
         requests=lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
     )
     with pytest.raises(RepetitionsRejectedError, match="was rejected 3 times") as ended:
@@ -374,10 +371,10 @@ def test_a_motion_that_is_never_of_use_ends_the_run(
     assert [e.outcome for e in campaign.folder.manifest() if "excitation" in e.name] == [
         "rejected"
     ] * 3
-    assert campaign.run(unrehearsed=True).repetitions == (1, 1), "and a next run goes on"
+    assert campaign.run(unrehearsed=True).repetitions == (1, 1), "a next run continues"
 
 
-def test_a_load_on_an_axis_is_seen(
+def test_a_load_on_an_axis_is_detected(
     tmp_path: Path, designed: Campaign, undisturbed: Campaign
 ) -> None:
     """The same campaign to the bit, but for 0.1 s in the middle of its last repetition."""
@@ -391,13 +388,10 @@ def test_a_load_on_an_axis_is_seen(
     assert result.repetitions == (4, 4)
 
 
-def test_a_repetition_with_lost_answers_is_as_planned(
+def test_a_repetition_with_lost_replies_is_as_planned(
     tmp_path: Path, designed: Campaign, undisturbed: Campaign
 ) -> None:
-    """Two in a row, at speed: the motion waits two cycles, and leaves nothing out.
-
-    What the controller's own hold does to the currents is another matter: they are compared.
-    """
+    """Two in a row, at speed: the motion pauses for two cycles and skips no set-point."""
     name = "excitation_001_a1.mcap"
     usual = open_archive(undisturbed.folder.archives / name, fields=["cycle"])
     middle = int(np.mean(usual.columns["cycle"][[0, -1]]))
@@ -442,7 +436,7 @@ def test_the_check_lets_noise_pass_and_names_what_differs(
     assert named in str(check.problem(replace(last, **{channel: values})))
 
 
-def test_the_check_sees_a_torn_or_saturated_motion(
+def test_a_truncated_stuck_or_saturated_motion_is_named(
     undisturbed: Campaign,
 ) -> None:
     campaign = undisturbed
@@ -458,8 +452,8 @@ def test_the_check_sees_a_torn_or_saturated_motion(
     assert check.problem(few) is None
     assert "packets were missed" in str(check.problem(many))
     position = good.position.copy()
-    told = good.commanded[:, 1]
-    end = 100 + int(np.argmax(np.abs(told[100:] - told[100]) > 0.03))
+    commanded = good.commanded[:, 1]
+    end = 100 + int(np.argmax(np.abs(commanded[100:] - commanded[100]) > 0.03))
     position[100:end, 1] = position[100, 1]
     found = check.problem(replace(good, position=position))
     assert "elbow is stuck: its position stays the same from 0.20 s" in str(found)
@@ -499,11 +493,10 @@ def test_an_archive_that_was_not_entered_is_adopted(tmp_path: Path, undisturbed:
     gone = [e for e in content["archives"] if e["name"].startswith(("excitation_003", "valid"))]
     content["archives"] = [e for e in content["archives"] if e not in gone]
     manifest.write_text(json.dumps(content), "utf-8")
-    # One that is torn, and one that came from elsewhere, are no part of it.
     foreign = root / "archives" / "excitation_002_a2.mcap"
     shutil.copy(root / "archives" / "excitation_001_a1.mcap", foreign)
-    torn = root / "archives" / "validation_000_a1.mcap"
-    torn.write_bytes(torn.read_bytes()[:-50])
+    truncated = root / "archives" / "validation_000_a1.mcap"
+    truncated.write_bytes(truncated.read_bytes()[:-50])
 
     result = Campaign.open(root).run(unrehearsed=True, durable=False)
     assert result.adopted == ("excitation_003_a1.mcap",)
@@ -552,7 +545,7 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(
     campaign = make(warmup_drift=0.004, warmup_least=5, warmup_most=7, repetitions=2)
     text = campaign.cell.text
     assert "friction_drift = 0.9" in text
-    watching = Person()
+    watching = Operator()
     first = campaign.run(
         simulated_link(campaign.cell, effects=True), operator=watching, unrehearsed=True
     )
@@ -579,11 +572,8 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(
     assert [len(later.earlier), len(later.motions)] == [5, 5]
 
 
-# --- What a run does not take for granted: files that were edited, copied, torn or half written
-
-
 class Real:
-    """A link in virtual time that says of itself that it leads to a real arm."""
+    """A link in virtual time that reports a real arm."""
 
     only_simulated = False
 
@@ -601,7 +591,7 @@ def dry(tmp_path_factory: pytest.TempPathFactory, designed: Campaign) -> Campaig
     cell = fast_cell(folder, repetitions=1)
     campaign = Campaign.create(folder / "campaign", cell, designed.plan)
     pass_rehearsal(campaign.folder)
-    campaign.run(dry_run_only=True, operator=Person())
+    campaign.run(dry_run_only=True, operator=Operator())
     return campaign
 
 
@@ -610,7 +600,6 @@ def copied(campaign: Campaign, to: Path) -> Campaign:
     return Campaign.open(to)
 
 
-# --- exactly what was looked at is what is sent
 def test_a_cell_edited_during_its_rehearsal_is_not_rehearsed(
     tmp_path: Path, designed: Campaign
 ) -> None:
@@ -675,7 +664,7 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(
 ) -> None:
     did = make("did", real=True)
     did.run(
-        simulated_link(did.cell, instead_of_hardware=True), dry_run_only=True, operator=Person()
+        simulated_link(did.cell, instead_of_hardware=True), dry_run_only=True, operator=Operator()
     )
     found = DryRun.load(did.folder)
     assert found is not None
@@ -690,19 +679,19 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(
         assert not list(mine.folder.archives.iterdir())
 
 
-@pytest.mark.parametrize("said", [{"operator": "me"}, {"simulated": "no"}, None])
-def test_the_link_says_which_kind_of_arm_moved(
-    make: Make, monkeypatch: pytest.MonkeyPatch, said: dict[str, str] | None
+@pytest.mark.parametrize("provenance", [{"operator": "me"}, {"simulated": "no"}, None])
+def test_the_link_decides_whether_the_arm_is_simulated(
+    make: Make, monkeypatch: pytest.MonkeyPatch, provenance: dict[str, str] | None
 ) -> None:
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
-    if said is None:  # as of a version that left it to the caller
+    if provenance is None:  # as of a version that left it to the caller
         monkeypatch.setattr("hil.campaign.run.provenance_of", lambda *_, **__: {})
-    campaign.run(twin, provenance=said, dry_run_only=True)
+    campaign.run(twin, provenance=provenance, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
     kind = open_archive(first, fields=()).header.entries.get("simulated")
-    assert kind == (None if said is None else "yes")
+    assert kind == (None if provenance is None else "yes")
     real = Real(simulated_link(campaign.cell, instead_of_hardware=True))
     with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
         campaign.run(real, dry_run_only=True)
@@ -711,7 +700,7 @@ def test_the_link_says_which_kind_of_arm_moved(
     ) is None  # fmt: skip
 
 
-def test_a_dry_run_without_archives_or_of_old_does_not_count(tmp_path: Path, dry: Campaign) -> None:
+def test_a_dry_run_without_archives_or_of_version_1_is_void(tmp_path: Path, dry: Campaign) -> None:
     gone = copied(dry, tmp_path / "gone")
     next(gone.folder.archives.glob("dryrun*")).unlink()
     with pytest.raises(DryRunError, match="was not done"):
@@ -731,14 +720,14 @@ def peak_speed(campaign: Campaign, name: str) -> Array:
     return np.asarray(speed / campaign.cell.joint_limits.velocity)
 
 
-def test_an_unwatched_way_is_no_faster_than_a_dry_run(tmp_path: Path, dry: Campaign) -> None:
+def test_an_unwatched_move_is_no_faster_than_a_dry_run(tmp_path: Path, dry: Campaign) -> None:
     """The arm was jogged elsewhere since; `approach_speed` of this cell is full speed."""
     campaign = copied(dry, tmp_path / "campaign")
     elsewhere = campaign.cell.with_values({"simulation.initial_deg": [70.0, -70.0]})
     result = campaign.run(simulated_link(elsewhere))
-    ways = [name for name in result.archives if name.startswith("move")]
-    assert len(ways) >= 2
-    for name in ways:
+    moves = [name for name in result.archives if name.startswith("move")]
+    assert len(moves) >= 2
+    for name in moves:
         assert peak_speed(campaign, name).max() <= OVERRIDE * 1.001
 
 
@@ -772,7 +761,7 @@ CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
 
 
 @pytest.mark.parametrize(
-    ("line", "error", "told"),
+    ("line", "error", "message"),
     [
         (CURRENT, MotionRefusedError,
          r"motor of shoulder: \S+ A, .*controller has 3 A .*cell file 20 A: write"),
@@ -782,12 +771,12 @@ CURRENT = ("current_limit = [20.0, 12.0]", "current_limit = [3.0, 12.0]")
          r"cycle is 1 ms in the controller, 2 ms in the cell; correct the cell file, or the c\w+$"),
     ],
 )  # fmt: skip
-def test_what_the_controller_states_is_looked_at_first(
-    tmp_path: Path, dry: Campaign, line: tuple[str, str], error: type[HilError], told: str
+def test_what_the_controller_states_is_checked_first(
+    tmp_path: Path, dry: Campaign, line: tuple[str, str], error: type[HilError], message: str
 ) -> None:
     campaign = copied(dry, tmp_path / "campaign")
     before = sorted(campaign.folder.archives.iterdir())
-    with pytest.raises(error, match=told):
+    with pytest.raises(error, match=message):
         campaign.run(link_to_controller_with(campaign, *line))
     assert sorted(campaign.folder.archives.iterdir()) == before
 
@@ -801,14 +790,16 @@ def test_wider_limits_of_a_controller_change_nothing(tmp_path: Path, dry: Campai
     assert active_checks(campaign.cell, link.connection, checks) is checks
 
 
-def test_a_narrower_limit_that_is_kept_is_noted(tmp_path: Path, dry: Campaign) -> None:
+def test_a_narrower_limit_that_the_plan_satisfies_is_noted(tmp_path: Path, dry: Campaign) -> None:
     campaign = copied(dry, tmp_path / "campaign")
     link = link_to_controller_with(campaign, CURRENT[0], "current_limit = [19.5, 12.0]")
     (note,) = [one for one in campaign.run(link).notes if "limits" in one]
     assert "counted (shoulder: 19.5 A in the controller, 20 in the cell file)" in note
 
 
-def test_a_single_way_keeps_the_controllers_current_limit(tmp_path: Path, dry: Campaign) -> None:
+def test_a_single_move_respects_the_controllers_current_limit(
+    tmp_path: Path, dry: Campaign
+) -> None:
     cell = dry.cell
     link = link_to_controller_with(dry, CURRENT[0], "current_limit = [0.5, 12.0]")
     move = plan_move(cell, link.connect(Stop()), cell.home)
@@ -849,7 +840,7 @@ def test_a_rehearsal_on_other_gears_opens_no_gate(
     with pytest.raises(OperatorStopError):
         campaign.rehearse(drive=drive, stop=stop, reporter=Stopping())
     found = campaign.folder.rehearsed.rglob("manifest.json")
-    assert {path.parent.parent.name for path in found} == {"other_drive"}, "never gone on with"
+    assert {path.parent.parent.name for path in found} == {"other_drive"}, "never resumed"
 
     from hil.campaign import rehearsal_run
 
@@ -860,7 +851,7 @@ def test_a_rehearsal_on_other_gears_opens_no_gate(
     assert Rehearsal.load(campaign.folder) is None
 
 
-def test_a_plan_that_failed_with_another_seed_says_so(
+def test_a_failure_with_another_seed_is_reported(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hil.campaign import rehearsal_run
@@ -870,12 +861,12 @@ def test_a_plan_that_failed_with_another_seed_says_so(
     pass_rehearsal(campaign.folder, passed=False)
     other = good.model_copy(update={"seed": 7})
     monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: other)
-    told = "passed with seed 7, but failed with seed 1"
-    assert told in campaign.rehearse(seed=7).line
-    assert told in campaign.rehearse(seed=7, again=True).line, "nor is it forgotten"
-    assert told in campaign.status().steps[1].sentence
-    assert any(told in note for note in campaign.run(dry_run_only=True).notes)
-    assert told in conduct_of(campaign.folder).steps[0].words
+    text = "passed with seed 7, but failed with seed 1"
+    assert text in campaign.rehearse(seed=7).line
+    assert text in campaign.rehearse(seed=7, again=True).line
+    assert text in campaign.status().steps[1].sentence
+    assert any(text in note for note in campaign.run(dry_run_only=True).notes)
+    assert text in conduct_of(campaign.folder).steps[0].words
 
 
 @pytest.mark.parametrize(
@@ -888,7 +879,7 @@ def test_a_plan_that_failed_with_another_seed_says_so(
         lambda content: content["criteria"].pop(),
     ],
 )
-def test_a_rehearsal_passed_only_if_each_of_its_criteria_did(
+def test_a_rehearsal_passes_with_all_its_criteria(
     tmp_path: Path, dry: Campaign, edit: Callable[[dict[str, Any]], object]
 ) -> None:
     folder = CampaignFolder(tmp_path)
@@ -904,10 +895,10 @@ def test_a_rehearsal_passed_only_if_each_of_its_criteria_did(
 
 # --- quality
 class Killed(BaseException):
-    """A run dies."""
+    """The process of a run is killed."""
 
 
-def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
+def test_an_archive_that_was_not_checked_is_not_pooled(
     tmp_path: Path, make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     campaign = make(repetitions=2)
@@ -920,25 +911,25 @@ def test_an_archive_that_nobody_lived_to_judge_is_not_pooled(
 
     monkeypatch.setattr(quality, "amend_outcome", dies)
     with suppress(Killed):
-        campaign.run(operator=Person(slow_second), unrehearsed=True)
+        campaign.run(operator=Operator(slow_second), unrehearsed=True)
     monkeypatch.undo()
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
     outcome = open_archive(slowed, fields=()).outcome
     assert outcome is not None and outcome.outcome == "completed"
     found = discover([str(campaign.folder.root)], CacheLocation(str(tmp_path / "cache")), Here())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
-    (told,) = (one for one in found.skipped if one.path == slowed.as_posix())
-    assert "not listed in its campaign's manifest.json" in told.reason
+    (skipped,) = (one for one in found.skipped if one.path == slowed.as_posix())
+    assert "not listed in its campaign's manifest.json" in skipped.reason
     good = campaign.folder.completed("excitation")
-    doubts = gather_sources([*good, slowed], 0.5).warnings
-    assert any(doubt.startswith(f"{slowed.name} is not in its campaign") for doubt in doubts)
+    warnings = gather_sources([*good, slowed], 0.5).warnings
+    assert any(text.startswith(f"{slowed.name} is not in its campaign") for text in warnings)
     again = campaign.run(unrehearsed=True)
     assert again.repetitions == (2, 2)
     assert [one.archive for one in again.rejected] == [slowed.name], "judged by the next run"
 
 
 def run_pushed(campaign: Campaign, *faults: Push) -> RunResult:
-    """A run during which the arm is leant against."""
+    """Run a campaign with loads on the arm."""
     controller = simulated_controller(campaign.cell, faults=list[Any](faults))
     link = Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
     return campaign.run(link, unrehearsed=True, durable=False)
@@ -950,7 +941,7 @@ def middle_of(campaign: Campaign, archive: str) -> int:
     return int(np.mean(found.columns["cycle"][[0, -1]]))
 
 
-def test_a_touched_first_repetition_spoils_no_others(make: Make) -> None:
+def test_a_disturbed_first_repetition_rejects_no_others(make: Make) -> None:
     undisturbed = finished(make("undisturbed"))
     campaign = make(repetitions=3)
     result = run_pushed(campaign, Push(middle_of(undisturbed, "excitation_000_a1.mcap")))
@@ -968,13 +959,13 @@ def test_a_touched_first_repetition_spoils_no_others(make: Make) -> None:
 
 
 class Drag(Push):
-    """From a cycle on something drags on the upper arm for good."""
+    """A load on the upper arm from a cycle on until the end."""
 
     def apply_to(self, on: Any) -> None:
         on.disturb("load", 1, self._load, 10**9)
 
 
-def test_an_arm_that_is_changed_in_mid_campaign_stops_it(make: Make) -> None:
+def test_an_arm_that_changes_during_a_campaign_ends_it(make: Make) -> None:
     undisturbed = finished(make("undisturbed", repetitions=3)).folder.archives
     third = open_archive(undisturbed / "excitation_002_a1.mcap", fields=["cycle"])
     campaign = make(repetitions=3)
@@ -986,7 +977,7 @@ def test_an_arm_that_is_changed_in_mid_campaign_stops_it(make: Make) -> None:
     for part in ("excitation_001_a1.mcap", "excitation_002_a3.mcap", "current of shoulder"):
         assert part in str(changed.value)
     good = [path.name for path in campaign.folder.completed("excitation")]
-    assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is judged anew"
+    assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is checked again"
 
 
 def finished(campaign: Campaign) -> Campaign:
@@ -994,14 +985,14 @@ def finished(campaign: Campaign) -> Campaign:
     return campaign
 
 
-def slowed_once(phase: str) -> Person:
-    """Somebody who slows motions of a kind until one is rejected for it."""
+def slowed_once(phase: str) -> Operator:
+    """An operator who slows motions of a kind until one is rejected."""
 
     def requests(status: RunStatus) -> OperatorRequest:
-        told = any("rejected" in note for note in status.notes)
-        return OperatorRequest(0.5 if status.phase == phase and not told else 1.0)
+        rejected = any("rejected" in note for note in status.notes)
+        return OperatorRequest(0.5 if status.phase == phase and not rejected else 1.0)
 
-    return Person(requests)
+    return Operator(requests)
 
 
 def test_a_repetition_slowed_for_a_moment_is_no_attempt(make: Make) -> None:
@@ -1009,9 +1000,9 @@ def test_a_repetition_slowed_for_a_moment_is_no_attempt(make: Make) -> None:
     result = campaign.run(operator=slowed_once("repetition"), unrehearsed=True)
     assert result.complete
     assert len(result.rejected) == 1
-    kept = make("kept", bad_repetitions=0)
+    slow = make("slow", bad_repetitions=0)
     with pytest.raises(RepetitionsRejectedError, match="was rejected 1 time,"):
-        kept.run(operator=Person(lambda status: OperatorRequest(0.5)), unrehearsed=True)
+        slow.run(operator=Operator(lambda status: OperatorRequest(0.5)), unrehearsed=True)
 
 
 def test_a_script_that_slows_each_attempt_is_ended(
@@ -1028,7 +1019,7 @@ def test_a_script_that_slows_each_attempt_is_ended(
         return OperatorRequest(0.5 if begins else 1.0)
 
     with pytest.raises(RepetitionsRejectedError, match=r"was rejected 2 times.* held or slowed"):
-        campaign.run(operator=Person(at_its_begin), stop=stop, unrehearsed=True)
+        campaign.run(operator=Operator(at_its_begin), stop=stop, unrehearsed=True)
 
 
 # --- warm-up
@@ -1048,15 +1039,15 @@ def test_warmth_is_not_read_from_the_times_of_files(make: Make) -> None:
 
 
 @pytest.mark.parametrize("when", ["before", "held"])
-def test_an_arm_that_rests_for_hours_is_warmed_up_anew(
+def test_an_arm_that_rests_for_hours_is_warmed_up_again(
     make: Make, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
-    """Between two repetitions, or while a person holds the next one before it begins."""
+    """Between two repetitions, or while the operator holds the next one before it begins."""
     campaign, clock = make(warmup_drift=0.9, warmup_least=4, repetitions=2), time.time
     passed = [0.0]
     monkeypatch.setattr("hil.campaign.warmup.time.time", lambda: clock() + passed[0])
 
-    class Leaves(Person):
+    class Leaves(Operator):
         def show(self, status: RunStatus) -> None:
             super().show(status)
             second = (status.phase, status.number) == ("repetition", 2)
@@ -1072,7 +1063,7 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_anew(
     assert any("rested for 120 min during the campaign" in note for note in result.notes)
 
 
-def test_a_warm_up_motion_that_was_slowed_tells_nothing_of_friction(make: Make) -> None:
+def test_a_slowed_warm_up_motion_gives_no_friction(make: Make) -> None:
     campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
     result = campaign.run(operator=slowed_once("warm-up"), unrehearsed=True)
     assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
@@ -1104,8 +1095,8 @@ def test_a_warm_up_motion_that_was_not_noted_is_adopted(
     assert result.warm_up == "not warm"
 
 
-# --- folder, disk, and the person who stops
-def test_looking_whether_a_run_is_at_work_keeps_none_out(
+# --- folder, disk, stop
+def test_a_query_of_the_lock_does_not_hold_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hil.campaign.folder.LOCK_PATIENCE", 30.0)
@@ -1122,9 +1113,7 @@ def test_looking_whether_a_run_is_at_work_keeps_none_out(
 
 
 @pytest.mark.parametrize("name", ["dry_run.json", "warmup.json"])
-def test_a_disk_that_refuses_is_named(
-    make: Make, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
+def test_a_full_disk_is_named(make: Make, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     drift = 1e-9 if name == "warmup.json" else 0.0
     campaign = make(warmup_drift=drift, warmup_least=3, warmup_most=3)
     write = hil.files._write_through
@@ -1143,14 +1132,14 @@ def test_a_disk_that_refuses_is_named(
     assert "dryrun" not in kinds(again)
 
 
-def test_a_stop_instead_of_an_answer_is_a_stop(tmp_path: Path, dry: Campaign) -> None:
+def test_a_stop_while_a_dry_run_is_asked_for(tmp_path: Path, dry: Campaign) -> None:
     campaign = copied(dry, tmp_path / "campaign")
     found = DryRun.load(campaign.folder)
     assert found is not None
     replace(found, accepted=None).save(campaign.folder.dry_run)
     stop = Stop()
 
-    class Leaves(Person):
+    class Leaves(Operator):
         def accept_dry_run(self, summary: DryRun) -> bool:
             stop.requested = True
             return False
@@ -1172,23 +1161,24 @@ def hil_run(campaign: Campaign, *options: str) -> Result:
 
 
 def exit_code(result: Result) -> int:
-    """As the program's: an error of ours carries its own."""
+    """Exit status of the program."""
     error = result.exception
     return error.exit_code if isinstance(error, HilError) else result.exit_code
 
 
-def test_a_script_without_a_terminal_gets_through_and_reads_json(campaign: Campaign) -> None:
+def test_a_script_without_a_terminal_reads_json(campaign: Campaign) -> None:
     refused = hil_run(campaign, "--json")
     assert exit_code(refused) == 3
-    told = json.loads(refused.stdout)
-    assert told["exit_code"] == 3
-    assert "--dry-run" in told["error"]
+    summary = json.loads(refused.stdout)
+    assert summary["exit_code"] == 3
+    assert "--dry-run" in summary["error"]
     assert not list(campaign.folder.archives.iterdir())
 
     slow = hil_run(campaign, "--dry-run", "--json")
     assert exit_code(slow) == 0, slow.exception
-    told = json.loads(slow.stdout)
-    assert (told["dry_run"], told["complete"], told["verdict"]) == ("to be accepted", False, None)
+    summary = json.loads(slow.stdout)
+    assert (summary["dry_run"], summary["complete"]) == ("to be accepted", False)
+    assert summary["verdict"] is None
 
     both = hil_run(campaign, "--dry-run", "--accept-dry-run")
     assert exit_code(both) == 2
@@ -1196,22 +1186,24 @@ def test_a_script_without_a_terminal_gets_through_and_reads_json(campaign: Campa
     done = hil_run(campaign, "--accept-dry-run", "--json")
     assert exit_code(done) == 0, done.exception
     (line,) = done.stdout.splitlines()
-    told = json.loads(line)
-    assert told["complete"]
-    assert told["repetitions"] == [4, 4]
-    assert told["verdict"]["good"]
-    assert set(told["archives"]) == {path.name for path in campaign.folder.archives.iterdir()} - {
+    summary = json.loads(line)
+    assert summary["complete"]
+    assert summary["repetitions"] == [4, 4]
+    assert summary["verdict"]["good"]
+    assert set(summary["archives"]) == {
+        path.name for path in campaign.folder.archives.iterdir()
+    } - {
         "move_000_a1.mcap",
         "move_001_a1.mcap",
         "dryrun_000_a1.mcap",
         "dryrun_001_a1.mcap",
     }
     results = Results.model_validate_json(campaign.folder.results.read_bytes())
-    assert results.verdict.line == told["verdict"]["line"]
+    assert results.verdict.line == summary["verdict"]["line"]
     assert campaign.folder.report.exists()
 
 
-def test_a_torque_that_contradicts_the_model_is_named_and_wants_a_word_of_its_own(
+def test_a_torque_against_the_model_needs_its_own_option(
     tmp_path: Path, designed: Campaign
 ) -> None:
     campaign = Campaign.create(
@@ -1238,13 +1230,13 @@ def test_a_live_view_of_virtual_time_is_refused(campaign: Campaign) -> None:
     assert "virtual time" in str(refused.exception)
 
 
-def test_at_a_terminal_the_dry_run_is_asked_for_and_ctrl_c_leaves_a_campaign_to_go_on_with(
+def test_on_a_terminal_a_dry_run_is_asked_for_and_ctrl_c_stops(
     campaign: Campaign,
 ) -> None:
     root = campaign.folder.root
     master, terminal = pty.openpty()
     process = subprocess.Popen(
-        # With the terminal as its own: keys are read by whoever is in its foreground.
+        # In the foreground of the terminal, from which keys are read.
         ["setsid", "--ctty", sys.executable, "-m", "hil", "run", str(root), "--no-identify"],
         stdin=terminal,
         stdout=terminal,
@@ -1259,10 +1251,10 @@ def test_at_a_terminal_the_dry_run_is_asked_for_and_ctrl_c_leaves_a_campaign_to_
         while process.poll() is None and time.monotonic() < deadline:
             try:
                 seen += os.read(master, 65536)
-            except OSError:  # the far end is closed
+            except OSError:  # the terminal is closed
                 break
             if not answered and b"Type yes" in seen:
-                time.sleep(0.3)  # what is typed before the question counts for nothing
+                time.sleep(0.3)  # input before the question is discarded
                 os.write(master, b"yes\n")
                 answered = True
             if not interrupted and list(campaign.folder.archives.glob("excitation_*")):
@@ -1274,7 +1266,7 @@ def test_at_a_terminal_the_dry_run_is_asked_for_and_ctrl_c_leaves_a_campaign_to_
         process.wait()
         os.close(master)
     assert answered
-    assert b"hil run" in seen, "what to type to go on"
+    assert b"hil run" in seen, "the command that resumes"
     outcomes = [entry.outcome for entry in campaign.folder.manifest()]
     assert set(outcomes) <= {"completed", "stopped"}
     rest = Campaign.open(root).run()

@@ -36,9 +36,9 @@ from sim_fixtures.serve import ControllerLinkError, Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
-"""A test asks what happens, not how fast: pauses of this machine shall not end open mode."""
+"""Pauses of this computer must not end open mode."""
 PATIENT = [*SLOW_MACHINE, "--patience", "0.5"]
-"""Nor the session's begin, where an answer has one cycle's time. Answers may not come late then."""
+"""Nor the start of the session; replies must not be late then."""
 
 OFF, DRIVING, CLOSED, ENDED = (f"status {s}, modes {[m] * 6}" for s, m in
                                ((0, 0), (5, 501), (5, 0), (0, 504)))  # fmt: skip
@@ -48,7 +48,7 @@ def opened(mode: int = 4) -> str:
     return f"status 5, modes {[mode] * 6}"
 
 
-def far_end_at(udp: str | None = None, can: str | None = None) -> Any:
+def link_at(udp: str | None = None, can: str | None = None) -> Any:
     settings = replace(controller_settings(Cell.load(CELL_PATH)), period=0.002)
     return open_controller_link(udp, can, settings, 6)
 
@@ -132,7 +132,7 @@ def last_json(text: str) -> dict[str, Any]:
 def session(
     controller: list[str], pc: list[str], until: list[str] | None = None
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What both sides say about one whole session; ended by a signal after the states `until`."""
+    """Accounts of both sides of one session; ended by a signal after the states `until`."""
     port = free_port()
     command = ["simulate", CELL_PATH, "--udp", f"127.0.0.1:{port}", "--json", *controller]
     with running(*FOREIGN, "--port", port, *pc) as program:
@@ -246,7 +246,7 @@ def test_the_controller_waits_for_a_program_that_starts_later():
     assert "the session has ended (504)" in output
 
 
-def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
+def test_signals_end_the_session_and_press_buttons():
     port = free_port()
     with (
         running(*FOREIGN, "--port", port, "--send-505", "20", "--exit-after", "0") as program,
@@ -266,7 +266,7 @@ def test_a_signal_ends_the_session_properly_and_buttons_are_signals():
     assert "emergency stop" in output
 
 
-def test_who_never_comes_or_is_interrupted_has_its_exit_status():
+def test_a_missing_pc_and_an_interrupt_have_an_exit_status():
     with hil("simulate", CELL_PATH, "--udp", f"127.0.0.1:{free_port()}", "--json",
              "--duration", "0.5") as cabinet:  # fmt: skip
         output = last_json(cabinet.finish(timeout=10))
@@ -331,7 +331,7 @@ def test_the_own_motion_of_the_command_has_no_end(monkeypatch):
     assert "no posture" in str(result.exception)
 
 
-def test_open_mode_lost_again_and_again_ends_the_session_with_a_reason_and_a_status(monkeypatch):
+def test_open_mode_lost_repeatedly_ends_the_session(monkeypatch):
     # of the child, which is forked from here; a second and twenty losses are too long for a test
     monkeypatch.setattr("hil.cli.simulate.LOST_OPENINGS", 5)
     monkeypatch.setattr("hil.cli.simulate.REOPENING", 0.1)
@@ -405,14 +405,14 @@ def test_impossible_options_are_refused_first(options, complaint):
 
 def test_a_bus_is_named_as_python_can_names_it():
     for text in ("virtual:simulate", "virtual:simulate:fd", "virtual:simulate:classic"):
-        far_end = far_end_at(can=text)
-        assert far_end.receive(0.001) is None
-        far_end.close()
+        link = link_at(can=text)
+        assert link.receive(0.001) is None
+        link.close()
     with pytest.raises(ControllerLinkError, match="no-such-bus"):
-        far_end_at(can="no-such-bus:0")
+        link_at(can="no-such-bus:0")
 
 
-def test_the_first_signal_asks_for_the_end_and_the_second_gives_up():
+def test_the_first_signal_asks_for_the_end_the_second_aborts():
     """A duration that is over asks for the end, but is no interrupt."""
     assert set(WORDS) == set(Phase)
     buttons = Buttons()
@@ -440,17 +440,17 @@ def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
 
 
 def test_foreign_and_lost_datagrams_are_ignored():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        far_end = far_end_at(f"127.0.0.1:{free_port()}")
-        stranger.sendto(b"hello", ("127.0.0.1", far_end.source_port))
-        assert far_end.receive(0.2) is None
-        address = f"127.0.0.1:{stranger.getsockname()[1]}"
-        assert (far_end.foreign, far_end.last_foreign) == (1, address)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        link = link_at(f"127.0.0.1:{free_port()}")
+        other.sendto(b"hello", ("127.0.0.1", link.source_port))
+        assert link.receive(0.2) is None
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        assert (link.foreign, link.last_foreign) == (1, address)
     for _ in range(5):  # a PC that does not listen is no error
-        far_end.send(b"anybody there?")
-        assert far_end.receive(0.002) is None
-    far_end.close()
-    far_end = far_end_at("255.255.255.255:9")  # broadcast is not permitted
-    far_end.send(b"x")
-    assert (far_end.unsent, far_end.problem) == (1, "Permission denied")
-    far_end.close()
+        link.send(b"anybody there?")
+        assert link.receive(0.002) is None
+    link.close()
+    link = link_at("255.255.255.255:9")  # broadcast is not permitted
+    link.send(b"x")
+    assert (link.unsent, link.problem) == (1, "Permission denied")
+    link.close()

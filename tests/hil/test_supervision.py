@@ -1,4 +1,4 @@
-"""What supervises a run: a motion that is watched and steered, signs of life, failing screens."""
+"""Supervision of a run: override, hold, stop, heartbeats, failing screens."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.hil.fast_cell import fast_campaign, fast_cell
 
 
 class Watcher:
-    """Requests what a script says of the time of the motion and of how often it was asked."""
+    """Requests by motion time and number of requests so far."""
 
     def __init__(
         self, script: Callable[[float, int], OperatorRequest] = lambda *_: OperatorRequest()
@@ -110,7 +110,7 @@ def test_a_dry_run_is_slow_from_its_first_cycle(arm: WatchedArm) -> None:
     assert {progress.override for progress in person.seen} == {0.2}
 
 
-def test_the_person_may_slow_a_dry_run_and_not_speed_it_up(arm: WatchedArm) -> None:
+def test_the_operator_may_slow_a_dry_run_and_not_speed_it_up(arm: WatchedArm) -> None:
     person = Watcher(lambda time, _: OperatorRequest(0.1 if time > 0.3 else 1.0))
     arm.run(person, override=0.2)
     assert {progress.override for progress in person.seen} == {0.2, 0.1}
@@ -163,7 +163,7 @@ def test_nothing_begins_while_a_hold_is_requested(arm: WatchedArm) -> None:
 
 
 @pytest.mark.parametrize("what", ["stop", "hold"])
-def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
+def test_a_request_while_the_archive_is_created_is_applied(
     arm: WatchedArm, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     """A slow disk: nothing has been asked of the controller yet, and nothing is."""
@@ -189,7 +189,7 @@ def test_what_is_pressed_while_the_archive_is_created_comes_in_time(
     assert not arm.archive.n_samples
 
 
-def test_a_motion_held_before_it_begins_rests_and_requests_are_archived(arm: WatchedArm) -> None:
+def test_a_motion_held_before_it_begins_rests(arm: WatchedArm) -> None:
     def script(_: float, asked: int) -> OperatorRequest:  # from the moment it was asked for on
         return OperatorRequest() if asked <= 2 else OperatorRequest(0.5, held=asked < 20)
 
@@ -230,7 +230,7 @@ def test_what_is_shown_is_what_is_archived(arm: WatchedArm) -> None:
 
 
 class Stubborn:
-    """A motion that knows no override: it rests."""
+    """A motion without override, at rest."""
 
     start = property(lambda self: np.zeros(6))
     finished = True
@@ -241,7 +241,7 @@ class Stubborn:
     def stop(self) -> None: ...
 
 
-def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm) -> None:
+def test_a_motion_without_override_is_not_run_slowly(arm: WatchedArm) -> None:
     """And an override is a fraction."""
     with pytest.raises(ControllerFault, match="supports no override"):
         arm.link.run(Stubborn(), spec(arm.cell, arm.path), Stop(), override=0.2)  # type: ignore[arg-type]
@@ -252,20 +252,20 @@ def test_a_motion_that_knows_no_override_is_not_run_slowly(arm: WatchedArm) -> N
 
 
 class Exchange:
-    """As much of an exchange process as is looked at."""
+    """The part of an exchange process that a view reads."""
 
     def __init__(self) -> None:
         self.control_fd = control_memory.create()
         self.alive = True
         self.state, self.ended_count = State.CLOSED, 3
-        self.said: list[Any] = []
+        self.queued: list[Any] = []
 
     def status(self) -> Any:
         return SimpleNamespace(state=self.state, ended_count=self.ended_count)
 
     def events(self) -> list[Any]:
-        said, self.said = self.said, []
-        return said
+        queued, self.queued = self.queued, []
+        return queued
 
 
 class Clock:
@@ -302,7 +302,7 @@ def view(exchange: Exchange) -> ExchangeView:
         (State.CLOSED, 59.0, r"did not begin within 60 s"),
     ],
 )
-def test_a_motion_that_does_not_begin_is_given_up(
+def test_a_motion_that_does_not_begin_ends(
     view: ExchangeView, exchange: Exchange, clock: Clock, state: State, waits: float, words: str
 ) -> None:
     exchange.state = state
@@ -313,10 +313,10 @@ def test_a_motion_that_does_not_begin_is_given_up(
 
 
 @pytest.mark.parametrize("event", [MotionStarted(0, 10), EventsLost(1)])
-def test_a_motion_that_began_or_may_have_is_not_given_up(
+def test_a_motion_that_may_have_begun_is_waited_for(
     view: ExchangeView, exchange: Exchange, clock: Clock, event: Any
 ) -> None:
-    exchange.said.append(event)
+    exchange.queued.append(event)
     view.poll()
     clock.now += 3600.0
     assert view.no_start() is None
@@ -327,11 +327,8 @@ def test_a_motion_that_began_or_may_have_is_not_given_up(
     assert view.ended is None
 
 
-# --- Signs of life are given only while the supervision itself is alive
-
-
 def beats_in(heart: Heartbeat, clock: Clock, given: list[float], seconds: float) -> int:
-    """How often it beats while so long nothing else happens."""
+    """Number of heartbeats within that time."""
     before, end = len(given), clock.now + seconds
     while clock.now < end:
         clock.now += 0.05
@@ -339,7 +336,7 @@ def beats_in(heart: Heartbeat, clock: Clock, given: list[float], seconds: float)
     return len(given) - before
 
 
-def test_beats_end_where_the_supervising_loop_stands_still() -> None:
+def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:
     clock, given = Clock(), list[float]()
     heart = Heartbeat(lambda: given.append(clock.now), clock)
     assert beats_in(heart, clock, given, 600.0) >= 11_999, "between motions work may take long"
@@ -351,12 +348,12 @@ def test_beats_end_where_the_supervising_loop_stands_still() -> None:
     explained = heart.with_cause(f"the exchange process ended ({NO_SUPERVISOR})")
     assert "show or request of the motion's watch did not return for 2.0 s" in explained
     heart.turn()
-    assert beats_in(heart, clock, given, 0.5) > 5, "and goes on with the loop"
+    assert beats_in(heart, clock, given, 0.5) > 5, "and resume with the loop"
     heart.rest()
     assert beats_in(heart, clock, given, 60.0) >= 1_199
 
 
-def test_a_program_that_got_no_processor_is_named() -> None:
+def test_a_lack_of_processor_time_is_named() -> None:
     clock = Clock()
     heart = Heartbeat(lambda: None, clock)
     assert heart.with_cause(NO_SUPERVISOR) == NO_SUPERVISOR
@@ -365,11 +362,8 @@ def test_a_program_that_got_no_processor_is_named() -> None:
     assert heart.with_cause("stopped by the operator") == "stopped by the operator"
 
 
-# --- What a run makes of an operator's screen that fails
-
-
 class Failing:
-    """An operator whose parts fail when they are told to."""
+    """An operator whose methods fail on demand."""
 
     can_answer = False
 
@@ -416,7 +410,7 @@ def test_a_screen_that_fails_is_asked_all_the_same(operator: Failing, watch: Run
     assert not watch.stop.requested
 
 
-def test_a_hold_that_nobody_can_release_becomes_a_stop(operator: Failing, watch: RunWatch) -> None:
+def test_a_hold_that_cannot_be_released_becomes_a_stop(operator: Failing, watch: RunWatch) -> None:
     operator.answer = OperatorRequest(held=True)
     watch.request()
     assert not watch.stop.requested
@@ -425,8 +419,6 @@ def test_a_hold_that_nobody_can_release_becomes_a_stop(operator: Failing, watch:
     assert watch.stop.requested
     assert "the run was stopped" in watch.problems[0]
 
-
-# --- When an arm that the controller moves counts as being at rest
 
 PERIOD = 0.002
 SECOND = round(1.0 / PERIOD)
@@ -504,13 +496,13 @@ print(before, mapped())
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the heap of glibc")
-def test_what_is_freed_is_not_kept_below_what_is_not() -> None:
-    def kept(*words: str) -> int:
+def test_freed_arrays_are_returned_to_the_system() -> None:
+    def growth(*words: str) -> int:
         done = subprocess.run(
             [sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, check=True
         )
         before, after = map(int, done.stdout.split())
         return after - before
 
-    assert kept() < 2 * 2**20
-    assert kept("adapted") > 8 * 2**20, "glibc returns them by itself: this is not needed any more"
+    assert growth() < 2 * 2**20
+    assert growth("adapted") > 8 * 2**20, "glibc returns them without it"

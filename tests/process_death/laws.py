@@ -37,7 +37,7 @@ NAMED: Final = {
         *(f"the archive process {what}" for what in (*GONE, "sent no heartbeat")),
         "cannot be written further",
     ),
-    "controller": ("controller", "link", "silent", "nothing heard", "no packet", "packet"),
+    "controller": ("controller", "link", "silent", "nothing received", "no packet", "packet"),
 }
 """Words of which one at least stands in the error of a supervisor that survived one of these. Of
 its own processes it knows that they are dead, and blames nobody else."""
