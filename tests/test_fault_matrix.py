@@ -1,8 +1,7 @@
-"""Every fault in every situation has the outcome that was decided for it, and breaks no law.
+"""Every fault in every situation has the outcome of docs/fault-matrix.md, and breaks no law.
 
-Checked in every run: the laws of `tests.drivers.judge`; the arm comes to rest; and a new motion,
-requested after the drive has been switched on again, completes.
-The outcomes are those of docs/fault-matrix.md; `python -m tests.fault_matrix` prints the table.
+The laws are those of `tests.drivers.judge`; also, the arm comes to rest, and a new motion completes
+after the drive was switched on again.
 """
 
 from __future__ import annotations

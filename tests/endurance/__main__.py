@@ -1,13 +1,12 @@
-"""Run the whole real path for hours and watch what it takes: `python -m tests.endurance`.
+"""Run the whole real path for hours and measure it: `python -m tests.endurance`.
 
-A simulated controller sends a packet each millisecond over UDP on this computer. The product's own
-exchange and archive process answer and record, and campaigns of short motions run on one link one
-after another, about 26 archives in half a minute. Every 5 s memory and threads of each process and
-the exchange's own histogram of its latencies go to the journal; each archive is checked, and
-removed when three newer campaigns are there. Campaigns whose archives are not whole stay.
+A simulated controller sends a packet each millisecond over UDP on this computer, and campaigns of
+short motions run on one link, about 26 archives in half a minute. Every 5 s memory and threads of
+each process and the histogram of latencies go to the journal; each archive is checked, and removed
+when there are three newer campaigns. Campaigns with incomplete archives remain.
 
-Each call is a piece and appends to the journal; --merge only prints what each of them has shown.
-Ctrl-C or SIGTERM ends a piece properly, SIGKILL costs the last 5 s.
+Each call is a piece and appends to the journal; --merge prints the verdict over all pieces of the
+journals given (also `.jsonl.xz`). Ctrl-C or SIGTERM end a piece, SIGKILL costs the last 5 s.
 Four hours in three pieces:
 
     for piece in 1 2 3; do
@@ -15,13 +14,11 @@ Four hours in three pieces:
     done
     python -m tests.endurance --merge --journal long.jsonl
 
-Merged are as many journals as are named, those compressed by `xz` (`long.jsonl.xz`) among them.
-
-The exit code is 1 if anything is wrong, 0 if not, and 2 if the journal is none. What a run is too
-short for is said as a doubt, and so is what the machine explains: slower replies while more was to
-do, campaigns given up and replies missed while its cores stood still, which a process on each of
-them tells that does nothing else. More than one reply in 10 000 beyond that is wrong. Two bounds
-hold whatever stood still: half of a piece's campaigns, and 1 % of its replies.
+Exit status 1 for any fault, 2 if the journal is not one of these. Figures of a run that is too
+short are warnings, and so is what the computer explains: slower replies at a higher load, campaigns
+abandoned and replies missed while its cores stalled (measured by a process on each core). More than
+one reply in 10 000 beyond that is a fault, and in any case half of a piece's campaigns or 1 % of
+its replies.
 """
 
 from __future__ import annotations
@@ -95,7 +92,7 @@ def _lines(verdict: Verdict) -> Iterator[str]:
         yield f"piece {number}"
         for name, value in piece.items():
             yield f"  {name:40} {value}"
-    yield from (f"doubt: {text}" for text in verdict.doubts)
+    yield from (f"warning: {text}" for text in verdict.warnings)
     yield from [f"WRONG: {text}" for text in verdict.faults] or ["nothing is wrong"]
 
 

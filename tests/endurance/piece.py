@@ -1,4 +1,4 @@
-"""One piece of a long run: campaigns one after another on one link to a simulated controller."""
+"""One piece of a long run: campaigns on one link to a simulated controller."""
 
 from __future__ import annotations
 
@@ -34,8 +34,7 @@ from tests.journal import Journal
 REPETITIONS: Final = 20  # Of the excitation in a campaign, which so takes about half a minute
 MISSED: Final = 3  # Answers in a row that the controller misses until it ends open mode
 TRIES: Final = 5
-"""Resumptions of one campaign until it is given up and the next begins: where the machine pauses
-again and again, repetitions differ and are rejected."""
+"""Resumptions of a campaign until it is abandoned: after pauses repetitions differ."""
 NEWEST: Final = 3  # Campaign folders that stay on the disk
 SAMPLED_EVERY: Final = 5.0  # s between two looks at everything
 PRIORITY: Final = 60
@@ -49,7 +48,7 @@ COUNTERS: Final = (
 def run_piece(
     folder: Path, journal_path: Path, seconds: float, rate: int, stop: Stop, reporter: Reporter
 ) -> None:
-    """Run for that long at a rate [Hz], and append to the journal; `folder` has the campaigns."""
+    """Run for some seconds at a rate [Hz], with campaigns in `folder`; append to the journal."""
     work = folder / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{os.getpid()}"
     work.mkdir(parents=True)
     cell = fast_cell(work, repetitions=REPETITIONS).with_values(
@@ -114,7 +113,7 @@ class _Piece:
 
     @contextmanager
     def sampled(self) -> Iterator[None]:
-        """Look at everything now and then, in a thread of its own; stop when the time is over."""
+        """Sample everything periodically in a thread; stop when the time is over."""
         over = threading.Event()
 
         def look() -> None:
@@ -151,7 +150,7 @@ class _Piece:
         self.task.advance(SAMPLED_EVERY, f"{status.ended_count} motions")
 
     def run(self, cell: Cell, plan: CampaignPlan) -> None:
-        """Campaign after campaign, until the time is over or somebody stops it."""
+        """Run campaigns until the time is over or a stop is requested."""
         number = 0
         while not self.stop.requested:
             before = self.link.exchange.status().ended_count
@@ -178,7 +177,7 @@ class _Piece:
             number += 1
 
     def _completed(self, campaign: Campaign, errors: list[str]) -> bool:
-        """Run and resume it until it is complete; False if it was stopped or given up."""
+        """Run and resume a campaign until it is complete; False if it was stopped or abandoned."""
         link: Any = _Lasting(self.link)
         while not self.stop.requested and len(errors) < TRIES:
             try:
@@ -190,7 +189,7 @@ class _Piece:
                 errors.append(f"{type(error).__name__}: {error}")
                 if not self.link.exchange.alive or not self.link.archive.alive:
                     raise
-                self.simulator.process.send_signal(signal.SIGUSR1)  # somebody presses drive-on
+                self.simulator.process.send_signal(signal.SIGUSR1)  # drive-on
                 campaign = Campaign.open(campaign.folder.root)
         return False
 
@@ -237,10 +236,9 @@ def count(folder: str) -> int:
 
 
 def own_memory(pid: int) -> int:
-    """Bytes in pages of a process that no file is behind, swapped ones too.
+    """Bytes in anonymous pages of a process, swapped ones too.
 
-    The unique set size that is usually asked for grows when any other process ends that had the
-    same libraries mapped.
+    The unique set size also grows when another process with the same libraries ends.
     """
     text = Path(f"/proc/{pid}/smaps_rollup").read_text("ascii")
     kilobytes = {name: value for name, _, value in (row.partition(":") for row in text.split("\n"))}
@@ -263,13 +261,11 @@ class _MallInfo(ctypes.Structure):
 
 
 def held() -> dict[str, int]:
-    """What this process holds of its memory: bytes of malloc, blocks of Python's own allocator.
+    """Memory in use by this process: bytes of malloc (with glibc), blocks of Python's allocator.
 
-    What it once held and gave back stays its own until it is used again: only this tells a leak
-    from a campaign that needed more for a moment than any before. Python's free lists and its cache
-    of attributes (4096 names at most) do not count: they fill for hours. Nor does what is used up
-    of its table of interned strings, as by names of files: that is rebuilt, to the size that those
-    in it need. Only blocks without glibc.
+    Freed memory stays with the process until it is used again; the memory in use separates a leak
+    from a campaign that needed more for a moment. Free lists, the attribute cache and the unused
+    part of the table of interned strings are cleared first: they fill for hours.
     """
     gc.collect()
     sys._clear_type_cache()

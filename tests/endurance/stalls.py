@@ -1,8 +1,7 @@
-"""How often and how long a core of this machine stands still, whatever runs on it.
+"""Stalls of the cores of this computer: `python -m tests.endurance.stalls`.
 
-A virtual machine is not run for some milliseconds now and then, and all its processes miss what was
-due meanwhile. A process that does nothing but wake each millisecond, before everything else that
-has a real-time priority, tells that from a fault of ours: `python -m tests.endurance.stalls`.
+A virtual machine may not run for some milliseconds, and all its processes miss what was due. A
+process that only wakes each millisecond, at the highest real-time priority, measures that.
 """
 
 from __future__ import annotations
@@ -24,14 +23,14 @@ _NAME: Final = "stalls_"  # of a file, and the number of the core
 
 
 def so_far(folder: Path) -> tuple[int, float]:
-    """Stalls of all cores that watchers have written into a folder, and how long they stood [s]."""
+    """Return number and total duration [s] of the stalls that the watchers wrote into a folder."""
     found = [_COUNTS.unpack(path.read_bytes()) for path in folder.glob(f"{_NAME}*")]
     return sum(count for count, _ in found), sum(seconds for _, seconds in found)
 
 
 @contextmanager
 def watched(folder: Path) -> Iterator[None]:
-    """One watcher a core writes into a folder; none sees any without real-time priority."""
+    """Run a watcher for each core; without real-time priority it detects none."""
     paths = tuple(folder / f"{_NAME}{core}" for core in sorted(os.sched_getaffinity(0)))
     with ExitStack() as undo:
         for path in paths:

@@ -31,11 +31,10 @@ Change = Callable[[Piece], Piece]
 
 
 def piece(seed: int, leak: float = 0.0, slow: float = 1.0, load: float = 1.0) -> Piece:
-    """80 minutes and 160 campaigns as they look on two cores.
+    """80 minutes and 160 campaigns on two cores.
 
-    With a leak in the archive process [MiB/h], or replies that are slower by a factor, at another
-    load, in the last quarter of an hour. Memory is a level that wanders up and down by pages;
-    replies take about 150 µs, the median of each minute scatters by 5 %.
+    With a leak in the archive process [MiB/h], or replies slower by a factor at another load in the
+    last quarter of an hour. Memory varies by pages, the median latency of each minute by 5 %.
     """
     rng = np.random.default_rng(seed)
     samples, counts, level = [], np.zeros(BINS, np.int64), 0.0
@@ -59,7 +58,7 @@ def piece(seed: int, leak: float = 0.0, slow: float = 1.0, load: float = 1.0) ->
 
 
 def ran(number: int, **changes: Any) -> Line:
-    """A campaign as it should be, but for the changes."""
+    """A faultless campaign with changes."""
     return {
         "number": number, "t": 30.0 * number, "complete": True, "stopped": False, "restarts": [],
         "motions": 26, "archives": 26, "faulty": [], "outcomes": {"completed": 26}, "held": {},
@@ -90,12 +89,12 @@ def not_in_time(name: str, share: float) -> Change:
 
 
 def stalling(share: float) -> Change:
-    """On a machine that stands still for this share of the time, 10 ms now and then."""
+    """Cores stall for this share of the time, 10 ms each."""
     return sampled(lambda _, s: {"stalls": round(100 * share * s["t"]), "stood": share * s["t"]})
 
 
 def given_up(*numbers: int) -> Change:
-    """These campaigns given up after some restarts."""
+    """Abandon these campaigns after some restarts."""
     lost = {"complete": False, "restarts": ["closed"] * 5}
     return each_campaign(lambda ran: lost if ran["number"] in numbers else {})
 
@@ -109,7 +108,7 @@ def all_of(*changes: Change) -> Change:
 
 
 def holding(name: str, grown: float) -> Change:
-    """A supervisor that holds so much more an hour."""
+    """A supervisor with so much more memory in use each hour."""
     return each_campaign(lambda ran: {"held": {name: 400_000 + round(grown * ran["t"] / 3600.0)}})
 
 
@@ -128,14 +127,17 @@ SHARED = sampled(lambda place, s: {"shared": 3 + int(s["t"] // 600.0) + place % 
     [
         (
             all_of(given_up(*range(81)), not_in_time("missed", 0.004), stalling(0.005)),
-            "81 of 160 campaigns were given up",
+            "81 of 160 campaigns were abandoned",
         ),
-        (given_up(70), "campaign 70 was given up, and no core stood"),
-        (all_of(LOADED, given_up(70)), "campaign 70 was given up, and no core"),
-        (all_of(given_up(70), stalling(0.005)), "campaign 70 was given up"),
+        (given_up(70), "campaign 70 was abandoned, and no core stalled"),
+        (all_of(LOADED, given_up(70)), "campaign 70 was abandoned, and no core"),
+        (all_of(given_up(70), stalling(0.005)), "campaign 70 was abandoned"),
         (not_in_time("missed", 0.2), "20.0% of the replies were missed"),
         (all_of(LOADED, not_in_time("late", 2e-4)), "96 of 480500 replies were late while"),
-        (all_of(stalling(0.003), not_in_time("missed", 0.009)), "were missed while no core stood"),
+        (
+            all_of(stalling(0.003), not_in_time("missed", 0.009)),
+            "were missed while no core stalled",
+        ),
         (all_of(stalling(0.05), not_in_time("late", 0.02)), "2.0% of the replies were late"),
         (lambda one: replace(one, ended={"reason": "no link"}), "ended early: no link"),
         (MORE_THREADS, "the exchange has 9 threads in the second half, 5 in"),
@@ -162,13 +164,13 @@ def test_slower_replies_are_a_fault_where_no_load_explains_them() -> None:
     assert len(faults) == 4 and "p50 of the latency" in faults[0]
     verdict = judge([piece(8, slow=1.5, load=6.0)])
     assert not verdict.faults
-    assert "at loads of 6.0 and 1.0" in verdict.doubts[0]
+    assert "at loads of 6.0 and 1.0" in verdict.warnings[0]
 
 
 @pytest.mark.parametrize("seed", range(10, 14))
 def test_hours_without_a_fault_are_good(seed: int) -> None:
     verdict = judge([piece(seed)])
-    assert (verdict.faults, verdict.doubts) == ([], [])
+    assert (verdict.faults, verdict.warnings) == ([], [])
     (figures,) = verdict.figures
     assert (figures["minutes"], figures["archives"]) == (80.0, 160 * 26)
 
@@ -176,38 +178,38 @@ def test_hours_without_a_fault_are_good(seed: int) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (with_one(restarts=["lost"] * 2), "2 restarts of campaigns, and no core stood still"),
-        (not_in_time("missed", 5e-5), "24 of 480500 replies were missed while no core stood still"),
+        (with_one(restarts=["lost"] * 2), "2 restarts of campaigns, and no core stalled"),
+        (not_in_time("missed", 5e-5), "24 of 480500 replies were missed while no core stalled"),
         (
             all_of(given_up(70), not_in_time("missed", 0.004), stalling(0.005)),
-            "1 of 160 campaigns were given up, as cores stood still",
+            "1 of 160 campaigns were abandoned, as cores stalled",
         ),
         (lambda one: replace(one, ended=None), "no end: it was killed, or it still runs"),
     ],
 )
-def test_what_the_machine_explains_is_a_doubt(sound: Piece, change: Change, words: str) -> None:
+def test_what_stalls_explain_is_a_warning(sound: Piece, change: Change, words: str) -> None:
     verdict = judge([change(sound)])
     assert verdict.faults == []
-    (doubt,) = verdict.doubts
-    assert words in doubt
+    (warning,) = verdict.warnings
+    assert words in warning
 
 
 def test_a_stall_excuses_no_more_replies_than_it_lasts(sound: Piece) -> None:
     change = all_of(given_up(70), not_in_time("missed", 0.004), stalling(0.001))
     campaign, replies = judge([change(sound)]).faults
-    assert "campaign 70 was given up, and no core stood still" in campaign
-    assert "of 480500 replies were missed while no core stood still" in replies
+    assert "campaign 70 was abandoned, and no core stalled" in campaign
+    assert "of 480500 replies were missed while no core stalled" in replies
 
 
-def test_files_of_others_that_come_and_go_are_none_of_ours(sound: Piece) -> None:
+def test_temporary_files_of_others_are_no_growth(sound: Piece) -> None:
     assert not judge([sampled(lambda place, _: {"shared": 3 + place // 40 % 3})(sound)]).faults
 
 
-def test_a_run_that_is_too_short_says_so(sound: Piece) -> None:
+def test_a_run_that_is_too_short_has_warnings(sound: Piece) -> None:
     short = replace(sound, samples=sound.samples[:40], campaigns=sound.campaigns[:3])
     verdict = judge([short])
     assert verdict.faults == []
-    assert sum("too short to tell" in text for text in verdict.doubts) == len(PROCESSES) + 2
+    assert sum("too short to tell" in text for text in verdict.warnings) == len(PROCESSES) + 2
     assert "no campaign was run" in judge([replace(short, campaigns=[])]).faults
 
 
@@ -243,7 +245,7 @@ def test_a_piece_is_not_appended_to_what_is_no_journal(tmp_path: Path) -> None:
     assert not folder.exists()
 
 
-def test_what_a_process_holds_is_known_to_the_byte() -> None:
+def test_memory_in_use_is_known_to_the_byte() -> None:
     before = held()
     made = np.ones(MIB), [object() for _ in range(1000)]
     after = held()
@@ -253,12 +255,12 @@ def test_what_a_process_holds_is_known_to_the_byte() -> None:
     assert held()["bytes"] - before["bytes"] < MIB
 
 
-def test_memory_of_its_own_is_no_file_that_a_process_maps(tmp_path: Path) -> None:
+def test_own_memory_excludes_mapped_files(tmp_path: Path) -> None:
     pid, size = os.getpid(), 40 * MIB
     (tmp_path / "library").write_bytes(b"x" * size)
     before = own_memory(pid)
     private = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
-    with mmap.mmap(-1, size, flags=private) as made:  # pages that nobody has used before
+    with mmap.mmap(-1, size, flags=private) as made:  # unused pages
         made.write(b"x" * size)
         after = own_memory(pid)
         assert after - before == pytest.approx(size, rel=0.1)
@@ -280,9 +282,9 @@ def test_some_seconds_of_it_leave_archives_and_a_journal(tmp_path: Path) -> None
         cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=200,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    said = json.loads(done.stdout)
-    assert said["faults"] == []
-    assert said["figures"][0]["archives"] > 0
+    report = json.loads(done.stdout)
+    assert report["faults"] == []
+    assert report["figures"][0]["archives"] > 0
     (found,) = read_journal(journal)
     assert found.ended is not None
     assert found.ended["reason"] == ""

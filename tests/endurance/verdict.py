@@ -1,4 +1,4 @@
-"""The journal of a long run, and what it has shown: figures of each piece, what is wrong."""
+"""Journal of a long run and its verdict: figures of each piece, faults, warnings."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tests.journal import entries
 
 PROCESSES: Final = ("exchange", "archive", "supervisor", "controller")
 WARM_UP: Final = 300.0
-"""s of a piece after which nothing is to be added to a process any more. The exchange holds 32 MiB
-of heap in reserve from its beginning: a leak shows in its memory only when that is used up."""
+"""s of a piece after which no process may grow any more. The exchange has 32 MiB of heap in reserve
+from the start: a leak shows in its memory only when that is used up."""
 LONG: Final = 4.0  # h that a leak is projected to
 CONFIDENCE: Final = 0.99
 SHARE: Final = 0.05  # of a process's memory that it may grow by in `LONG`
@@ -29,16 +29,15 @@ RARE: Final = 0.01  # chance of one false alarm among all comparisons of blocks
 BUSIER: Final = 0.5  # by which a load has to be larger to explain that replies are slower
 BIN: Final = 2.0**0.25  # ratio of two latencies that the exchange's own histogram just separates
 GIVEN_UP: Final = 0.5
-"""Of the campaigns of a piece that may be given up, whatever stood still: with more of them it has
-hardly shown anything."""
+"""Share of a piece's campaigns that may be abandoned in any case."""
 NOT_IN_TIME: Final = 0.01
-"""Of the replies of a piece that may be missed, or late, whatever stood still. The exchange stops a
-motion that loses 3 of 100: with a third of that all the time next to no motion comes to its end."""
-OTHERWISE: Final = 1e-4  # of the replies that may be missed, or late, while no core stood still
+"""Share of a piece's replies that may be missed, or late, in any case; with three times as many the
+exchange stops a motion."""
+OTHERWISE: Final = 1e-4  # of the replies that may be missed, or late, while no core stalled
 
 Line = dict[str, Any]
 """One line of the journal, as `tests.endurance.piece` writes it."""
-Finding = tuple[Literal["faults", "doubts"], str]
+Finding = tuple[Literal["faults", "warnings"], str]
 
 
 @dataclass(frozen=True)
@@ -57,10 +56,10 @@ class Piece:
 
 
 def read_journal(path: Path) -> list[Piece]:
-    """All pieces of a journal, compressed if its name ends in `.xz`; none if there is no such file.
+    """Return all pieces of a journal, compressed if its name ends in `.xz`; none without the file.
 
     Raises:
-        JournalError: it cannot be read, or a line of it is none of ours.
+        JournalError: it cannot be read, or has another line.
     """
     pieces: list[Piece] = []
 
@@ -81,10 +80,10 @@ def read_journal(path: Path) -> list[Piece]:
 
 @dataclass
 class Verdict:
-    """Figures of each piece, what is wrong, and what the machine explains or nobody can tell."""
+    """Figures of each piece, faults, and warnings: what the computer explains or is unknown."""
 
     faults: list[str] = field(default_factory=list)
-    doubts: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     figures: list[dict[str, Any]] = field(default_factory=list)
 
 
@@ -124,7 +123,7 @@ def _figures(piece: Piece) -> dict[str, Any]:
 
 
 def _given_up(ran: Iterable[Line]) -> list[Line]:
-    """Those left incomplete though nobody had asked for that."""
+    """Campaigns left incomplete without a request to stop."""
     return [one for one in ran if not (one["complete"] or one["stopped"])]
 
 
@@ -132,17 +131,16 @@ def _ending(piece: Piece) -> Iterator[Finding]:
     if not piece.campaigns and piece.seconds >= WARM_UP:
         yield "faults", f"{piece.seconds:.0f} s without one campaign"
     if piece.ended is None:
-        yield "doubts", "no end: it was killed, or it still runs"
+        yield "warnings", "no end: it was killed, or it still runs"
     elif (reason := piece.ended.get("reason", "")) not in ("", "interrupted"):
         yield "faults", f"ended early: {reason}"
 
 
 def _campaigns(piece: Piece) -> Iterator[Finding]:
-    """Campaigns that were given up or resumed, and archives that are not whole.
+    """Campaigns that were abandoned or resumed, and archives that are not complete.
 
-    A controller that misses some replies in a row ends open mode, as it should. The machine excuses
-    that where its cores stand still (`tests.endurance.stalls`); no load does, as exchange and
-    controller run before whatever else there is to do.
+    Missed replies end open mode. Stalled cores excuse that; a load does not, as exchange and
+    controller have the highest priority.
     """
     ran = piece.campaigns
     for one in ran:
@@ -154,21 +152,21 @@ def _campaigns(piece: Piece) -> Iterator[Finding]:
         yield from (("faults", f"campaign {one['number']}: {text}") for text in what)
     given_up = _given_up(ran)
     if len(given_up) > GIVEN_UP * len(ran):
-        yield "faults", f"{len(given_up)} of {len(ran)} campaigns were given up"
+        yield "faults", f"{len(given_up)} of {len(ran)} campaigns were abandoned"
         return
     excused = set(_excused(piece))
     for one in given_up:
         if one["number"] not in excused:
-            yield "faults", f"campaign {one['number']} was given up, and no core stood still"
+            yield "faults", f"campaign {one['number']} was abandoned, and no core stalled"
     if count := sum(one["number"] in excused for one in given_up):
-        yield "doubts", f"{count} of {len(ran)} campaigns were given up, as cores stood still"
+        yield "warnings", f"{count} of {len(ran)} campaigns were abandoned, as cores stalled"
     calm = [one for one in ran if one["number"] not in excused and one["complete"]]
     if resumed := sum(len(one["restarts"]) for one in calm):
-        yield "doubts", f"{resumed} restarts of campaigns, and no core stood still"
+        yield "warnings", f"{resumed} restarts of campaigns, and no core stalled"
 
 
 def _excused(piece: Piece) -> Iterator[int]:
-    """Campaigns in which replies were missed, and cores stood still for as long."""
+    """Campaigns in which replies were missed while cores stalled for as long."""
     begun = 0.0
     for one in piece.campaigns:
         samples = [sample for sample in piece.samples if begun <= sample["t"] <= one["t"]]
@@ -180,7 +178,7 @@ def _excused(piece: Piece) -> Iterator[int]:
 
 
 def _replies(piece: Piece) -> Iterator[Finding]:
-    """Replies that were missed or late: too many, or any while no core stood still."""
+    """Replies missed or late: too many, or any without a stall."""
     if not piece.samples:
         return
     counters = piece.samples[-1]["counters"]
@@ -189,12 +187,12 @@ def _replies(piece: Piece) -> Iterator[Finding]:
         if (count := counters[name]) > NOT_IN_TIME * answered:
             yield "faults", f"{count / answered:.1%} of the replies were {name}"
         elif count := _otherwise(piece, piece.samples, name):
-            words = f"{count:.0f} of {answered:.0f} replies were {name} while no core stood still"
-            yield "faults" if count > OTHERWISE * answered else "doubts", words
+            words = f"{count:.0f} of {answered:.0f} replies were {name} while no core stalled"
+            yield "faults" if count > OTHERWISE * answered else "warnings", words
 
 
 def _otherwise(piece: Piece, samples: Sequence[Line], name: str) -> float:
-    """How far a counter rose beyond the time, from sample to sample, that cores stood still.
+    """How far a counter rose beyond the time, from sample to sample, of stalls.
 
     A stall costs the cycles that it lasts, and the one in which it begins.
     """
@@ -207,15 +205,15 @@ def _otherwise(piece: Piece, samples: Sequence[Line], name: str) -> float:
 def _counts(piece: Piece) -> Iterator[Finding]:
     """Threads and descriptors of each process, and files of shared memory.
 
-    More of a process in the second half is growth. The files are of whoever, and those of others
-    come and go; what is never given back shows in the fewest of each quarter.
+    More of a process in the second half is growth. Of the files, which may be of others, the fewest
+    in each quarter are compared.
     """
     settled = [one for one in piece.samples if one["t"] >= WARM_UP]
     idle = [one["descriptors"] for one in piece.campaigns if not one["stopped"]]
     threads = [{name: use["threads"] for name, use in one["processes"].items()} for one in settled]
     for what, each in (("descriptors", idle), ("threads", threads)):
         if len(each) < 2:
-            yield "doubts", f"{what}: too short to tell"
+            yield "warnings", f"{what}: too short to tell"
             continue
         halves = each[: len(each) // 2], each[len(each) // 2 :]
         for name in PROCESSES:
@@ -231,10 +229,9 @@ def _counts(piece: Piece) -> Iterator[Finding]:
 
 
 def _memory(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:
-    """Memory of each process behind which is no file, and what the supervisor holds of its own.
+    """Anonymous memory of each process, and the memory in use by the supervisor.
 
-    The resident memory also grows while the rings between the processes are gone through for the
-    first time, and by no more than their size.
+    Resident memory also grows while the rings are filled for the first time.
     """
     used: dict[str, list[tuple[float, int]]] = {f"the {name}'s memory": [] for name in PROCESSES}
     for one in piece.samples + piece.campaigns:
@@ -250,12 +247,12 @@ def _memory(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:
 def _growth(
     what: str, sizes: Sequence[tuple[float, int]], figures: dict[str, Any]
 ) -> Iterator[Finding]:
-    """A leak: by the median of each minute, as a sample is much like the one before."""
+    """A leak, by the medians of minutes: successive samples are correlated."""
     minutes = np.array([int(t // 60.0) for t, _ in sizes])
     values = np.array([value for _, value in sizes], dtype=np.float64)
     present = np.unique(minutes)
     if len(present) < BLOCK:
-        yield "doubts", f"{what}: too short to tell (warm-up is {WARM_UP:g} s)"
+        yield "warnings", f"{what}: too short to tell (warm-up is {WARM_UP:g} s)"
         return
     medians = [np.median(values[minutes == one]) for one in present]
     found = theilslopes(medians, present / 60.0, CONFIDENCE)
@@ -265,14 +262,14 @@ def _growth(
     if low > 0.0 and slope > SHARE:
         yield "faults", words
     elif high > SHARE:
-        yield "doubts", f"too short to tell whether {words}"
+        yield "warnings", f"too short to tell whether {words}"
 
 
 def _latency(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:
-    """The last minutes against the first ones; more load beside it explains slower replies."""
+    """The last minutes against the first ones; a higher load explains slower replies."""
     minutes = list(_minutes(piece))
     if len(minutes) < 2 * BLOCK:
-        yield "doubts", f"latency: no {2 * BLOCK} full minutes, too short to tell"
+        yield "warnings", f"latency: no {2 * BLOCK} full minutes, too short to tell"
         return
     ends = minutes[:BLOCK], minutes[-BLOCK:]
     loads = [float(np.median([m[0] for m in part])) for part in ends]
@@ -286,7 +283,7 @@ def _latency(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:
                 f"{name} of the latency is {last:.0f} µs in the last {BLOCK} minutes and "
                 f"{first:.0f} µs in the first, at loads of {loads[1]:.1f} and {loads[0]:.1f}"
             )
-            yield "doubts" if loads[1] > loads[0] + BUSIER else "faults", words
+            yield "warnings" if loads[1] > loads[0] + BUSIER else "faults", words
 
 
 def _minutes(piece: Piece) -> Iterator[tuple[float, dict[str, float]]]:

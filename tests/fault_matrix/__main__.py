@@ -1,7 +1,6 @@
-"""Run every fault in every situation and print what came of it: `python -m tests.fault_matrix`.
+"""Run every fault in every situation and print the outcomes: `python -m tests.fault_matrix`.
 
-The table is that of docs/fault-matrix.md, which the tests read; the exit code is 1 if a law was
-broken.
+The table is that of docs/fault-matrix.md, which the tests read; exit status 1 if a law was broken.
 """
 
 from __future__ import annotations

@@ -143,8 +143,8 @@ def session(
     return Session(DriveTrain(**table), Guard(limits, period), ring, settle_cycles=10, **options)
 
 
-class Heard:
-    """A session that remembers its answers, and hands out its events twice."""
+class LoggedSession:
+    """A session that stores its replies, and returns its events twice."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -166,58 +166,54 @@ class Heard:
 
 
 class JudgedSession(Judged):
-    """A session all whose packets, answers and records are judged.
+    """A session whose packets, replies and records are judged; `broken` is the first broken law."""
 
-    Attributes:
-        broken: the law that was broken first, in words; nothing is judged after it.
-    """
-
-    def __init__(self, heard: Heard, limits: GuardLimits) -> None:
+    def __init__(self, logged: LoggedSession, limits: GuardLimits) -> None:
         conduct = Conduct(
-            limits, heard.drive_train, Mode.POSITION, 1, tuple(range(N)), (1,) * N,
+            limits, logged.drive_train, Mode.POSITION, 1, tuple(range(N)), (1,) * N,
             threshold=limits.following_error, current=limits.current, period=PERIOD,
             max_gap=MAX_GAP,
         )  # fmt: skip
         self.hear(
-            heard._session, heard._ring, conduct, n_axes=N, max_gap=MAX_GAP, silence=SILENCE,
+            logged._session, logged._ring, conduct, n_axes=N, max_gap=MAX_GAP, silence=SILENCE,
             period=PERIOD, inits={},
         )  # fmt: skip
-        self.session = self._heard = heard  # type: ignore[assignment]
+        self.session = self._logged = logged  # type: ignore[assignment]
         self.broken: list[str] = []
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._heard, name)
+        return getattr(self._logged, name)
 
     def reply(self, packet: bytes, now: float, ages: Any) -> bytes | None:
         if self.broken:
-            return self._heard.reply(packet, now, ages)
+            return self._logged.reply(packet, now, ages)
         self._silent_by(now)
         try:
             self.deliver(packet, now - self.now)
         except AssertionError as error:
             line = extract_tb(error.__traceback__)[-1].line
             self.broken.append(str(error).partition("\n")[0] or str(line))
-        return self._heard.replies[-1] or None
+        return self._logged.replies[-1] or None
 
     def tick(self, now: float) -> None:
         self._silent_by(now)
-        self._heard.tick(now)
+        self._logged.tick(now)
 
     def _silent_by(self, now: float) -> None:
-        if now >= self._heard.deadline:
+        if now >= self._logged.deadline:
             self.silence_heard()
 
     def events(self) -> list[Any]:
         self.take_events()
-        events, self._heard.pending = self._heard.pending, []
+        events, self._logged.pending = self._logged.pending, []
         return events
 
     def request(self, source: TrajectoryPlayer) -> None:
-        self._heard.request(source)
+        self._logged.request(source)
         self.conduct.entitled, self.conduct.stopping = True, False
 
     def stop(self, reason: str) -> None:
-        self._heard.stop(reason)
+        self._logged.stop(reason)
         self.take_events()
         self.conduct.stopping = self.conduct.entitled
 
@@ -226,8 +222,8 @@ class JudgedSession(Judged):
 class Run:
     """One session with one fault.
 
-    Attributes:
-        outcome: what came of the motion requested before the fault, or of open mode without one.
+    `outcome` is of the motion requested before the fault, or of open mode without one; `recovery`
+    of a motion requested afterwards with the drive on.
     """
 
     controller: SimulatedController
@@ -242,8 +238,8 @@ class Run:
 
     def __post_init__(self) -> None:
         made = session(self.current_share, max_gap=MAX_GAP, silence_timeout=SILENCE)
-        self.heard = Heard(made)
-        self.session = JudgedSession(self.heard, made._guard.limits)
+        self.logged = LoggedSession(made)
+        self.session = JudgedSession(self.logged, made._guard.limits)
         self.events: list[Any] = []
 
     def play(self, faults: tuple[Any, ...], fault_cycle: int = 0, over: int = 0) -> None:
@@ -253,14 +249,14 @@ class Run:
         if self.requested_first:
             self.session.request(motion(np.array(small_cell.HOME), WAY, self.speed))
         patience = fault_cycle + 150
-        self._go_on(lambda: self.transport.cycle > patience and self._calm(), 1500)
+        self._exchange(lambda: self.transport.cycle > patience and self._calm(), 1500)
         self.outcome = self._describe()
         self._check_calm()
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
             self.recovery = self._recover()
         self.broken += self.session.broken
 
-    def _go_on(self, until: Callable[[], bool], limit: int) -> None:
+    def _exchange(self, until: Callable[[], bool], limit: int) -> None:
         end = self.transport.cycle + limit
 
         def done() -> bool:
@@ -299,7 +295,7 @@ class Run:
         return self._fate() + note
 
     def _fate(self) -> str:
-        """The first thing that came of it."""
+        """The first relevant event."""
         for event in self.events:
             if isinstance(event, Refused):
                 return f"{self._asked_for()} {type(event.error).__name__}"
@@ -313,8 +309,8 @@ class Run:
         return "waits" if self.session.requested else "open"
 
     def _asked_for(self) -> str:
-        """What the first answer asks for that is no set-point: 505 on all axes, or 508 on one."""
-        for reply in self.heard.replies:
+        """The request in the first reply without a set-point: 505 on all axes, or 508 on one."""
+        for reply in self.logged.replies:
             if len(reply) == cyclic_length(N):
                 modes = CyclicPacket.decode(reply, N).axes["mode"].tolist()
                 if modes == [Mode.DRIVE_OFF_REQUEST] * N:
@@ -324,20 +320,20 @@ class Run:
         return "nothing asked for"
 
     def _recover(self) -> str:
-        """Somebody presses the button, and a new motion is asked for if none is waiting."""
-        self._go_on(lambda: self.transport.cycle >= self._over + 50, 500)
+        """Switch the drive on, request a new motion if none is waiting, and return its outcome."""
+        self._exchange(lambda: self.transport.cycle >= self._over + 50, 500)
         self.controller.drive_on()
         before = len(self.events)
         if self.session.requested and self.session.state is State.OPENING:
-            self.session.stop("somebody lost patience")
-            self._go_on(lambda: self.session.state is State.CLOSED, 200)
+            self.session.stop("it was not started")
+            self._exchange(lambda: self.session.state is State.CLOSED, 200)
         if not self.session.requested:
-            self._go_on(self._ready, 1500)
+            self._exchange(self._ready, 1500)
             try:
                 self.session.request(motion(self.controller.plant.position.copy(), -0.4 * WAY))
             except RequestError as error:
                 return f"no: {error}"
-        self._go_on(lambda: not self.session.requested, 2500)
+        self._exchange(lambda: not self.session.requested, 2500)
         ends = [event for event in self.events[before:] if isinstance(event, MotionEnded)]
         return f"{ends[-1].outcome}: {ends[-1].reason}" if ends else self.session.state.name
 
@@ -358,7 +354,7 @@ class Run:
             return rested >= 60
 
         if self.session.state is not State.ENDED and self.controller.phase is not Phase.ENDED:
-            self._go_on(long_at_rest, 900)
+            self._exchange(long_at_rest, 900)
             if not self.session.requested and rested < 60:
                 self.broken.append(f"the arm does not come to rest: {self._speed():.4f} rad/s")
         elif self._speed() >= AT_REST:
@@ -413,7 +409,7 @@ def play(fault: str, situation: str, while_silent: str = "hold") -> Run:
 
 
 def behaviours(fault: str, situation: str) -> tuple[str, ...]:
-    """What the controller may do meanwhile, where that makes a difference."""
+    """Reactions of the controller to a missing reply, where they make a difference."""
     matters = fault in ANSWER_MISSING and situation in HAS_OPEN_AXES
     return BEHAVIOURS if matters else BEHAVIOURS[:1]
 

@@ -1,4 +1,4 @@
-"""The smallest arm worth moving, with everything a simulated controller needs to know of it."""
+"""A simulated arm of two joints with its controller."""
 
 from __future__ import annotations
 
@@ -70,9 +70,7 @@ QUICK: dict[str, Any] = {
 def controller(**changes: Any) -> SimulatedController:
     """A controller with short phases; `changes` are settings, or arguments of the controller."""
     options: dict[str, Any] = {"seed": 1, "initial_position": HOME}
-    options |= {
-        name: changes.pop(name) for name in ("faults", "seed", "announced") if name in changes
-    }
+    options |= {name: changes.pop(name) for name in ("faults", "seed") if name in changes}
     physical = changes.pop("drive", None) or drive()
     return SimulatedController(
         URDF, physical, truth(), ControllerSettings(**(QUICK | changes)), **options

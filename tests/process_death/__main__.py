@@ -1,16 +1,14 @@
 """Kill the processes of a real campaign at random moments: `python -m tests.process_death`.
 
-Each round runs a short campaign over loopback UDP, with a controller, a supervisor, an exchange and
-an archive process of its own, kills one of them (or two, or three) by SIGKILL, and then asks: did
-the arm come to rest, was open mode left, is everything that was recorded readable, and does the
-next run complete the campaign? The number of a round is its seed.
+Each round runs a short campaign over loopback UDP, kills one to three of its processes by SIGKILL,
+and checks that the arm came to rest, open mode was left, every recording is readable, and the next
+run completes the campaign. The number of a round is its seed.
 
     python -m tests.process_death --rounds 1000 --jobs 2 --journal deaths.jsonl
     python -m tests.process_death --rounds 1 --start 417      # this one again
 
-Rounds that the journal knows are not run again, so the first command may be interrupted and
-repeated. Exit status 1 if a law was broken; the folders of such rounds are kept. Exit status 2 if
-the journal is none of these.
+Rounds in the journal are not run again, so that an interrupted command may be repeated. Exit status
+1 if a law was broken (the folders of such rounds remain), 2 if the journal is not one of these.
 """
 
 from __future__ import annotations
@@ -38,7 +36,7 @@ from tests.journal import Journal, JournalError, rounds  # noqa: E402
 from tests.process_death.controller import die_with_parent  # noqa: E402
 from tests.process_death.laws import PROMISED  # noqa: E402
 from tests.process_death.play import DEFECTS, Stage, planted, play  # noqa: E402  # noqa: E402
-from tests.process_death.rounds import VICTIMS, drawn  # noqa: E402
+from tests.process_death.rounds import VICTIMS, round_of  # noqa: E402
 
 _stage: Stage | None = None  # What rounds share; their processes are forked from one that has it
 
@@ -51,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     option("--start", type=whole_number, default=0, help="number of the first (0)")
     option("--jobs", type=at_least_one, default=1, help="rounds at a time (1)")
     option("--only", choices=VICTIMS, help="those rounds in which this process dies first")
-    option("--journal", type=Path, help="JSON lines with the results; made, and gone on with")
+    option("--journal", type=Path, help="JSON lines with the results; resumed if it exists")
     option("--json", action="store_true", help="print nothing but one JSON object")
     option("--defect", choices=sorted(DEFECTS), help="break the product, to see that it is found")
     given = parser.parse_args(arguments)
@@ -65,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"error: {error}\n")
         return 2
     numbers = range(given.start, given.start + given.rounds)
-    wanted = [n for n in numbers if given.only in (None, drawn(n).victims[0])]
+    wanted = [n for n in numbers if given.only in (None, round_of(n).victims[0])]
     results = [known[n] for n in wanted if n in known]
     missing = [n for n in wanted if n not in known]
     began = time.monotonic()
@@ -76,15 +74,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for result in _played(missing, given.jobs, folder, given.defect):
                 results.append(result)
                 journal.add(**result)
-                _tell(result, len(results), len(wanted), folder, quiet=given.json)
+                _print(result, len(results), len(wanted), folder, quiet=given.json)
     except KeyboardInterrupt:
         interrupted = True
-        sys.stderr.write("interrupted; with --journal the same command goes on from here\n")
+        sys.stderr.write("interrupted; with --journal the same command resumes\n")
     finally:
-        kept = sorted(str(path) for path in folder.glob("round_*"))
-        if not kept:
+        folders = sorted(str(path) for path in folder.glob("round_*"))
+        if not folders:
             shutil.rmtree(folder)
-    report = summary(results) | {"wall_seconds": time.monotonic() - began, "kept": kept}
+    report = summary(results) | {"wall_seconds": time.monotonic() - began, "kept": folders}
     if given.json:
         sys.stdout.write(json.dumps(report) + "\n")
     else:
@@ -98,7 +96,7 @@ def _played(
     global _stage
     if not numbers:
         return
-    if sys.dont_write_bytecode:  # else each process of each round would compile everything anew
+    if sys.dont_write_bytecode:  # else each process compiles everything
         os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
         os.environ["PYTHONPYCACHEPREFIX"] = str(folder / "compiled")
     _stage = Stage.set_up(folder, None if defect is None else planted(defect, folder))
@@ -117,8 +115,8 @@ def _play(number: int) -> dict[str, Any]:
     return play(_stage, number)
 
 
-def _tell(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: bool) -> None:
-    """A line for each round where somebody looks; what was broken always, with how to repeat it."""
+def _print(result: dict[str, Any], done: int, of: int, folder: Path, *, quiet: bool) -> None:
+    """Print a line for each round, and what was broken with the command that repeats it."""
     broken = result["broken"]
     if broken:
         lines = [

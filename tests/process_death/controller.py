@@ -1,8 +1,4 @@
-"""A simulated controller in a process of its own, which waits for a PC as long as that one lives.
-
-It writes down each of its cycles in memory that outlives it: an account of the session that no
-part of the product has touched.
-"""
+"""A simulated controller in its own process, with an account of its cycles in shared memory."""
 
 from __future__ import annotations
 
@@ -51,7 +47,7 @@ rad/s]."""
 CAPACITY: Final = 40_000
 _HEADER: Final = 128
 WAIT: Final = 60.0  # s that a living PC is waited for
-REST: Final = 10  # Cycles of standing after which an arm is at rest
+REST: Final = 10  # Cycles without motion after which an arm is at rest
 _PDEATHSIG: Final = 1
 
 
@@ -69,7 +65,7 @@ class Page:
 
     count = _word(0)  # cycles written down
     finished = _word(1)  # whether the controller's program is to end once the axes are closed
-    given_up = _word(2)  # whether the controller is to fall silent
+    abandoned = _word(2)  # whether the controller is to fall silent
     exchange = _word(3)  # process id of the exchange that it waits for, 0 as long as there is none
 
     def __init__(self) -> None:
@@ -97,7 +93,7 @@ def listening(port: int) -> bool:
 
 
 class _Life:
-    """Whether a process lives, whoever its parent is; one that is not known yet counts as alive."""
+    """Whether a process has ended; an unknown one counts as alive."""
 
     def __init__(self) -> None:
         self._descriptor = -1
@@ -115,8 +111,8 @@ class _Life:
         return self._dead
 
 
-class WaitingEnd:
-    """A far end that waits for an answer as long as the exchange process lives, and no longer."""
+class WaitingLink:
+    """A link that waits for a reply as long as the exchange process lives."""
 
     def __init__(self, host: str, port: int, page: Page) -> None:
         self.number = 0
@@ -125,9 +121,9 @@ class WaitingEnd:
         self._exchange = _Life()
 
     def send(self, packet: bytes) -> None:
-        """Send, once somebody listens."""
+        """Send, once the port is open."""
         self.number = packet_number(packet)
-        while not (self._began or self._page.given_up):
+        while not (self._began or self._page.abandoned):
             self._began = listening(self._port)
             time.sleep(0.005)
         self._link.send(packet)
@@ -135,7 +131,7 @@ class WaitingEnd:
     def receive(self, timeout: float) -> bytes | None:
         """The next packet of the PC, None if none came or none can come any more."""
         until = time.monotonic() + timeout
-        while not self._page.given_up:
+        while not self._page.abandoned:
             self.deserted = self._exchange.over(self._page.exchange)
             if self.deserted:
                 return self._link.receive(0.0)
@@ -150,26 +146,23 @@ class WaitingEnd:
 
 
 class _PageButtons(Buttons):
-    """Ends program and session when the page says so."""
+    """Ends program and session as the page requests."""
 
     def __init__(self, page: Page) -> None:
         super().__init__()
         self._page = page
 
     def request(self) -> Request:
-        if self._page.given_up:
+        if self._page.abandoned:
             return Request.ABORT
         return Request.END if self._page.finished else Request.CONTINUE
 
 
 def serve(cell: Cell, played: Round, page: Page) -> None:
-    """Be the controller of a round until the session has ended, or the page says so.
-
-    It does not outlive the process that watches.
-    """
+    """Simulate the controller of a round until its session or the parent ends, or on request."""
     die_with_parent(signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end = WaitingEnd(cell.controller.host or "", cell.controller.port or 0, page)
+    end = WaitingLink(cell.controller.host or "", cell.controller.port or 0, page)
     settings = replace(
         controller_settings(cell),
         while_silent=played.while_silent,
@@ -210,7 +203,7 @@ def die_with_parent(how: int = signal.SIGTERM) -> None:
 
 
 def forked(serve: Callable[[], int | None]) -> int:
-    """Process id of a process that does this; its exit status is what that returns."""
+    """Process id of a child that runs `serve` and exits with the status that it returns."""
     pid = os.fork()
     if pid:
         return pid

@@ -1,4 +1,4 @@
-"""What must hold after a process died, judged by the controller's account and by what is left."""
+"""Laws after the death of a process, checked by the controller's account and the files left."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from tests.process_death.rig import Seen
 Records = NDArray[np.void]
 
 PROMISED: Final = 52
-"""Cycles that a dead archive process may cost beyond those that it had not taken: a chunk of
-100 ms, and the one or two that come while it is written."""
+"""Cycles that a dead archive process may cost beyond its backlog: a chunk of 100 ms, and one or two
+that come while it is written."""
 COMPARED: Final = ("number", "position", "target_current", "commanded_position", "state", "gap")
 GONE: Final = ("ended", "is gone", "cannot be started")
 NAMED: Final = {
@@ -39,12 +39,11 @@ NAMED: Final = {
     ),
     "controller": ("controller", "link", "silent", "nothing received", "no packet", "packet"),
 }
-"""Words of which one at least stands in the error of a supervisor that survived one of these. Of
-its own processes it knows that they are dead, and blames nobody else."""
+"""Words, one of which is in the error of a surviving supervisor, by the process that died."""
 
 
 @dataclass(frozen=True, eq=False)
-class Kept:
+class Recorded:
     """One archive, as far as it can be read."""
 
     path: Path
@@ -56,14 +55,14 @@ class Kept:
 def broken_by(
     seen: Seen, campaign: Campaign, earlier: frozenset[str] = frozenset()
 ) -> tuple[list[str], dict[str, int]]:
-    """What was broken, and figures; `earlier` are archives of before the run that was seen."""
+    """Return broken laws, and figures; archives in `earlier` are not checked."""
     figures: dict[str, int] = {}
-    problems = [*_told(seen), *_arm(seen), *_link(seen), *_entered(seen.entered, campaign)]
+    problems = [*_supervisor(seen), *_arm(seen), *_link(seen), *_entered(seen.entered, campaign)]
     if seen.left:
         problems.append(f"processes are left over: {seen.left}")
-    if seen.port_taken:
-        problems.append("the port is still taken")
-    kept: list[Kept] = []
+    if seen.port_in_use:
+        problems.append("the port is still in use")
+    recorded: list[Recorded] = []
     for path in sorted(campaign.folder.archives.iterdir()):
         if path.name in earlier:
             continue
@@ -78,31 +77,31 @@ def broken_by(
                 problems.append(f"{path.name} cannot be read: {error}")
             continue
         cycles = archive.columns.get("cycle", np.zeros(0))
-        kept.append(Kept(path, name, archive, np.asarray(cycles, np.int64)))
-    for one in kept:
+        recorded.append(Recorded(path, name, archive, np.asarray(cycles, np.int64)))
+    for one in recorded:
         problems += _readable(one, seen)
         problems += _as_exchanged(one, seen.records)
         problems += _outcome(one, seen)
-    problems += _archived(kept, seen, figures)
-    problems += _motions(kept, seen, campaign)
+    problems += _archived(recorded, seen, figures)
+    problems += _motions(recorded, seen, campaign)
     return problems, figures
 
 
-def _told(seen: Seen) -> Iterator[str]:
-    """A supervisor that lives says who died; whatever it says, it says in one of its own errors."""
+def _supervisor(seen: Seen) -> Iterator[str]:
+    """A surviving supervisor names the process that died, in an error of the project."""
     if seen.status is None:
         return
-    if seen.status not in (0, 2, 4) or not seen.said:
-        yield f"the supervisor ended with status {seen.status} and said {seen.said}"
-    text = seen.said.get("text", "")
+    if seen.status not in (0, 2, 4) or not seen.report:
+        yield f"the supervisor ended with status {seen.status} and reported {seen.report}"
+    text = seen.report.get("text", "")
     if seen.deaths and text:
         words = [word for victim in seen.killed for word in NAMED.get(victim, ())]
         if not any(word in text for word in words):
-            yield f"{' and '.join(seen.killed)} died, and the supervisor said: {text}"
+            yield f"{' and '.join(seen.killed)} died, and the supervisor reported: {text}"
 
 
 def _arm(seen: Seen) -> Iterator[str]:
-    """The controller's account: nothing refused, nothing missed, and the arm at rest at the end."""
+    """The controller missed and rejected nothing, and the arm is at rest at the end."""
     rows = seen.rows
     if not len(rows):
         return
@@ -115,7 +114,7 @@ def _arm(seen: Seen) -> Iterator[str]:
             f"{np.abs(rows['velocity'][-1]).max():.3g} rad/s"
         )
     answered = rows[~rows["deserted"]]
-    # The one of the cycle in which the exchange ended is nobody's fault.
+    # The packet of the cycle in which the exchange ended is no fault.
     if not answered["replied"][:-1].all():
         count = np.count_nonzero(~answered["replied"][:-1])
         yield f"{count} packets were not answered while the exchange lived"
@@ -130,16 +129,13 @@ def _arm(seen: Seen) -> Iterator[str]:
 
 
 def _seen_last(rows: Records) -> Phase:
-    """The phase that the last answered packet told of: the one after the cycle before.
-
-    What a controller does after the last answer, say to open its axes once more, nobody knew.
-    """
+    """Return the phase in the last packet that was replied to: that after the cycle before it."""
     last = int(np.flatnonzero(rows["replied"])[-1]) if rows["replied"].any() else 0
     return Phase(rows["phase"][last - 1]) if last else Phase.START
 
 
 def _link(seen: Seen) -> Iterator[str]:
-    """The exchange's records hold each packet that the controller saw answered, once."""
+    """The records of the exchange contain each packet that the controller had replied to, once."""
     rows, records = seen.rows, seen.records
     if not len(records):
         return
@@ -160,7 +156,7 @@ def _link(seen: Seen) -> Iterator[str]:
 
 
 def _entered(entered: list[Entry], campaign: Campaign) -> Iterator[str]:
-    """What was entered in the manifest stays there as it was."""
+    """Entries of the manifest and their files are unchanged."""
     there = {entry.name: entry for entry in campaign.folder.manifest()}
     for entry in entered:
         if there.get(entry.name) != entry:
@@ -177,22 +173,22 @@ def _is_newest(path: Path) -> bool:
     return path == max(path.parent.iterdir(), key=lambda one: one.stat().st_mtime_ns)
 
 
-def _readable(one: Kept, seen: Seen) -> Iterator[str]:
-    """A gap-free prefix, and the same for other people's readers."""
+def _readable(one: Recorded, seen: Seen) -> Iterator[str]:
+    """An archive is a gap-free prefix, also for the `mcap` package."""
     if one.cycles.size and (np.diff(one.cycles) != 1).any():
         yield f"{one.path.name} has gaps"
     if not one.archive.complete and not ("archive" in seen.killed and _is_newest(one.path)):
         yield f"{one.path.name} is not complete: {one.archive.missing}"
-    found = _counted_plainly(one.path, whole=one.archive.complete)
+    found = _cycles_by_mcap(one.path, whole=one.archive.complete)
     if found != one.cycles.size:
-        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the plain mcap reader"
+        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the mcap package"
     outcome = one.archive.outcome
     if outcome is not None and outcome.records_lost:
-        yield f"{one.path.name} says that {outcome.records_lost} records were lost"
+        yield f"{one.path.name} states that {outcome.records_lost} records were lost"
 
 
-def _counted_plainly(path: Path, *, whole: bool) -> int:
-    """Cycles that the `mcap` package alone reads."""
+def _cycles_by_mcap(path: Path, *, whole: bool) -> int:
+    """Return the number of cycles that the `mcap` package reads."""
     with path.open("rb") as stream:
         if whole:
             reader = make_reader(stream, validate_crcs=True)
@@ -205,12 +201,12 @@ def _counted_plainly(path: Path, *, whole: bool) -> int:
                 elif isinstance(record, Message):
                     count += channels[record.channel_id] == "/hil/cycle"
         except (McapError, EOFError):
-            pass  # a torn file ends somewhere
+            pass  # a truncated file ends somewhere
         return count
 
 
-def _as_exchanged(one: Kept, records: Records) -> Iterator[str]:
-    """What is in the file is what was exchanged."""
+def _as_exchanged(one: Recorded, records: Records) -> Iterator[str]:
+    """An archive contains what was exchanged."""
     if not one.cycles.size:
         return
     rows = _rows_of(one, records)
@@ -223,20 +219,20 @@ def _as_exchanged(one: Kept, records: Records) -> Iterator[str]:
             yield f"{name} in {one.path.name} is not what was exchanged"
 
 
-def _outcome(one: Kept, seen: Seen) -> Iterator[str]:
-    """A file that was completed says how its motion ended, and no less than what happened."""
+def _outcome(one: Recorded, seen: Seen) -> Iterator[str]:
+    """A completed archive has the outcome of its motion."""
     if one.archive.outcome is None:
         return
     outcome = one.archive.outcome.entries["outcome"]
     if int(one.archive.outcome.entries["samples"]) != one.cycles.size:
-        yield f"{one.path.name} has {one.cycles.size} cycles and says {one.archive.outcome}"
+        yield f"{one.path.name} has {one.cycles.size} cycles and states {one.archive.outcome}"
     if outcome not in ("completed", "stopped", "void", "lost", "refused"):
         yield f"the outcome of {one.path.name} is {outcome}"
     alone = "exchange" not in seen.killed and "controller" not in seen.killed
     if outcome == "lost" and alone:
-        yield f"{one.path.name} is said to be lost, and neither end of the link had died"
+        yield f"{one.path.name} is marked lost, and neither end of the link had died"
     if outcome == "void" and one.cycles.size and _moving(one.archive.columns).any():
-        yield f"{one.path.name} is said to be void, and holds motion"
+        yield f"{one.path.name} is marked void, and holds motion"
 
 
 def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
@@ -246,7 +242,7 @@ def _moving(columns: Mapping[str, NDArray[Any]] | Records) -> NDArray[np.bool_]:
     return moving
 
 
-def _rows_of(one: Kept, records: Records) -> Records | None:
+def _rows_of(one: Recorded, records: Records) -> Records | None:
     """The exchange's records of the cycles of an archive."""
     if not len(records):
         return None
@@ -255,13 +251,13 @@ def _rows_of(one: Kept, records: Records) -> Records | None:
     return rows if len(rows) == one.cycles.size else None
 
 
-def _archived(kept: list[Kept], seen: Seen, figures: dict[str, int]) -> Iterator[str]:
-    """Every cycle of motion is archived, but for what a dead archive process may cost."""
+def _archived(recorded: list[Recorded], seen: Seen, figures: dict[str, int]) -> Iterator[str]:
+    """Every cycle of motion is archived, except what a dead archive process may cost."""
     records = seen.records
     if not len(records):
         return
     moving = records["cycle"][_moving(records)]
-    there = np.concatenate([np.zeros(0, np.int64), *(one.cycles for one in kept)])
+    there = np.concatenate([np.zeros(0, np.int64), *(one.cycles for one in recorded)])
     if np.unique(there).size != there.size:
         yield "a cycle is in two archives"
     missing = np.setdiff1d(moving, there)
@@ -271,16 +267,16 @@ def _archived(kept: list[Kept], seen: Seen, figures: dict[str, int]) -> Iterator
             yield f"{missing.size} cycles of motion are in no archive"
         return
     lost = int(np.count_nonzero(missing < records["cycle"][0] + death.written))
-    if any(not one.archive.complete for one in kept) or lost:
+    if any(not one.archive.complete for one in recorded) or lost:
         figures["lost"] = lost
-    # Nobody can make the system run a process: what it had no time to take is not its loss.
+    # Records that the system gave it no time to read are not its loss.
     if lost > PROMISED + death.behind:
         yield f"{lost} cycles of motion were lost with the archive process"
 
 
-def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
+def _motions(recorded: list[Recorded], seen: Seen, campaign: Campaign) -> Iterator[str]:
     """Every set-point of a repetition or validation motion lies on its planned path."""
-    for one in kept:
+    for one in recorded:
         plan = campaign.plan
         match one.name.kind:
             case "excitation":
@@ -310,11 +306,11 @@ def _motions(kept: list[Kept], seen: Seen, campaign: Campaign) -> Iterator[str]:
         ends = motion.sample(np.array([0.0, motion.duration]))[0]
         short = np.abs(commanded[-1] - commanded[0] - (ends[1] - ends[0])).max() > 1e-6
         if short and (one.archive.outcome or ArchiveOutcome()).outcome == "completed":
-            yield f"{one.path.name} is said to be completed, and its motion was not"
+            yield f"{one.path.name} is marked completed, and its motion was not"
 
 
 def _on_path(motion: Any, commanded: NDArray[np.float64]) -> bool:
-    """Whether set-points lie on a planned path, from whose begin they may be off by rounding."""
+    """Return whether set-points lie on a path, up to a constant rounding offset."""
     step = 2e-4  # s
     path, velocity, _ = motion.sample(np.arange(0.0, motion.duration + step, step))
     offset = commanded[0] - path[0]

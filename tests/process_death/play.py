@@ -1,4 +1,4 @@
-"""One round from its number to what was broken in it."""
+"""Runs one round, and checks it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from hil.simulation import simulated_controller
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.laws import broken_by
 from tests.process_death.rig import ARCHIVE, EXCHANGE, Seen, made, run
-from tests.process_death.rounds import Round, drawn
+from tests.process_death.rounds import Round, round_of
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ if {module!r} in sys.orig_argv:
 
 
 def planted(name: str, folder: Path) -> Path:
-    """A folder that plants a defect in whoever has it on the path."""
+    """Return a folder that injects a defect into processes with it on their path."""
     defect, there = DEFECTS[name], folder / "planted"
     there.mkdir()
     (there / "sitecustomize.py").write_text(
@@ -111,7 +111,7 @@ class Stage:
     folder: Path  # of the rounds
     cell: Cell  # of the small arm
     plan: CampaignPlan  # of its campaign
-    undisturbed: Estimated  # what is found where nobody dies
+    undisturbed: Estimated  # of an undisturbed run
     planted: Path | None = None  # folder of a planted defect, None for none
 
     @classmethod
@@ -125,7 +125,7 @@ class Stage:
 
 
 def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
-    """Run what is missing, with an arm that somebody jogged home."""
+    """Run what is missing, with the arm jogged home."""
     cell = campaign.cell
     at_home = cell.with_values({"simulation.initial_deg": cell.campaign.home_deg})
     controller = simulated_controller(at_home, seed=seed)
@@ -139,14 +139,14 @@ def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
 
 
 def estimate_of(campaign: Campaign) -> Estimated:
-    """What is found in the archives of a campaign with fixed settings, so that rounds compare."""
+    """Return the estimate from the archives of a campaign, with fixed settings."""
     pooled = identify_campaign(campaign.folder.root, Silent(), FIXED).estimate.pooled
     return Estimated(np.asarray(pooled.values), np.asarray(pooled.covariance))
 
 
 def play(stage: Stage, number: int) -> dict[str, Any]:
-    """Play a round; what is worth writing down. Its folder stays if something was broken."""
-    played, began = drawn(number), time.monotonic()
+    """Run a round and return its result; the folder remains if a law was broken."""
+    played, began = round_of(number), time.monotonic()
     used = os.times()
     folder = stage.folder / f"round_{number:05d}"
     shutil.rmtree(folder, ignore_errors=True)
@@ -155,12 +155,12 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
     result: dict[str, Any] = {"round": number, "what": str(played)}
     campaign = made(folder, stage.cell, stage.plan)
     try:
-        seen = run(campaign, played, played.victims, folder / "said.json", stage.planted)
+        seen = run(campaign, played, played.victims, folder / "report.json", stage.planted)
         broken, figures = broken_by(seen, campaign)
         result |= {
             "killed": list(seen.killed),
             "status": seen.status,
-            "said": seen.said.get("text", ""),
+            "message": seen.report.get("text", ""),
             "cycles": len(seen.rows),
             **figures,
         }
@@ -171,7 +171,7 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
             if apart > stage.undisturbed.bound:
                 broken.append(f"the estimate is another one (squared distance {apart:.1f})")
     except Exception as error:
-        # Whatever it is, this round is to be looked at, and the others go on.
+        # Of any kind: this round is reported, and the others continue.
         broken = [f"{type(error).__name__}: {error}"]
         (folder / "error.txt").write_text(traceback.format_exc())
     now = os.times()
@@ -183,14 +183,14 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
 
 
 def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> list[str]:
-    """Finish the campaign; what was broken."""
+    """Finish the campaign; return broken laws."""
     earlier = frozenset(path.name for path in campaign.folder.archives.iterdir())
     before = campaign.folder.manifest()
     problems: list[str] = []
     if played.over_sockets:
-        again = run(campaign, played, (), folder / "said-again.json")
+        again = run(campaign, played, (), folder / "report-again.json")
         if again.status != 0:
-            problems.append(f"the next run failed with status {again.status}: {again.said}")
+            problems.append(f"the next run failed with status {again.status}: {again.report}")
         problems += broken_by(again, campaign, earlier)[0]
     else:
         finish_in_virtual_time(campaign, seed=played.seed)
@@ -201,7 +201,7 @@ def finished(campaign: Campaign, played: Round, seen: Seen, folder: Path) -> lis
 
 
 def _whole(campaign: Campaign, seen: Seen) -> Iterator[str]:
-    """Each interval of the plan is entered once as completed, and is whole."""
+    """Each interval of the plan is entered once as completed, and its archive is complete."""
     settings = campaign.cell.campaign
     wanted = {"standstill": 1, "excitation": settings.repetitions, "validation": 1}
     entered = Counter(

@@ -1,8 +1,7 @@
-"""The real campaign of a round: a controller, a supervisor, what it starts, and who gets killed.
+"""The real campaign of a round: controller, supervisor, and the processes that it starts.
 
-Controller and supervisor are forked from a process that has everything imported; exchange and
-archive process are started by the product itself, as in any run. What is seen of them is seen from
-outside: their memory, their files, and the controller's own account.
+Controller and supervisor are forked from a process with all imports. All processes are observed
+from outside: by their memory, their files, and the controller's account.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ _RING, _CONTROL = 2, 4  # places in the exchange's command line, behind the modu
 
 
 def started_by(supervisor: int, module: str) -> int:
-    """Process id of the child of a supervisor that runs a module, 0 if there is none."""
+    """Process id of a supervisor's child that runs a module, 0 if there is none."""
     with suppress(OSError):
         children = Path(f"/proc/{supervisor}/task/{supervisor}/children").read_text()
         for pid in map(int, children.split()):
@@ -85,7 +84,7 @@ def _descriptor(exchange: int, place: int) -> int:
 
 
 class Memory:
-    """The shared memory of an exchange, beyond its death; OSError if there is none any more."""
+    """Shared memory of an exchange, also after its death; OSError if it is gone."""
 
     def __init__(self, exchange: int) -> None:
         self._ring = _descriptor(exchange, _RING)
@@ -100,12 +99,12 @@ class Memory:
 
     @property
     def behind(self) -> int:
-        """Records written that the archive process has not taken; 0 before it has begun to."""
+        """Records written that the archive process has not read; 0 before it began."""
         read = int(self._words[record._READ])
         return self.written - read if read else 0
 
     def records(self) -> NDArray[np.void]:
-        """All records of the session: the ring is larger than any of these."""
+        """All records of the session; none was overwritten."""
         return RingReader(self._ring, JOINTS, acknowledge=False).drain()
 
     def close(self) -> None:
@@ -145,12 +144,12 @@ class Seen:
 
     deaths: list[Death]  # in order
     status: int | None  # exit status of the supervisor, None if it was killed
-    said: dict[str, Any]  # what it said, see `supervise`
+    report: dict[str, Any]  # its report, see `supervise`
     rows: Rows  # the controller's account up to when everything else had ended
     records: NDArray[np.void]  # the exchange's, from its memory
     entered: list[Entry]  # manifest as it was before the first kill
     left: list[int] = field(default_factory=list)  # processes that should have ended
-    port_taken: bool = False  # whether nobody else could have had the port afterwards
+    port_in_use: bool = False  # whether the port was still in use afterwards
 
     @property
     def killed(self) -> tuple[Victim, ...]:
@@ -158,12 +157,14 @@ class Seen:
 
 
 class Watched:
-    """The processes of one run while it goes on; they end with the block."""
+    """The processes of one run; they end with the block."""
 
-    def __init__(self, campaign: Campaign, played: Round, said: Path, planted: Path | None) -> None:
+    def __init__(
+        self, campaign: Campaign, played: Round, report: Path, planted: Path | None
+    ) -> None:
         self.campaign, self.played, self.page = campaign, played, Page()
         controller = forked(lambda: serve(campaign.cell, played, self.page))
-        supervisor = forked(lambda: supervise(campaign.folder.root, said, planted))
+        supervisor = forked(lambda: supervise(campaign.folder.root, report, planted))
         self.pids: dict[Victim, int] = {"supervisor": supervisor, "controller": controller}
         self.status: dict[Victim, int] = {}
         self.memory: Memory | None = None
@@ -208,7 +209,7 @@ class Watched:
         return True
 
     def look(self) -> None:
-        """Find what the supervisor has started meanwhile."""
+        """Find processes and memory that the supervisor has created meanwhile."""
         for victim, module in MODULES.items():
             if victim not in self.pids and (pid := started_by(self.pids["supervisor"], module)):
                 self.pids[victim] = pid
@@ -223,11 +224,10 @@ class Watched:
             self.page.finished = 1  # as whoever stands at the cabinet would
 
     def _left_alone(self) -> bool:
-        """Whether nobody wants anything to move any more, and nothing does.
+        """Return whether nothing moves and nothing will be requested any more.
 
-        An exchange may take some cycles to notice that its supervisor is dead, and begin a motion
-        meanwhile. A controller that is to end closes its axes as soon as their targets stand, which
-        they also do at the begin of a motion.
+        An exchange may begin a motion within some cycles after its supervisor died; the targets are at
+        rest then, so that a controller that is to end would close its axes.
         """
         control = None if self.memory is None else self.memory.control
         if not (self.over("supervisor") or (control is not None and control.finish)):
@@ -238,7 +238,7 @@ class Watched:
         return not moves and self.page.count - self._leaving > NOTICED
 
     def until(self, done: Callable[[], bool], what: str, every: float = LOOK) -> None:
-        """Look until something has come about; NeverHappenedError if it does not."""
+        """Poll until `done()`; NeverHappenedError after `PATIENCE` s."""
         deadline = time.monotonic() + PATIENCE
         while not done():
             self.look()
@@ -252,7 +252,7 @@ class Watched:
             self.until(partial(self.over, victim), f"the end of the {victim}", 5 * LOOK)
 
     def struck(self, victims: tuple[Victim, ...], how: Strike) -> tuple[list[Death], list[Entry]]:
-        """Wait for the moment and strike; who died, and the manifest as it was before."""
+        """Wait for the moment and strike; return the deaths, and the manifest before them."""
         due, deaths = _Due(self), list[Death]()
         self.until(
             lambda: self.over("supervisor") or (bool(victims) and due.now()),
@@ -274,7 +274,7 @@ class Watched:
             if victim in self.pids and not self.over(victim):
                 written = 0 if self.memory is None else self.memory.written
                 self._strike(victim, how)
-                if how not in ("SIGINT", "SIGHUP"):  # which nobody dies of
+                if how not in ("SIGINT", "SIGHUP"):  # which end no process
                     deaths.append(Death(victim, written, max(self._behind, default=0)))
         return deaths, entered
 
@@ -292,13 +292,13 @@ class Watched:
                 os.kill(pid, signal.Signals[how])
 
     def rest(self) -> Rows:
-        """Nobody replies any more: the account until the controller alone has its arm at rest.
+        """Return the account up to where the controller alone has its arm at rest.
 
-        And no longer: some open their axes again and again, whoever listens.
+        Not later: some open their axes again and again.
         """
         deadline = time.monotonic() + PATIENCE  # after which the laws will say so
         while True:
-            # One that nobody ever answered has not begun; one that ended its session is done.
+            # Without any reply it has not begun; with an ended session it is done.
             done = self.over("controller") or time.monotonic() > deadline
             rows = self.page.rows()
             if done or not len(rows) or at_rest(rows):
@@ -306,7 +306,7 @@ class Watched:
             time.sleep(5 * LOOK)
 
     def left(self) -> list[int]:
-        """Processes that should have ended; a child that plans a motion may take a moment."""
+        """Processes that should have ended; a child that plans a motion may take some seconds."""
         deadline = time.monotonic() + 10.0
         while left := marked(MARK, str(self.campaign.folder.root)):
             if time.monotonic() > deadline:
@@ -326,10 +326,10 @@ def made(folder: Path, cell: Cell, plan: CampaignPlan) -> Campaign:
     return Campaign.create(folder / "campaign", local, plan)
 
 
-def supervise(campaign: Path, said: Path, planted: Path | None) -> int:
-    """Be the supervisor: run what is missing; the exit status, and in `said` what came of it."""
+def supervise(campaign: Path, report: Path, planted: Path | None) -> int:
+    """Run what is missing; return the exit status, and write the result to `report`."""
     os.setsid()
-    words = os.open(said.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    words = os.open(report.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     nothing = os.open(os.devnull, os.O_RDONLY)
     for ours, standard in ((nothing, 0), (words, 1), (words, 2)):
         os.dup2(ours, standard)
@@ -344,7 +344,7 @@ def supervise(campaign: Path, said: Path, planted: Path | None) -> int:
     except HilError as error:
         outcome = {"error": type(error).__name__, "text": str(error)}
         status = error.exit_code
-    said.write_text(json.dumps(outcome))
+    report.write_text(json.dumps(outcome))
     return status
 
 
@@ -392,32 +392,32 @@ def run(
     campaign: Campaign,
     played: Round,
     victims: tuple[Victim, ...],
-    said: Path,
+    report: Path,
     planted: Path | None = None,
     how: Strike = "SIGKILL",
 ) -> Seen:
-    """Run a campaign with a controller of its own, and strike those `victims` when it is time."""
-    with Watched(campaign, played, said, planted) as watched:
+    """Run a campaign with a new controller, and strike the `victims` at their moment."""
+    with Watched(campaign, played, report, planted) as watched:
         deaths, entered = watched.struck(victims, how)
         watched.wait("supervisor", "exchange", "archive")
         rows, memory = watched.rest(), watched.memory
         records = np.zeros(0, cycle_dtype(JOINTS)) if memory is None else memory.records()
-        watched.page.given_up = 1
+        watched.page.abandoned = 1
         watched.wait("controller")
         killed = "supervisor" in {one.victim for one in deaths}
         return Seen(
             deaths,
             None if killed else watched.status["supervisor"],
-            json.loads(said.read_text()) if said.exists() else {},
+            json.loads(report.read_text()) if report.exists() else {},
             rows,
             records,
             entered,
             left=watched.left(),
-            port_taken=_port_taken(campaign.cell.controller.port or 0),
+            port_in_use=_port_in_use(campaign.cell.controller.port or 0),
         )
 
 
-def _port_taken(port: int) -> bool:
+def _port_in_use(port: int) -> bool:
     with socket(AF_INET, SOCK_DGRAM) as probe:
         try:
             probe.bind((LOOPBACK, port))

@@ -1,4 +1,4 @@
-"""One round of the campaign of kills, drawn from its number: who dies, when, and what follows."""
+"""Rounds of kills, random by their number: which process is killed, when, and what follows."""
 
 from __future__ import annotations
 
@@ -23,20 +23,18 @@ MINUTES: Final = 0.1
 drive to be switched on."""
 CYCLES: Final = 150  # Cycles within which the controller has begun, and switched its drive on
 LONGEST: Final = 0.8  # s that the longest motion of the small cell takes
-REPORTED: Final = 0.07  # s between two moments at which the exchange says how far a motion has come
+REPORTED: Final = 0.07  # s between two moments at which the exchange reports the motion time
 ARCHIVES: Final = 6
-"""Archives of a whole campaign of it: two ways, standstill, two repetitions, validation."""
+"""Archives of a whole campaign: two moves, standstill, two repetitions, validation."""
 STATES: Final = (State.CLOSED, State.OPENING, State.OPEN, State.EXITING)
 
 
 @dataclass(frozen=True)
 class Trigger:
-    """When the first victim dies.
+    """When the first process is killed: `delay` s after its moment.
 
-    Attributes:
-        moment: what is waited for: the `start` of the supervisor, a `cycle` of the controller, a
-            `motion` that has come some way, an `archive` that is created, one that is `entered` in
-            the manifest, a `state` of the exchange.
+    `moment` is the `start` of the supervisor, a `cycle` of the controller, a time of a `motion`, an
+    `archive` that is created or `entered` in the manifest, or a `state` of the exchange.
     """
 
     moment: Moment
@@ -66,25 +64,22 @@ class Round:
     apart: float  # s between two kills
     trigger: Trigger  # when the first of them comes
     over_sockets: bool  # whether the campaign is finished over sockets, with a new controller
-    loops: bool  # whether the controller's program goes on opening the axes when nobody wants it to
+    loops: bool  # whether the controller's program opens the axes again and again
     while_silent: WhileSilent
     missed_replies: int
     stagger: int  # how the controller behaves; see `sim_fixtures.ControllerSettings`
 
     @property
     def seed(self) -> int:
-        """Of the controller's noise and of what its model has wrong; never 0.
-
-        One controller keeps its model: repetitions made with another would not agree.
-        """
+        """Seed of the controller's noise and parameters, never 0; repetitions have the same."""
         return 1 + self.number
 
     def __str__(self) -> str:
         return f"round {self.number}: {' and '.join(self.victims)} killed {self.trigger}"
 
 
-def drawn(number: int) -> Round:
-    """The round of that number; the victims come in turn, everything else by chance."""
+def round_of(number: int) -> Round:
+    """Return the round of that number; the first victims alternate, everything else is random."""
     chance = random.Random(f"process death {number}")
     first = VICTIMS[number % len(VICTIMS)]
     others = [one for one in VICTIMS if one != first]

@@ -1,4 +1,4 @@
-"""Rounds as a person plays them, what is drawn for them, and planted defects that they find."""
+"""Rounds as a person plays them, what is round_of for them, and planted defects that they find."""
 
 from __future__ import annotations
 
@@ -20,10 +20,18 @@ from hil.progress import Silent
 from sim_fixtures.program import Phase
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.controller import ROW
-from tests.process_death.laws import PROMISED, Kept, _archived, _arm, _readable, _told, broken_by
+from tests.process_death.laws import (
+    PROMISED,
+    Recorded,
+    _archived,
+    _arm,
+    _readable,
+    _supervisor,
+    broken_by,
+)
 from tests.process_death.play import DEFECTS, NOISE, SHORT, finished
 from tests.process_death.rig import Death, Seen, Strike, made, run
-from tests.process_death.rounds import VICTIMS, Moment, Victim, drawn
+from tests.process_death.rounds import VICTIMS, Moment, Victim, round_of
 
 CYCLES = 3000
 
@@ -37,37 +45,39 @@ def seen(*victims: Victim, text: str = "", behind: int = 0) -> Seen:
     return Seen(deaths, 4, {"text": text} if text else {}, rows, records, [])
 
 
-def kept(count: int, path: Path = Path("move_000_a1.mcap"), *, complete: bool = False) -> Kept:
+def recorded(
+    count: int, path: Path = Path("move_000_a1.mcap"), *, complete: bool = False
+) -> Recorded:
     """An archive of the first so many cycles."""
-    archive: Any = SimpleNamespace(complete=complete, missing="torn", outcome=None)
-    return Kept(path, cast("Any", None), archive, np.arange(count, dtype=np.int64))
+    archive: Any = SimpleNamespace(complete=complete, missing="truncated", outcome=None)
+    return Recorded(path, cast("Any", None), archive, np.arange(count, dtype=np.int64))
 
 
 @pytest.mark.parametrize(
     ("lost", "behind", "allowed"),
     [(PROMISED, 0, True), (PROMISED + 1, 0, False), (PROMISED + 20, 20, True), (2500, 100, False)],
 )
-def test_a_dead_archive_process_costs_a_chunk_and_what_it_had_not_taken(
+def test_a_dead_archive_process_costs_a_chunk_and_its_backlog(
     lost: int, behind: int, allowed: bool
 ) -> None:
     figures: dict[str, int] = {}
-    broken = list(_archived([kept(CYCLES - lost)], seen("archive", behind=behind), figures))
+    broken = list(_archived([recorded(CYCLES - lost)], seen("archive", behind=behind), figures))
     assert bool(broken) is not allowed
     assert figures["lost"] == lost
 
 
-def test_only_the_newest_archive_may_be_torn_by_a_death(
+def test_only_the_newest_archive_may_be_truncated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     older, newest = tmp_path / "move_000_a1.mcap", tmp_path / "excitation_000_a1.mcap"
     for place, path in enumerate((older, newest), 1):
         path.touch()
         os.utime(path, ns=(place * 10**9, place * 10**9))
-    monkeypatch.setattr("tests.process_death.laws._counted_plainly", lambda *_, **__: 7)
-    assert list(_readable(kept(7, newest), seen("archive"))) == []
-    (broken,) = _readable(kept(7, older), seen("archive"))
+    monkeypatch.setattr("tests.process_death.laws._cycles_by_mcap", lambda *_, **__: 7)
+    assert list(_readable(recorded(7, newest), seen("archive"))) == []
+    (broken,) = _readable(recorded(7, older), seen("archive"))
     assert "move_000_a1.mcap is not complete" in broken
-    assert list(_readable(kept(7, newest), seen("exchange")))
+    assert list(_readable(recorded(7, newest), seen("exchange")))
 
 
 @pytest.mark.parametrize(
@@ -83,10 +93,8 @@ def test_only_the_newest_archive_may_be_torn_by_a_death(
         ("controller", "the exchange process ended", False),
     ],
 )
-def test_a_supervisor_blames_who_died_and_nobody_else(
-    victim: Victim, text: str, true: bool
-) -> None:
-    assert (not list(_told(seen(victim, text=text)))) is true
+def test_a_supervisor_names_the_process_that_died(victim: Victim, text: str, true: bool) -> None:
+    assert (not list(_supervisor(seen(victim, text=text)))) is true
 
 
 @pytest.mark.parametrize(
@@ -99,7 +107,7 @@ def test_a_supervisor_blames_who_died_and_nobody_else(
         ((Phase.OPEN, Phase.CLOSED, Phase.CLOSED), False, False),
     ],
 )
-def test_an_exchange_ends_when_the_last_packet_it_answered_told_of_closed_axes(
+def test_an_exchange_ends_with_closed_axes(
     phases: tuple[Phase, ...], deserted_answered: bool, broken: bool
 ) -> None:
     rows = np.zeros(20, ROW)
@@ -108,8 +116,8 @@ def test_an_exchange_ends_when_the_last_packet_it_answered_told_of_closed_axes(
     rows["deserted"][10:] = True
     rows["replied"][10:] = False
     rows["replied"][10] = deserted_answered
-    said = list(_arm(Seen([Death("supervisor", 20)], None, {}, rows, rows, [])))
-    assert any("ended by itself" in one for one in said) is broken
+    problems = list(_arm(Seen([Death("supervisor", 20)], None, {}, rows, rows, [])))
+    assert any("ended by itself" in one for one in problems) is broken
 
 
 ROOT: Final = Path(__file__).resolve().parents[2]
@@ -137,8 +145,8 @@ def test_the_arm_rests_and_the_campaign_is_completed(first: int) -> None:
 
 
 def test_rounds_are_known_by_number_and_kill_all_at_all_moments() -> None:
-    assert drawn(417) == drawn(417)
-    rounds = [drawn(number) for number in range(1000)]
+    assert round_of(417) == round_of(417)
+    rounds = [round_of(number) for number in range(1000)]
     assert len({str(one) for one in rounds[:200]}) > 190
     assert [one.victims[0] for one in rounds[:4]] == list(VICTIMS)
     assert all(len(set(one.victims)) == len(one.victims) for one in rounds)
@@ -150,7 +158,7 @@ def test_rounds_are_known_by_number_and_kill_all_at_all_moments() -> None:
 def round_in_which(victim: Victim) -> int:
     """The first round that kills it alone, half way through a repetition."""
     for number in range(10_000):
-        one = drawn(number)
+        one = round_of(number)
         trigger = one.trigger
         half_way = trigger.count in (3, 4) and 0.25 < trigger.way < 0.45
         if one.victims == (victim,) and trigger.moment == "motion" and half_way and not one.loops:
@@ -178,11 +186,11 @@ def test_what_is_no_kill_brings_the_arm_to_rest_too(
     """Ctrl-C, a terminal that is closed, an archive process that hangs, a full disk."""
     cell = fast_cell(tmp_path, **SHORT).with_values({"simulation.current_noise": NOISE})
     campaign = made(tmp_path, cell, design(cell, Silent()))
-    played = replace(drawn(round_in_which(victim)), over_sockets=False)
-    seen = run(campaign, played, (victim,), tmp_path / "said.json", how=how)
+    played = replace(round_of(round_in_which(victim)), over_sockets=False)
+    seen = run(campaign, played, (victim,), tmp_path / "report.json", how=how)
     assert broken_by(seen, campaign)[0] == []
     assert seen.status == status
-    assert words in seen.said["text"]
+    assert words in seen.report["text"]
     assert finished(campaign, played, seen, tmp_path) == []
 
 
