@@ -28,10 +28,8 @@ DryRunState = Literal["accepted", "to be accepted", "left out"]
 
 SIMULATED: Final = "simulated"
 """Metadata key: whether only a simulated arm can have moved, "yes" or "no", by the link."""
-OVERRIDE: Final = 0.2
-"""Largest share of the planned speed."""
-FORMAT_VERSION: Final = 2
-"""1 had no check of torques."""
+OVERRIDE: Final = 0.2  # Largest share of the planned speed
+FORMAT_VERSION: Final = 2  # 1 had no check of torques
 _FIELDS: Final = (
     *("cycle", "gap", "position", "target_position", "target_current", "torque"),
     "commanded_position",
@@ -39,13 +37,10 @@ _FIELDS: Final = (
 AGAINST: Final = (
     "measured torque runs against the model's gravity: joint_sign, URDF or torque sign may be wrong"
 )
-CLEAR: Final = 0.5
-"""Magnitude of a correlation of torque and gravity that is significant."""
-_LEAST_SHARE: Final = 0.05
-"""Gravity as a share of the rms torque below which it is not compared."""
+CLEAR: Final = 0.5  # Magnitude of a correlation of torque and gravity that is significant
+_LEAST_SHARE: Final = 0.05  # Gravity as a share of the rms torque below which it is not compared
 _LEAST_SAMPLES: Final = 100
-_STEP: Final = 0.01
-"""Period of the samples whose torque is compared, s."""
+_STEP: Final = 0.01  # Period of the samples whose torque is compared, s
 
 
 def yes_or_no(only_simulated: bool) -> str:

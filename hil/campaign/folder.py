@@ -40,10 +40,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 LOCK: Final = "campaign.lock"
-LOCK_PATIENCE: Final = 0.5
-"""s to wait for a lock: `busy` holds it for a moment."""
-MESH: Final = "mesh "
-"""Prefix of the entry of a mesh, by its name in the URDF."""
+LOCK_PATIENCE: Final = 0.5  # s to wait for a lock: `busy` holds it for a moment
+MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 _ANOTHER: Final = "{} is not the one this campaign began with"
 _RESTORE: Final = "restore it, or begin a new campaign"

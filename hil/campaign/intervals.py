@@ -32,12 +32,9 @@ Array = NDArray[np.float64]
 _ROUNDED: Final = 9e-7
 """Rounding of a position at its limit in packets, as a share of half a joint's range; guard and
 player allow as much."""
-AT_REST_TOLERANCE: Final = 1e-6
-"""rad; a shorter move is left out."""
-START_TOLERANCE: Final = 1e-3
-"""Largest distance of the arm from the start of a motion, rad."""
-REPEATED: Final = ("excitation", "warmup")
-"""Kinds of motion that run the excitation."""
+AT_REST_TOLERANCE: Final = 1e-6  # rad; a shorter move is left out
+START_TOLERANCE: Final = 1e-3  # Largest distance of the arm from the start of a motion, rad
+REPEATED: Final = ("excitation", "warmup")  # Kinds of motion that run the excitation
 
 
 @dataclass(frozen=True, eq=False)

@@ -81,26 +81,20 @@ from .steering import PacketCounts, Steering
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-HEARTBEAT_PERIOD: Final = 0.05
-"""s; the exchange stops the arm after 0.5 s without a heartbeat."""
-STALL: Final = 1.0
-"""Longest time between two turns of the loop that supervises a motion, s."""
+HEARTBEAT_PERIOD: Final = 0.05  # s; the exchange stops the arm after 0.5 s without a heartbeat
+STALL: Final = 1.0  # Longest time between two turns of the loop that supervises a motion, s
 _STARVED: Final = 0.4
 """Time between two heartbeats that is reported, s: the exchange may have missed them."""
 HUNG: Final = 5.0
 """s without a heartbeat after which an exchange process is killed: the controller, without replies
 for so long, has acted by its own watchdog."""
-POLL: Final = 0.02
-"""Period of the supervising loop, s."""
-OPEN_TIMEOUT = 10.0
-"""s within which a file must have been created, or completed."""
-SLOW_DISK: Final = 1.0
-"""Duration of one flush that is reported as a fault of the disk, s."""
+POLL: Final = 0.02  # Period of the supervising loop, s
+OPEN_TIMEOUT = 10.0  # s within which a file must have been created, or completed
+SLOW_DISK: Final = 1.0  # Duration of one flush that is reported as a fault of the disk, s
 REST_TIMEOUT: Final = 30.0
 """s for an arm to come to rest, and for the archive of a motion that has ended."""
 _M_MMAP_THRESHOLD: Final = -3
-LARGE: Final = 128 * 1024
-"""Bytes; glibc's own value, before it adapts."""
+LARGE: Final = 128 * 1024  # Bytes; glibc's own value, before it adapts
 
 
 def return_large_arrays() -> None:
@@ -804,16 +798,11 @@ class LiveLink(MotionLink):
         )
 
 
-SILENCE: Final = 1.0
-"""s without a packet after which the controller is assumed to have gone."""
-NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))
-"""States without a session."""
-TARGET_MOVED: Final = 1e-5
-"""rad; a target at rest does not change, but its rounding may."""
-ARM_MOVED: Final = 5e-4
-"""rad; more than an encoder's noise, less than any motion moves in a second."""
-REST: Final = 1.0
-"""s of the controller's time without motion after which the arm is at rest."""
+SILENCE: Final = 1.0  # s without a packet after which the controller is assumed to have gone
+NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))  # States without a session
+TARGET_MOVED: Final = 1e-5  # rad; a target at rest does not change, but its rounding may
+ARM_MOVED: Final = 5e-4  # rad; more than an encoder's noise, less than any motion moves in a second
+REST: Final = 1.0  # s of the controller's time without motion after which the arm is at rest
 OFF: Final = 1.0
 """s with the drive off after which replies end; a session that is being ended has ended by then."""
 

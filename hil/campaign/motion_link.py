@@ -37,12 +37,9 @@ from .steering import PacketCounts, Steering
 
 Array = NDArray[np.float64]
 
-START_TIMEOUT: Final = 60.0
-"""s within which an accepted motion must have started."""
-OFF_TIMEOUT: Final = 2.0
-"""s with the drive off after which an accepted motion is dropped."""
-END_TIMEOUT: Final = 30.0
-"""s within which a session must end after that was requested."""
+START_TIMEOUT: Final = 60.0  # s within which an accepted motion must have started
+OFF_TIMEOUT: Final = 2.0  # s with the drive off after which an accepted motion is dropped
+END_TIMEOUT: Final = 30.0  # s within which a session must end after that was requested
 NOT_STARTED: Final = "it had not begun"
 """Reason of a motion that was stopped before it was requested."""
 _WITHOUT_DRIVE: Final = (State.SYNC, State.INIT, State.DRIVE_OFF, State.FAULTED, State.ENDED)

@@ -222,11 +222,9 @@ class Unattended:
         return False
 
 
-unwatched_motion = Unattended()
-"""For motions without a watch."""
+unwatched_motion = Unattended()  # For motions without a watch
 
-NOTES = 4
-"""Notes on quality that are shown."""
+NOTES = 4  # Notes on quality that are shown
 
 
 @dataclass(eq=False)

@@ -30,12 +30,9 @@ from planner import FourierSeries, PiecewiseCubic, PlanFile
 
 from .errors import MotionRefusedError
 
-LEAST: Final = 4
-"""Least population of a genetic search."""
-SLOWEST: Final = 0.5
-"""Smallest share of a joint's speed in the search: slow motions excite little."""
-LONGEST: Final = 60.0
-"""Longest excitation, s."""
+LEAST: Final = 4  # Least population of a genetic search
+SLOWEST: Final = 0.5  # Smallest share of a joint's speed in the search: slow motions excite little
+LONGEST: Final = 60.0  # Longest excitation, s
 FORMAT_VERSION = 4
 """1 has no moves and no limits; 2 excitations through via points only, without their method; 3 no
 Fourier series as validation motions."""

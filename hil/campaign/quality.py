@@ -34,30 +34,23 @@ Array = NDArray[np.float64]
 _SENT: Final = ("commanded_position", "commanded_velocity")
 FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)
 """Columns of an archive that are checked."""
-MISSED_SHARE: Final = 0.01
-"""Largest share of missed packets."""
+MISSED_SHARE: Final = 0.01  # Largest share of missed packets
 OFF_PATH: Final = 1e-4
 """Largest distance of set-point and plan, rad; float32 targets are exact to 2e-6."""
 _ARM_MOVED: Final = 5e-4
 """rad; more than an encoder's noise, less than any motion makes in a second."""
-SATURATED: Final = 0.98
-"""Share of the current limit from which a current is saturated."""
-SATURATED_CYCLES: Final = 3
-"""Saturated cycles in a row that are more than noise."""
-COMPARED: Final = 9
-"""Earlier repetitions that a new one is compared with."""
-FEWEST: Final = 4
-"""Earlier repetitions from which the bounds follow their own scatter."""
+SATURATED: Final = 0.98  # Share of the current limit from which a current is saturated
+SATURATED_CYCLES: Final = 3  # Saturated cycles in a row that are more than noise
+COMPARED: Final = 9  # Earlier repetitions that a new one is compared with
+FEWEST: Final = 4  # Earlier repetitions from which the bounds follow their own scatter
 _CHANNELS: Final = (
     ("position", "the following-error threshold", 0.05, 0.005),
     ("current", "its rms current", 0.1, 0.02),
 )
 """Quantity; its scale; share of it by which the first repetitions may differ (rms); and the least
 bound of later ones."""
-_WIDE: Final = 3.0
-"""Least bound as a multiple of the median difference of the earlier ones."""
-_OUTLYING: Final = 6.0
-"""Robust standard deviations above the median difference."""
+_WIDE: Final = 3.0  # Least bound as a multiple of the median difference of the earlier ones
+_OUTLYING: Final = 6.0  # Robust standard deviations above the median difference
 _FEWEST_ALIKE: Final = 2
 """Least number of rejected attempts that agree before the reference is questioned."""
 

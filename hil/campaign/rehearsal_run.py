@@ -53,22 +53,17 @@ from .rehearsal import AS_MODELLED, CRITERIA, EFFECTS, Criterion, Rehearsal
 
 Array = NDArray[np.float64]
 
-SPREAD: Final = 0.1
-"""Largest relative deviation of the simulated parameters from the nominal ones."""
-NOISE_SHARE: Final = 0.005
-"""Noise of the current, rms, as a share of the weakest motor's limit."""
-RESOLUTION_SHARE: Final = 0.001
-"""Resolution of the target current, as a share of the same limit."""
-FAULT_EVERY: Final = 3.0
-"""Mean time between two faults of the link, s."""
+SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
+NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
+RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
+FAULT_EVERY: Final = 3.0  # Mean time between two faults of the link, s
 LOOP_CYCLES: Final = 0.5
 """Mean delay of a target current, cycles: it acts over the cycle before the packet."""
 RESONANCE: Final = 500.0
 """Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
 FASTEST: Final = 800.0
 """Highest resonance in any posture, rad/s: the simulated arm has steps of half a cycle."""
-POSTURES: Final = 60
-"""Postures in which the resonances are computed."""
+POSTURES: Final = 60  # Postures in which the resonances are computed
 MAIN_AXES: Final = 3
 SLOWEST_LOOP: Final = 0.002
 """Slowest current loop, s; a slower one makes the simulated arm oscillate."""
@@ -248,8 +243,7 @@ MOST_SIGMA: Final = 4.0
 """Largest deviation of an estimate from the simulated value, in standard deviations."""
 MOST_ERROR: Final = 1.2
 """Largest error on unseen motion, as a multiple of that of the simulated parameters."""
-SATURATED: Final = 0.99
-"""Share of the current limit from which a motor is saturated."""
+SATURATED: Final = 0.99  # Share of the current limit from which a motor is saturated
 _NAMED: Final = 3
 
 

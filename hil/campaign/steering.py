@@ -27,10 +27,8 @@ from hil.errors import ControllerFault
 
 from .operator import Latency, MotionProgress, MotionWatch, Stop
 
-REQUEST_PERIOD: Final = 0.02
-"""Period of reading the operator's request during a hold, s."""
-SHOW_PERIOD: Final = 0.1
-"""Period of showing the motion, s."""
+REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during a hold, s
+SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s
 EVENTS_SHOWN: Final = 8
 
 

@@ -25,12 +25,9 @@ from .plan import CampaignPlan, plan_around
 Array = NDArray[np.float64]
 
 PLAYER: Final = "play_ur.py"
-RATE: Final = 500.0
-"""Rate of the tables, Hz: the cycle of an e-Series controller."""
-ROS_RATE: Final = 100.0
-"""Rate of the points that a trajectory controller interpolates, Hz."""
-SCRIPT_RATE: Final = 125.0
-"""Rate of the set-points of a URScript program, Hz."""
+RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
+ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller interpolates, Hz
+SCRIPT_RATE: Final = 125.0  # Rate of the set-points of a URScript program, Hz
 UR_JOINTS: Final = 6
 
 _PLAYER: Final = '''\

@@ -38,17 +38,13 @@ DEFAULT_DRIFT: Final = 0.002
 """Change per motion below which a real arm is warm. Thirty repetitions then change friction by some
 per cent at most; with half a minute each and the usual time constant of 20 min the slope falls to
 it from 1 % within about 40 motions."""
-WINDOW: Final = 4
-"""Motions of which the slope is computed."""
-COLD_AFTER: Final = 600.0
-"""s without motion after which the joints are assumed to be cold."""
-FORMAT_VERSION: Final = 2
-"""1 had no time of the last motion."""
+WINDOW: Final = 4  # Motions of which the slope is computed
+COLD_AFTER: Final = 600.0  # s without motion after which the joints are assumed to be cold
+FORMAT_VERSION: Final = 2  # 1 had no time of the last motion
 _FIELDS: Final = ("torque", "commanded_position", "position")
 _LEAST_SHARE: Final = 0.02
 """Share of a joint's rms torque below which its friction cannot be measured."""
-_LEAST_WAY: Final = 1e-2
-"""rad of travel below which the friction of a joint cannot be measured."""
+_LEAST_WAY: Final = 1e-2  # rad of travel below which the friction of a joint cannot be measured
 
 
 def drift_wanted(cell: Cell, *, only_simulated: bool | None = None) -> float:

@@ -470,8 +470,7 @@ class AngleFrame:
         return np.asarray((np.radians(shown) - self.offset) * self.sign, dtype=np.float64)
 
 
-URDF_ROUNDING = 1e-5
-"""Relative tolerance for the rounding of degrees and radians."""
+URDF_ROUNDING = 1e-5  # Relative tolerance for the rounding of degrees and radians
 
 _SAME_NUMBER = 0.01  # relative
 _FULL_TURN = 6.3  # 2π, rounded up

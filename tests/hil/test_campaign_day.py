@@ -21,7 +21,6 @@ import pytest
 from typer.testing import CliRunner
 
 import hil
-from hil.archive.header import motion_name
 from hil.campaign import Campaign, CampaignFolderError, MotionFailedError, MotionRefusedError, Stop
 from hil.campaign.campaign import campaign_of_design
 from hil.campaign.dry_run import Acceptance, DryRun
@@ -117,8 +116,8 @@ def test_status_names_incomplete_and_rejected_archives(
     day: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(day["folder"])
-    done = Campaign.open(Path("runs/mine"))
-    campaign = Campaign.create(tmp_path / "two words", done.cell, done.plan)
+    designed = Campaign.open(Path("runs/mine"))
+    campaign = Campaign.create(tmp_path / "two words", designed.cell, designed.plan)
     status = campaign.status()
     assert status.next_command == f"hil rehearse '{tmp_path}/two words'"
     assert [step.state for step in status.steps[:3]] == ["done", "next", "blocked"]
@@ -186,15 +185,15 @@ def left_in_cycles(work: Callable[[], object]) -> Counter[str]:
         gc.enable()
 
 
-def test_a_campaign_leaves_nothing_to_the_cycle_collector(tmp_path: Path) -> None:
+def test_a_campaign_leaves_nothing_to_the_cycle_collector(tmp_path: Path, ran: Campaign) -> None:
     """Made of a cell file, run, stopped on the way, opened and run again."""
-    plan = fast_campaign(tmp_path / "first", fast_cell(tmp_path, repetitions=1)).plan
-    folder = tmp_path / "second"
+    fast_cell(tmp_path, repetitions=1)
+    folder = tmp_path / "campaign"
     software()  # what is installed is read once in a process
 
     def work() -> None:
         stop = Stop()
-        campaign = Campaign.create(folder, Cell.load(tmp_path / "cell.toml"), plan)
+        campaign = Campaign.create(folder, Cell.load(tmp_path / "cell.toml"), ran.plan)
         with pytest.raises(MotionFailedError):
             campaign.run(stop=stop, operator=Impatient(stop), unrehearsed=True)
         assert Campaign.open(folder).run(unrehearsed=True).complete
@@ -297,49 +296,12 @@ def test_dates_are_those_of_motions_in_real_time(ran: Campaign) -> None:
     assert when(dated).startswith("2026-03-01 08:01 to 10:05 ")
 
 
-def test_a_motion_is_numbered_from_one_with_its_archive() -> None:
-    stopped = MotionFailedError(
-        motion_name("excitation", 0), "stopped", "stopped by the operator", None,
-        "excitation_000_a1.mcap",
-    )  # fmt: skip
-    assert str(stopped).startswith(
-        "repetition 1 (excitation_000_a1.mcap) was stopped by the operator; everything recorded"
-    )
-    lost = MotionFailedError(motion_name("dryrun", 1), "lost", "the link went silent")
-    assert lost.sentence == "dry run 2 was lost: the link went silent"
-
-
 # --- a campaign in a script: arguments, status, bytes of its archives
 
 
-@pytest.fixture(scope="module")
-def planned(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    """A plan of one repetition; only read it."""
-    folder = tmp_path_factory.mktemp("designed")
-    return fast_campaign(folder / "campaign", fast_cell(folder, repetitions=1), rehearsed=False)
-
-
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, planned: Campaign) -> Campaign:
-    """The same, run without a rehearsal; only read it."""
-    root = tmp_path_factory.mktemp("done") / "a"
-    campaign = Campaign.create(root, planned.cell, planned.plan)
-    campaign.run(unrehearsed=True, durable=False)
-    return campaign
-
-
 @pytest.fixture
-def campaign(tmp_path: Path, planned: Campaign) -> Campaign:
-    return Campaign.create(tmp_path / "campaign", planned.cell, planned.plan)
-
-
-def test_folders_may_be_text_and_arguments_have_their_names(
-    tmp_path: Path, planned: Campaign
-) -> None:
-    root = str(tmp_path / "named")
-    made = Campaign.create(folder=root, cell=planned.cell, excitation=planned.plan)
-    assert Campaign.open(root).folder.plan_hash == made.folder.plan_hash
-    assert made.plan.to_text() == planned.plan.to_text()
+def campaign(tmp_path: Path, ran: Campaign) -> Campaign:
+    return Campaign.create(tmp_path / "campaign", ran.cell, ran.plan)
 
 
 @pytest.mark.parametrize(
@@ -352,9 +314,9 @@ def test_folders_may_be_text_and_arguments_have_their_names(
     ],
 )
 def test_an_argument_of_another_type_is_a_type_error(
-    wrong: dict[str, object], sentence: str, tmp_path: Path, planned: Campaign
+    wrong: dict[str, object], sentence: str, tmp_path: Path, ran: Campaign
 ) -> None:
-    given = {"folder": tmp_path / "c", "cell": planned.cell, "excitation": planned.plan, **wrong}
+    given = {"folder": tmp_path / "c", "cell": ran.cell, "excitation": ran.plan, **wrong}
     with pytest.raises(TypeError, match=sentence) as refused:
         Campaign.create(**given)  # type: ignore[arg-type]
     assert isinstance(refused.value, hil.errors.InputError)
@@ -365,34 +327,34 @@ class TestExistOk:
     """`exist_ok` opens a campaign that fits, so that a script can be run again."""
 
     def test_what_fits_is_opened_with_what_it_holds(
-        self, campaign: Campaign, planned: Campaign
+        self, campaign: Campaign, ran: Campaign
     ) -> None:
         pass_rehearsal(campaign.folder)
-        for excitation in (planned.plan, planned.plan.excitation):
-            again = Campaign.create(campaign.folder.root, planned.cell, excitation, exist_ok=True)
+        for excitation in (ran.plan, ran.plan.excitation):
+            again = Campaign.create(str(campaign.folder.root), ran.cell, excitation, exist_ok=True)
             assert again.folder.plan_hash == campaign.folder.plan_hash
             assert again.folder.rehearsal.exists()
 
     def test_another_cell_or_excitation_is_refused(
-        self, campaign: Campaign, planned: Campaign, tmp_path: Path
+        self, campaign: Campaign, ran: Campaign, tmp_path: Path
     ) -> None:
         root, cell = campaign.folder.root, fast_cell(tmp_path, repetitions=7)
         with pytest.raises(hil.errors.InputError, match="a campaign with another cell"):
-            Campaign.create(root, cell, planned.plan, exist_ok=True)
-        other = replace(planned.plan, validation=planned.plan.validation[:0])
+            Campaign.create(root, cell, ran.plan, exist_ok=True)
+        other = replace(ran.plan, validation=ran.plan.validation[:0])
         with pytest.raises(hil.errors.InputError, match="a campaign with another excitation"):
-            Campaign.create(root, planned.cell, other, exist_ok=True)
+            Campaign.create(root, ran.cell, other, exist_ok=True)
 
     def test_without_it_and_for_other_things_in_the_folder(
-        self, campaign: Campaign, planned: Campaign, tmp_path: Path
+        self, campaign: Campaign, ran: Campaign, tmp_path: Path
     ) -> None:
         with pytest.raises(hil.errors.InputError, match="is not empty"):
-            Campaign.create(campaign.folder.root, planned.cell, planned.plan)
+            Campaign.create(campaign.folder.root, ran.cell, ran.plan)
         (tmp_path / "mine").mkdir()
         (tmp_path / "mine" / "notes.txt").touch()
         with pytest.raises(hil.errors.InputError, match="is not empty"):
-            Campaign.create(tmp_path / "mine", planned.cell, planned.plan, exist_ok=True)
-        made = Campaign.create(tmp_path / "new", planned.cell, planned.plan, exist_ok=True)
+            Campaign.create(tmp_path / "mine", ran.cell, ran.plan, exist_ok=True)
+        made = Campaign.create(tmp_path / "new", ran.cell, ran.plan, exist_ok=True)
         assert made.folder.plan.exists()
 
 
@@ -410,18 +372,18 @@ def checksums(campaign: Campaign) -> dict[str, str]:
     return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in archives}
 
 
-def test_one_seed_gives_the_same_bytes_in_any_folder(tmp_path: Path, done: Campaign) -> None:
-    again = Campaign.create(tmp_path / "another name", done.cell, done.plan)
+def test_one_seed_gives_the_same_bytes_in_any_folder(tmp_path: Path, ran: Campaign) -> None:
+    again = Campaign.create(tmp_path / "another name", ran.cell, ran.plan)
     again.run(unrehearsed=True, durable=False)
-    assert checksums(again) == checksums(done)
-    assert len(checksums(done)) >= 4
+    assert checksums(again) == checksums(ran)
+    assert len(checksums(ran)) >= 4
 
 
 # --- moves
 
 
-def test_an_arm_at_its_limit_by_rounding_may_leave_it(planned: Campaign) -> None:
-    cell, limits = planned.cell, planned.cell.joint_limits
+def test_an_arm_at_its_limit_by_rounding_may_leave_it(ran: Campaign) -> None:
+    cell, limits = ran.cell, ran.cell.joint_limits
     start = limits.lower - 4e-7 * (limits.upper - limits.lower)
     assert np.array_equal(at_limit(start, limits), limits.lower)
     motions = [straight_move(cell, start, cell.home).trajectory, plan_move(cell, start, cell.home)]
@@ -434,9 +396,9 @@ def test_an_arm_at_its_limit_by_rounding_may_leave_it(planned: Campaign) -> None
 
 @pytest.mark.parametrize("plan_of_move", [straight_move, plan_move])
 def test_an_arm_beyond_its_limit_is_reported_in_degrees(
-    plan_of_move: Callable[..., object], planned: Campaign
+    plan_of_move: Callable[..., object], ran: Campaign
 ) -> None:
-    cell, start = planned.cell, planned.cell.joint_limits.lower.copy()
+    cell, start = ran.cell, ran.cell.joint_limits.lower.copy()
     start[1] -= np.radians(0.5)
     elbow = np.degrees(start[1])
     with pytest.raises(
@@ -448,13 +410,13 @@ def test_an_arm_beyond_its_limit_is_reported_in_degrees(
 # --- status
 
 
-def test_a_status_asks_for_gates_as_the_run_does(done: Campaign, campaign: Campaign) -> None:
-    steps = {step.name: step for step in done.status().steps}
+def test_a_status_asks_for_gates_as_the_run_does(ran: Campaign, campaign: Campaign) -> None:
+    steps = {step.name: step for step in ran.status().steps}
     assert steps["rehearse"].sentence == "left out, as a simulated arm allows"
     assert steps["dry run"].state == steps["validation"].state == "done"
-    assert done.status().next_command.startswith("hil identify ")
-    (name, *_) = [path.name for path in done.folder.completed("excitation")]
-    (campaign.folder.archives / name).write_bytes((done.folder.archives / name).read_bytes())
+    assert ran.status().next_command.startswith("hil identify ")
+    (name, *_) = [path.name for path in ran.folder.completed("excitation")]
+    (campaign.folder.archives / name).write_bytes((ran.folder.archives / name).read_bytes())
     campaign.folder.add(name, "completed")
     assert campaign.status().next_command.startswith("hil rehearse ")
 
@@ -469,12 +431,12 @@ def test_a_status_asks_for_gates_as_the_run_does(done: Campaign, campaign: Campa
     ],
 )
 def test_status_never_names_itself_where_a_file_is_damaged(
-    name: str, command: str, campaign: Campaign, done: Campaign
+    name: str, command: str, campaign: Campaign, ran: Campaign
 ) -> None:
     """The next command is that of the step, or none with a sentence."""
     folder = campaign.folder
-    for entry in done.folder.manifest():
-        (folder.archives / entry.name).write_bytes((done.folder.archives / entry.name).read_bytes())
+    for entry in ran.folder.manifest():
+        (folder.archives / entry.name).write_bytes((ran.folder.archives / entry.name).read_bytes())
         folder.add(entry.name, entry.outcome)
     path = folder.root / name
     path.write_text(path.read_text("utf-8") + "\n# edited" if path.exists() else "{", "utf-8")
@@ -486,9 +448,9 @@ def test_status_never_names_itself_where_a_file_is_damaged(
 
 
 def test_an_incomplete_archive_that_was_replaced_is_not_needed(
-    campaign: Campaign, done: Campaign
+    campaign: Campaign, ran: Campaign
 ) -> None:
-    complete = done.folder.completed("excitation")[0]
+    complete = ran.folder.completed("excitation")[0]
     folder = campaign.folder
     (folder.archives / "excitation_000_a1.mcap").write_bytes(b"truncated")
     (folder.archives / "move_000_a1.mcap").write_bytes(b"truncated")

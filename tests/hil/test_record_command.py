@@ -38,12 +38,17 @@ from sim_fixtures.ns16 import CELL_PATH
 NAME = "excitation_000_a1.mcap"
 
 
-def own_motion_link(cell: Cell, *faults: Lose | Corrupt, accept_init: bool = False) -> Link:
-    """A link in virtual time to a controller whose own program moves the arm."""
+def own_motion_link(
+    cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = None, accept_init: bool = False
+) -> Link:
+    """A link in virtual time to a controller whose own program moves the arm.
+
+    `stated` is the cell that the PC has, by default the controller's.
+    """
     settings = replace(controller_settings(cell), own_motion=own_postures(cell))
     controller = simulated_controller(cell, settings=settings)
     transport = SimulatedTransport(controller, faults)
-    return Link.over(transport, cell, controller.finish, accept_init=accept_init)
+    return Link.over(transport, stated or cell, controller.finish, accept_init=accept_init)
 
 
 def recording_of(
@@ -85,7 +90,6 @@ def test_every_cycle_is_archived_with_its_source(recorded: Path) -> None:
     assert np.isnan(columns["commanded_position"]).all()
     assert np.all(columns["interval"] == -1)
     assert np.all(np.ptp(columns["position"], axis=0) > 0.3)
-    archive = open_archive(recorded)
     assert archive.header.entries["motion"] == "controller"
     assert archive.kind == "excitation"
     assert set(archive.attachments) == {
@@ -152,23 +156,13 @@ def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: C
 
 def test_a_controller_of_another_arm_is_recorded_if_accepted(tmp_path: Path, cell: Cell) -> None:
     wrong = Cell.from_texts(cell.text.replace("k65 = 0.035", "k65 = 0.045"), cell.urdf, cell.path)
-    settings = replace(controller_settings(cell), own_motion=own_postures(cell))
-
-    def link(*, accept_init: bool) -> Link:
-        transport = SimulatedTransport(simulated_controller(cell, settings=settings))
-        return Link.over(transport, wrong, accept_init=accept_init)
-
-    def attempt(*, accept_init: bool) -> None:
-        record(
-            link(accept_init=accept_init), wrong, tmp_path / NAME,
-            kind="excitation", stop=Stop(), duration=0.5, durable=False,
-        )  # fmt: skip
-
+    how: dict[str, Any] = {"kind": "excitation", "stop": Stop(), "duration": 0.5, "durable": False}
     with pytest.raises(ControllerFault, match=r"k65 of axis 6 .*--accept-init"):
-        attempt(accept_init=False)
+        record(own_motion_link(cell, stated=wrong), wrong, tmp_path / NAME, **how)
     assert not (tmp_path / NAME).exists()
 
-    attempt(accept_init=True)
+    accepting = own_motion_link(cell, stated=wrong, accept_init=True)
+    record(accepting, wrong, tmp_path / NAME, **how)
     archive = open_archive(tmp_path / NAME)
     assert archive.header.entries["accepted_init"] == "yes"
     assert "k65 of axis 6" in archive.header.entries["accepted_init.differences"]

@@ -226,8 +226,8 @@ class Watched:
     def _left_alone(self) -> bool:
         """Return whether nothing moves and nothing will be requested any more.
 
-        An exchange may begin a motion within some cycles after its supervisor died; the targets are at
-        rest then, so that a controller that is to end would close its axes.
+        An exchange may begin a motion within some cycles after its supervisor died; targets rest
+        then, so that a controller that is to end would close its axes.
         """
         control = None if self.memory is None else self.memory.control
         if not (self.over("supervisor") or (control is not None and control.finish)):
