@@ -105,7 +105,7 @@ class Described:
         if self.gravity is not None and not all(map(math.isfinite, self.gravity)):
             problem, remedy = f"{self.gravity} is not a vector", "give m/s², as in 0 0 -9.81"
             raise InputError(None, problem, field="--gravity", remedy=remedy)
-        if not math.isfinite(self.standstill):
+        if not 0.0 <= self.standstill < math.inf:
             problem, remedy = f"{self.standstill} is not a speed", "give rad/s, as in 0.01"
             raise InputError(None, problem, field="--standstill", remedy=remedy)
         law = FrictionLaw.from_table(

@@ -320,32 +320,24 @@ def references(
         InputError: a file cannot be read, or its criteria are not comparable.
     """
 
-    def refused(path: Path | None, problem: str, remedy: str) -> InputError:
-        return InputError(path, problem, field="--compare", remedy=remedy)
-
     def parameters_of(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
         if asked.objective.parameters == "payload":
             return {"payload"}
         return set(named or cell.model.parameter_names)
 
-    if paths and together:
-        problem = "cannot be combined with --earlier, which adds the information of other archives"
-        raise refused(None, problem, "leave out one of the two")
     found: dict[str, tuple[float, ...]] = {}
     new = parameters_of(settings, settings.objective.named)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
-        if "earlier" in result.data:
-            problem = "was designed with --earlier: its criteria include the earlier archives"
-            raise refused(path, problem, "name designs without --earlier")
         old = parameters_of(result.settings, result.data["search"].get("parameters"))
-        if new != old:
+        if together or "earlier" in result.data or new != old:
             problem = (
                 f"has criteria of {len(old)} parameters, this design of {len(new)}, of which "
-                f"{len(new & old)} are the same"
+                f"{len(new & old)} are the same; with --earlier they include those archives"
             )
-            raise refused(path, problem, "name designs with the same [objective]")
+            remedy = "name designs with the same [objective], none of them with --earlier"
+            raise InputError(path, problem, field="--compare", remedy=remedy)
         method = result.excitation.method
         name = f"method {method.upper()}" if len(method) == 1 else method
         name += " (kinematic)" if result.settings.unchecked else ""

@@ -153,10 +153,7 @@ def run_search(
     earlier: EarlierEstimate | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> excitation.Design:
-    """Search a motion for a cell.
-
-    The result does not depend on the number of `workers`, processes that score motions. `stop` is
-    called between generations; true ends the search with the best motion so far.
+    """Search a motion for a cell; `workers` processes, `stop` as in `identification`'s `search`.
 
     Raises:
         NoExcitationError: no motion satisfies all constraints.

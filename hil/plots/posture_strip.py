@@ -204,9 +204,3 @@ def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
         )
         for look in looks:
             axes.add_patch(Rectangle((low[0], low[1]), *size, edgecolor=_HATCH, **look))
-    for wall in workspace.walls:
-        normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
-        across, up = normal[list(view.axes)]
-        if np.hypot(across, up) > 1.0 - 1e-9:  # planes parallel to the direction of view
-            foot = (across * wall.offset, up * wall.offset)
-            axes.axline(foot, (foot[0] - up, foot[1] + across), color=style.INK, zorder=1.6)

@@ -3,7 +3,7 @@
 # ruff: noqa: F401
 import types
 
-from identification.excitation.collision.bodies import Box, Wall, Workspace
+from identification.excitation.collision.bodies import Box, Workspace
 from identification.excitation.collision.checker import CollisionChecker, Contact
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
@@ -29,7 +29,6 @@ from identification.excitation.errors import (
     DesignError,
     JournalError,
     MissingMeshError,
-    PostureError,
     WorkspaceError,
 )
 from identification.excitation.excitation import Excitation, ViaPointMotion

@@ -21,12 +21,8 @@ class MissingMeshError(CollisionModelError):
         super().__init__(f"the collision mesh {mesh} cannot be found")
 
 
-class PostureError(IdentificationError, ValueError):
-    """A posture with a joint position that is not finite."""
-
-
 class WorkspaceError(IdentificationError, ValueError):
-    """Invalid obstacles or margin."""
+    """A box whose corners are not in order."""
 
 
 class DesignError(IdentificationError, ValueError):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +20,6 @@ from planner import (
     harmonic_bounds,
     plan_chunk,
 )
-from planner.arrays import read_only
 
 Array = NDArray[np.float64]
 Motion: TypeAlias = PiecewiseCubic | FourierSeries
@@ -29,30 +28,6 @@ Motion: TypeAlias = PiecewiseCubic | FourierSeries
 _PATH_SPACING: Final = 0.1
 # Draws of one via point before the last one is used even if it collides.
 _DRAWS: Final = 50
-
-
-class Genome(Protocol):
-    """A family of motions, each given by `n_genes` numbers from 0 to 1."""
-
-    @property
-    def n_genes(self) -> int:
-        """Number of genes of a motion."""
-        ...
-
-    def motions(self, genes: Array) -> Sequence[Motion | PlannerError]:
-        """Return the motion of each row of genes (m, n_genes), or its planning error.
-
-        A motion does not depend on the other rows, to the last bit.
-        """
-        ...
-
-    def sample(self, random: np.random.Generator, count: int) -> Array:
-        """Draw a first population (count, n_genes)."""
-        ...
-
-    def source(self, genes: Array) -> dict[str, Any]:
-        """Return the fields of `Excitation` that genes (n_genes,) determine."""
-        ...
 
 
 def _interpolated(lower: ArrayLike, upper: ArrayLike, genes: Array) -> Array:
@@ -85,10 +60,6 @@ class ViaPointGenome:
     #: points as in the paper
     checker: CollisionChecker | None = None
 
-    def __post_init__(self) -> None:
-        if self.home is not None:
-            object.__setattr__(self, "home", read_only(self.home))
-
     @property
     def n_genes(self) -> int:
         """Number of genes, K n + n."""
@@ -105,7 +76,10 @@ class ViaPointGenome:
         return points, _interpolated(self.slowest, 1.0, rates)
 
     def motions(self, genes: Array) -> Sequence[Motion | PlannerError]:
-        """Plan each row of genes (m, n_genes) in this process, which the solver can crash."""
+        """Plan each row of genes (m, n_genes) in this process, which the solver can crash.
+
+        Errors are in place of their motion. It does not depend on the other rows, to the last bit.
+        """
         points, speed = self.decode(genes)
         return plan_chunk(list(points), speed, self.limits, self.fly)
 
@@ -123,7 +97,7 @@ class ViaPointGenome:
         return genes
 
     def source(self, genes: Array) -> dict[str, Any]:
-        """Return via points, speeds and corner rounding of genes (n_genes,)."""
+        """Return the fields of `Excitation` that genes (n_genes,) determine."""
         points, speed = (each[0] for each in self.decode(genes))
         return {"via_points": points, "speed": speed, "fly": self.fly}
 
@@ -190,9 +164,6 @@ class SineGenome:
     fastest: Array | None = None
 
     def __post_init__(self) -> None:
-        for name in ("offset", "slowest", "fastest"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, read_only(getattr(self, name)))
         try:
             harmonic_bounds(self.limits, self.centre, self.harmonics)
         except InvalidSetting as error:
@@ -246,5 +217,8 @@ class SineGenome:
         return random.random((count, self.n_genes))
 
     def source(self, genes: Array) -> dict[str, Any]:  # noqa: ARG002
-        """Return no fields: the series itself has all parameters."""
+        """Return the fields of `Excitation` that genes determine: none, the series has all."""
         return {}
+
+
+Genome: TypeAlias = ViaPointGenome | SineGenome

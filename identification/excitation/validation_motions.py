@@ -46,18 +46,9 @@ def random_validation_motions(
 ) -> tuple[ViaPointMotion, ...]:
     """Return random motions across the joint ranges to validate predictions on.
 
-    They satisfy the same constraints as an excitation; their random numbers are independent of
-    those of any search.
-
-    Args:
-        limits: joint limits of the plan.
-        home: start and end posture (n,) [rad], within the limits.
-        seed: the same seed gives the same motions bit for bit.
-        count: number of motions; the first ones do not depend on it.
-        n_via: via points between the two ends.
-        fly: corner rounding, 0 to 1.
-        checker: clearance of every motion.
-        currents: torque and current limits of every motion.
+    They begin and end in `home` (n,) [rad], with `n_via` points between and corner rounding `fly`,
+    and satisfy the same constraints as an excitation. Their random numbers are independent of those
+    of any search. The same seed gives the same motions bit for bit, the first ones for any `count`.
 
     Raises:
         NoFeasibleMotionError: 100 attempts in a row without a feasible motion.

@@ -16,9 +16,9 @@ Array = NDArray[np.float64]
 
 # Texts about speeds below standstill.
 _ZONES = {
-    "exclude": "nothing was fitted: static friction can have any value up to the Coulomb"
-    " friction, in both directions.",
-    "linear": "sgn(v) is v / standstill, as fitted.",
+    "exclude": "Below the standstill speed nothing was fitted: static friction can have any value"
+    " up to the Coulomb friction, in both directions.",
+    "linear": "Below the standstill speed of a linear zone sgn(v) is v / standstill, as fitted.",
 }
 
 
@@ -35,31 +35,24 @@ def friction_text(model: RobotModel, coefficients: Array) -> str:
     names = [_line(name) for name in model.joint_names]
     # symbols that mean different terms of different joints
     shared = {symbol for symbol, count in Counter(k.symbol for k in kinds).items() if count > 1}
-    lines = []
-    if kinds:
-        lines += [
-            f"Friction torque at the speed v of a joint: {_formula(kinds)}",
-            f"with {_joined([kind.description for kind in kinds])}.",
-        ]
-        slow: dict[tuple[float, str], list[str]] = {}  # joints by standstill and zone
-        for name, law in zip(names, friction.laws, strict=True):
-            if law.symbols and law.zone in _ZONES:
-                slow.setdefault((law.standstill, law.zone), []).append(name)
-        for (speed, zone), joints in sorted(slow.items()):
-            which = "" if len(joints) == n else f" {_joined(joints)}:"
-            lines.append(f"Slower than {speed:g} rad/s (m/s){which} {_ZONES[zone]}")
-        lines.append("")
+    lines = [
+        f"Friction torque at the speed v of a joint: {_formula(kinds)}",
+        f"with {_joined([kind.description for kind in kinds])}.",
+        *(text for zone, text in _ZONES.items() if zone in {law.zone for law in friction.laws}),
+        "",
+    ]
     for name, law, row, revolute in zip(
-        names, friction.laws, table, model.chain.revolute.tolist(), strict=False
+        names, friction.laws, table, friction.revolute, strict=False
     ):
+        unit = "rad/s" if revolute else "m/s"
         values = _values(law, row, revolute)
-        for term in law.terms:
-            if term.symbol in shared:
-                values.append(f"{term.symbol} with {term.basis}")
-            if term.speed_symbol:
-                unit = "rad/s" if revolute else "m/s"
-                values.append(f"{term.speed_symbol} = {term.speed:g} {unit}")
-        lines.append(f"{name}: " + (", ".join(values) or "no friction"))
+        values += [f"{t.symbol} with {t.basis}" for t in law.terms if t.symbol in shared]
+        values += [f"{t.speed_symbol} = {t.speed:g} {unit}" for t in law.terms if t.speed_symbol]
+        zone = " (linear zone)" if law.zone == "linear" else ""
+        lines.append(
+            f"{name}: {', '.join(values) or 'no friction'}; "
+            f"standstill below {law.standstill:g} {unit}{zone}"
+        )
     if any(law.asymmetric and law.coulomb for law in friction.laws):
         lines.append(
             "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
@@ -70,7 +63,7 @@ def friction_text(model: RobotModel, coefficients: Array) -> str:
             ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({names[j]})"
             for j in np.flatnonzero(share)
         )
-        numbers = _values(friction.laws[motor], row, bool(friction.revolute[motor]))
+        numbers = _values(friction.laws[motor], row, friction.revolute[motor])
         lines.append(
             f"motor {motor + 1}, at v = {speed_sum}: {', '.join(numbers)}; this torque times its"
             " factor acts on each of these joints"

@@ -40,10 +40,7 @@ def parameters_json(
     essential: Collection[str] | None = None,
     provenance: Mapping[str, str] | None = None,
 ) -> str:
-    """Return an estimate as JSON text.
-
-    With the standard parameters of a consistent estimate, the names of essential parameters, and
-    the provenance, if given.
+    """Return an estimate as JSON text, with what else is given.
 
     Raises:
         IdentificationError: the estimate is of other parameters.

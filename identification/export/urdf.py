@@ -11,17 +11,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple
-from xml.parsers import expat
-from xml.sax.saxutils import escape
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Final
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ModelError
+from identification.errors import IdentificationError
 from identification.model.friction import TERMS
 from identification.model.kinematics import (
     FROM_PINOCCHIO,
@@ -48,6 +47,7 @@ _DYNAMICS: Final = {kind.symbol: kind.urdf for kind in reversed(TERMS) if kind.u
 _STATES: Final = 50
 _SEED: Final = 20140902
 _ROUNDING: Final = 1e-8  # relative to the largest torque of a joint
+_PROLOG: Final = re.compile(r"(?:\s+|<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>\[]*(?:\[.*?\])?\s*>)*", re.S)
 
 
 class NotConsistentError(IdentificationError):
@@ -56,118 +56,6 @@ class NotConsistentError(IdentificationError):
 
 class WriteBackError(IdentificationError):
     """The description does not fit the model, or reads back with other parameters."""
-
-
-# Only changed bytes are replaced; writing a parsed tree would lose comments and formatting.
-
-
-@dataclass(eq=False)
-class Element:
-    """An element and its position in the UTF-8 text."""
-
-    name: str  # of the tag
-    attributes: dict[str, str]  # as parsed
-    start: int  # first byte of the opening tag
-    inside: int  # first byte after the opening tag
-    end: int = -1  # first byte after the element
-    children: list[Element] = field(default_factory=list)
-
-    def child(self, name: str) -> Element | None:
-        """Return the first child with that tag."""
-        return next((child for child in self.children if child.name == name), None)
-
-    def named(self, name: str) -> dict[str, Element]:
-        """Return the children with that tag by their attribute `name`."""
-        return {e.attributes.get("name", ""): e for e in self.children if e.name == name}
-
-
-class Edit(NamedTuple):
-    """Replacement of the bytes from `start` to `end`, which may be equal, with `text`."""
-
-    start: int
-    end: int
-    text: str
-
-
-class XmlSource:
-    """An XML text for editing in place, with its root element `root`.
-
-    Raises:
-        ModelError: the text is not well-formed XML.
-    """
-
-    def __init__(self, text: str) -> None:
-        self._bytes = data = text.encode("utf-8")
-        self._newline = "\r\n" if b"\r\n" in data else "\n"
-        parser = expat.ParserCreate("utf-8")
-        tag = re.compile(rb"<(?:[^>\"']|\"[^\"]*\"|'[^']*')*>")  # values may contain '>'
-        open_elements = [Element("", {}, 0, 0)]
-
-        def opened(name: str, attributes: dict[str, str]) -> None:
-            start = parser.CurrentByteIndex
-            found = tag.match(data, start)
-            assert found is not None
-            element = Element(name, attributes, start, found.end())
-            open_elements[-1].children.append(element)
-            open_elements.append(element)
-
-        def closed(_: str) -> None:
-            element = open_elements.pop()
-            empty = data[element.inside - 2 : element.inside] == b"/>"
-            after = data.find(b">", parser.CurrentByteIndex) + 1
-            element.end = element.inside if empty else after
-
-        parser.StartElementHandler = opened
-        parser.EndElementHandler = closed
-        try:
-            parser.Parse(data, True)
-        except expat.ExpatError as error:
-            raise ModelError(f"the robot description is not XML: {error}") from error
-        self.root = open_elements[0].children[0]
-
-    def edited(self, edits: Iterable[Edit]) -> str:
-        """Return the text with non-overlapping edits applied."""
-        data = self._bytes
-        for edit in sorted(edits, reverse=True):
-            data = data[: edit.start] + edit.text.encode("utf-8") + data[edit.end :]
-        return data.decode("utf-8")
-
-    def with_attributes(self, element: Element, values: Mapping[str, str]) -> Edit:
-        """Return the edit that sets attributes of an element."""
-        tag = self._bytes[element.start : element.inside].decode("utf-8")
-        for name, value in values.items():
-            written = f'"{escape(value, {chr(34): "&quot;"})}"'
-            pattern = re.compile(rf"(\s{re.escape(name)}\s*=\s*)(\"[^\"]*\"|'[^']*')")
-            if found := pattern.search(tag):
-                tag = tag[: found.start(2)] + written + tag[found.end() :]
-            else:
-                head = tag.removesuffix(">").removesuffix("/").rstrip()
-                tag = f"{head} {name}={written}{tag[len(head) :]}"
-        return Edit(element.start, element.inside, tag)
-
-    def with_first_child(self, element: Element, lines: Iterable[str]) -> Edit:
-        """Return the edit that inserts lines of XML after the opening tag."""
-        outer = self._indentation(element)
-        children = [self._indentation(child) for child in element.children]
-        inner = next((indent for indent in children if indent), outer + "  ")
-        block = "".join(f"{self._newline}{inner}{line}" for line in lines)
-        tag = self._bytes[element.start : element.inside].decode("utf-8")
-        if tag.endswith("/>"):
-            closing = f"{self._newline}{outer}</{element.name}>"
-            return Edit(element.start, element.end, f"{tag[:-2].rstrip()}>{block}{closing}")
-        return Edit(element.inside, element.inside, block)
-
-    def with_comment(self, lines: Iterable[str]) -> Edit:
-        """Return the edit that inserts a comment before the root element."""
-        inside = comment_text(self._newline.join(f"  {line}" for line in lines))
-        at = self.root.start
-        return Edit(at, at, self._newline.join(["<!--", inside, "-->", ""]))
-
-    def _indentation(self, element: Element) -> str:
-        """Return the white space before an element at the start of its line, else nothing."""
-        before = self._bytes[: element.start].decode("utf-8")
-        line = before[before.rfind("\n") + 1 :]
-        return line if not line.strip() else ""
 
 
 def comment_text(text: str) -> str:
@@ -182,15 +70,10 @@ def write_urdf(
     friction: Array | None = None,
     remarks: Sequence[str] = (),
 ) -> str:
-    """Return the URDF text with new inertial parameters, and friction if given.
+    """Return the URDF text of a model with standard parameters (s,), and friction (k,) if given.
 
-    Args:
-        urdf: text that the model was created from.
-        model: the robot.
-        standard: all standard parameters (s,), see `RobotModel.standard_names`.
-        friction: coefficients (k,), see `RobotModel.friction_part`; a NaN leaves its attribute,
-            None all of ``<dynamics>`` unchanged.
-        remarks: lines of a comment before the robot.
+    A coefficient of NaN leaves its attribute unchanged, None all of ``<dynamics>``; `remarks` are
+    lines of a comment before the robot.
 
     Raises:
         NotConsistentError: a link, a rotor or friction is not physically consistent.
@@ -213,23 +96,36 @@ def write_urdf(
     ]
     _require_consistent(model, standard, inertial, dynamics)
     bodies, removed = _without_locked(urdf, model, inertial)
-    source = XmlSource(urdf)
-    tree = _Tree(source.root, model, removed)
-    edits = [source.with_comment(remarks)] if remarks else []
+    root = urdf_tree(urdf, comments=True)
+    tree = _Tree(root, model, removed)
     for joint, parameters, values in zip(model.joint_names, bodies, dynamics, strict=True):
         link = tree.end(tree.joints[joint], "child")
-        edits += _inertia_edits(source, link, body(parameters))
+        _set_inertia(link, body(parameters))
         for merged in tree.fixed_to(link):
-            if (element := merged.child("inertial")) is not None:
-                name = comment_text(link.attributes["name"])
-                note = f"<!-- inertia is contained in {name} -->"
-                edits.append(Edit(element.start, element.end, note))
+            if (element := merged.find("inertial")) is not None:
+                name = comment_text(link.attrib["name"])
+                note = ElementTree.Comment(f" inertia is contained in {name} ")
+                note.tail = element.tail
+                merged[list(merged).index(element)] = note
         if values:
             figures = {attribute: as_text(value) for attribute, value in values.items()}
-            edits += _set(source, tree.joints[joint], {"dynamics": figures})
-    text = source.edited(edits)
+            _child(tree.joints[joint], "dynamics").attrib.update(figures)
+    text = _joined(urdf, root, remarks)
     _compare(text, model, inertial, dynamics)
     return text
+
+
+def _joined(urdf: str, root: Element, remarks: Sequence[str]) -> str:
+    """Return a text with another root element, and a comment before it."""
+    prolog = _PROLOG.match(urdf)
+    assert prolog is not None
+    rest = re.split(rf"</{re.escape(root.tag)}\s*>", urdf)[-1]
+    lines = "".join(f"  {comment_text(line)}\n" for line in remarks)
+    comment = f"<!--\n{lines}-->\n" if remarks else ""
+    text = ElementTree.tostring(root, encoding="unicode")
+    if 2 * urdf.count(" />") < urdf.count("/>"):
+        text = text.replace(" />", "/>")
+    return prolog[0] + comment + text + rest
 
 
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
@@ -280,13 +176,16 @@ class _Tree:
 
     def __init__(self, root: Element, model: RobotModel, removed: Collection[str]) -> None:
         # children only: transmissions have <joint> elements too
-        self.links, self.joints = root.named("link"), root.named("joint")
+        self.links, self.joints = (
+            {element.get("name", ""): element for element in root.findall(tag)}
+            for tag in ("link", "joint")
+        )
         self._rigid: list[Element] = []
         missing = [name for name in model.joint_names if name not in self.joints]
         if missing:
             raise WriteBackError(f"the description has no joint {missing[0]!r}")
         for name, joint in self.joints.items():
-            if joint.attributes.get("type") == "fixed":
+            if joint.get("type") == "fixed":
                 self._rigid.append(joint)
             elif name in model.locked:
                 self._rigid += [] if name in removed else [joint]
@@ -306,50 +205,35 @@ class _Tree:
 
     def end(self, joint: Element, end: str) -> Element:
         """Return the link at an end of a joint, "parent" or "child"."""
-        named = joint.child(end)
-        name = named.attributes.get("link", "") if named else ""
+        named = joint.find(end)
+        name = "" if named is None else named.get("link", "")
         if name not in self.links:
             raise WriteBackError(
-                f"joint {joint.attributes.get('name')!r} has no {end} link in the description"
+                f"joint {joint.get('name')!r} has no {end} link in the description"
             )
         return self.links[name]
 
 
-def _inertia_edits(source: XmlSource, link: Element, of: Body) -> Iterator[Edit]:
+def _set_inertia(link: Element, of: Body) -> None:
     """Set or insert the inertial element of a link."""
-    element = link.child("inertial")
-    origin = element and element.child("origin")
-    rotation = _rotation(origin.attributes.get("rpy", "")) if origin else np.eye(3)
+    element = _child(link, "inertial")
+    tags = ["inertia", "mass", "origin"]  # each is inserted before those that are there
+    inertia, mass, origin = (_child(element, tag) for tag in tags)
+    rotation = _rotation(origin.get("rpy", ""))
     tensor = rotation.T @ of.inertia @ rotation
-    parts = {
-        "origin": {"xyz": as_text(of.centre)},
-        "mass": {"value": as_text(of.mass)},
-        "inertia": {name: as_text(tensor[index]) for name, index in TENSOR.items()},
-    }
-    if element is not None:
-        yield from _set(source, element, parts)
-        return
-    parts["origin"]["rpy"] = "0 0 0"
-    tags = [f"  {_tag(name, values)}" for name, values in parts.items()]
-    yield source.with_first_child(link, ["<inertial>", *tags, "</inertial>"])
+    origin.set("xyz", as_text(of.centre))
+    mass.set("value", as_text(of.mass))
+    inertia.attrib.update({name: as_text(tensor[index]) for name, index in TENSOR.items()})
 
 
-def _set(
-    source: XmlSource, parent: Element, parts: Mapping[str, Mapping[str, str]]
-) -> Iterator[Edit]:
-    """Set attributes of an element's children, and insert missing children."""
-    missing = []
-    for name, values in parts.items():
-        if (child := parent.child(name)) is None:
-            missing.append(_tag(name, values))
-        else:
-            yield source.with_attributes(child, values)
-    if missing:
-        yield source.with_first_child(parent, missing)
-
-
-def _tag(name: str, values: Mapping[str, str]) -> str:
-    return f"<{name} " + " ".join(f'{key}="{value}"' for key, value in values.items()) + "/>"
+def _child(parent: Element, tag: str) -> Element:
+    """Return the first child with that tag, inserted with the layout of the others if missing."""
+    child = parent.find(tag)
+    if child is None:
+        child = Element(tag)
+        child.tail = parent.text
+        parent.insert(0, child)
+    return child
 
 
 def as_text(values: float | Sequence[float] | Array) -> str:

@@ -50,24 +50,19 @@ class BaseParameters:
         """Return a message about the rank decision and its margin."""
         s = len(self.standard_names)
         absent = s - np.count_nonzero(np.any(np.abs(self.grouping) > _NEGLIGIBLE, axis=0))
+        weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
         text = (
             f"{self.rank} of {s} standard parameters are independent, {s - self.rank - absent} are"
-            f" grouped with them, {absent} do not affect the torque."
-        )
-        if self.rank == s:
-            return text
-        weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
-        text += (
-            f" The smallest residual of an independent column is {self.smallest_pivot:.1e}"
-            f" ({weakest}), the largest of a dependent one {self.largest_dropped:.1e}; the"
-            f" threshold is {TOLERANCE:g}."
+            f" grouped with them, {absent} do not affect the torque. The smallest residual of an"
+            f" independent column is {self.smallest_pivot:.1e} ({weakest}), the largest of a"
+            f" dependent one {self.largest_dropped:.1e}; the threshold is {TOLERANCE:g}."
         )
         if self.gap < _CLEAR or self.smallest_pivot < _WEAK:
-            return (
-                f"{text} These are close: small lengths or angles of the robot description"
+            text += (
+                " These are close: small lengths or angles of the robot description"
                 f" determine whether {weakest} is independent."
             )
-        return f"{text} They differ by {np.log10(self.gap):.0f} orders of magnitude."
+        return text
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group as a formula: ``I1yy + I1m + 0.09 m2 + ...``."""

@@ -30,10 +30,6 @@ class Coupling:
 
     def __post_init__(self) -> None:
         matrix = np.array(self.motor_from_joint, dtype=np.float64)
-        if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-            raise ModelError(f"the coupling has shape {matrix.shape}; it must be square")
-        if not np.all(np.isfinite(matrix)):
-            raise ModelError("the coupling has an entry that is not finite")
         direct, most = np.abs(np.diag(matrix)), np.abs(matrix).max(axis=1, initial=0.0)
         if np.any(direct <= _UNCOUPLED * most):
             motor = int(np.argmax(direct <= _UNCOUPLED * most)) + 1
@@ -45,11 +41,6 @@ class Coupling:
             raise ModelError("the coupling is singular: joints cannot be moved independently")
         matrix.setflags(write=False)
         object.__setattr__(self, "motor_from_joint", matrix)
-
-    @property
-    def n_joints(self) -> int:
-        """Number n of joints."""
-        return len(self.motor_from_joint)
 
     @property
     def speeds(self) -> Array:

@@ -6,7 +6,6 @@ the distance l.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -73,19 +72,13 @@ class Element(ABC):
 
 @dataclass(frozen=True)
 class Anchors:
-    """Two anchors in the plane of a joint.
-
-    Raises:
-        ModelError: a distance is not positive, or they are equal.
-    """
+    """Two anchors in the plane of a joint (ModelError if their distances are equal)."""
 
     base: float  #: distance of the anchor on the base side from the axis [m]
     link: float  #: distance of the anchor on the link side from the axis [m]
     angle: float  #: between the two at joint angle zero [rad]
 
     def __post_init__(self) -> None:
-        _require_positive("distance of an anchor from the axis", "m", self.base, self.link)
-        _require_finite("angle between the anchors", self.angle)
         if abs(self.base - self.link) <= _SAME_DISTANCE * self.base:
             raise ModelError(
                 f"both anchors are {self.base:g} m from the axis, so that their distance is zero at"
@@ -108,7 +101,7 @@ class TorsionSpring(Element):
     """A torsion spring; the torque of the drive is ``stiffness (q - rest)``.
 
     Raises:
-        ModelError: a known spring has no stiffness, or a number is not finite.
+        ModelError: a known spring has no stiffness.
     """
 
     rest: float  #: position without torque [rad]
@@ -116,7 +109,6 @@ class TorsionSpring(Element):
     identified: bool = False  #: whether the stiffness is a parameter
 
     def __post_init__(self) -> None:
-        _require_finite("rest angle", self.rest)
         _require_stiffness(self.stiffness, identified=self.identified)
 
     @property
@@ -134,7 +126,7 @@ class ExtensionSpring(Element):
     """A spring between two anchors with tension ``stiffness (l - free_length) + preload``.
 
     Raises:
-        ModelError: a known spring has no stiffness, or a number is not finite.
+        ModelError: a known spring has no stiffness.
     """
 
     anchors: Anchors  #: fixed points
@@ -145,7 +137,6 @@ class ExtensionSpring(Element):
     identified: bool = False  #: whether the stiffness is a parameter
 
     def __post_init__(self) -> None:
-        _require_finite("free length or preload", self.free_length, self.preload or 0.0)
         _require_stiffness(self.stiffness, identified=self.identified)
 
     @property
@@ -171,7 +162,7 @@ class GasCylinder(Element):
     `length`.
 
     Raises:
-        ModelError: a figure is not positive, or the gas has no volume left at some angle.
+        ModelError: the gas has no volume left at some angle.
     """
 
     anchors: Anchors  #: fixed points
@@ -183,8 +174,6 @@ class GasCylinder(Element):
     identified: bool = False  #: whether a factor of its torque is a parameter
 
     def __post_init__(self) -> None:
-        for name, unit in (("length", "m"), ("area", "m²"), ("pressure", "Pa"), ("volume", "m³")):
-            _require_positive(name, unit, getattr(self, name))
         base, link = self.anchors.base, self.anchors.link
         end = base + link if self.pulls else abs(base - link)
         left = float(self._volume_left(np.array(end)))
@@ -343,20 +332,8 @@ class JointElements:
         return torque
 
 
-def _require_positive(what: str, unit: str, *values: float) -> None:
-    for value in values:
-        if not 0.0 < value < math.inf:
-            raise ModelError(f"the {what} is {value!r} {unit}; it must be finite and positive")
-
-
-def _require_finite(what: str, *values: float) -> None:
-    if not all(map(math.isfinite, values)):
-        raise ModelError(f"the {what} is not finite; give a number")
-
-
 def _require_stiffness(stiffness: float | None, *, identified: bool) -> None:
     if stiffness is None and not identified:
         raise ModelError(
             "the spring has neither a stiffness nor identified = true; give one of the two"
         )
-    _require_finite("stiffness", stiffness or 0.0)

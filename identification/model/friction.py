@@ -19,7 +19,6 @@ authors' later software, and cubic elsewhere.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -241,26 +240,6 @@ class FrictionLaw:
     presliding: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.third not in (None, "quadratic", "cubic"):
-            raise ModelError(
-                f'friction term third = {self.third!r} must be "quadratic", "cubic" or None'
-            )
-        for name, value in (
-            ("standstill speed", self.standstill),
-            ("presliding displacement", self.presliding),
-        ):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise ModelError(
-                    f"friction's {name} is {value!r}; it must be a finite number, zero or more"
-                )
-        for term in self.terms:
-            if not (math.isfinite(term.speed) and term.speed > 0.0):
-                raise ModelError(
-                    f"friction's {term.label} speed is {term.speed!r}; it must be finite and"
-                    " positive"
-                )
-        if self.zone not in ("exclude", "linear"):
-            raise ModelError(f'friction zone = {self.zone!r} must be "exclude" or "linear"')
         if self.zone == "linear" and self.standstill == 0.0:
             raise ModelError("a linear friction zone needs a standstill speed above zero")
 

@@ -157,14 +157,10 @@ class Chain:
 def chain_from_urdf(urdf: str, locked: Mapping[str, float] | None = None) -> Chain:
     """Read a chain from URDF text; links of fixed joints are merged with their parents.
 
-    Args:
-        urdf: the text of the file.
-        locked: positions [rad or m] of joints to be fixed, by name.
-
     Raises:
         ModelError: the text is not a URDF, has no moving joint or more than `MOST_JOINTS`, a joint
             of another type than revolute, continuous, prismatic or fixed, or no joint of a name
-            in `locked`.
+            in `locked` (positions [rad or m]).
     """
     model = pinocchio_model(urdf, locked)
     if model.njoints < 2:

@@ -182,32 +182,16 @@ class RobotModel:
     ) -> RobotModel:
         """Create the model from URDF text.
 
-        Args:
-            urdf: text of the file.
-            gravity: in base axes [m/s²].
-            rotor_inertia: identify a rotor inertia of every joint.
-            friction: friction law of every joint.
-            joint_friction: other laws for some joints, by name.
-            locked: positions [rad or m] of joints to be fixed, by name.
-            coupling: of motors and joints, joints in the model's order.
-            payload: known body that the arm carries.
-            elements: springs and balancers.
+        Gravity (3,) [m/s²] is in base axes; `joint_friction` has the laws of joints that differ,
+        `locked` the positions [rad or m] of joints to be fixed, both by name.
 
         Raises:
-            ModelError: the text is not an open chain of revolute and prismatic joints, gravity is
-                not a finite vector, there is no joint of a name, the coupling is of another
-                number of joints, or an offset or element cannot be separated from other
-                parameters.
+            ModelError: the text is not an open chain of revolute and prismatic joints, there is no
+                joint of a name, or an offset or element cannot be separated from other parameters.
         """
         chain = chain_from_urdf(urdf, locked)
         down = np.array(gravity, dtype=np.float64)
-        if down.shape != (3,) or not np.all(np.isfinite(down)):
-            raise ModelError(f"gravity is {gravity!r}; it must be three finite numbers [m/s²]")
         laws = _laws(chain, friction, joint_friction)
-        if coupling is not None and coupling.n_joints != chain.n_joints:
-            raise ModelError(
-                f"the coupling is of {coupling.n_joints} joints, the robot has {chain.n_joints}"
-            )
         revolute = tuple(bool(turns) for turns in chain.revolute)
         pairs = coupling.pairs if coupling is not None and coupling.inertia else ()
         layout = StandardLayout(revolute, rotor_inertia, pairs if rotor_inertia else ())

@@ -183,7 +183,7 @@ def test_a_locked_folder_is_refused(invoke, settings, copied, option):
     invoke(CELL_PATH, "--resume", "-o", copied)
 
 
-def test_the_folder_is_locked_until_the_picture_is_drawn(invoke, copied):
+def test_the_folder_is_locked_until_the_picture_is_saved(invoke, copied):
     def meanwhile(*_, **__):
         with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).locked():
             pass
@@ -245,8 +245,8 @@ def test_json_agrees_with_the_file(bare):
         assert printed[name] == getattr(found.excitation.criteria, name)
     assert printed["complete"] is True
     assert Path(printed["file"]) == bare[0] / "excitation.toml"
-    kept = found.settings.constraints
-    assert not (kept.closed or kept.collision or kept.current)
+    given = found.settings.constraints
+    assert not (given.closed or given.collision or given.current)
 
 
 def test_resuming_a_complete_search_gives_the_same_file(invoke, bare, copied):
@@ -270,12 +270,12 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
     settings.write_text(SETTINGS + "[constraints]\nmax_duration = 0.5\n")
     with pytest.raises(NoExcitationError) as caught:
         invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
-    said = str(caught.value)
-    assert "duration excludes 16" in said and "0.5" in said
+    text = str(caught.value)
+    assert "duration excludes 16" in text and "0.5" in text
     lasts = r"the shortest motion lasts [\d.]+ s, allowed are 0 to 0.5 s: allow more "
-    assert re.search(lasts + r"time \(\[constraints\] max_duration\)", said)
-    assert "evaluate more" not in said
-    assert "repeat the command with --force, or with --resume if cell and settings" in said
+    assert re.search(lasts + r"time \(\[constraints\] max_duration\)", text)
+    assert "evaluate more" not in text
+    assert "repeat the command with --force, or with --resume if cell and settings" in text
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
@@ -309,7 +309,7 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         ([CELL_PATH, "-o", ""], "--output: is empty; name a folder"),
     ],
 )
-def test_says_what_is_wrong(invoke, settings, tmp_path, arguments, words):
+def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, words):
     names = {"SETTINGS": settings, "NOWHERE": tmp_path / "nowhere"}
     given = [names.get(argument, argument) for argument in arguments]
     if "-o" not in given:
@@ -333,10 +333,10 @@ class Seen:
     """Arguments of the drawing."""
 
     def __init__(self) -> None:
-        self.drawn: dict = {}
+        self.arguments: dict = {}
 
     def __call__(self, *_, **asked) -> Figure:
-        self.drawn.update(asked)
+        self.arguments.update(asked)
         return Figure()
 
 
@@ -344,7 +344,7 @@ def test_other_designs_are_named_on_the_front(made, bare, invoke, copied):
     seen, compare = Seen(), ("--compare", made[0], "--compare", bare[0])
     invoke(CELL_PATH, "--resume", "-o", copied, *compare, draw=seen)
     whole, kinematic = (load_design(folder).criteria for folder in (made[0], bare[0]))
-    assert seen.drawn["references"] == {
+    assert seen.arguments["references"] == {
         "method B": whole.measures,
         "method B (kinematic)": kinematic.measures,
     }
@@ -353,19 +353,19 @@ def test_other_designs_are_named_on_the_front(made, bare, invoke, copied):
 def test_unchecked_constraints_are_in_picture_json_and_stderr(invoke, bare, copied):
     unchecked = ["floor", "walls", "the arm itself", "motor currents"]
     seen = Seen()
-    said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
-    assert list(seen.drawn["unchecked"]) == unchecked
-    assert f"warning: not checked: {', '.join(unchecked)}" in said.stderr
+    result = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
+    assert list(seen.arguments["unchecked"]) == unchecked
+    assert f"warning: not checked: {', '.join(unchecked)}" in result.stderr
     assert json.loads(bare[1])["unchecked"] == unchecked
-    assert seen.drawn["margins"] == "" and not seen.drawn["together"]
+    assert seen.arguments["margins"] == "" and not seen.arguments["together"]
 
 
-def test_a_real_cells_motion_is_drawn_with_its_margins(invoke, made, tmp_path):
+def test_the_picture_has_the_margins_of_a_real_cell(invoke, made, tmp_path):
     seen, copied = Seen(), Path(shutil.copytree(made[0], tmp_path / "copied"))
-    said = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
-    assert seen.drawn["unchecked"] == () and seen.drawn["complete"]
-    assert seen.drawn["margins"].startswith("current at most ")
-    assert said.stderr == ""
+    result = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
+    assert seen.arguments["unchecked"] == () and seen.arguments["complete"]
+    assert seen.arguments["margins"].startswith("current at most ")
+    assert result.stderr == ""
 
 
 @pytest.mark.parametrize("name", ["excitation.toml", "settings.toml"])
@@ -418,8 +418,8 @@ def interrupted(
             assert run.poll() is None, run.communicate()
             time.sleep(0.02)
         run.send_signal(kind)
-        _, said = run.communicate(timeout=60)
-    return run.returncode, said
+        _, text = run.communicate(timeout=60)
+    return run.returncode, text
 
 
 def test_ctrl_c_writes_the_best_motion_and_resume_continues(invoke, tmp_path):
@@ -428,9 +428,9 @@ def test_ctrl_c_writes_the_best_motion_and_resume_continues(invoke, tmp_path):
     arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic"]
     out = tmp_path / "out"
     command = [sys.executable, "-m", "hil", "design", *arguments, "-o", str(out)]
-    code, said = interrupted(command, out / "search.journal")
-    assert code == 130, said
-    assert "continue with --resume" in said
+    code, text = interrupted(command, out / "search.journal")
+    assert code == 130, text
+    assert "continue with --resume" in text
     half = DesignResult.load(out)
     assert not half.complete and 1 <= half.data["search"]["generations"] < 25
     assert invoke(CELL_PATH, "--resume", "-o", out).exit_code == 0
@@ -445,8 +445,8 @@ def test_sigterm_writes_the_best_motion(tmp_path):
     settings.write_text(SETTINGS.replace("generations = 2", "generations = 2000"))
     arguments = [str(CELL_PATH), "--settings", str(settings), "--kinematic", "-o", str(out)]
     command = [sys.executable, "-m", "hil", "design", *arguments]
-    code, said = interrupted(command, out / "search.journal", signal.SIGTERM)
-    assert code == 130, said
+    code, text = interrupted(command, out / "search.journal", signal.SIGTERM)
+    assert code == 130, text
     assert not DesignResult.load(out).complete
 
 

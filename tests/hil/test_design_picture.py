@@ -197,7 +197,7 @@ class TestPostures:
         far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
         assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
 
-    def test_a_motion_of_an_instant_is_drawn(self, ns16):
+    def test_a_motion_of_an_instant_has_a_picture(self, ns16):
         points = np.array([ns16.home, ns16.home + 1e-4])
         motion = plan(points, ns16.joint_limits)
         strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
@@ -226,13 +226,13 @@ class TestCorrelations:
         np.testing.assert_allclose(shown, expected, atol=1e-5)
         assert np.all(np.isfinite(correlation(information(factor))))
 
-    def test_a_motion_that_leaves_parameters_unexcited_says_so(self, ns16):
+    def test_parameters_without_excitation_are_reported(self, ns16):
         still = plan(np.array([ns16.home, ns16.home + 0.4 * np.eye(6)[0]]), ns16.joint_limits)
         figure = draw_design(excitation(ns16, still), ns16)
-        said = " ".join(texts(figure))
-        assert "does not excite a parameter" in said
-        assert "I_c ∞" in said
-        assert "nan" not in said
+        shown = " ".join(texts(figure))
+        assert "does not excite a parameter" in shown
+        assert "I_c ∞" in shown
+        assert "nan" not in shown
 
 
 class TestFront:
@@ -253,15 +253,15 @@ class TestFront:
         front = front_of([100.0, 105.7, 108.0], [70.0, 80.0, 110.0])
         others = {"A": (104.0, 90.5), "B (kinematic)": (101.2, 80.9), "C": (20.0, 400.0)}
         figure, axes = self.page(two_link, front, chosen=1, references=others)
-        said = texts(figure)
+        shown = texts(figure)
         for label in (
             "chosen (105.7, 80.0)",
             "A (104.0, 90.5)",
             "B (kinematic) (101.2, 80.9)",
             "C (20.0, 400.0)",
         ):
-            assert label in said
-        assert "polished" not in " ".join(said)
+            assert label in shown
+        assert "polished" not in " ".join(shown)
         assert axes.get_xlim()[1] < 120.0 and axes.get_ylim()[0] > 95.0  # C does not flatten it
         assert not front_axes(draw_design(excitation(two_link, wandering(two_link)), two_link))
         criteria = excitation(two_link, wandering(two_link)).criteria
@@ -269,9 +269,9 @@ class TestFront:
         front = front_of([determinant - 3.0, determinant - 1.0], [index + 1.0, index + 3.0])
         knee = (determinant - 1.0, index + 3.0)
         figure, axes = self.page(two_link, front, knee=knee)
-        said = " ".join(texts(figure))
-        assert "chosen, polished (" in said
-        assert f"grew from ({knee[0]:.1f}, {knee[1]:.1f})" in said
+        shown = " ".join(texts(figure))
+        assert "chosen, polished (" in shown
+        assert f"grew from ({knee[0]:.1f}, {knee[1]:.1f})" in shown
         star = next(line for line in axes.lines if line.get_marker() == "*")
         assert (star.get_xdata(), star.get_ydata()) == (index, determinant)
 
@@ -301,7 +301,7 @@ class TestFront:
 
 
 class TestPage:
-    def test_joints_are_drawn_between_their_limits_in_the_angles_of_the_cell(self, ns16):
+    def test_positions_have_the_limits_and_angles_of_the_cell(self, ns16):
         figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
         (position,) = (a for a in figure.axes if a.get_ylabel() == "joint_2")
         assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
@@ -346,9 +346,9 @@ class TestPage:
                 save(figure, tmp_path / name)
             assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
-    @pytest.mark.parametrize("said", [False, True])
+    @pytest.mark.parametrize("full", [False, True])
     @pytest.mark.parametrize("title", ["", "a $\\frac{title}{}$ <of> a person\n" * 3])
-    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title, said):
+    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title, full):
         nearest = "nearest 0.112 m (" + "a_link_with_a_long_name, " * 6 + "floor)"
         more = {
             "unchecked": ("floor", "walls", "the arm itself", "currents"),
@@ -362,18 +362,18 @@ class TestPage:
             excitation(ns16, wandering(ns16)),
             ns16,
             front=front_of([100.0, 105.0], [70.0, 95.0]),
-            chosen=None if said else 0,
+            chosen=None if full else 0,
             title=title,
-            **(more if said else {}),
+            **(more if full else {}),
         )
         with style.page():
             renderer = laid_out(figure)
-            drawn = figure.get_tightbbox(renderer)
+            extent = figure.get_tightbbox(renderer)
             width, height = figure.get_size_inches()
-            assert drawn.x0 >= 0.0
-            assert drawn.y0 >= 0.0
-            assert drawn.x1 <= width
-            assert drawn.y1 <= height
+            assert extent.x0 >= 0.0
+            assert extent.y0 >= 0.0
+            assert extent.x1 <= width
+            assert extent.y1 <= height
             heads = [*figure.texts, *(axes.title for axes in figure.axes)]
             heads += [axes._left_title for axes in figure.axes]
             boxes = [
@@ -400,7 +400,7 @@ URDF = (
     ("old", "new"),
     [("<collision>", '<collision><origin xyz="0 0 1e300"/>'), ("0.3 0.1", "0.3 1e308")],
 )
-def test_of_a_shape_beyond_every_robot_nothing_is_drawn(old: str, new: str) -> None:
+def test_shapes_beyond_every_robot_are_left_out(old: str, new: str) -> None:
     arm = Arm.from_urdf(URDF.replace(old, new, 1))
     assert len(Arm.from_urdf(URDF).solids) == 2
     assert len(arm.solids) == 1

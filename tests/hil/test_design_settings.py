@@ -123,11 +123,11 @@ def test_invalid_settings_name_file_field_value_and_remedy(text, words, tmp_path
     path.write_text(text)
     with pytest.raises(SettingsError) as caught:
         load_settings(path)
-    said = str(caught.value)
+    text = str(caught.value)
     for word in ["my.toml", *words]:
-        assert word in said
+        assert word in text
     for word in ("Value error", "value error", "dictionary", "instance of"):
-        assert word not in said
+        assert word not in text
     with pytest.raises(SettingsError, match=r"none\.toml: cannot be read.*name a TOML file"):
         load_settings(tmp_path / "none.toml")
 
@@ -177,7 +177,7 @@ def test_unchecked_constraints_are_named():
     assert bare.unchecked == ("motor currents", "rest at both ends")
 
 
-def test_listed_parameters_are_in_the_criteria(cell):
+def test_named_parameters_are_in_the_criteria(cell):
     names = cell.model.parameter_names
     settings = preset("b").kinematic()
     chosen = settings.replaced(objective={"parameters": [names[9], names[2]]})
@@ -289,14 +289,14 @@ def duration(value: float, bound: float) -> Violation:
     return Violation("duration", "the motion", value, bound, None)
 
 
-def said(cell: Cell, settings: DesignSettings, rejected: dict, nearest: list, **more) -> str:
+def message(cell: Cell, settings: DesignSettings, rejected: dict, nearest: list, **more) -> str:
     found = {violation.kind: violation for violation in nearest}
     error = NoFeasibleMotionError(rejected, found, **({"tried": 1000} | more))
     return str(no_excitation(error, AngleFrame.of(cell), None, settings))
 
 
 def advised(*arguments, **more) -> str:
-    return said(*arguments, **more).partition("Possible changes: ")[2]
+    return message(*arguments, **more).partition("Possible changes: ")[2]
 
 
 @pytest.mark.parametrize(
@@ -341,7 +341,7 @@ def test_a_duration_is_reported_with_its_limits(cell, value, asked, words, longe
 
 def test_the_closest_motion_has_one_violation_of_each_kind(cell):
     rejected, closest = {"collision": 1000, "current": 1000}, (CONTACT, DEEPER, CURRENT)
-    sentence = said(cell, VIA, rejected, [CONTACT, CURRENT], closest=closest)
+    sentence = message(cell, VIA, rejected, [CONTACT, CURRENT], closest=closest)
     breaks = sentence.partition("closest to feasible violates ")[2]
     assert breaks.count("collision of") == 1 and "link_1 and link_6" in breaks
     assert breaks.count("current of") == 1

@@ -172,10 +172,10 @@ def table(path: Path) -> list[dict[str, str]]:
 def test_only_consistent_parameters_become_a_urdf(arm: IdentifiedArm, tmp_path: Path) -> None:
     """Otherwise an old URDF is removed; friction is that of the free estimate."""
     exported(arm, tmp_path)
-    (tmp_path / "mine.urdf").write_text("kept")
-    found = write_exports(tmp_path, arm.cell, arm.estimate, "the solver gave up")
+    (tmp_path / "mine.urdf").write_text("mine")
+    found = write_exports(tmp_path, arm.cell, arm.estimate, "no convergence")
     assert set(found.withheld) == {"identified.urdf", "standard.csv"}
-    assert "the solver gave up" in found.withheld["identified.urdf"]
+    assert "no convergence" in found.withheld["identified.urdf"]
     left = {path.name for path in tmp_path.iterdir()}
     assert left == (ALL - set(found.withheld)) | {"mine.urdf"}
     free = arm.estimate.values[arm.cell.model.base.rank :]

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification import FrictionLaw, ModelError, Preprocessing, Recording, RobotModel, prepare
+from identification import FrictionLaw, Preprocessing, Recording, RobotModel, prepare
 from identification.factor.factor import Estimate, Factor, estimate
 from identification.model.base_parameters import TOLERANCE
 from identification.model.coupling import Coupling
@@ -87,7 +87,7 @@ def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
     assert text.startswith("40 of 66 standard parameters are independent, 16 are grouped")
     assert "10 do not affect the torque" in text
     assert "1e-05" in text
-    assert "orders of magnitude" in text
+    assert "These are close" not in text
 
 
 def test_an_unclear_rank_is_reported(model: RobotModel) -> None:
@@ -99,18 +99,6 @@ def test_an_unclear_rank_is_reported(model: RobotModel) -> None:
     assert "These are close" in base.explanation()
     weakest = base.names[int(np.argmin(base.shares[base.pivots]))]
     assert f"whether {weakest} is independent" in base.explanation()
-
-
-def test_a_full_rank_needs_no_decision() -> None:
-    slider = (
-        '<robot name="r"><link name="a"/><link name="b"/><joint name="s" type="prismatic">'
-        '<parent link="a"/><child link="b"/><axis xyz="1 0 0"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
-    )
-    base = RobotModel.from_urdf(slider, rotor_inertia=False).base
-    assert base.explanation().startswith(
-        "1 of 10 standard parameters are independent, 0 are grouped"
-    )
 
 
 ARMS = {
@@ -154,11 +142,6 @@ def test_the_number_of_base_parameters_is_the_rank_of_pinocchios_regressor(arm: 
     base = RobotModel.from_urdf(urdf).base
     assert base.rank == rank_by_pinocchio(urdf)
     assert base.gap > 1e4
-
-
-def test_a_description_that_xacro_left_empty_says_so() -> None:
-    with pytest.raises(ModelError, match=r"no name; write <robot name="):
-        RobotModel.from_urdf(robot_text("ur_description/urdf/ur3.urdf"))
 
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "tx40"

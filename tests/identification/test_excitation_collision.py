@@ -3,6 +3,7 @@ from __future__ import annotations
 import gc
 import pickle
 import time
+from dataclasses import replace
 from itertools import combinations, pairwise
 
 import coal
@@ -17,8 +18,6 @@ from identification.excitation import (
     Box,
     CollisionChecker,
     CollisionModelError,
-    PostureError,
-    Wall,
     Workspace,
     WorkspaceError,
 )
@@ -192,7 +191,6 @@ def mixed_shapes():
     )
     workspace = Workspace(
         floor=-0.4,
-        walls=(Wall((1.0, -1.0, 0.5), -1.2),),
         boxes=(Box((0.4, 0.4, -0.2), (0.9, 0.7, 0.5)),),
         margin=0.02,
     )
@@ -261,26 +259,21 @@ def test_a_motion_is_clear_if_and_only_if_every_instant_of_it_is(brute, seed, ki
 @pytest.mark.parametrize("steps", [7, 40])
 def test_contacts_between_samples_are_found(steps):
     # A ball on an arm of 1 m sweeps past a post of 2 cm in a hundredth of a second.
-    urdf = robot(
-        link("base"),
-        link("arm", '<sphere radius="0.01"/>', at="1 0 0"),
-        '<joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>'
-        '<axis xyz="0 0 1"/></joint>',
-    )
+    urdf = ball_on_a_turntable(0.01)
     limits = JointLimits([-4.0], [4.0], [4.0], [20.0], [200.0])
     motion = plan([[-1.5], [1.63]], limits)
     samples = sampled(motion, motion.duration / steps)
     post = Box((0.99, -0.001, -1.0), (1.01, 0.001, 1.0))
     tip = np.abs(np.sin(samples.position[:, 0]))
     assert np.all(tip > 0.02)  # no sample touches
-    standing = Workspace(floor=None, boxes=(post,), margin=0.0)
-    contact = CollisionChecker(urdf, standing).deepest_along(motion, samples)
-    assert contact is not None
+    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the path
+    contact, none = (
+        CollisionChecker(urdf, replace(NOWHERE, boxes=(box,))).deepest_along(motion, samples)
+        for box in (post, aside)
+    )
     assert (contact.first, contact.second) == ("arm", "box 0")
     assert abs(np.sin(contact.posture[0])) < 0.011
-    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the path
-    lying = Workspace(floor=None, boxes=(aside,), margin=0.0)
-    assert CollisionChecker(urdf, lying).deepest_along(motion, samples) is None
+    assert none is None
 
 
 @given(st.integers(0, 10**6))
@@ -338,22 +331,19 @@ def test_a_contact_with_the_floor_is_named(arm):
     assert CollisionChecker(urdf_text(), NOWHERE).deepest_contact(q) is None
 
 
-def test_contacts_with_walls_and_boxes():
-    urdf = robot(
+def ball_on_a_turntable(radius: float) -> str:
+    """A ball at 1 m from a vertical axis."""
+    return robot(
         link("base"),
-        link("arm", '<sphere radius="0.1"/>', at="1 0 0"),
+        link("arm", f'<sphere radius="{radius}"/>', at="1 0 0"),
         '<joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>'
         '<axis xyz="0 0 1"/></joint>',
     )
-    q = np.linspace(0.0, np.pi, 1801)[:, None]  # 0.1 degrees each
-    wall = Workspace(floor=None, walls=(Wall((0.0, -2.0, 0.0), -1.6),), margin=0.0)  # y <= 0.8
-    contact = CollisionChecker(urdf, wall).deepest_contact(q)
-    assert (contact.first, contact.second) == ("arm", "wall 0")
-    assert q[contact.sample, 0] == pytest.approx(np.pi / 2, abs=2e-3)
-    assert contact.distance == pytest.approx(0.8 - 1.1, abs=1e-5)
-    touching = np.sin(q[:, 0]) > 0.7
-    np.testing.assert_array_equal(CollisionChecker(urdf, wall).clear(q), ~touching)
 
+
+def test_contacts_with_boxes():
+    urdf = ball_on_a_turntable(0.1)
+    q = np.linspace(0.0, np.pi, 1801)[:, None]  # 0.1 degrees each
     box = Workspace(floor=None, boxes=(Box((-2.0, -1.0, -1.0), (-0.5, 1.0, 1.0)),), margin=0.05)
     checker = CollisionChecker(urdf, box)
     contact = checker.deepest_contact(q)
@@ -393,8 +383,7 @@ def test_only_close_pairs_of_a_wrist_are_unchecked():
     assert contact.distance < 0.0
 
 
-@pytest.mark.parametrize("limit", ['lower="-2" upper="2"', "", 'lower="-0.02" upper="0.02"'])
-def test_missing_or_narrow_limits_leave_no_pair_unchecked(limit):
+def test_missing_limits_leave_no_pair_unchecked():
     # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
     rod = '<cylinder radius="0.05" length="0.5"/>'
     parts = [link("base")]
@@ -404,7 +393,7 @@ def test_missing_or_narrow_limits_leave_no_pair_unchecked(limit):
             link(f"l{k}", rod, at="0.3 0 0"),
             f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
             f'<origin xyz="{at}"/><axis xyz="0 {int(k > 0)} {int(k == 0)}"/>'
-            f'<limit effort="1" velocity="1" {limit}/></joint>',
+            '<limit effort="1" velocity="1"/></joint>',
         ]
     urdf = robot(*parts)
     limits = JointLimits([-3.0] * 3, [3.0] * 3, [2.0] * 3, [10.0] * 3, [100.0] * 3)
@@ -454,13 +443,12 @@ def test_limits_and_postures_of_another_arm_are_refused():
         CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_postures_that_are_not_finite_are_refused(value):
+def test_postures_that_are_not_finite_are_refused():
     q = np.zeros((3, 6))
-    q[1, 4] = value
-    for look in (checkers(0.05).clear, checkers(0.05).deepest_contact):
-        with pytest.raises(PostureError, match=r"joint 4 .* posture 1"):
-            look(q)
+    q[1, 4] = np.nan
+    for check in (checkers(0.05).clear, checkers(0.05).deepest_contact):
+        with pytest.raises(ValueError, match="finite"):
+            check(q)
 
 
 def violent_sines(size, pace, ramp):
@@ -547,20 +535,9 @@ def test_a_description_without_usable_shapes_is_refused(shape):
         CollisionChecker(urdf, Workspace())
 
 
-@pytest.mark.parametrize(
-    "build",
-    [
-        lambda: Workspace(margin=-0.01),
-        lambda: Workspace(margin=np.nan),
-        lambda: Workspace(floor=np.inf),
-        lambda: Wall((0.0, 0.0, 0.0), 1.0),
-        lambda: Wall((1.0, 0.0, 0.0), np.nan),
-        lambda: Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)),
-    ],
-)
-def test_invalid_obstacles_are_refused(build):
+def test_a_box_without_volume_is_refused():
     with pytest.raises(WorkspaceError):
-        build()
+        Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
 
 
 def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting() -> None:

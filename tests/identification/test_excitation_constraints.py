@@ -17,7 +17,7 @@ from identification.excitation.constraints import (
     sampled,
 )
 from identification.excitation.joint_limits import limit_violations
-from identification.excitation.violation import KINDS, Violation, excess_by_kind
+from identification.excitation.violation import KINDS, excess_by_kind
 from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
 
 # Two links of 1 m that swing in a vertical plane: known to every textbook.
@@ -249,9 +249,3 @@ def test_excess_by_kind_is_the_largest(make_currents, swing):
     for kind, worst in zip(KINDS, excess, strict=True):
         assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
     assert not excess_by_kind(()).any()
-
-
-def test_a_motion_that_cannot_be_planned_has_no_numbers():
-    assert str(Violation("planning", "the motion (a cusp)", 1.0, 0.0, None)) == (
-        "planning of the motion (a cusp)"
-    )

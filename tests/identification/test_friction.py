@@ -63,8 +63,6 @@ class TestFrictionTable:
 
     def test_a_speed_of_zero_means_no_stribeck_term(self) -> None:
         assert FrictionLaw.from_table({"stribeck": 0.0}).stribeck is None
-        with pytest.raises(ModelError, match="Stribeck speed"):
-            FrictionLaw(stribeck=0.0)
 
 
 Array = NDArray[np.float64]
@@ -149,25 +147,9 @@ def test_offsets_do_not_count_as_friction() -> None:
     assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"stribeck": 0.0}, "Stribeck"),
-        ({"stribeck": np.inf}, "Stribeck"),
-        ({"zone": "dead"}, "exclude"),
-        ({"zone": "linear", "standstill": 0.0}, "standstill"),
-        ({"standstill": -1.0}, "standstill"),
-        ({"standstill": np.nan}, "standstill"),
-        ({"standstill": np.inf}, "standstill"),
-        ({"third": "stribeck"}, "quadratic.*cubic"),
-    ],
-)
-def test_invalid_settings_are_refused(settings: dict[str, object], words: str) -> None:
-    with pytest.raises(ModelError, match=words):
-        FrictionLaw(**settings)  # type: ignore[arg-type]
-
-
-def test_a_law_of_an_unknown_joint_is_refused() -> None:
+def test_invalid_laws_are_refused() -> None:
+    with pytest.raises(ModelError, match="standstill"):
+        FrictionLaw(zone="linear", standstill=0.0)
     with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
         RobotModel.from_urdf(TWO_LINK, joint_friction={"wrist": FrictionLaw()})
 
@@ -347,8 +329,6 @@ def test_uncoupled_motors_add_nothing() -> None:
 @pytest.mark.parametrize(
     ("matrix", "words"),
     [
-        (np.ones((2, 3)), "square"),
-        (np.full((2, 2), np.nan), "not finite"),
         (np.array([[0.0, 1.0], [1.0, 0.0]]), "motor 1 .* does not turn with joint 1"),
         (np.array([[1.0, 0.0], [16.0, 1e-308]]), "motor 2 .* does not turn with joint 2"),
         (np.ones((2, 2)), "singular"),
@@ -357,8 +337,3 @@ def test_uncoupled_motors_add_nothing() -> None:
 def test_an_invalid_coupling_is_refused(matrix: Array, words: str) -> None:
     with pytest.raises(ModelError, match=words):
         Coupling(matrix)
-
-
-def test_a_coupling_of_another_number_of_joints_is_refused() -> None:
-    with pytest.raises(ModelError, match="2 joints, the robot has 6"):
-        RobotModel.from_urdf(urdf_text(), coupling=Coupling(np.eye(2)))

@@ -84,18 +84,6 @@ def test_a_first_population_is_uniform_and_its_seed_decides_it(genome):
     assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
 
 
-def test_a_genome_copies_its_arrays():
-    posture, rates = HOME.copy(), np.full(6, 2.0)
-    closed = ViaPointGenome(LIMITS, n_via=2, home=posture)
-    swinging = SineGenome(LIMITS, length=20.0, ramp=2.0, offset=posture, fastest=rates)
-    before = [genome.decode(np.ones(genome.n_genes)) for genome in (closed, swinging)]
-    posture += 0.1
-    rates *= 0.5
-    for genome, expected in zip((closed, swinging), before, strict=True):
-        for ours, theirs in zip(genome.decode(np.ones(genome.n_genes)), expected, strict=True):
-            np.testing.assert_array_equal(ours, theirs)
-
-
 # Via points
 
 
@@ -141,16 +129,6 @@ def test_motions_are_those_of_the_planner(genome):
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_planning_errors_are_in_place_of_their_motion(monkeypatch):
-    # No legal genes are known to fail; so the second's via points leave the range on the way.
-    genes = some_genes(OPEN, 3)
-    points, speed = OPEN.decode(genes)
-    points[1, 2, 3] += 100.0
-    monkeypatch.setattr(ViaPointGenome, "decode", lambda self, genes: (points, speed))
-    kinds = [type(motion).__name__ for motion in OPEN.motions(genes)]
-    assert kinds == ["PiecewiseCubic", "InvalidViaPoints", "PiecewiseCubic"]
-
-
 # Via points among obstacles
 
 
@@ -194,7 +172,7 @@ def test_a_population_among_obstacles_covers_the_free_range(checker):
     assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
 
 
-def test_a_population_is_drawn_without_free_space(checker):
+def test_a_population_without_free_space(checker):
     everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
     blocked = CollisionChecker(urdf_text(), everywhere)
     genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=blocked)

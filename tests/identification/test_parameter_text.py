@@ -204,9 +204,9 @@ class TestFrictionText:
         )
         text = friction_text(model, np.arange(len(model.friction.terms), dtype=float))
         for words in (
-            "Slower than 0.1 rad/s (m/s) shoulder: sgn(v) is v / standstill",
-            "Slower than 0.01 rad/s (m/s) elbow: nothing was fitted",
-            "vs = 0.4 rad/s",
+            "standstill below 0.1 rad/s (linear zone)\n",
+            "Below the standstill speed nothing was fitted",
+            "vs = 0.4 rad/s; standstill below 0.01 rad/s\n",
             "its asymmetry cannot be distinguished from the zero error of a sensor",
             "motor 2, at v = 0.5 v(shoulder) + v(elbow): f0 = 7 N·m, f1 = 8 N·m·s/rad",
         ):

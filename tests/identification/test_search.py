@@ -3,8 +3,6 @@ from __future__ import annotations
 import io
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -246,7 +244,7 @@ def test_a_polish_must_be_better_at_a_millisecond(population, method, measure):
     assert design.excitation.criteria == design.origin_criteria == unpolished.excitation.criteria
 
 
-def test_motions_are_counted_as_they_are_scored():
+def test_scored_motions_are_reported():
     counts = []
     chosen = settings("b", population=20, generations=2)
     with Population(problem()) as population:
@@ -268,11 +266,6 @@ def test_a_seed_determines_the_design_bit_for_bit(population, method, capsys):
     np.random.seed(1)  # noqa: NPY002
     np.testing.assert_array_equal(np.random.get_state()[1], between[1])  # noqa: NPY002
     assert capsys.readouterr() == ("", "")
-
-
-def test_another_seed_is_another_design(population):
-    one, other = (search(population, settings("b", seed=seed)) for seed in (3, 4))
-    assert one.genes.tobytes() != other.genes.tobytes()
 
 
 def test_the_number_of_processes_changes_no_bit(population):
@@ -315,46 +308,6 @@ def test_an_interrupt_loses_one_generation_only(population, after):
     assert bits(search(population.begin(), chosen, journal=journal)) == whole
     first = [200, 12, 12, 12, 12, 16, 16]
     assert journal.recalled == sum(first[:after])
-
-
-@pytest.mark.slow
-def test_ctrl_c_ends_the_processes_and_the_journal_is_complete(population, tmp_path):
-    chosen = settings("front", generations=40, polish=60)
-    path = tmp_path / "search.journal"
-    script = f"""
-import sys
-from dataclasses import asdict
-from identification.excitation import Journal, Population, SearchSettings, search
-from tests.identification.searching import problem
-chosen = {chosen!r}
-def say(progress):
-    print(progress.evaluated, flush=True)
-with open({str(path)!r}, "xb+") as file, Population(problem(), workers=2) as population:
-    print(*(child.pid for child in population._children), flush=True)
-    search(population, chosen, journal=Journal(file, {{"settings": asdict(chosen)}}), progress=say)
-"""
-    with subprocess.Popen(
-        [sys.executable, "-c", script],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    ) as running:
-        pids = [int(pid) for pid in running.stdout.readline().split()]
-        seen = [int(running.stdout.readline()) for _ in range(6)]
-        os.killpg(running.pid, signal.SIGINT)
-        rest, said = running.communicate(timeout=20.0)
-    seen += [int(line) for line in rest.split()]
-    assert said.rstrip().endswith("KeyboardInterrupt")
-    for pid in pids:
-        with pytest.raises(ProcessLookupError):
-            os.kill(pid, 0)
-    with path.open("rb+") as file:
-        journal = opened(file, chosen)
-        resumed = search(population, chosen, journal=journal)
-    assert journal.recalled in (seen[-1], seen[-1] + 12)  # it may come before that was seen
-    assert bits(resumed) == bits(search(population.begin(), chosen))
 
 
 def test_progress_reports_counts_and_the_best_motion(population):
@@ -480,21 +433,6 @@ def test_scores_do_not_depend_on_processes_batch_and_order(scorers):
     assert scorers.score(rows[order]).rows.tobytes() == expected.rows[order].tobytes()
     alone = [scorers.score(rows[k : k + 1]).rows for k in range(3)]
     assert np.concatenate(alone).tobytes() == expected.rows[:3].tobytes()
-
-
-@pytest.mark.slow
-def test_a_motion_that_crashes_its_process_costs_no_other_motion(scorers):
-    rows = genes(20, seed=3)
-    rows[:, 0] *= 0.9
-    rows[11, 0] = 0.99
-    with Population(problem(faulty(crash=(0.95, 1.0))), workers=2) as crashing:
-        scores = crashing.score(rows)
-        assert same(crashing.score(rows[:12]), Scores.of_rows(scores.rows[:12]))  # nor is it chance
-    crashed = rows[:, 0] >= 0.95
-    np.testing.assert_array_equal(scores.feasible, ~crashed)
-    np.testing.assert_array_equal(scores.rows[crashed], unplanned()[None])
-    assert np.all(scores.excess[crashed, PLANNING] > 0.0)
-    assert scores.rows[~crashed].tobytes() == scorers.score(rows[~crashed]).rows.tobytes()
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def test_motions_do_not_depend_on_their_number(found, limits, checker, make_curr
 
 
 def test_the_motions_of_a_seed_never_change(limits):
-    # Taken when campaigns were first recorded; plans of old archives name these seeds.
+    # Recorded with the first campaigns; plans of old archives name these seeds.
     found = random_validation_motions(limits, home=HOME, seed=7, count=2)
     text = json.dumps([[m.via_points.tolist(), m.speed.tolist()] for m in found])
     assert (
@@ -149,7 +149,7 @@ def test_a_home_posture_in_collision_is_refused_by_the_pair(limits):
 
 def test_a_blocked_cell_is_refused_with_the_obstacle(model, limits, monkeypatch):
     tries = "identification.excitation.validation_motions._TRIES_PER_MOTION"
-    monkeypatch.setattr(tries, 3)  # each looks at fifty ways
+    monkeypatch.setattr(tries, 3)  # of fifty via points each
     monkeypatch.setattr("identification.excitation.validation_motions._RANGE_SHARE", 0.02)
     middle = (limits.lower + limits.upper) / 2
     wrist = joint_poses(model.chain, middle[None])[1][5, 0]

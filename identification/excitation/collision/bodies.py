@@ -25,22 +25,6 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Wall:
-    """A plane with free space on one side: points x with ``normal · x >= offset``."""
-
-    normal: Vector  #: direction into the free space, base axes; any length but zero
-    #: for a normal of length 1, the plane's distance from the base's origin along it [m]
-    offset: float
-
-    def __post_init__(self) -> None:
-        if not np.all(np.isfinite([*self.normal, self.offset])) or not any(self.normal):
-            raise WorkspaceError(
-                f"wall with normal {self.normal} and offset {self.offset}: both must be finite, "
-                "the normal not zero"
-            )
-
-
-@dataclass(frozen=True)
 class Box:
     """A solid box with edges along the base axes, from corner `lower` to corner `upper` [m]."""
 
@@ -60,15 +44,8 @@ class Workspace:
     """Obstacles in the base frame of the URDF, and the clearance."""
 
     floor: float | None = 0.0  #: height of the floor [m]; None: no floor
-    walls: tuple[Wall, ...] = ()  #: planes
     boxes: tuple[Box, ...] = ()  #: solid boxes
     margin: float = 0.05  #: least distance [m] between the arm and anything, itself included
-
-    def __post_init__(self) -> None:
-        if self.floor is not None and not np.isfinite(self.floor):
-            raise WorkspaceError(f"floor at {self.floor} m: it must be a finite height or None")
-        if not (np.isfinite(self.margin) and self.margin >= 0.0):
-            raise WorkspaceError(f"margin of {self.margin} m: it must be finite, 0 or more")
 
 
 def _unread_shapes(urdf: str, links: Iterable[str]) -> str | None:
@@ -190,13 +167,8 @@ def _convex(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
 
 
 def obstacles(workspace: Workspace) -> list[Body]:
-    """Return floor, walls and boxes as bodies."""
-    planes = [("floor", (0.0, 0.0, 1.0), workspace.floor)] if workspace.floor is not None else []
-    planes += [(f"wall {i}", wall.normal, wall.offset) for i, wall in enumerate(workspace.walls)]
-    bodies = [
-        _plane(name, np.array(normal, dtype=float), float(offset))
-        for name, normal, offset in planes
-    ]
+    """Return floor and boxes as bodies."""
+    bodies = [] if workspace.floor is None else [floor_at(workspace.floor)]
     for i, box in enumerate(workspace.boxes):
         lower, upper = np.array(box.lower, dtype=float), np.array(box.upper, dtype=float)
         middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
@@ -208,21 +180,12 @@ def obstacles(workspace: Workspace) -> list[Body]:
     return bodies
 
 
-def moved_back(plane: Body, distance: float) -> Body:
-    """Return a floor or wall moved away from the free space by a distance [m]."""
-    assert plane.normal is not None
-    offset = float(plane.normal @ plane.hull.centre) - distance
-    return _plane(plane.name, plane.normal, offset)
-
-
-def _plane(name: str, normal: Array, offset: float) -> Body:
-    length = float(np.linalg.norm(normal))
-    normal = normal / length
-    shape = coal.Halfspace(normal, offset / length)  # solid on the side opposite to the normal
-    hull = Hull(normal * (offset / length), normal, 0.0, 0.0, 0.0, exact=True)
-    return Body(
-        name, name, -1, shape, coal.Transform3s(np.eye(3), np.zeros(3)), hull, normal=normal
-    )
+def floor_at(height: float) -> Body:
+    """Return a floor [m], solid below."""
+    normal = np.array([0.0, 0.0, 1.0])
+    hull = Hull(normal * height, normal, 0.0, 0.0, 0.0, exact=True)
+    pose = coal.Transform3s(np.eye(3), np.zeros(3))
+    return Body("floor", "floor", -1, coal.Halfspace(normal, height), pose, hull, normal=normal)
 
 
 def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) -> Hull:

@@ -44,15 +44,11 @@ def versions() -> dict[str, str]:
 
 
 class Journal:
-    """Append-only file of the scores of a search, found by their genes.
+    """Append-only binary file of the scores of a search, found by their genes.
 
-    Records after a damaged or truncated one are dropped and scored again. Records that the disk
-    refuses are held in memory and written with the next one.
-
-    Args:
-        file: binary, readable, writable, seekable and unbuffered; empty or an earlier journal of
-            this search. The caller closes it. One search at a time may use it.
-        search: tables by name of all that scores depend on, for JSON; package releases are added.
+    The file is unbuffered, empty or an earlier journal of this search, and closed by the caller.
+    `search` has tables by name of all that scores depend on, for JSON. Records after a damaged one
+    are dropped; records that the disk refuses are written with the next one.
 
     Attributes:
         recalled: number of motions whose scores were read from the file.

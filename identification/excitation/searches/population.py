@@ -104,17 +104,11 @@ class Population:
     """Scores motions of one problem in child processes.
 
     Scores do not depend on the number of workers, to the last bit: each child has one thread for
-    linear algebra. A motion that alone crashes its process twice, or exceeds the timeout, is
-    scored as unplannable.
-
-    Args:
-        problem: of the search.
-        workers: number of processes, at least 1.
-        timeout: longest time [s] for `CHUNK` motions, then for each of them alone; long enough
-            for a busy computer.
+    linear algebra. A motion that alone crashes its process twice, or exceeds the timeout [s] (of
+    `CHUNK` motions, then of one alone), is scored as unplannable.
 
     Raises:
-        DesignError: no workers.
+        DesignError: less than one worker.
         PlannerNotStarted: in `score`: a process cannot be started.
     """
 

@@ -1,8 +1,4 @@
-"""Searches for the best excitation: the paper's methods, a balanced fitness and a Pareto front.
-
-The same seed gives the same design bit for bit, for any number of processes and with any number of
-interruptions.
-"""
+"""Searches for the best excitation, bit-identical for any number of processes and interruptions."""
 
 from __future__ import annotations
 
@@ -312,15 +308,10 @@ def search(
     scored: Callable[[int], None] | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Design:
-    """Search for the best motion.
+    """Search for the best motion of a population's problem; new scores are appended to `journal`.
 
-    Args:
-        population: scores motions of its problem.
-        settings: method and effort.
-        journal: earlier scores; new ones are appended.
-        progress: called after each generation.
-        scored: called with each number of newly scored motions of a generation.
-        stop: called before each generation; true ends the search with the best motion so far.
+    `progress` is called after each generation, `scored` with each number of newly scored motions,
+    `stop` before each generation; true ends the search with the best motion so far.
 
     Raises:
         NoFeasibleMotionError: no motion satisfies all constraints and excites every parameter.
