@@ -18,15 +18,14 @@ from pydantic import (
     Field,
     FiniteFloat,
     ValidationError,
-    field_validator,
     model_validator,
 )
 
 from hil.cell.errors import first_error
 from hil.errors import InputError
 from hil.reading import parse_toml, read_text
+from identification.excitation import Method
 
-Method = Literal["a", "b", "balanced", "front"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 
 # Strict: pydantic would read "24" as 24 and true as 1.
@@ -181,7 +180,7 @@ class ConstraintTable(_Table):
 class ObjectiveTable(_Table):
     """`[objective]`: parameters in the criteria."""
 
-    parameters: Literal["all", "payload"] | list[str] = Field(
+    parameters: Literal["all", "payload"] | Annotated[list[str], Field(min_length=2)] = Field(
         default="all",
         description='"all"; "payload", a body on the last link of a known arm; or a list of at '
         "least two names of parameters as `hil identify` reports them",
@@ -196,16 +195,6 @@ class ObjectiveTable(_Table):
     def named(self) -> list[str] | None:
         """Names of the parameters, None if they are not listed."""
         return None if isinstance(self.parameters, str) else self.parameters
-
-    @field_validator("parameters")
-    @classmethod
-    def _two_at_least(cls, parameters: str | list[str]) -> str | list[str]:
-        if isinstance(parameters, list) and len(parameters) < 2:
-            raise ValueError(
-                f'has {len(parameters)} of two or more names; give "all", or at least two '
-                "names as `hil identify` reports them"
-            )
-        return parameters
 
     @model_validator(mode="after")
     def _one_choice(self) -> ObjectiveTable:

@@ -44,7 +44,13 @@ def urdf_fault(text: str) -> str | None:
     for joint in joints:
         if (fault := _joint_fault(joint, links)) is not None:
             return f"joint {joint.get('name', '')!r} {fault}"
-    return _tree_fault(links, joints)
+    children = [end.get("link", "") for joint in joints for end in joint.findall("child")]
+    roots = [link for link in links if link not in children]
+    if not roots:
+        return "every link is the child of a joint: a closed chain"
+    if len(roots) > 1:
+        return f"links {', '.join(map(repr, roots))} have no parent joint; only the base may not"
+    return None
 
 
 def _joint_fault(joint: Element, links: list[str]) -> str | None:
@@ -73,16 +79,6 @@ def closed_chain(text: str) -> str | None:
     children = Counter(end.get("link", "") for joint in joints for end in joint.findall("child"))
     name, count = children.most_common(1)[0] if children else ("", 0)
     return f"link {name!r} is the child of {count} joints: a closed chain" if count > 1 else None
-
-
-def _tree_fault(links: list[str], joints: list[Element]) -> str | None:
-    children = [end.get("link", "") for joint in joints for end in joint.findall("child")]
-    roots = [link for link in links if link not in children]
-    if not roots:
-        return "every link is the child of a joint: a closed chain"
-    if len(roots) > 1:
-        return f"links {', '.join(map(repr, roots))} have no parent joint; only the base may not"
-    return None
 
 
 Array = NDArray[np.float64]
@@ -213,7 +209,14 @@ def pinocchio_model(urdf: str, locked: Mapping[str, float] | None = None) -> pin
     if (closed := closed_chain(urdf)) is not None:
         raise ModelError(f"the robot description is not an open chain: {closed}")
     for index in range(1, model.njoints):
-        _require_direction(model, index)
+        if model.joints[index].nv == 1 and not (
+            abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
+        ):
+            name = model.names[index]
+            raise ModelError(
+                f'joint {name!r} has an <axis> of length zero; write one such as xyz="0 0 1"',
+                joint=name,
+            )
     if not locked:
         _require_near(model)
         return model
@@ -285,18 +288,6 @@ def _require_near(model: pin.Model) -> None:
                 f"{name!r} of the robot description is more than {FARTHEST:g} m away from its "
                 "parent"
             )
-
-
-def _require_direction(model: pin.Model, index: int) -> None:
-    """Check that the axis of a joint is not zero."""
-    if model.joints[index].nv == 1 and not (
-        abs(float(np.linalg.norm(_subspace(model, index))) - 1.0) < _UNIT
-    ):
-        name = model.names[index]
-        raise ModelError(
-            f'joint {name!r} has an <axis> of length zero; write one such as xyz="0 0 1"',
-            joint=name,
-        )
 
 
 def _subspace(model: pin.Model, index: int) -> Array:

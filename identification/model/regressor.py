@@ -581,22 +581,16 @@ class _Step:
         self._along = [
             (after[0, part, a], after[1, part, a], float(axis[a])) for a, _ in self._axis
         ]
-        self._plan_shift(chain.translation[joint], before)
-        self._plan_rotation(rotation)
-
-    def _plan_shift(self, shift: Array, before: Array) -> None:
-        """Prepare the shift of the reference point: linear part l + w x p = l - [p]x w."""
+        # Shift of the reference point p: linear part l + w x p = l - [p]x w.
         self._before = before
-        self._shifted = np.empty_like(before) if np.any(shift) else before
-        matrix = -skew(shift)
+        matrix = -skew(chain.translation[joint])
+        self._shifted = np.empty_like(before) if np.any(matrix) else before
         self._shifts = [
             (before[:, 0, column], float(matrix[row, column]), self._shifted[:, 1, row])
             for row, column in np.argwhere(matrix != 0.0)
         ]
         self._scratch = np.empty_like(before[:, 0, 0])
-
-    def _plan_rotation(self, rotation: Array) -> None:
-        """Prepare the rotation of the axes: as a whole, or one axis fixed and two in a plane."""
+        # Rotation of the axes: as a whole, or one axis fixed and two in a plane.
         rows = columns = slice(0, 3)
         self._fixed_axis: tuple[Array, float, Array] | None = None
         if (found := _find_fixed_axis(self.blend)) is not None:

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
-from hil.plots.design_picture import POSTURES, blocks, draw_design
+from hil.plots.design_picture import POSTURES, draw_design
 from hil.plots.posture_strip import Strip, covered, draw_strip, outlines, posture_times
 from identification.excitation import correlation, information
 from identification.excitation.constraints import sampled
@@ -205,10 +205,6 @@ class TestPostures:
 
 
 class TestCorrelations:
-    def test_parameters_are_grouped_by_joint(self):
-        names = ("I1yy", "I2xx", "mc2x", "I3m", "m12", "I12xy")
-        assert blocks(names) == [("1", 0, 1), ("2", 1, 3), ("3", 3, 4), ("12", 4, 6)]
-
     def test_the_matrix_is_that_of_the_motion_without_friction(self, ns16):
         designed = excitation(ns16, wandering(ns16))
         figure = draw_design(designed, ns16)

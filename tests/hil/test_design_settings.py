@@ -110,7 +110,10 @@ def test_missing_settings_are_those_of_the_preset():
         ),
         ("seed = -1", ["seed = -1", "0 or more"]),
         ("[objective]\nparameters = []", ["objective.parameters", '"all"', "hil identify"]),
-        ('[objective]\nparameters = ["mc2y"]', ["has 1 of two or more names", "hil identify"]),
+        (
+            '[objective]\nparameters = ["mc2y"]',
+            ["objective.parameters", "a list of at least two names"],
+        ),
         (
             '[objective]\nparameters = ["mc2y", "mc2z"]\nmax_relative_std = 30.0',
             ["objective", "leave one of them out"],

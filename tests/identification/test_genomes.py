@@ -280,18 +280,8 @@ def test_an_excitation_is_restored_bit_for_bit(make, seed):
     restored = through_json(excitation)
     assert restored.to_dict() == excitation.to_dict()
     assert restored.criteria == excitation.criteria
-    assert (restored.method, restored.seed, restored.tried, dict(restored.rejected)) == (
-        excitation.method,
-        excitation.seed,
-        excitation.tried,
-        excitation.rejected,
-    )
-    times = np.linspace(0.0, excitation.trajectory.duration, 101)
     assert type(restored.trajectory) is type(excitation.trajectory)
-    for ours, theirs in zip(
-        restored.trajectory.sample(times), excitation.trajectory.sample(times), strict=True
-    ):
-        np.testing.assert_array_equal(ours, theirs)
+    assert bits(restored.trajectory) == bits(excitation.trajectory)
     if restored.via_points is not None:  # its moves plan to the motion bit for bit
         again = plan_moves(restored.via_points[0], restored.moves, ROOMY)
         assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
@@ -320,22 +310,14 @@ def test_data_without_method_are_restored():
 @pytest.mark.parametrize(
     "damage",
     [
-        {"trajectory": {"type": "fourier_series"}},
-        {"trajectory": {"type": "fourier_series", "length": "long"}},
+        *({"trajectory": each} for each in ([], {"type": "fourier_series"}, {"type": "spline"})),
+        {"trajectory": sines(1).trajectory.to_dict() | {"amplitude": [[10**400], [1]]}},
         {"criteria": {"log10_det": 1.0}},
         {"criteria": {**sines(1).to_dict()["criteria"], "beauty": 1.0}},
-        {"seed": "first"},
-        {"seed": float("inf")},
-        {"seed": 10**400},
-        {"method": "\ud800"},
-        {"trajectory": []},
-        {"trajectory": {"type": "spline"}},
-        {"trajectory": sines(1).trajectory.to_dict() | {"length": 10**400}},
-        {"trajectory": sines(1).trajectory.to_dict() | {"amplitude": [[10**400], [1]]}},
-        {"criteria": {}},
         {"criteria": asdict(sines(1).criteria) | {"log10_det": "x"}},
-        {"rejected": 3},
-        {"rejected": {"limits": "many"}},
+        *({"seed": seed} for seed in ("first", float("inf"), 10**400)),
+        {"method": "\ud800"},
+        *({"rejected": each} for each in (3, {"limits": "many"})),
     ],
 )
 def test_invalid_data_are_refused(damage):

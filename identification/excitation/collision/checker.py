@@ -230,7 +230,7 @@ class CollisionChecker:
         # obstacle and a shape of the first link at a constant distance below the margin. A plane
         # is moved back for one of the first two links that never has the margin from it, but does
         # not touch it in all postures.
-        near = min(self.margin, _NEAR)
+        near, samples = min(self.margin, _NEAR), np.arange(_N_POSTURES)
         checked: list[tuple[int, int]] = []
         unchecked, reduced = list[ClosePair](), list[ClosePair]()
         for pair in range(len(self.separation.first)):
@@ -238,9 +238,12 @@ class CollisionChecker:
             obstacle, plane = b >= self._n_links, self._bodies[b].normal is not None
             joints = self._joints_apart(a, b)
             least, most = -np.inf, np.inf
-            if joints <= 2 and self._may_be_near(pair, near):
-                distances = self._distances(pair)
-                least, most = float(distances.min()), float(distances.max())
+            if joints <= 2:
+                repeated = np.full(_N_POSTURES, pair)
+                bound, _ = self.separation.bound(self._tried.bodies, repeated, samples)
+                if np.all(bound < near):
+                    distances = self._distances(pair)
+                    least, most = float(distances.min()), float(distances.max())
             names = self._bodies[a].shape_name, self._bodies[b].shape_name
             fixed = joints <= 1 and most - least <= _CONSTANT if obstacle else True
             if most < near and fixed:
@@ -277,12 +280,6 @@ class CollisionChecker:
     def _distances(self, pair: int) -> Array:
         """Return the distances of a pair in the sampled postures (k,) [m]."""
         return np.array([self.distance(pair, self._tried, k) for k in range(_N_POSTURES)])
-
-    def _may_be_near(self, pair: int, near: float) -> bool:
-        """Whether a pair may be closer than `near` [m] in all sampled postures."""
-        samples = np.arange(_N_POSTURES)
-        pairs = np.full(_N_POSTURES, pair)
-        return bool(np.all(self.separation.bound(self._tried.bodies, pairs, samples)[0] < near))
 
     def deepest_contact(self, q: Array, time: Array | None = None) -> Contact | None:
         """Return the deepest contact in postures (m, n) at times (m,), None if all are clear.

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.errors import JournalError
-from identification.excitation.searches.scores import ROW, Scores
+from identification.excitation.searches.scores import Scores
 
 Array = NDArray[np.float64]
 
@@ -84,9 +84,9 @@ class Journal:
             )
         self._next = len(head)
         while (content := _content(stored, self._next)) is not None:
-            generation = _generation(content)
-            if generation is not None:
-                self._rows[_key(generation[0])] = generation[1]
+            stream = io.BytesIO(content)
+            genes, rows = (np.load(stream, allow_pickle=False) for _ in range(2))
+            self._rows[_key(genes)] = rows
             self._next += _FRAME.size + len(content)
         self.damaged = len(stored) - self._next
 
@@ -148,26 +148,14 @@ def _key(genes: Array) -> bytes:
 
 def _difference(stored: bytes | None, identity: bytes) -> str:
     """Return the first difference between the identities of two searches."""
-    with suppress(ValueError, TypeError, AttributeError, RecursionError):  # damaged
-        before, now = json.loads(stored or b""), json.loads(identity)
-        for part in sorted({*before, *now}):
-            old, new = before.get(part, {}), now.get(part, {})
-            for name in sorted({*old, *new}):
-                if old.get(name) != new.get(name):
-                    return f"{part} {name} was {old.get(name)!r:.80}, is {new.get(name)!r:.80}"
-    return "its identity is damaged"
-
-
-def _generation(content: bytes) -> tuple[Array, Array] | None:
-    """Return genes and rows of scores, None if the frame has other content."""
-    stream = io.BytesIO(content)
-    try:
-        genes, rows = (np.lib.format.read_array(stream, allow_pickle=False) for _ in range(2))
-    except Exception:  # an invalid header can raise almost anything
-        return None
-    if genes.ndim != 2 or rows.shape != (len(genes), ROW) or rows.dtype != np.float64:
-        return None
-    return (genes, rows) if genes.dtype.kind in "fiu" else None
+    if stored is None:
+        return "its identity is damaged"
+    old, new = (
+        {(part, name): value for part, table in found.items() for name, value in table.items()}
+        for found in (json.loads(stored), json.loads(identity))
+    )
+    first = min(key for key in old.keys() | new.keys() if old.get(key) != new.get(key))
+    return f"{' '.join(first)} was {old.get(first)!r:.80}, is {new.get(first)!r:.80}"
 
 
 def _framed(content: bytes) -> bytes:
