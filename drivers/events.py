@@ -38,11 +38,9 @@ class Counters:
 class InitReceived:
     """The controller started a session.
 
-    Attributes:
-        init: its init packet.
-        unusable: why the arm cannot be moved in this session, or None.
-        differences: from the cell, each naming the axis and both values.
-        adopted: the controller's gear ratios, calibration and coupling are used.
+    `unusable` tells why the arm cannot be moved in it, or None; `differences` from the cell name
+    axis and both values; `adopted`: the controller's gear ratios, calibration and coupling are
+    used.
     """
 
     init: InitPacket = field(repr=False)
@@ -106,14 +104,10 @@ class HoldChanged:
 
 @dataclass(frozen=True)
 class MotionEnded:
-    """The end of a requested motion.
+    """The end of a requested motion in `cycle`; `interval` of its records is -1 without open mode.
 
-    Attributes:
-        outcome: "completed" and "stopped": open mode was left after coming to rest; "refused":
-            a set-point was refused; "lost": drive, open mode or link was lost.
-        reason: text.
-        interval: of its records, -1 if open mode was never reached.
-        cycle: the controller's cycle.
+    "completed" and "stopped": open mode was left after coming to rest; "refused": a set-point was
+    refused; "lost": drive, open mode or link was lost.
     """
 
     outcome: Outcome
@@ -126,10 +120,8 @@ class MotionEnded:
 class PacketRejected:
     """`count` packets since the last drain got no reply.
 
-    Attributes:
-        kind: "malformed", "stale" or "ended", or the link's reason to discard them.
-        count: number of packets.
-        reason: of the last one; "" if unknown.
+    `kind` is "malformed", "stale" or "ended", or the link's reason to discard them; `reason` is
+    that of the last one, "" if unknown.
     """
 
     kind: str
@@ -139,11 +131,9 @@ class PacketRejected:
 
 @dataclass(frozen=True, eq=False)
 class Refused:
-    """A set-point was not sent.
+    """A set-point was not sent, because of `error`.
 
-    Attributes:
-        error: the reason.
-        flight_recorder: (k,) of `cycle_dtype`, the last records up to and including this cycle.
+    `flight_recorder` (k,) of `cycle_dtype` has the last records up to and including this cycle.
     """
 
     error: RefusalError

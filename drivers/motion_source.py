@@ -118,7 +118,7 @@ class HoldableSource(Protocol):
     def hold(self) -> None:
         """Come to rest on the path, within the bounds of a stop, and wait; not `finished`.
 
-        `stop` may follow a hold. A source that does not come to rest is stopped after
+        `stop` may follow. A source that does not come to rest is stopped after
         `session.STOP_TIMEOUT`.
         """
 

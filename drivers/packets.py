@@ -148,11 +148,8 @@ def echo(packet: bytes) -> bytes:
 class CyclicPacket:
     """One packet of the cyclic exchange, in either direction.
 
-    Attributes:
-        number: sequence number, 1..0x7FFF.
-        status: 4 bytes, one per arm (arm 1 first).
-        functionality: 4 bytes, one per arm; always zero towards the controller.
-        axes: (n_axes,) of `AXIS_DTYPE`, in slot order. Read-only after `decode`.
+    `status` and `functionality` have one byte per arm; the latter is always zero towards the
+    controller. `axes` (n_axes,) of `AXIS_DTYPE`, in slot order, is read-only after `decode`.
     """
 
     number: int
@@ -250,12 +247,8 @@ class InitPacket:
     ) -> InitPacket:
         """Return an init packet with arm 1's first `n_axes` axes open in slots 0..n_axes-1.
 
-        Args:
-            n_axes: open axes, 1..10.
-            sample_time: ms.
-            arm_1: per-axis fields of arm 1 (`calibration`, `gear_ratio`, ...), (k,) with k <= 10;
-                the remaining axes stay zero.
-            fields: other fields of `INIT_DTYPE`, in full.
+        `arm_1` has per-axis fields of arm 1 (`calibration`, ...), (k,) with k <= 10, zero beyond;
+        `fields` are other fields of `INIT_DTYPE`, in full.
         """
         record = np.zeros(1, INIT_DTYPE)
         record["number"] = INIT_NUMBER

@@ -220,13 +220,7 @@ class _Writer(_Ring):
 
 
 class CycleRing(_Writer):
-    """The last `capacity` cycle records, written in place by the session.
-
-    Args:
-        n_joints: n.
-        capacity: rows, without `fd`.
-        fd: descriptor of shared memory, see `shared`.
-    """
+    """The last `capacity` cycle records, written in place; `fd` is that of `shared` memory."""
 
     def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
         super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), capacity=capacity, fd=fd)

@@ -71,8 +71,7 @@ def warm_up(
 ) -> tuple[State, bytes | None]:
     """Run a motion at rest in a separate session: the first cycles of a process are slow.
 
-    Returns:
-        State of that session, open unless something is wrong, and its last reply.
+    Returns the state of that session, open unless something is wrong, and its last reply.
     """
     n = drives.n_joints
     position = 0.5 * (limits.lower + limits.upper)

@@ -87,19 +87,15 @@ class ControlBlock(ctypes.Structure):
 
     Counts of packets are those of `drivers.events.Counters`.
 
-    Args:
-        fd: descriptor of the memory.
-
     Attributes:
         supervisor_heartbeat, exchange_heartbeat, archive_heartbeat: s.
         stop_count: incremented for each requested stop.
-        override: requested fraction of the speed.
-        override_count: incremented after `override` was written.
+        override: requested fraction of the speed; `override_count` is incremented after it.
         finish: 1 if the exchange has to leave open mode and end.
         program_offered: id of the motion to be read, incremented for each.
         program_id: id of the motion that may begin once it was read; negative to withdraw it.
-        held: 1 to hold the present motion on its path, 0 to resume it; a command, not a state.
-        hold_count: incremented after `held` was written.
+        held: 1 to hold the present motion on its path, 0 to resume it; a command, not a state;
+            `hold_count` is incremented after it.
         state: `drivers.states.State` of the session.
         cycle: the controller's cycle.
         interval: in open mode, -1 before the first.
@@ -111,8 +107,7 @@ class ControlBlock(ctypes.Structure):
         ended_interval: of its records, -1 if open mode was not reached.
         overflow: records overwritten before they were archived.
         late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
-            answered late.
-        answered_late: those of them that were answered.
+            answered late; `answered_late` of them were answered.
         unanswered: replies not accepted by the controller.
         worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
             to the departure of the reply, µs.
@@ -196,11 +191,8 @@ MAX_INTERVAL: Final = 0.5
 class HeartbeatMonitor:
     """Measures how long a heartbeat has not changed while this process was running.
 
-    The age of a heartbeat is not enough: after a suspension of the computer all of them are old.
-
-    Args:
-        heartbeat: reads the heartbeat, any number; 0 before the first.
-        max_interval: largest part of the time between two calls that counts, s.
+    After a suspension of the computer all heartbeats are old; so at most `max_interval` s between
+    two calls count. `heartbeat` reads a number, 0 before the first.
     """
 
     def __init__(

@@ -23,13 +23,7 @@ NO_ARCHIVE: Final = "the archive process sends no heartbeat"
 
 @dataclass(frozen=True)
 class ExchangeStarted:
-    """The link is open.
-
-    Attributes:
-        pid: of the process.
-        realtime: permissions granted by the system.
-        notes: options of the link that the system refused.
-    """
+    """The link is open; `notes` are options of the link that the system refused."""
 
     pid: int
     realtime: RealTimeReport
@@ -136,11 +130,7 @@ class EventWriter(_Log):
         self._count = 0
 
     def write(self, event: ExchangeEvent) -> None:
-        """Append one event, over the oldest if the log is full.
-
-        Raises:
-            ValueError: it is longer than the log.
-        """
+        """Append one event, over the oldest if the log is full; raises ValueError if too long."""
         body = pickle.dumps(event, protocol=5)
         frame = _FRAME.pack(len(body), zlib.crc32(body), self._count) + body
         if len(frame) > self._capacity:
@@ -160,11 +150,7 @@ class EventWriter(_Log):
 
 
 class EventReader(_Log):
-    """A reader's end, from the oldest event available; lost events appear as `EventsLost`.
-
-    Attributes:
-        lost: events overwritten before they were read.
-    """
+    """A reader's end, from the oldest event available; the `lost` ones appear as `EventsLost`."""
 
     def __init__(self, fd: int) -> None:
         super().__init__(fd)

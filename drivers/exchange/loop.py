@@ -56,11 +56,7 @@ _Kind = tuple[int, int, bytes]
 
 
 def _accepts_any_peer(session: Session) -> bool:
-    """Whether there is no session that a change of the controller's port would break.
-
-    There is none before the init packet, and a lost one is resumed by the first packet that gets a
-    reply.
-    """
+    """Whether there is no session, or a lost one, which the first packet with a reply resumes."""
     return session.state is State.SYNC or session.deadline == math.inf
 
 
@@ -94,13 +90,9 @@ class _PeerSelection:
 
 
 class Arrival(NamedTuple):
-    """A packet received.
+    """A packet received at time `arrived` on the link's clock, of reception if it is not `stamped`.
 
-    Attributes:
-        packet: its bytes.
-        arrived: time of arrival on the link's clock, of reception if the link has no time stamps.
-        ages: of its values, see `Transport.ages`.
-        stamped: whether the link has time stamps.
+    `ages` are those of its values, see `Transport.ages`.
     """
 
     packet: bytes
@@ -120,8 +112,7 @@ class ReceiveQueue:
     A full queue contains the oldest packets. If the newest packet found is so old that later ones
     were dropped, it gets no reply either while axes are open: the next one comes within a cycle.
 
-    Where the link has no time stamps, arrivals are estimated to detect a backlog, and for nothing
-    else.
+    Where the link has no time stamps, arrivals are estimated, only to detect a backlog.
     """
 
     def __init__(self, transport: Transport, session: Session) -> None:
@@ -218,10 +209,7 @@ class _Backlog:
     """The newest packet of each kind, in the order of arrival.
 
     Two packets whose numbers are far apart are both retained: one is of another session, or its
-    number is corrupt, which the session can decide.
-
-    Args:
-        n_axes: axes in use; what some controllers send behind them makes no kind.
+    number is corrupt, which the session can decide. Bytes behind `n_axes` axes make no kind.
 
     Attributes:
         newest: kind and packet.
@@ -272,12 +260,11 @@ def _ahead(later: int, earlier: int) -> int:
 
 
 class _LatenessMonitor:
-    """Counts replies that leave more than a cycle after their packet arrived.
+    """Counts replies that leave more than a cycle after their packet arrived, as "answered late".
 
-    Each is counted as "answered late", in every state. More than `max_late` in a row, each
-    overtaken by the controller's next packet, stop a motion on its path: the controller has
-    accepted none of them, or each in a later cycle than intended. A controller that waits for its
-    reply is never overtaken.
+    More than `max_late` in a row, each overtaken by the controller's next packet, stop a motion on
+    its path: the controller has accepted none of them, or each in a later cycle than intended. A
+    controller that waits for its reply is never overtaken.
     """
 
     def __init__(self, session: Session, max_late: int) -> None:
@@ -316,14 +303,8 @@ def exchange(
 
     `until` is called once per packet, after the reply was sent, and at least every 0.1 s; it is the
     place for work that can wait. Of a backlog only the newest packets are answered
-    (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion.
-
-    Args:
-        transport: the link.
-        session: decides on the replies.
-        until: end condition.
-        max_late: consecutive late replies, each overtaken by the next packet, that do not stop a
-            motion.
+    (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More than
+    `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
     """
     queue = ReceiveQueue(transport, session)
     peers = _PeerSelection(transport, session)

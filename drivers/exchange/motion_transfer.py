@@ -27,11 +27,7 @@ _SPAN: Final = struct.Struct("<QQ")
 
 
 def pack(source: MotionSource) -> int:
-    """Return the descriptor of sealed memory with the source; the caller closes it.
-
-    Raises:
-        Exception: the source cannot be pickled.
-    """
+    """Return the descriptor of sealed memory with the pickled source; the caller closes it."""
     arrays: list[memoryview] = []
 
     def copied(buffer: pickle.PickleBuffer) -> bool:
@@ -69,12 +65,7 @@ def _write(fd: int, block: memoryview, begin: int) -> None:
 
 
 def unpack(fd: int) -> MotionSource:
-    """Return the source in the memory of `pack`.
-
-    Raises:
-        ValueError: the memory is not sealed.
-        Exception: the source cannot be unpickled.
-    """
+    """Return the source in the memory of `pack`; raises ValueError if it is not sealed."""
     if fcntl.fcntl(fd, fcntl.F_GET_SEALS) & _SEALS != _SEALS:
         raise ValueError("the memory of a motion is not sealed")
     size = os.fstat(fd).st_size
@@ -99,11 +90,7 @@ _DESCRIPTOR: Final = struct.Struct("@i")
 
 
 class Inbox:
-    """The exchange's end of the socket; never waits.
-
-    Attributes:
-        identity: id of the motion received last.
-    """
+    """The exchange's end of the socket; never waits. `identity` is that of the last motion."""
 
     def __init__(self, channel: socket.socket) -> None:
         self.identity = 0

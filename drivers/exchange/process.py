@@ -33,9 +33,6 @@ class ExchangeSettings:
     """Settings of an exchange process; pickles.
 
     Attributes:
-        transport: the link.
-        drive_train: of the arm.
-        guard_limits: limits of every set-point.
         period: the controller's cycle, s.
         session: further keyword arguments of `Session`.
         realtime: requested permissions.
@@ -92,13 +89,11 @@ class ExchangeProcess:
     and ends.
 
     Attributes:
-        pid: of the process.
         realtime: permissions granted by the system.
         notes: options of the link that the system refused.
         ring_fd: memory of the cycle records, for a `RingReader`.
         packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not stored.
-        event_fd: memory of the events, for an `EventReader`.
-        control_fd: memory of the control block, for a `ControlBlock`.
+        event_fd, control_fd: memory for an `EventReader` and a `ControlBlock`.
     """
 
     def __init__(self, settings: ExchangeSettings) -> None:
@@ -155,19 +150,14 @@ class ExchangeProcess:
         self._control.supervisor_heartbeat = time.monotonic()
 
     def submit(self, source: MotionSource, confirm: Callable[[], bool] = lambda: True) -> int:
-        """Hand a motion over, to be run as soon as all its axes are open.
+        """Hand a motion over, to be run as soon as all its axes are open; return its id.
 
         Its arrays of 4 KiB and more arrive read-only. Reading it takes the exchange about 0.2 ms
         per MB, so that replies may be late; axes should be closed. Sends heartbeats while it
         waits. A motion that is not accepted in time is withdrawn.
 
-        Args:
-            source: the motion.
-            confirm: called when the exchange has read the motion, which may take long, and then
-                until it has requested it; False withdraws the motion.
-
-        Returns:
-            The id of the motion.
+        `confirm` is called when the exchange has read the motion, which may take long, and then
+        until it has requested it; False withdraws the motion.
 
         Raises:
             WithdrawnError: `confirm` returned False; nothing has begun.

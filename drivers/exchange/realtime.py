@@ -25,11 +25,8 @@ _open_files: list[int] = []
 class RealTimeSettings:
     """Requested settings; a refusal is reported and never fatal.
 
-    Attributes:
-        priority: of SCHED_FIFO, 1..99; 0 for ordinary scheduling.
-        cpu: the only processor to run on; None for all.
-        lock_memory: lock all pages in memory.
-        hold_cpu_awake: hold `/dev/cpu_dma_latency` at 0 until the process ends.
+    `priority` of SCHED_FIFO, 1..99; 0 for ordinary scheduling. `cpu` is the only processor to run
+    on; None for all. `hold_cpu_awake` holds `/dev/cpu_dma_latency` at 0 until the process ends.
     """
 
     priority: int = 50
@@ -40,13 +37,9 @@ class RealTimeSettings:
 
 @dataclass(frozen=True)
 class RealTimeReport:
-    """Settings granted by the system.
+    """Settings granted by the system; `scheduling` is "SCHED_FIFO" with its priority, or "ordinary".
 
-    Attributes:
-        scheduling: "SCHED_FIFO" with its priority, or "ordinary".
-        memory_locked: whether all pages, also of later allocations, are locked in memory.
-        cpu_awake: whether slow idle states of the processors are excluded.
-        refused: one sentence per refusal, with its remedy.
+    `refused` has one sentence per refusal, with its remedy.
     """
 
     scheduling: str

@@ -124,11 +124,8 @@ class ControlServer:
 
     Runs the commands of the supervisor and publishes state and events.
 
-    Args:
-        session, transport, ring, events, control: of this process.
-        channel: socket to the supervisor.
-        terminated: whether the process was asked to end: stop on the path, leave open mode, end.
-        needs_archive: whether motions are stopped and refused while the archive is not written.
+    `terminated` tells whether the process was asked to end: stop on the path, leave open mode,
+    end. With `needs_archive` motions are stopped and refused while the archive is not written.
 
     Attributes:
         reason: why the process ends or is about to; empty otherwise.
@@ -393,8 +390,8 @@ class ControlServer:
     def _may_end(self, now: float) -> bool:
         """Whether replies are no longer needed, once there is a reason to end.
 
-        Without a supervisor packets are answered as long as the arm moves, without limit: nobody
-        could react to what the controller does without replies.
+        Without a supervisor packets are answered as long as the arm moves, without limit: there is
+        nothing to react to what the controller does without replies.
         """
         if self._open or (self._detached and now - self._arm_moved_at < ARM_RESTS):
             return False

@@ -84,11 +84,7 @@ class SimulatedTransport:
         """Do nothing: there is only one peer."""
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return the next packet; None after `timeout` s without one.
-
-        Raises:
-            TransportClosed: closed, or the session has ended.
-        """
+        """Return the next packet; None after `timeout` s without one. Raises TransportClosed."""
         self._require_open()
         left = timeout
         while True:
@@ -153,11 +149,7 @@ class SimulatedTransport:
         self._to_controller = [d for d in self._to_controller if d.due > now]
 
     def send(self, packet: bytes) -> None:
-        """Send a reply in the present cycle.
-
-        Raises:
-            TransportClosed: closed.
-        """
+        """Send a reply in the present cycle; raises TransportClosed."""
         self._require_open()
         index = self.cycle - 1
         for delay, content in self._link.carry(index, "to_controller", packet):

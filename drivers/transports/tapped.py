@@ -16,16 +16,11 @@ MAX_BUFFERED: Final = 256
 
 
 class TappedTransport:
-    """Wraps a link and copies its packets to a ring.
+    """Wraps a link and copies its packets to the ring `sink`.
 
     Packets are copied before the wait for the next one, so that replies are not delayed, and when
-    their cycle is known. Packets of a backlog have the cycle of the one answered; the first ones
+    their `cycle` is known. Packets of a backlog have the cycle of the one answered; the first ones
     of a backlog of more than `MAX_BUFFERED` that of the one answered before.
-
-    Args:
-        transport: the link.
-        sink: ring for the copies.
-        cycle: returns the controller's cycle of the packet answered last.
     """
 
     def __init__(self, transport: Transport, sink: PacketRing, cycle: Callable[[], int]) -> None:

@@ -59,11 +59,7 @@ class UdpSpec:
     bind: str = "0.0.0.0"
 
     def open(self) -> UdpTransport:
-        """Bind the port.
-
-        Raises:
-            TransportError: unknown address, or the port is in use or not permitted.
-        """
+        """Bind the port; raises TransportError."""
         return UdpTransport(self.peer_host, self.port, self.bind)
 
 

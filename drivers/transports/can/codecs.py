@@ -112,9 +112,8 @@ class SlowStore:
     def update(self, number: int, index: int, value: bytes, words: Words) -> int:
         """Store the slow value of a cycle and write all of them into its words, (n, 9).
 
-        Returns:
-            Cycles since the previous update, 0 for the first; negative if this cycle is older,
-            whose slow values are unknown.
+        Returns the cycles since the previous update, 0 for the first; negative if this cycle is
+        older, whose slow values are unknown.
         """
         ahead = 0 if self._last is None else (number - self._last) % LAST_NUMBER
         if ahead > LAST_NUMBER // 2 or (ahead == 0 and self._last is not None):
@@ -161,12 +160,8 @@ class Reply(NamedTuple):
 class Sent:
     """The cyclic packet that a reply belongs to, as sent or received at one end.
 
-    Attributes:
-        number: its number.
-        status: status byte of arm 1.
-        words: (n, 9) its axis blocks.
-        modes: mode of each slot.
-        mask: (n, 9) all bits set in the words that a mirrored axis returns, none if it cannot be.
+    `status` is that of arm 1, `words` (n, 9) its axis blocks; `mask` (n, 9) has all bits set in the
+    words that a mirrored axis returns, none if it cannot be mirrored.
     """
 
     number: int
@@ -208,12 +203,7 @@ def _mirrored(status: int, modes: tuple[int, ...]) -> Words:
 
 
 def read_reply(reply: bytes, sent: Sent) -> Reply:
-    """Decode a reply.
-
-    Raises:
-        CanModeError: it has values that the frames cannot carry.
-        CanValueError: a target is not finite.
-    """
+    """Decode a reply; raises CanModeError, CanValueError if the frames cannot carry it."""
     words = words_of(reply, len(sent.words))
     mirrored = (sent.mask[:, 0] != 0) & (words == (sent.words & sent.mask)).all(axis=1)
     floats = words.view(np.float32)
@@ -258,13 +248,10 @@ def drive_off(sent: Sent) -> Reply:
 
 
 class UpSet(NamedTuple):
-    """Decoded frames of one cycle.
+    """Decoded frames of one cycle; slow values in `words` (n, 9) are zero.
 
-    Attributes:
-        number, status: of the packet.
-        words: (n, 9) modes and numbers; slow values are zero.
-        slow: index and four bytes of the slow value.
-        counts: (n,) D3 in counts, NaN out of range, to compute D4 from; None if D4 was sent.
+    `slow` is index and four bytes of the slow value; `counts` (n,) D3 in counts, NaN out of range,
+    to compute D4 from; None if D4 was sent.
     """
 
     number: int

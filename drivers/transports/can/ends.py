@@ -76,11 +76,7 @@ class Segmenter:
         self._transfer = 0
 
     def split(self, packet: bytes) -> list[bytes]:
-        """Return the payloads, in order.
-
-        Raises:
-            ValueError: the packet is empty or longer than 1500 bytes.
-        """
+        """Return the payloads, in order; raises ValueError for a length outside 1..1500 bytes."""
         if not 1 <= len(packet) <= LONGEST:
             raise ValueError(f"a packet has 1..{LONGEST} bytes, not {len(packet)}")
         transfer = self._transfer
@@ -97,10 +93,8 @@ class Segmenter:
 class SegmentAssembler:
     """Assembles packets from segments; only complete ones with the right CRC are returned.
 
-    Args:
-        size: bytes of a full payload, 8 or 64.
-        discarded: counts "torn" (a segment is missing), "corrupt" (wrong CRC or length) and
-            "malformed" (not a segment).
+    `size` is that of a full payload, 8 or 64 bytes. Counted in `discarded` are "torn" (a segment is
+    missing), "corrupt" (wrong CRC or length) and "malformed" (not a segment).
     """
 
     def __init__(self, size: int, discarded: Counter[str]) -> None:
@@ -161,17 +155,11 @@ LATE: Final = 3
 
 
 class SetAssembler:
-    """Collects one frame of each identifier with the same cycle number.
+    """Collects one frame of each identifier with the same cycle number, modulo `modulus`.
 
     A frame of another cycle starts a new set; an incomplete set is dropped and counted as "torn".
-    Duplicates and frames of up to `LATE` cycles earlier are ignored. Numbers repeat, so a set must
-    also be complete within `span`.
-
-    Args:
-        ids: identifiers of a complete set.
-        modulus: of the cycle numbers.
-        span: longest time between the arrivals of the first and the last frame of a set, s.
-        discarded: counts "torn".
+    Duplicates and frames of up to `LATE` cycles earlier are ignored. Numbers repeat, so all frames
+    of a set must also arrive within `span` s.
     """
 
     def __init__(
@@ -282,8 +270,7 @@ class End(ABC):
     def receive(self, frame: Frame, time: float) -> bytes | None:
         """Add a frame that arrived at `time` (s); returns the packet when it is complete.
 
-        Raises:
-            CanError: an init packet of a session that this bus cannot carry.
+        Raises CanError for an init packet of a session that this bus cannot carry.
         """
         if frame.id == (SEGMENT_UP if self._upwards else SEGMENT_DOWN):
             packet = self._segments.add(frame.data, time)
@@ -377,7 +364,6 @@ class PcEnd(End):
 
         Raises:
             CanModeError, CanValueError: the frames cannot carry it.
-            ValueError: neither cyclic nor 1..1500 bytes.
         """
         codec = self._codec
         if codec is not None and len(packet) == cyclic_length(codec.n_axes):
@@ -413,7 +399,6 @@ class ControllerEnd(End):
 
         Raises:
             CanError: an init packet of a session that this bus cannot carry.
-            ValueError: not 1..1500 bytes.
         """
         init = self._cyclic_session(packet)
         if init is not None:

@@ -46,13 +46,10 @@ _REMEDIES = {
 def open_bus(
     interface: str, channel: str, rates: BusRates, options: Mapping[str, Any]
 ) -> can.BusABC:
-    """Open a bus of python-can.
+    """Open a bus of python-can, with further arguments `options`.
 
-    Args:
-        interface: python-can's name: socketcan, slcan, pcan, virtual, udp_multicast, ...
-        channel: can0, /dev/ttyACM0, ...; a multicast group may have its port behind a slash.
-        rates: profile and bit rates; on SocketCAN they are set by `ip link`, not here.
-        options: further arguments of that bus.
+    `channel` is can0, /dev/ttyACM0, ...; a multicast group may have its port behind a slash. On
+    SocketCAN the bit rates are set by `ip link`, not here.
 
     Raises:
         TransportError: it cannot be opened.
@@ -123,17 +120,10 @@ _MAX_ECHOES: Final = 256
 
 
 class Port:
-    """Sends and receives the frames of one end.
+    """Sends and receives the frames of one end; the bus is closed with it.
 
-    Args:
-        bus: of python-can; closed with the port.
-        end: converts frames to packets.
-        fd: whether frames are FD frames.
-        clock: time of arrival of frames without a time stamp, s.
-
-    Attributes:
-        discarded: counts of the end, and "bus_error" (error frames) and "unsent" (frames not
-            accepted by the bus).
+    `clock` gives the time of arrival of frames without a time stamp, s. `discarded` has the counts
+    of the end, and "bus_error" (error frames) and "unsent" (frames not accepted by the bus).
     """
 
     def __init__(
@@ -315,16 +305,10 @@ MOVABLE = frozenset((Mode.POSITION, Mode.POSITION_RELATIVE, Mode.DELTA_POSITION)
 
 
 class CanTransport:
-    """The PC's end of the CAN profile on an open bus.
+    """The PC's end of the CAN profile on an open bus, which is closed with it, and its lock.
 
     A reply that the frames cannot carry is replaced by a request for drive-off, and the link is
-    closed with the reason.
-
-    Args:
-        bus: of python-can; closed with the transport.
-        rates: profile and bit rates.
-        clock: time of arrival of frames without a time stamp, s.
-        lock: of the bus; released when the transport is closed.
+    closed with the reason. `clock` is that of `Port`.
     """
 
     def __init__(
@@ -433,10 +417,7 @@ class CanSpec:
         )
 
     def check(self, mode: int | None = None) -> None:
-        """Check that this bus can carry the session.
-
-        Args:
-            mode: open mode of the motions; None without motions.
+        """Check that this bus can carry the session, and motions in this open mode.
 
         Raises:
             CanAxesError: more axes than the frames can carry.
@@ -453,8 +434,8 @@ class CanSpec:
         """Open the bus.
 
         Raises:
-            TransportError: it cannot be opened, another program uses it, or (`CanError`) it
-                cannot carry the session.
+            TransportError: it cannot be opened, another program uses it, or (`CanError`) it cannot
+                carry the session.
         """
         self.check()
         lock = BusLock(self.interface, self.channel)
