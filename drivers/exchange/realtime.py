@@ -37,7 +37,7 @@ class RealTimeSettings:
 
 @dataclass(frozen=True)
 class RealTimeReport:
-    """Settings granted by the system; `scheduling` is "SCHED_FIFO" with its priority, or "ordinary".
+    """Granted settings; `scheduling` is "SCHED_FIFO" with its priority, or "ordinary".
 
     `refused` has one sentence per refusal, with its remedy.
     """
