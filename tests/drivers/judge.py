@@ -42,11 +42,11 @@ class Conduct:
     Attributes:
         usable: whether this session may move the arm at all.
         entitled: a motion was requested and accepted, and has not ended.
-        stopping: a stop was asked for (or a long gap was, or too many answers were not taken) in
+        stopping: a stop was asked for (or a long gap was, or too many replies were not accepted) in
             this interval.
         overridden: a change of override was accepted in this interval.
-        aged: a target in the packet was sent in an earlier cycle: answers lost do not show.
-        tally: how often which law was put to use.
+        aged: a target in the packet was sent in an earlier cycle: lost replies are not visible.
+        tally: how often each law was applied.
     """
 
     limits: GuardLimits
@@ -76,7 +76,7 @@ class Conduct:
     missed: int = 0
     at_most: int = 0
     without_jerk_bound: int = 0
-    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
+    continuing: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))
     tally: dict[str, int] = field(default_factory=dict)
 
     def all_open(self, packet: bytes) -> bool:
@@ -141,7 +141,7 @@ class Conduct:
         leaving, self.exiting = self.exiting, bool(record["state"] == State.EXITING)
         if all(ready) and not leaving:
             self._open(received, answer, record)
-            self.kept = np.ones(len(ready), bool)
+            self.continuing = np.ones(len(ready), bool)
         elif any(ready) and self.motor is not None:
             self._leaving(answer, safe, ready)
         elif any(ready):
@@ -208,17 +208,17 @@ class Conduct:
 
     def _leaving(self, answer: oracle.Packet, safe: oracle.Packet, ready: list[bool]) -> None:
         for joint, (slot, up) in enumerate(zip(self.slots, ready, strict=True)):
-            self.kept[joint] &= up
+            self.continuing[joint] &= up
             if not up:
                 continue
             axis = answer.axes[slot]
             # An axis that was closed and is open again has its target, as when opening.
-            if self.mode in POSITION_MODES and self.kept[joint]:
+            if self.mode in POSITION_MODES and self.continuing[joint]:
                 assert axis.floats[0] == np.float32(self.motor[joint]), "leaving: not held"
                 assert axis.keep(1) == axis
             else:
                 assert axis == safe.axes[slot]
-        # To be held is a motion as well: nobody is brought to rest by a jump.
+        # Coming to rest must not be a jump.
         if self.mode in POSITION_MODES:
             self._advance(self.sent[-1], 1, 0.0)
         elif self.mode != 9:
@@ -268,10 +268,10 @@ class Conduct:
         else:
             rounding_of_target = 0.0
             if self.at_most > self.max_gap:
-                self._go_on_from_target(a, r)
+                self._resume_from_target(a, r)
                 rounding_of_target = np.spacing(np.float32(np.abs(r[0])))
             assert (np.abs(r[2] - self.motor) <= self.threshold * (1 + 2e-6)).all(), "not there"
-            near = np.concatenate((self.motors[-self.max_gap - 1 :], self._led_on()))
+            near = np.concatenate((self.motors[-self.max_gap - 1 :], self._extrapolated()))
             nearest = np.abs(near - r[0]).min(axis=0)
             assert (nearest <= 0.1 * self.threshold * (1 + 1e-6)).all(), "a leap after losses"
             low, high = np.float32(motor - rounding), np.float32(motor + rounding)
@@ -301,7 +301,7 @@ class Conduct:
         self.motor = motor
         del self.sent[:-3]
 
-    def _go_on_from_target(self, a: np.ndarray, r: np.ndarray) -> None:
+    def _resume_from_target(self, a: np.ndarray, r: np.ndarray) -> None:
         """After a long gap in which the controller led the motion, its target counts as sent.
 
         It carried the motion on, as fast as before or a little slower, or brought it to rest. A
@@ -326,13 +326,13 @@ class Conduct:
         off = np.abs(r[0] - ahead).max(axis=1)
         assert (np.abs(r[0] - ahead[off.argmin()]) <= 0.1 * self.threshold).all(), "off its way"
         slower = np.abs(r[1] - step) <= np.maximum(0.5 * np.abs(step), standstill) * (1 + 1e-6)
-        assert slower.all() or (np.abs(r[1]) <= standstill).all(), "goes on at another speed"
+        assert slower.all() or (np.abs(r[1]) <= standstill).all(), "continues at another speed"
         self.motors = [r[0] - k * r[1] for k in (3, 2, 1, 0)]
         self.sent, self.motor = [self.train.joint_position(row) for row in self.motors], r[0]
-        self._count("goes on from the target")
+        self._count("resumed from the target")
 
-    def _led_on(self) -> np.ndarray:
-        """(k, n) where a controller that goes on over packets missed may be, motor revolutions."""
+    def _extrapolated(self) -> np.ndarray:
+        """(k, n) of a controller that extrapolates over missed packets, motor revolutions."""
         ahead = np.arange(1, min(self.missed, self.max_gap) + 1)[:, np.newaxis]
         return self.motor + ahead * self._last_step()
 
@@ -348,9 +348,9 @@ class Conduct:
         return int(back.argmin(axis=0)[behind].max(initial=0))
 
     def _again(self, target: np.ndarray) -> None:
-        """A set-point that the controller has not taken: the motion waits."""
+        """Check a set-point sent again because it was not accepted: the motion waits."""
         lag = self._lag(target)
-        assert lag > self.lag, "sent again although it was taken"
+        assert lag > self.lag, "sent again although it was accepted"
         assert not self.aged, "sent again though an older target shows no loss"
         self.lost += 1 if self.repeats else lag - self.lag
         self.repeats += 1
@@ -358,10 +358,9 @@ class Conduct:
         self._count("again")
 
     def _count_lost(self, target: np.ndarray) -> None:
-        """More than `max_gap` answers that show in no target are reason enough for a stop.
+        """Count replies not accepted; more than `max_gap` allow a stop.
 
-        The motion goes on, though the target is further behind than before, only with small steps,
-        or on its way to rest.
+        The motion continues with a target further behind only in small steps or while stopping.
         """
         lag = self._lag(target)
         slow = np.abs(self._last_step()).max() <= 4.0 * self.limits.standstill * (1 + 1e-6)
@@ -374,7 +373,7 @@ class Conduct:
         self.stopping = self.stopping or self.lost > self.max_gap
 
     def _factors(self) -> tuple[float, float]:
-        """What acceleration and jerk may be multiplied by, from what was asked for."""
+        """Return the factors on acceleration and jerk."""
         limits = self.limits
         if self.stopping:
             return limits.stop_acceleration, limits.stop_jerk
@@ -444,7 +443,7 @@ SILENCE = 301.0
 
 
 class Judged:
-    """What a drawn conversation is made of; whoever draws says `hear` once, then `deliver`.
+    """A random conversation with a session: `set_up` once, then `deliver` each packet.
 
     Attributes:
         last: the packet answered afresh last, and its answer.
@@ -455,7 +454,7 @@ class Judged:
 
     source: Any = None
 
-    def hear(
+    def set_up(
         self,
         session: Session,
         ring: CycleRing,
@@ -467,7 +466,7 @@ class Judged:
         period: float,
         inits: Mapping[bytes, bool],
     ) -> None:
-        """Begin; `inits` are init packets of which it is known whether the arm may be moved."""
+        """Start; `inits` are init packets, and whether the arm may be moved with them."""
         self.session, self.ring, self.conduct = session, ring, conduct
         self.reception = Reception(silence)
         self.max_gap = max_gap
@@ -478,7 +477,7 @@ class Judged:
         self.unanswered = 0
 
     def deliver(self, packet: bytes, elapsed: float | None = None) -> bytes | None:
-        """One packet, and its answer judged.
+        """Deliver one packet and check its reply.
 
         Raises:
             AssertionError: a law is broken.
@@ -486,7 +485,7 @@ class Judged:
         elapsed = self._period if elapsed is None else elapsed
         self.now += elapsed
         if elapsed > SILENCE:
-            self.silence_heard()
+            self.record_silence()
         before, last = self.ring.slot, self.reception.last
         kind = self.reception.expect(packet)
         asked = self.source.asked if self.source is not None else 0
@@ -494,7 +493,7 @@ class Judged:
         if self.source is not None and self.source.asked > asked:
             assert self.source.asked == asked + 1, "asked twice for one packet"
             assert kind == "cyclic" and self.conduct.all_open(packet), "asked with an axis closed"
-        self.take_events()
+        self.read_events()
         rows = self.ring.slot - before
         assert rows == (kind == "cyclic") or (kind == "cyclic" and rows < 0), "records"
         if kind == "nothing":
@@ -526,13 +525,13 @@ class Judged:
         if all(axis.mode == 504 for axis in oracle.parse(packet, self._n_axes).axes):
             self.reception.ended = True
 
-    def silence_heard(self) -> None:
+    def record_silence(self) -> None:
         """Record a silence longer than allowed."""
         if not self.reception.ended:
             self.reception.silent = self.reception.n_axes is not None
             self.conduct.interrupted()
 
-    def take_events(self) -> None:
+    def read_events(self) -> None:
         """Read from events which motions ended and whether the arm can be moved."""
         for event in self.session.events():
             if isinstance(event, MotionEnded):

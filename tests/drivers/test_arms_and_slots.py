@@ -1,6 +1,6 @@
-"""One to four arms, one to twenty open axes, in any slots: each axis gets its own answer.
+"""One to four arms, one to twenty open axes, in any slots: each axis gets its own reply.
 
-Expected answers come from the oracle, which knows of slots and arms only what the test drew.
+Expected replies are those of the oracle.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def opened(slots, arm, n, **options) -> Bench:
 TWO_ARMS = tuple((arm, axis) for axis in range(3) for arm in (2, 1))
 
 
-def test_a_drive_that_is_off_on_another_arm_changes_nothing():
+def test_drive_of_another_arm_off():
     bench = opened(TWO_ARMS, 1, 3)
     bench.status[1] = 0
     received, answer = bench.cycle()
@@ -177,7 +177,7 @@ def test_a_drive_that_is_off_on_another_arm_changes_nothing():
     assert answer.status == bytes(4)
 
 
-def test_the_drive_of_the_wanted_arm_going_off_ends_open_mode_whatever_the_others_do():
+def test_drive_of_the_moved_arm_goes_off():
     bench = opened(TWO_ARMS, 1, 3)
     bench.status[0] = 0
     for slot, (arm, _) in enumerate(TWO_ARMS):
@@ -192,11 +192,11 @@ def lacking(arm: int, *axes: int) -> list[str]:
 
 
 class TestArmWithoutAllItsJoints:
-    def never_moved(self, bench: Bench, says: list[str]) -> None:
-        """Through every kind of packet: no set-point of its own, no motion accepted."""
+    def never_moved(self, bench: Bench, texts: list[str]) -> None:
+        """Check that no packet gets a set-point and no motion is accepted."""
         bench.start()
         (init,) = bench.seen(InitReceived)
-        for part in says:
+        for part in texts:
             assert part in init.unusable
         for mode in (CLOSED, OPEN, 5, 501, CLOSED):
             bench.modes = [mode] * len(bench.slots)
@@ -227,8 +227,8 @@ class TestArmWithoutAllItsJoints:
 
 class TestAxisMaps:
     @pytest.mark.parametrize("mode", [5, 7, 9])
-    def test_without_a_map_no_open_axis_gets_an_echo_while_any_drive_is_on(self, mode):
-        """Whose axis it is nobody knows; an echoed position would be a delta in mode 7."""
+    def test_no_echo_to_open_axes_without_a_valid_map(self, mode):
+        """The arm of the axis is unknown; an echoed position would be an offset in mode 7."""
         slots = tuple((1, axis) for axis in range(6))
         table = np.full((4, 10), 1)
         bench = Bench(slots, 1, 6, open_axes_map=table)
@@ -242,16 +242,16 @@ class TestAxisMaps:
 
     @settings(max_examples=60)
     @given(st.lists(st.integers(-3, 25) | st.just(255), min_size=40, max_size=40), st.data())
-    def test_any_map_whatever_moves_the_arm_only_if_it_is_a_bijection(self, table, data):
+    def test_arm_moves_only_if_the_map_is_a_bijection(self, table, data):
         n_axes = data.draw(st.integers(1, 20))
         slots = tuple((1 + k // 10, k % 10) for k in range(n_axes))
         bench = Bench(slots, 1, 1, open_axes_map=np.array(table).reshape(4, 10))
         bench.start()
         given_slots = sorted(slot for slot in table if slot not in (255, -1))
-        sound = given_slots == list(range(n_axes)) and table[0] not in (255, -1)
-        assert (bench.seen(InitReceived)[0].unusable is None) == sound
+        valid = given_slots == list(range(n_axes)) and table[0] not in (255, -1)
+        assert (bench.seen(InitReceived)[0].unusable is None) == valid
         received, answer = bench.cycle()
-        if not sound:
+        if not valid:
             assert oracle.differences(answer, oracle.safe_answer(received, (1,) * n_axes)) == []
 
 

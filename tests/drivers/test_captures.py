@@ -1,8 +1,8 @@
-"""Our session in the place of the foreign PC program of each capture, packet by packet.
+"""Captured packets of controllers, replied to by the session.
 
-Every answer is held, field by field, against two references: the oracle, which is the documented
-answer, and what the foreign program said. Where these two differ, the difference is one of those
-listed in `DIFFERENT_ON_PURPOSE`, and it must really occur.
+Each reply is compared, field by field, with the documented reply (`oracle`) and with that of the
+captured PC program. Where these two differ, the difference is in `DIFFERENT_ON_PURPOSE`, and it
+must occur.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from drivers import (
     Session,
     State,
 )
-from drivers.errors import NotAtStandstill, VelocityLimit
+from drivers.errors import VelocityLimit
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
 from tests.drivers.rig import Table
@@ -45,7 +45,7 @@ CAPTURES = (
     "b_ufmg_mode4",
     "s_TestMode4_movement_7ax_stagger",
 )
-"""The letter says who wrote the ends: `a_*` a model of the controller and one laboratory's PC
+"""The letter is that of the programs: `a_*` a model of the controller and one laboratory's PC
 program, `b_*` one laboratory's controller and another's PC program, `s_*` the tail of a session."""
 ETHERNET = 1
 
@@ -120,7 +120,7 @@ DIFFERENT_ON_PURPOSE = {
     "open": {"D2"},
     # Theirs asks for drive-off because the test wants it; ours has come to the end of its motion.
     "their 505": {"mode", "D2"},
-    # Theirs steps by 5 revolutions, finds the following error too large after the fact, says 508
+    # Theirs steps by 5 revolutions, detects the following error afterwards, replies 508
     # on the first axis and a target of zero on the others. Ours never sends such a step.
     "their 508": {"mode", "D1"},
 }
@@ -140,7 +140,7 @@ def limits(n: int, following_error: float) -> GuardLimits:
 
 
 def train_of(init: InitPacket, n: int) -> DriveTrain:
-    """The arm that the controller announces; where it announces nonsense, some arm."""
+    """Return the arm of the init packet, with some values where those are invalid."""
     k54, k64, k65 = (float(np.nan_to_num(k)) for k in init.wrist_coupling())
     ratio = init.gear_ratio[0, :n].astype(np.float64)
     return DriveTrain(
@@ -173,7 +173,7 @@ def their_targets(pairs: list[tuple[bytes, bytes | None]], n: int) -> np.ndarray
 
 @dataclass
 class Replay:
-    """Our session, fed with a capture; sees to the motion and to the clock."""
+    """A session that receives the packets of a capture, with motion and clock."""
 
     pairs: list[tuple[bytes, bytes | None]]
     n: int
@@ -266,9 +266,7 @@ def assert_equal(ours: oracle.Packet, expected: oracle.Packet, positions: np.nda
 
 
 @pytest.mark.parametrize("name", MOVED)
-def test_every_answer_is_the_documented_one_and_differs_from_theirs_only_on_purpose(
-    shared_data: Path, name: str
-):
+def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     n = 6
     replay = replay_of(shared_data, name)
     arms = (1,) * n
@@ -293,7 +291,7 @@ def test_every_answer_is_the_documented_one_and_differs_from_theirs_only_on_purp
         else:
             expected = oracle.safe_answer(received, arms)
             if what == "their 508":
-                axes = tuple(replace_mode(axis, 505) for axis in expected.axes)
+                axes = tuple(axis._replace(mode=505) for axis in expected.axes)
                 expected = expected._replace(axes=axes)
             assert oracle.differences(ours, expected) == [], (what, received.number)
         if theirs is None:
@@ -308,16 +306,17 @@ def test_every_answer_is_the_documented_one_and_differs_from_theirs_only_on_purp
         assert found or what == "open", f"{what}: nothing differs any more"
     assert {"driving on", "closed"} <= set(seen)
     assert ("opening" in seen) == (name == "a_stagger")
-
-
-def replace_mode(axis: oracle.Axis, mode: int) -> oracle.Axis:
-    return axis._replace(mode=mode)
+    (ended,) = replay.seen(MotionEnded)
+    # In the others the drive went off, or open mode was closed, with the last set-point.
+    assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
+    refused = [(type(event.error), event.error.joint) for event in replay.seen(Refused)]
+    assert refused == ([(VelocityLimit, 0)] if name == "a_508" else [])
 
 
 def assert_documented(
     what: str, name: str, received: oracle.Packet, ours: oracle.Packet, theirs: oracle.Packet
 ) -> None:
-    """What the foreign program does instead is what the facts say of it."""
+    """Check that the captured reply is as the facts describe it."""
     if what in ("off", "driving on", "closed"):
         assert all(axis.d == (oracle.ZERO,) * 8 for axis in theirs.axes)
         assert [a.mode for a in theirs.axes] == [a.mode for a in received.axes]
@@ -341,22 +340,7 @@ def assert_documented(
         assert not any(axis.floats[0] for axis in theirs.axes[1:])
 
 
-@pytest.mark.parametrize("name", MOVED)
-def test_the_motion_of_the_capture_ends_as_the_controller_ended_it(shared_data: Path, name: str):
-    replay = replay_of(shared_data, name)
-    for packet, _ in replay.pairs:
-        replay.feed(packet)
-    (ended,) = replay.seen(MotionEnded)
-    # Elsewhere the drive dropped, or open mode was closed, with the last set-point.
-    assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
-    refused = replay.seen(Refused)
-    assert len(refused) == (name == "a_508")
-    if refused:
-        assert isinstance(refused[0].error, VelocityLimit)
-        assert refused[0].error.joint == 0
-
-
-def test_a_controller_with_an_impossible_axis_map_is_answered_but_never_moved(shared_data: Path):
+def test_controller_with_an_invalid_axis_map_is_not_moved(shared_data: Path):
     """Five axes that all claim slot 1, a cycle of 1500: the foreign driver moved one of them."""
     n = 5
     replay = Replay(conversation(shared_data, IMPOSSIBLE_MAP), n)
@@ -370,7 +354,7 @@ def test_a_controller_with_an_impossible_axis_map_is_answered_but_never_moved(sh
         received, ours = oracle.parse(packet, n), oracle.parse(ours_raw, n)
         expected = oracle.safe_answer(received, (1,) * n)
         if situation(received, None) == "open":
-            axes = tuple(replace_mode(axis, oracle.DRIVE_OFF_REQUEST) for axis in expected.axes)
+            axes = tuple(axis._replace(mode=oracle.DRIVE_OFF_REQUEST) for axis in expected.axes)
             expected = expected._replace(axes=axes)
         assert oracle.differences(ours, expected) == []
         if reply is not None:
@@ -383,7 +367,7 @@ def test_a_controller_with_an_impossible_axis_map_is_answered_but_never_moved(sh
     assert np.isnan(replay.ring.last(100)["commanded_position"]).all()
 
 
-class TestSevenAxesFromTheMiddleOfASession:
+class TestSevenAxesInMidSession:
     """The capture begins in open mode, at speed, without an init packet."""
 
     N = 7
@@ -396,14 +380,8 @@ class TestSevenAxesFromTheMiddleOfASession:
         }
         return InitPacket.build(self.N, 2, arm).encode()
 
-    def packets(self, shared_data: Path) -> list[tuple[bytes, bytes | None]]:
-        return conversation(shared_data, SEVEN_AXES)
-
-    def closed(self, packet: bytes, number: int) -> bytes:
-        """The arm at rest where that packet's target is, axes closed."""
-        return self.resting(packet, number, 0)
-
     def resting(self, packet: bytes, number: int, mode: int) -> bytes:
+        """Return a packet of the arm at rest at the target of another packet."""
         received = oracle.parse(packet, self.N)
         axes = tuple(
             oracle.Axis(mode, (a.d[0], oracle.ZERO, a.d[0], oracle.ZERO, *a.d[4:]))
@@ -411,8 +389,8 @@ class TestSevenAxesFromTheMiddleOfASession:
         )
         return oracle.build(received._replace(number=number, axes=axes))
 
-    def test_before_an_init_packet_a_drive_that_is_on_gets_no_answer(self, shared_data: Path):
-        pairs = self.packets(shared_data)
+    def test_no_reply_with_a_drive_on_before_init(self, shared_data: Path):
+        pairs = conversation(shared_data, SEVEN_AXES)
         replay = Replay([(self.init(), None), *pairs], self.N)
         for packet, _ in pairs:
             on = packet[4] == oracle.DRIVE_ON
@@ -420,34 +398,15 @@ class TestSevenAxesFromTheMiddleOfASession:
         assert replay.session.counters.malformed == sum(p[4] == 5 for p, _ in pairs) > 50
         assert replay.session.state is State.SYNC
 
-    def test_an_arm_found_open_and_moving_is_asked_to_switch_off(self, shared_data: Path):
-        pairs = self.packets(shared_data)
-        first = pairs[0][0]
-        replay = Replay([(self.init(), None), *pairs], self.N)
-        replay.requested = True
-        replay.feed(self.init())
-        replay.next_number = None
-        replay.feed(self.closed(first, 223))
-        for packet, _ in pairs:
-            received = oracle.parse(packet, self.N)
-            expected = oracle.safe_answer(received, (1,) * self.N)
-            if situation(received, None) == "open":
-                axes = tuple(replace_mode(a, oracle.DRIVE_OFF_REQUEST) for a in expected.axes)
-                expected = expected._replace(axes=axes)
-            assert oracle.differences(oracle.parse(replay.feed(packet), self.N), expected) == []
-        (refused,) = replay.seen(Refused)
-        assert isinstance(refused.error, NotAtStandstill)
-        assert replay.session.state is State.ENDED
-
-    def test_its_motion_from_rest_is_answered_with_the_foreign_targets(self, shared_data: Path):
-        pairs = self.packets(shared_data)
+    def test_motion_from_rest_has_the_captured_targets(self, shared_data: Path):
+        pairs = conversation(shared_data, SEVEN_AXES)
         first = pairs[0][0]
         replay = Replay([(self.init(), None), *pairs], self.N)
         start = [axis.floats[0] for axis in oracle.parse(first, self.N).axes]
         replay.targets = np.vstack([start, replay.targets])
         replay.feed(self.init())
         replay.next_number = None
-        replay.feed(self.closed(first, 222))
+        replay.feed(self.resting(first, 222, 0))
         replay.feed(self.resting(first, 223, 4))
         compared = 0
         for packet, reply in pairs:
@@ -463,14 +422,12 @@ class TestSevenAxesFromTheMiddleOfASession:
 
 def open_axes(pairs: list[tuple[bytes, bytes | None]], name: str) -> int:
     inits = [packet for packet, _ in pairs if len(packet) == INIT_LENGTH]
-    # One capture begins after the init packet; the name tells the number of axes.
+    # One capture begins after the init packet; its name has the number of axes.
     return 7 if name == SEVEN_AXES else struct.unpack_from("<i", inits[0], 12)[0]
 
 
 @pytest.mark.parametrize("name", CAPTURES)
-def test_every_packet_of_either_end_decodes_field_by_field_and_encodes_bit_for_bit(
-    shared_data: Path, name: str
-):
+def test_packets_decode_and_encode_unchanged(shared_data: Path, name: str):
     datagrams = read_datagrams(capture_path(shared_data, name))
     n = open_axes(conversation(shared_data, name), name)
     kinds = dict.fromkeys(("init", "whole", "long"), 0)

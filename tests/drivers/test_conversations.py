@@ -1,4 +1,4 @@
-"""A session in arbitrary conversations, judged at every step, and with a check taken away."""
+"""Random conversations with a session, checked at each step; sessions without one check."""
 
 from __future__ import annotations
 
@@ -18,22 +18,24 @@ from tests.fuzz.targets import session
 from tests.fuzz.targets.session import Conversation
 
 
-def drawn(seed: int) -> bytes:
-    """Bytes of a conversation, in which a motion is asked for first."""
+def random_conversation(seed: int) -> bytes:
+    """Return bytes of a conversation in which a motion is requested first."""
     chance = random.Random(seed)
     return chance.randbytes(5) + bytes(6) + bytes((1,)) + chance.randbytes(chance.choice((60, 300)))
 
 
 @pytest.mark.parametrize("part", range(4))
-def test_no_conversation_breaks_a_law(part):
-    opened = sum(session.run(drawn(seed)) for seed in range(100 * part, 100 * part + 60))
+def test_random_conversations(part):
+    opened = sum(
+        session.run(random_conversation(seed)) for seed in range(100 * part, 100 * part + 60)
+    )
     assert opened > 20, "and they do get deep into the session"
 
 
 @pytest.mark.slow
-def test_the_same_for_longer():
+def test_many_random_conversations():
     for seed in range(1000, 11_000):
-        session.run(drawn(seed))
+        session.run(random_conversation(seed))
 
 
 def begun(head: bytes = b"", *, obedient: bool = True) -> Conversation:
@@ -69,8 +71,8 @@ def disturb(talk: Conversation, column: int, value: float) -> None:
     talk.controller.d[slot, column] = before
 
 
-def test_an_axis_that_closes_in_mid_motion_is_one_of_the_checks(monkeypatch):
-    """Nothing is found with the check; without it, the axes that are left are held by a jump."""
+def test_check_of_an_axis_that_closes_during_a_motion(monkeypatch):
+    """Without it, the axes that are still open are stopped by a jump."""
     close_an_axis(in_motion(40, Breaks()))
     monkeypatch.setattr(StateMachine, "require_axes", skip)
     talk = in_motion(40, Breaks())
@@ -79,7 +81,7 @@ def test_an_axis_that_closes_in_mid_motion_is_one_of_the_checks(monkeypatch):
 
 
 @pytest.mark.parametrize(("last", "refused"), [(50, True), (100, True), (200, False)])
-def test_a_source_that_says_it_is_finished_while_it_moves_is_refused(last, refused):
+def test_source_that_is_finished_while_it_moves_is_refused(last, refused):
     """Though nothing of its end was to be held before open mode is left."""
     talk = in_motion(last, Breaks("finishes early", index=last))
     talk.obedient = False  # it takes its time to leave open mode
@@ -88,7 +90,7 @@ def test_a_source_that_says_it_is_finished_while_it_moves_is_refused(last, refus
     assert ("refused" in talk.conduct.tally) == refused
 
 
-def test_a_target_lost_after_a_following_error_is_not_held_at_zero():
+def test_target_lost_after_a_following_error():
     talk = begun(obedient=False)
     talk.open_properly()
     disturb(talk, 2, talk.controller.d[talk.arm.slots[0], 2] + 2.1)
@@ -96,7 +98,7 @@ def test_a_target_lost_after_a_following_error_is_not_held_at_zero():
     assert talk.conduct.tally["no target"] == 1
 
 
-def test_axes_of_a_drive_that_is_off_are_echoed_in_a_refusal_too():
+def test_axes_with_their_drive_off_in_a_refusal():
     talk = begun(bytes((0, 0, 0, 2)), obedient=False)  # two axes of others, one of arm 2
     talk.controller.modes = [505] * len(talk.arm.axes)
     talk.run(1)
@@ -106,13 +108,13 @@ def test_axes_of_a_drive_that_is_off_are_echoed_in_a_refusal_too():
 
 
 def skip(*_args, **_kwargs) -> None:
-    """A check that was taken away."""
+    """Replacement of a check that passes everything."""
 
 
 OPEN_AT_ONCE = {**TRANSITIONS, State.FAULTED: {**TRANSITIONS[State.CLOSED], Input.SYNC: State.SYNC}}
 
 
-def test_a_first_set_point_to_an_arm_elsewhere_is_found(monkeypatch):
+def test_missing_check_of_the_start_is_detected(monkeypatch):
     monkeypatch.setattr(Guard, "check_start", skip)
     talk = begun(obedient=False)
     talk.controller.d[talk.arm.slots[0], 2] += 0.21  # a tenth of the threshold is 0.2
@@ -129,8 +131,8 @@ def test_a_first_set_point_to_an_arm_elsewhere_is_found(monkeypatch):
         (drivers.state_machine, "TRANSITIONS", OPEN_AT_ONCE, "closed axes"),
     ],
 )
-def test_a_session_with_a_check_taken_away_is_found(monkeypatch, owner, check, broken, finding):
+def test_missing_check_is_detected(monkeypatch, owner, check, broken, finding):
     monkeypatch.setattr(owner, check, broken)
     with pytest.raises(AssertionError, match=finding):
         for seed in range(3000):
-            session.run(drawn(seed))
+            session.run(random_conversation(seed))

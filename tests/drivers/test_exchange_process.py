@@ -57,11 +57,10 @@ HOST = "127.0.0.1"
 
 
 class UdpController:
-    """Asks, waits for the answer, follows it. Its cycles last as long as the answers take, or
-    longer where `cycle_time` says so.
+    """Sends a packet, waits for the reply and follows it; a cycle takes at least `cycle_time` s.
 
-    Axes open when `open` is set; an answer that asks for the end of open mode closes them, one
-    that asks for drive-off switches the drive off.
+    Axes open when `open` is set; a request for the end of open mode closes them, a request for
+    drive-off switches the drive off.
     """
 
     def __init__(self, port: int, beat=lambda: None):
@@ -124,7 +123,7 @@ class UdpController:
         expected = next_number(self.number)
         reply = self.socket.recv(2048)
         while self.unanswered and CyclicPacket.decode(reply, N).number < expected:
-            reply = self.socket.recv(2048)  # that one came after it had been given up
+            reply = self.socket.recv(2048)  # late reply to an earlier packet
         assert CyclicPacket.decode(reply, N).number == expected
         self._follow(reply)
 
@@ -188,14 +187,14 @@ class UdpController:
         )
 
 
-ORDINARY = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
+NO_REALTIME = RealTimeSettings(priority=0, lock_memory=False, hold_cpu_awake=False)
 
 
 def settings(port: int, **changes) -> ExchangeSettings:
     # The controller here waits for its answers, however late they are, and so does the exchange:
     # a second without packets is nothing on a machine that stands still now and then.
     session = {"settle_cycles": 5, "silence_timeout": 20.0, **changes.pop("session", {})}
-    chosen = {"needs_archive": False, "realtime": ORDINARY, "ring_capacity": 5000, **changes}
+    chosen = {"needs_archive": False, "realtime": NO_REALTIME, "ring_capacity": 5000, **changes}
     link = chosen.pop("link", UdpSpec)(HOST, port, HOST)
     return ExchangeSettings(link, drive_train(), limits(), PERIOD, session, **chosen)
 
@@ -321,18 +320,11 @@ class TestRefusedMotions:
             with pytest.raises(RequestError, match="archive process sends no heartbeat"):
                 exchange.submit(still(10))
 
-            def wanted():
+            def confirm():
                 control.archive_heartbeat = time.monotonic()
                 return True
 
-            exchange.submit(still(10), wanted)
-
-    def test_motion_after_the_requested_end_is_refused(self):
-        with running() as (exchange, controller):
-            exchange.finish()
-            controller.cycle(5)
-            with pytest.raises(RequestError, match="the supervisor requested the end"):
-                exchange.submit(still(10))
+            exchange.submit(still(10), confirm)
 
 
 def test_motion_not_accepted_in_time_does_not_begin_later(monkeypatch):
@@ -356,16 +348,16 @@ def test_motion_can_be_withdrawn_after_it_was_read():
     with running(preload=(__name__,)) as (exchange, controller):
         begin = time.monotonic()
         controller.open = True
-        for said in (False, True):
+        for confirmed in (False, True):
 
-            def wanted(said=said):
-                assert time.monotonic() - begin > Lengthy.READING  # the exchange has it by now
-                return said
+            def confirm(confirmed=confirmed):
+                assert time.monotonic() - begin > Lengthy.READING  # it was read
+                return confirmed
 
-            with nullcontext() if said else pytest.raises(WithdrawnError):
-                exchange.submit(Lengthy(), wanted)
+            with nullcontext() if confirmed else pytest.raises(WithdrawnError):
+                exchange.submit(Lengthy(), confirm)
             controller.cycle(20)
-            assert (controller.moved > 0.0) is said
+            assert (controller.moved > 0.0) is confirmed
 
 
 class TestBetweenReadingAndBegin:
@@ -394,13 +386,13 @@ class TestBetweenReadingAndBegin:
         with running() as (exchange, controller):
             signals = iter([signal.SIGSTOP, signal.SIGCONT])
 
-            def wanted():
+            def confirm():
                 number = next(signals)
                 os.kill(exchange.pid, number)
                 return number is signal.SIGSTOP
 
             with pytest.raises(WithdrawnError):
-                exchange.submit(Cruise(), wanted)
+                exchange.submit(Cruise(), confirm)
             assert list(signals) == []
             self.assert_nothing_moves(controller)
 
@@ -688,11 +680,6 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to dr
 
 
 class TestRealTimeSettings:
-    def test_without_settings_only_the_collector_is_off(self):
-        report, collecting, _ = enter("priority=0, lock_memory=False, hold_cpu_awake=False")
-        assert report == RealTimeReport("ordinary", False, False, [])
-        assert not collecting
-
     def test_each_setting_is_granted_or_refused(self):
         report, _, _ = enter("priority=37")
         granted = (
@@ -701,6 +688,13 @@ class TestRealTimeSettings:
             report.cpu_awake,
         )
         assert sum(granted) + len(report.refused) == 3
+
+    def test_processor_without_other_settings(self):
+        cpu = max(os.sched_getaffinity(0))
+        options = f"priority=0, lock_memory=False, hold_cpu_awake=False, cpu={cpu}"
+        report, collecting, cpus = enter(options)
+        assert report == RealTimeReport("ordinary", False, False, [])
+        assert (collecting, cpus) == (False, [cpu])
 
     @needs_root
     def test_refusals_of_an_unprivileged_user_have_remedies(self):
@@ -729,8 +723,8 @@ class TestRealTimeSettings:
             def mallopt(self, *_):
                 return 1
 
-            def mlockall(self, wanted):
-                self.asked = wanted
+            def mlockall(self, confirm):
+                self.asked = confirm
                 return 0
 
         c = C()
@@ -741,12 +735,6 @@ class TestRealTimeSettings:
         assert realtime._lock_memory(refused) is locked
         assert c.asked == flags
         assert len(refused) == (not locked)
-
-    def test_processor_can_be_selected(self):
-        cpu = max(os.sched_getaffinity(0))
-        report, _, cpus = enter(f"priority=0, lock_memory=False, hold_cpu_awake=False, cpu={cpu}")
-        assert cpus == [cpu]
-        assert not report.refused
 
     @pytest.mark.parametrize(
         ("impossible", "remedy"),

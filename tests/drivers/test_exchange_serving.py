@@ -1,4 +1,4 @@
-"""What the exchange shares with other processes, and does between two packets."""
+"""Memory shared by the exchange, and its work between two packets."""
 
 from __future__ import annotations
 
@@ -46,90 +46,8 @@ from drivers.exchange.event_log import (
 )
 from drivers.exchange.loop import POLL
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, ControlServer, EventLimiter
-from drivers.record import CycleRing, RingReader
+from drivers.record import CycleRing
 from tests.drivers.rig import PERIOD, Cruise, N, drive_train, limits, still
-
-
-def write(ring: CycleRing, numbers) -> None:
-    for number in numbers:
-        row = ring.slot
-        ring.number[row] = number
-        ring.cycle[row] = 10 * number
-        ring.measured[row] = number
-        ring.commanded[row] = -number
-        ring.commit()
-
-
-class TestRing:
-    def test_records_are_read_once(self):
-        ring = CycleRing.shared(N, 100)
-        reader = RingReader(ring.fd, N)
-        write(ring, range(5))
-        records = reader.drain()
-        assert records["number"].tolist() == [0, 1, 2, 3, 4]
-        assert records["cycle"].tolist() == [0, 10, 20, 30, 40]
-        np.testing.assert_array_equal(records["position"], np.arange(5.0)[:, None] * np.ones(N))
-        np.testing.assert_array_equal(records["commanded_velocity"][3], np.full(N, -3.0))
-        assert len(reader.drain()) == 0
-
-    def test_later_reader_begins_with_the_oldest_available(self):
-        ring = CycleRing.shared(N, 10)
-        write(ring, range(25))
-        reader = RingReader(ring.fd, N)
-        assert reader.drain()["number"].tolist() == list(range(16, 25))
-        assert reader.missed == 0
-
-    def test_writer_counts_records_overwritten_unread(self):
-        ring = CycleRing.shared(N, 10)
-        reader = RingReader(ring.fd, N)
-        spectator = RingReader(ring.fd, N, acknowledge=False)
-        write(ring, range(10))
-        assert ring.overflow == 0
-        assert len(spectator.drain()) == 9
-        write(ring, range(10, 13))
-        assert ring.overflow == 3
-        reader.drain()
-        write(ring, range(13, 23))
-        assert ring.overflow == 3
-        write(ring, range(23, 24))
-        assert ring.overflow == 4
-
-    @given(st.lists(st.integers(0, 25), max_size=30))
-    def test_each_record_is_read_in_order_or_counted(self, steps):
-        ring = CycleRing.shared(1, 10)
-        reader = RingReader(ring.fd, 1)
-        seen, written = [], 0
-        for count in steps:
-            write(ring, range(written, written + count))
-            written += count
-            seen += reader.drain()["number"].tolist()
-        assert seen == sorted(set(seen))
-        assert len(seen) + reader.missed == written
-        os.close(ring.fd)
-
-    def test_records_overwritten_during_the_copy_are_dropped(self):
-        ring = CycleRing.shared(N, 10)
-        reader = RingReader(ring.fd, N)
-        write(ring, range(9))
-        rows = reader.rows
-
-        class Overtaken:
-            def take(self, index, mode):
-                write(ring, range(9, 13))
-                return rows.take(index, mode=mode)
-
-        reader.rows = Overtaken()
-        assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
-        assert reader.missed == 4
-
-    def test_other_memory_is_refused(self):
-        ring = CycleRing.shared(N, 10)
-        with pytest.raises(ValueError, match="for 6 joints, not 7"):
-            RingReader(ring.fd, 7)
-        with pytest.raises(ValueError, match="not a ring"):
-            CycleRing(N, fd=control.create())
-        with pytest.raises(ValueError, match="at least 2"):
-            CycleRing.shared(N, 1)
 
 
 def gaps(numbers):
@@ -306,7 +224,7 @@ LONGEST = upper_edge(BINS - 2)
 latencies = st.floats(SHORTEST, LONGEST)
 
 
-def counted(seconds) -> list[int]:
+def counts_of(seconds) -> list[int]:
     counts = [0] * BINS
     for one in seconds:
         counts[bin_of(one)] += 1
@@ -331,11 +249,11 @@ class TestLatencyBins:
 
     def test_quantile_without_replies_and_of_share_zero(self):
         assert quantile([0] * BINS, 0.5) is None
-        assert quantile(counted([1e-3]), 0.0) == upper_edge(bin_of(1e-3))
+        assert quantile(counts_of([1e-3]), 0.0) == upper_edge(bin_of(1e-3))
 
     @given(st.lists(latencies, min_size=1), st.floats(0.0, 1.0, exclude_min=True))
     def test_quantile_is_at_most_one_bin_too_long(self, found, share):
-        estimated = quantile(counted(found), share)
+        estimated = quantile(counts_of(found), share)
         assert estimated is not None
         needed = sorted(found)[max(0, math.ceil(share * len(found) - 1e-9) - 1)]
         assert needed <= estimated * (1.0 + 1e-12)
@@ -347,13 +265,13 @@ class Machine:
 
     now, beat = 100.0, 1.0
 
-    def watch(self, pulse: HeartbeatMonitor, seconds: float, *, beating: bool = False) -> float:
-        """Look each 0.1 s; the last quiet time seen."""
+    def watch(self, monitor: HeartbeatMonitor, seconds: float, *, beating: bool = False) -> float:
+        """Poll each 0.1 s; return the last silence, s."""
         quiet = 0.0
         for _ in range(round(seconds / 0.1)):
             self.now += 0.1
             self.beat += beating
-            quiet = pulse.silence()
+            quiet = monitor.silence()
         return quiet
 
 
@@ -366,18 +284,18 @@ def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
 
 class TestHeartbeatMonitor:
     def test_silence_ends_with_the_next_heartbeat(self, machine: Machine) -> None:
-        pulse = HeartbeatMonitor(lambda: machine.beat)
-        assert machine.watch(pulse, 10.0, beating=True) == 0.0
-        assert machine.watch(pulse, 6.0) == pytest.approx(6.0)
-        assert machine.watch(pulse, 0.1, beating=True) == 0.0
+        monitor = HeartbeatMonitor(lambda: machine.beat)
+        assert machine.watch(monitor, 10.0, beating=True) == 0.0
+        assert machine.watch(monitor, 6.0) == pytest.approx(6.0)
+        assert machine.watch(monitor, 0.1, beating=True) == 0.0
 
     @pytest.mark.parametrize("longest", [MAX_INTERVAL, 0.1])
     def test_suspension_of_the_computer_is_not_silence(
         self, machine: Machine, longest: float
     ) -> None:
-        pulse = HeartbeatMonitor(lambda: machine.beat, max_interval=longest)
+        monitor = HeartbeatMonitor(lambda: machine.beat, max_interval=longest)
         machine.now += 3600.0
-        assert pulse.silence() == longest
+        assert monitor.silence() == longest
 
     def test_no_silence_before_the_first_heartbeat(self, machine: Machine) -> None:
         machine.beat = 0.0
@@ -388,7 +306,7 @@ STEP = 0.01
 
 
 class FakeSession:
-    """A session that is in a given state, and hears a packet per step."""
+    """A session in a given state that receives a packet per step."""
 
     requested = False
     interval = -1
@@ -398,31 +316,31 @@ class FakeSession:
         self.state = State.CLOSED
         self.counters = Counters()
         self.pending = []
-        self.asked = []
-        self.hears = True
+        self.calls = []
+        self.receives_packets = True
 
     def events(self):
         events, self.pending = self.pending, []
         return events
 
     def stop(self, reason):
-        self.asked.append("stop")
+        self.calls.append("stop")
 
     def request(self, source):
         self.requested = True
-        self.asked.append(source)
+        self.calls.append(source)
 
     def hold(self):
         if not self.requested:
             raise RequestError("closed", "no motion was requested", "hold")
-        self.asked.append("hold")
+        self.calls.append("hold")
 
     def resume(self):
-        self.asked.append("resume")
+        self.calls.append("resume")
 
 
 class Bench:
-    """A serving with all it needs, but a link."""
+    """A control server without a link."""
 
     def __init__(self, clock):
         self.clock = clock
@@ -453,7 +371,7 @@ class Bench:
         """One packet later; whether that is the end."""
         self.clock.time += STEP
         self.control.supervisor_heartbeat = self.clock.time
-        self.session.counters.answered += self.session.hears
+        self.session.counters.answered += self.session.receives_packets
         return self.serving()
 
     def time_to_the_end(self, states) -> float:
@@ -501,8 +419,9 @@ class TestLeaving:
     )
     def test_packets_are_answered_two_seconds_after_closing(self, bench, spans, seconds):
         bench.terminated.append(True)
-        taken = bench.time_to_the_end(states(*spans))
-        assert taken == pytest.approx(seconds + DETACHED_LINGER, abs=2.1 * STEP)
+        assert bench.time_to_the_end(states(*spans)) == pytest.approx(
+            seconds + DETACHED_LINGER, abs=2.1 * STEP
+        )
 
     def test_axes_that_open_repeatedly_do_not_delay_the_end(self, bench):
         bench.terminated.append(True)
@@ -518,9 +437,10 @@ class TestLeaving:
         bench.terminated.append(True)
         bench.session.state = State.FREEZING
         bench.step()
-        bench.session.hears = False
-        taken = bench.time_to_the_end(states((State.FREEZING, 10.0)))
-        assert taken == pytest.approx(1.0 + DETACHED_LINGER, abs=2.1 * STEP)
+        bench.session.receives_packets = False
+        assert bench.time_to_the_end(states((State.FREEZING, 10.0))) == pytest.approx(
+            1.0 + DETACHED_LINGER, abs=2.1 * STEP
+        )
 
     def test_leaving_is_logged_once(self, bench):
         bench.terminated.append(True)
@@ -542,7 +462,7 @@ class TestSupervisorHeartbeat:
             bench.serving()
         assert bench.clock.time - silent_from == pytest.approx(timeout, abs=1.1 * STEP)
         assert bench.serving.reason == NO_SUPERVISOR
-        assert "stop" in bench.session.asked
+        assert "stop" in bench.session.calls
 
     def test_motion_requested_after_a_silence_is_stopped(self, bench):
         bench.step()
@@ -551,10 +471,10 @@ class TestSupervisorHeartbeat:
             assert not bench.serving()
         bench.session.requested = True
         bench.serving()
-        assert bench.session.asked == ["stop"]
+        assert bench.session.calls == ["stop"]
 
     def test_heartbeat_with_the_permission_ends_the_silence(self, bench, monkeypatch):
-        """Which may come between any two looks of one call."""
+        """It may arrive between any two readings of one call."""
         offered, consent = object(), bench.serving._archive.silence
         bench.step()
         bench.serving._offered = offered
@@ -572,13 +492,13 @@ class TestSupervisorHeartbeat:
         monkeypatch.setattr(bench.serving._archive, "silence", consents)
         bench.clock.time += STEP
         bench.serving()
-        assert bench.session.asked == [offered]
+        assert bench.session.calls == [offered]
         assert not bench.serving.reason
 
     def test_time_in_which_this_process_stood_still_is_no_silence(self, bench):
         bench.session.requested = True
         bench.step()
-        for _ in range(round(0.9 * HEARTBEAT_TIMEOUT / POLL)):  # each as long as the machine liked
+        for _ in range(round(0.9 * HEARTBEAT_TIMEOUT / POLL)):
             bench.clock.time += 3600.0
             bench.serving()
         assert not bench.serving.reason
@@ -597,23 +517,21 @@ class TestHold:
             bench.control.hold_count += 1
             bench.step()
             bench.step()
-        assert bench.session.asked == ["hold", "resume", "hold"]
+        assert bench.session.calls == ["hold", "resume", "hold"]
+        for held in (1, 0):  # of two changes between two packets the last is applied
+            bench.control.held = held
+            bench.control.hold_count += 1
+        bench.step()
+        assert bench.session.calls[3:] == ["resume"]
 
     def test_hold_without_motion_is_refused(self, bench):
         bench.control.held = 1
         bench.control.hold_count += 1
         bench.step()
-        assert bench.session.asked == []
+        assert bench.session.calls == []
         (notice,) = bench.reader.drain()
         assert isinstance(notice, HoldRefused)
         assert "no motion was requested" in notice.reason
-
-    def test_last_of_two_changes_is_applied(self, bench):
-        for held in (1, 0):
-            bench.control.held = held
-            bench.control.hold_count += 1
-        bench.step()
-        assert bench.session.asked == ["resume"]
 
 
 class TestPublished:

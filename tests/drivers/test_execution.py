@@ -1,4 +1,4 @@
-"""How long a source may take, what it is granted, and what of it is believed."""
+"""Duration of stops and holds, allowed bounds, and results of motions and corrections."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ HERE = np.array([0.5, -0.25])
 
 
 class Motion:
-    """Steps of `step` rad in joint 1 until told otherwise."""
+    """Steps of `step` rad in joint 1; records the calls of its other methods."""
 
     def __init__(self, step=0.01):
         self.step = step
         self.position = HERE
         self.finished = False
         self.bounds = "plan"
-        self.told = []
+        self.calls = []
 
     def begin(self, position):
         self.position = position
@@ -31,16 +31,16 @@ class Motion:
         return self.position, np.array([self.step / 0.002, 0.0])
 
     def stop(self):
-        self.told.append("stop")
+        self.calls.append("stop")
 
     def hold(self):
-        self.told.append("hold")
+        self.calls.append("hold")
 
     def resume(self):
-        self.told.append("resume")
+        self.calls.append("resume")
 
     def override(self, fraction):
-        self.told.append(fraction)
+        self.calls.append(fraction)
 
     def feed_forward(self):
         return np.full(N, 0.25), np.full(N, 0.5)
@@ -82,7 +82,7 @@ def fails(execution: Execution, words: str, cycle: int = 7) -> None:
 
 
 class TestEnd:
-    def test_the_end_is_held_for_as_long_as_was_asked(self):
+    def test_end_is_held_for_the_settling_time(self):
         source = Motion()
         execution = begun(source)
         execution.advance(1)
@@ -95,8 +95,7 @@ class TestEnd:
             np.testing.assert_array_equal(velocity, np.zeros(N))
             assert bounds == "plan"
         assert execution.settled
-
-    def test_after_its_end_a_correction_is_zero_for_as_long(self):
+        assert not execution.leaving
         source = Correction()
         execution = begun(source)
         source.finished = True
@@ -106,7 +105,7 @@ class TestEnd:
             np.testing.assert_array_equal(execution.advance(2 + cycle), np.zeros((2, N)))
         assert execution.settled
 
-    def test_what_goes_with_it_is_zero_from_then_on(self):
+    def test_feed_forward_is_zero_after_the_end(self):
         source = Motion()
         execution = begun(source)
         execution.advance(1)
@@ -117,38 +116,40 @@ class TestEnd:
         execution.advance(3)
         np.testing.assert_array_equal(execution.feed_forward(3), np.zeros((2, N)))
 
-    def test_what_was_not_asked_to_leave_does_not(self):
-        execution = begun(Motion())
-        assert not execution.leaving
-        assert (execution.outcome, execution.fraction, execution.held) == ("completed", None, False)
-
 
 @pytest.mark.parametrize("kind", [Motion, Correction])
 class TestStop:
-    def test_it_may_take_so_many_cycles_and_no_more(self, kind):
+    def test_longest_duration(self, kind):
         execution = begun(kind())
         execution.advance(1)
         execution.stop("enough", 2)
         for cycle in range(STOP):
             execution.advance(2 + cycle)
         fails(execution, f"did not come to rest in the {STOP} cycles")
-
-    def test_cycles_count_in_which_no_set_point_was_asked_for(self, kind):
         execution = begun(kind())
         execution.stop("enough", 1)
         execution.advance(1)
-        fails(execution, "did not come to rest", cycle=1 + STOP)
+        fails(execution, "did not come to rest", cycle=1 + STOP)  # after missed packets
 
-    def test_the_first_reason_stays_and_it_is_told_once(self, kind):
+    def test_end_of_a_stop_is_held_without_limit(self, kind):
         source = kind()
-        told = []
-        source.stop = lambda: told.append("stop")
+        execution = begun(source)
+        execution.stop("enough", 1)
+        source.finished = True
+        for cycle in range(3 * STOP):
+            execution.advance(1 + cycle)
+        assert execution.outcome == "stopped"
+
+    def test_first_reason_stays_and_the_source_is_called_once(self, kind):
+        source = kind()
+        calls = []
+        source.stop = lambda: calls.append("stop")
         execution = begun(source)
         execution.stop("first", 1)
         execution.stop("second", 2)
-        assert (execution.outcome, execution.reason, told) == ("stopped", "first", ["stop"])
+        assert (execution.outcome, execution.reason, calls) == ("stopped", "first", ["stop"])
 
-    def test_one_that_came_to_its_end_is_not_stopped(self, kind):
+    def test_finished_motion_is_not_stopped(self, kind):
         source = kind()
         execution = begun(source)
         source.finished = True
@@ -158,7 +159,7 @@ class TestStop:
         assert execution.hold(0) is None
         assert not execution.held
 
-    def test_one_that_stops_is_neither_held_nor_resumed(self, kind):
+    def test_stopping_motion_is_not_held_or_resumed(self, kind):
         execution = begun(kind())
         assert execution.hold(0) is None
         assert execution.held
@@ -171,26 +172,18 @@ class TestStop:
 
 class TestHold:
     @pytest.mark.parametrize("kind", [Motion, Correction])
-    def test_one_that_goes_on_for_as_long_as_a_stop_may_take_is_stopped(self, kind):
+    def test_motion_that_does_not_come_to_rest_is_stopped(self, kind):
         execution = begun(kind())
         execution.hold(0)
         for cycle in range(STOP):
             execution.advance(1 + cycle)
             assert execution.outcome == "completed"
+            execution.hold(1 + cycle)  # a second request does not extend the time
         execution.advance(9)
         assert execution.outcome == "stopped"
         assert execution.reason == f"it did not come to rest in {STOP} cycles of a hold"
 
-    def test_a_second_hold_is_no_new_time(self):
-        execution = begun(Motion())
-        execution.hold(0)
-        for cycle in range(STOP):
-            execution.advance(1 + cycle)
-            execution.hold(1 + cycle)
-        execution.advance(9)
-        assert execution.outcome == "stopped"
-
-    def test_one_that_rests_may_rest_for_ever(self):
+    def test_rest_has_no_limit(self):
         source = Motion()
         execution = begun(source)
         execution.hold(0)
@@ -202,8 +195,8 @@ class TestHold:
         assert execution.held
 
     @pytest.mark.parametrize("what", ["step", "speed"])
-    def test_rest_is_neither_a_step_nor_a_velocity(self, what):
-        """Seen over one cycle; what rounding leaves is none."""
+    def test_rest_has_neither_step_nor_velocity(self, what):
+        """Over one cycle, except for rounding."""
         source = Motion(step=0.0)
         execution = begun(source)
         execution.hold(0)
@@ -227,7 +220,7 @@ class TestHold:
             execution.advance(9 + cycle)
         assert execution.outcome == "completed"
 
-    def test_rest_without_a_hold_is_none_of_it(self):
+    def test_rest_before_the_hold_does_not_count(self):
         source = Motion(step=0.0)
         execution = begun(source)
         execution.advance(1)
@@ -237,22 +230,22 @@ class TestHold:
             execution.advance(2 + cycle)
         assert execution.outcome == "stopped"
 
-    def test_before_the_beginning_the_source_is_told_only_when_it_begins(self):
+    def test_hold_before_the_begin(self):
         source = Motion()
         execution = execution_of(source, Mode.POSITION, N, SETTLE, STOP)
         assert isinstance(execution, MotionExecution)
         assert execution.hold(0) is None
-        assert (execution.held, source.told, execution.widest) == (True, [], "plan")
+        assert (execution.held, source.calls, execution.widest) == (True, [], "plan")
         assert execution.resume() is None
-        assert (execution.held, source.told) == (False, [])
+        assert (execution.held, source.calls) == (False, [])
         execution.hold(0)
         execution.begin(HERE, 0)
-        assert (source.told, execution.widest) == (["hold"], "stop")
+        assert (source.calls, execution.widest) == (["hold"], "stop")
         for cycle in range(STOP + 1):
             execution.advance(1 + cycle)
         assert execution.outcome == "stopped"
 
-    def test_resuming_ends_the_count(self):
+    def test_resume_ends_the_time_limit(self):
         source = Motion()
         execution = begun(source)
         execution.hold(0)
@@ -265,7 +258,7 @@ class TestHold:
 
 
 class TestBounds:
-    def test_each_is_granted_from_the_first_call_that_needs_it(self):
+    def test_bounds_are_allowed_from_the_first_call(self):
         source = Motion()
         execution = begun(source)
         for needs, call in (
@@ -280,16 +273,19 @@ class TestBounds:
         source.bounds = "override"
         assert execution.advance(3)[2] == "override"
         assert execution.widest == "stop"
+        execution = begun(source)
+        execution.stop("enough", 1)
+        fails(execution, "not plan or stop")
 
     @pytest.mark.parametrize("wrong", ["wide", None, 7, ["plan"]])
-    def test_what_is_no_name_of_any_is_refused(self, wrong):
+    def test_invalid_name_is_refused(self, wrong):
         source = Motion()
         execution = begun(source)
         execution.override(0.5)
         source.bounds = wrong
         fails(execution, "not plan or override")
 
-    def test_a_correction_at_rest_has_those_of_a_stop_no_longer_unless_it_stops(self):
+    def test_bounds_of_a_correction_at_rest(self):
         execution = begun(Correction())
         assert isinstance(execution, CorrectionExecution)
         execution.hold(0)
@@ -301,7 +297,7 @@ class TestBounds:
         assert execution.widest == "stop"
 
     @pytest.mark.parametrize("fraction", [-0.01, 1.01, float("nan")])
-    def test_an_override_is_a_share(self, fraction):
+    def test_override_is_between_0_and_1(self, fraction):
         execution = begun(Motion())
         assert "is not one of 0..1" in execution.override(fraction)
         assert execution.widest == "plan"

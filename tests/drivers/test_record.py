@@ -39,7 +39,7 @@ from drivers.record import (
 )
 from drivers.states import State
 from drivers.transports.tapped import MAX_BUFFERED, TappedTransport
-from tests.drivers.rig import Cruise, Rig, init_packet, moving, running, still
+from tests.drivers.rig import Cruise, N, Rig, init_packet, moving, running, still
 
 
 def put(ring: CycleRing, count: int, first: int = 0) -> None:
@@ -48,7 +48,76 @@ def put(ring: CycleRing, count: int, first: int = 0) -> None:
         ring.commit()
 
 
-def test_a_record_has_the_documented_fields():
+def write(ring: CycleRing, numbers) -> None:
+    for number in numbers:
+        row = ring.slot
+        ring.number[row] = number
+        ring.cycle[row] = 10 * number
+        ring.measured[row] = number
+        ring.commanded[row] = -number
+        ring.commit()
+
+
+class TestRing:
+    def test_later_reader_begins_with_the_oldest_available(self):
+        ring = CycleRing.shared(N, 10)
+        write(ring, range(25))
+        reader = RingReader(ring.fd, N)
+        assert reader.drain()["number"].tolist() == list(range(16, 25))
+        assert reader.missed == 0
+
+    def test_writer_counts_records_overwritten_unread(self):
+        ring = CycleRing.shared(N, 10)
+        reader = RingReader(ring.fd, N)
+        spectator = RingReader(ring.fd, N, acknowledge=False)
+        write(ring, range(10))
+        assert ring.overflow == 0
+        assert len(spectator.drain()) == 9
+        write(ring, range(10, 13))
+        assert ring.overflow == 3
+        reader.drain()
+        write(ring, range(13, 23))
+        assert ring.overflow == 3
+        write(ring, range(23, 24))
+        assert ring.overflow == 4
+
+    @given(st.lists(st.integers(0, 25), max_size=30))
+    def test_each_record_is_read_in_order_or_counted(self, steps):
+        ring = CycleRing.shared(1, 10)
+        reader = RingReader(ring.fd, 1)
+        seen, written = [], 0
+        for count in steps:
+            write(ring, range(written, written + count))
+            written += count
+            seen += reader.drain()["number"].tolist()
+        assert seen == sorted(set(seen))
+        assert len(seen) + reader.missed == written
+        os.close(ring.fd)
+
+    def test_records_overwritten_during_the_copy_are_dropped(self):
+        ring = CycleRing.shared(N, 10)
+        reader = RingReader(ring.fd, N)
+        write(ring, range(9))
+        rows = reader.rows
+
+        class Overtaken:
+            def take(self, index, mode):
+                write(ring, range(9, 13))
+                return rows.take(index, mode=mode)
+
+        reader.rows = Overtaken()
+        assert reader.drain()["number"].tolist() == [4, 5, 6, 7, 8]
+        assert reader.missed == 4
+
+    def test_other_memory_is_refused(self):
+        ring = CycleRing.shared(N, 10)
+        with pytest.raises(ValueError, match="for 6 joints, not 7"):
+            RingReader(ring.fd, 7)
+        with pytest.raises(ValueError, match="at least 2"):
+            CycleRing.shared(N, 1)
+
+
+def test_fields_of_a_record():
     dtype = cycle_dtype(6)
     scalars = {"cycle": "i8", "number": "i4", "arrival": "f8", "gap": "i4", "interval": "i4"}
     for name, kind in {**scalars, "state": "u1", "status": "u1"}.items():
@@ -58,7 +127,7 @@ def test_a_record_has_the_documented_fields():
         assert dtype[name] == np.dtype(("f8", (6,)))
 
 
-def test_block_views_and_fields_are_the_same_memory():
+def test_blocks_and_fields_are_the_same_memory():
     ring = CycleRing(3, 4)
     ring.measured[2] = np.arange(24).reshape(8, 3)
     ring.commanded[2] = [[-1, -2, -3], [-4, -5, -6]]
@@ -71,7 +140,7 @@ def test_block_views_and_fields_are_the_same_memory():
 
 
 @given(st.lists(st.integers(0, 12), max_size=20))
-def test_what_is_drained_is_everything_but_what_was_overwritten(batches):
+def test_ring_of_its_own_memory(batches):
     ring = CycleRing(1, 8)
     written, drained = 0, []
     for batch in batches:
@@ -84,15 +153,7 @@ def test_what_is_drained_is_everything_but_what_was_overwritten(batches):
     assert ring.overflow == lost
 
 
-def test_the_newest_records_are_kept_when_nobody_drains():
-    ring = CycleRing(2, 8)
-    put(ring, 20)
-    assert ring.overflow == 12
-    assert ring.drain()["cycle"].tolist() == list(range(12, 20))
-    assert ring.overflow == 12
-
-
-def test_last_looks_back_over_what_was_drained():
+def test_last_records_drained_or_not():
     ring = CycleRing(2, 8)
     put(ring, 5)
     ring.drain()
@@ -100,14 +161,6 @@ def test_last_looks_back_over_what_was_drained():
     assert ring.last(4)["cycle"].tolist() == [3, 4, 5, 6]
     assert ring.last(50)["cycle"].tolist() == [0, 1, 2, 3, 4, 5, 6]
     assert ring.drain()["cycle"].tolist() == [5, 6]
-
-
-def test_drained_records_are_copies():
-    ring = CycleRing(1, 4)
-    put(ring, 4)
-    drained = ring.drain()
-    put(ring, 4, 100)
-    assert drained["cycle"].tolist() == [0, 1, 2, 3]
 
 
 class Wire:
@@ -155,7 +208,7 @@ def drained(ring: PacketRing) -> list[tuple[int, float, int, bytes]]:
     ]
 
 
-def test_packets_reach_the_ring_once_their_cycle_is_known() -> None:
+def test_packets_are_stored_with_their_cycle() -> None:
     ring, cycle = PacketRing(10), 6
     link = TappedTransport(Wire(b"one", b"two"), ring, lambda: cycle)
     assert link.receive(0.1) == b"one"
@@ -169,7 +222,7 @@ def test_packets_reach_the_ring_once_their_cycle_is_known() -> None:
     assert drained(ring) == [(8, 0.75, 0, b"two")]
 
 
-def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
+def test_packets_of_a_backlog_have_the_cycle_of_the_reply() -> None:
     ring, cycle = PacketRing(10), 6
     link = TappedTransport(Wire(b"old", b"older", b"newest"), ring, lambda: cycle)
     link.receive(0.1)
@@ -182,7 +235,7 @@ def test_packets_of_a_pile_wait_for_the_one_that_is_answered() -> None:
     ]  # fmt: skip
 
 
-def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
+def test_buffer_without_replies_is_bounded() -> None:
     ring = PacketRing(10_000)
     link = TappedTransport(Wire(*[b"flood"] * 5000), ring, lambda: 3)
     for _ in range(5000):
@@ -193,7 +246,7 @@ def test_a_flood_that_nobody_answers_takes_no_memory_without_end() -> None:
     assert len(handed_on) + len(drained(ring)) == 5000
 
 
-def test_a_tap_changes_nothing_for_the_session() -> None:
+def test_tapped_link_passes_everything_through() -> None:
     wire = Wire(b"packet")
     link = TappedTransport(wire, PacketRing(10), lambda: 0)
     assert link.receive(0.1) == b"packet"
@@ -204,7 +257,7 @@ def test_a_tap_changes_nothing_for_the_session() -> None:
     assert wire.closed
 
 
-def test_of_a_link_that_knows_when_packets_arrived_that_time_is_kept() -> None:
+def test_time_of_arrival_of_the_link_is_stored() -> None:
     ring = PacketRing(10)
     link = TappedTransport(StampedWire(b"packet"), ring, lambda: 0)
     assert link.arrived == 0.125
@@ -213,34 +266,7 @@ def test_of_a_link_that_knows_when_packets_arrived_that_time_is_kept() -> None:
     assert drained(ring)[0][1] == 0.125
 
 
-@given(
-    capacity=st.integers(2, 8),
-    steps=st.lists(st.one_of(st.integers(0, 12), st.none()), max_size=12),
-)
-def test_a_reader_gets_every_packet_in_order_or_counts_it(
-    capacity: int, steps: list[int | None]
-) -> None:
-    """Steps are packets written, None a look of the reader."""
-    ring = PacketRing.shared(capacity)
-    reader = PacketReader(ring.fd)
-    seen, written = 0, 0
-    for step in [*steps, None]:
-        for _ in range(step or 0):
-            ring.put(written, 0.5 * written, written % 2 == 1, written.to_bytes(2, "little"))
-            written += 1
-        if step is None:
-            lost = reader.missed
-            rows = reader.drain()
-            seen += reader.missed - lost
-            assert rows["cycle"].tolist() == list(range(seen, written))
-            assert rows["sent"].tolist() == [n % 2 for n in range(seen, written)]
-            numbers = rows["data"][:, :2].astype(int) @ [1, 256]
-            assert np.array_equal(numbers, np.arange(seen, written))
-            seen = written
-    os.close(ring.fd)
-
-
-def test_one_kind_of_memory_is_not_taken_for_the_other() -> None:
+def test_memory_of_the_other_kind_is_refused() -> None:
     packets, cycles = PacketRing.shared(4), CycleRing.shared(2, 4)
     with pytest.raises(ValueError, match="not a ring of raw packets"):
         PacketReader(cycles.fd)
@@ -307,7 +333,7 @@ def assert_same(mine, theirs):
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_every_error(kind):
+def test_errors_pickle(kind):
     error = EXAMPLES.get(kind)
     if error is None:
         assert issubclass(kind, GuardError), f"no example of {kind.__name__}"
@@ -320,7 +346,7 @@ def test_every_error(kind):
         assert again.check == error.check
 
 
-def test_an_error_with_a_unit_of_its_own():
+def test_error_with_its_own_unit_pickles():
     again = through_pickle(CorrectionNotEnded(1, 2.0, 0.0, 3, "rad/s"))
     assert again.unit == "rad/s"
     assert "2 rad/s" in str(again)
@@ -344,7 +370,7 @@ EVENTS = {
 
 
 @pytest.mark.parametrize("kind", get_args(events.Event), ids=lambda kind: kind.__name__)
-def test_every_event(kind):
+def test_events_pickle(kind):
     event = EVENTS[kind]
     assert type(event) is kind
     assert_same(event, through_pickle(event))
@@ -354,7 +380,7 @@ def _nothing(self, *_):
     pass
 
 
-def test_events_of_a_real_session():
+def test_events_of_a_session_pickle():
     rig, _ = moving()
     rig.session.stop()
     rig.run()
@@ -379,7 +405,7 @@ def test_events_of_a_real_session():
         assert_same(event, through_pickle(event))
 
 
-def test_the_cause_of_a_failed_source_is_in_its_message():
+def test_cause_of_a_failed_source_is_in_its_message():
     class Broken:
         bounds, finished = "plan", False
 
@@ -392,7 +418,7 @@ def test_the_cause_of_a_failed_source_is_in_its_message():
     assert "StopIteration" in str(through_pickle(rig.refusal))
 
 
-def test_counters_too():
+def test_counters_pickle():
     rig = Rig()
     rig.session.request(still(2))
     rig.session.discarded("torn", 4)

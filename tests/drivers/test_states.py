@@ -32,14 +32,14 @@ FROM_PACKETS = [
 RUNNING = [state for state in State if state not in (State.SYNC, State.ENDED)]
 
 
-def test_every_running_state_knows_what_follows_every_packet_and_every_fault():
+def test_table_of_running_states_is_complete():
     for state, what in itertools.product(RUNNING, [*FROM_PACKETS, Input.INIT, Input.SILENCE]):
-        assert what in TRANSITIONS[state], f"{state.name} does not know {what.name}"
+        assert what in TRANSITIONS[state], f"no entry of {state.name} for {what.name}"
     for state in RUNNING:
         assert TRANSITIONS[state][Input.REFUSAL] is State.FAULTED
 
 
-def test_every_state_can_be_reached():
+def test_each_state_can_be_reached():
     reached = {State.SYNC}
     while True:
         more = {after for state in reached for after in TRANSITIONS[state].values()} - reached
@@ -49,21 +49,21 @@ def test_every_state_can_be_reached():
     assert reached == set(State)
 
 
-def test_nothing_leads_out_of_the_end():
+def test_ended_is_final():
     assert not TRANSITIONS[State.ENDED]
 
 
-def test_an_init_packet_always_starts_over():
+def test_init_packet_leads_to_init():
     for state in [State.SYNC, *RUNNING]:
         assert TRANSITIONS[state][Input.INIT] is State.INIT
 
 
-def test_drive_off_always_leads_out_of_open_mode():
+def test_drive_off_leads_out_of_open_mode():
     for state in RUNNING:
         assert TRANSITIONS[state][Input.OFF] is State.DRIVE_OFF
 
 
-def test_open_mode_is_entered_only_from_where_axes_were_closed_with_the_drive_on():
+def test_open_mode_is_entered_after_closed_axes():
     entered_from = {
         state for state, row in TRANSITIONS.items() for after in row.values() if after is State.OPEN
     }
@@ -73,16 +73,16 @@ def test_open_mode_is_entered_only_from_where_axes_were_closed_with_the_drive_on
 
 @pytest.mark.parametrize("state", [State.INIT, State.DRIVE_OFF, State.FREEZING, State.FAULTED])
 @pytest.mark.parametrize("what", [Input.OPEN, Input.PARTLY_OPEN])
-def test_open_axes_are_not_believed_before_closed_ones(state, what):
+def test_open_axes_before_closed_ones_are_a_fault(state, what):
     assert TRANSITIONS[state][what] is State.FAULTED
 
 
-def test_a_fault_is_left_only_by_what_cannot_move():
+def test_no_set_points_after_a_fault():
     moving = {after for after in TRANSITIONS[State.FAULTED].values() if after in HAS_SET_POINTS}
     assert not moving
 
 
-def test_only_open_axes_can_be_left_on_request():
+def test_exit_is_an_input_of_open_axes():
     asking = [state for state, row in TRANSITIONS.items() if Input.EXIT in row]
     assert asking == [State.OPENING, State.OPEN, State.EXITING]
 
@@ -113,51 +113,31 @@ class TestReading:
         assert self.read(modes) is meaning
 
     @pytest.mark.parametrize("modes", [[0, 0, 0], [4, 4, 4], [501, 501, 501], [502] * 3])
-    def test_without_the_drive_modes_do_not_matter(self, modes):
+    def test_modes_with_the_drive_off(self, modes):
         assert self.read(modes, drive_on=False) is Input.OFF
 
-    def test_axes_that_are_not_wanted_do_not_matter(self):
+    def test_unwanted_axes(self):
         assert self.read([4, 4, 0], wanted=slice(0, 2)) is Input.OPEN
         assert self.read([0, 0, 4], wanted=slice(0, 2)) is Input.CLOSED
 
 
-class TestWaitingRequests:
-    @pytest.mark.parametrize(
-        "before", [State.DRIVE_OFF, State.DRIVING_ON, State.CLOSED, State.FREEZING]
-    )
-    def test_wait_for_open_mode(self, before):
-        for after in (State.CLOSED, State.OPENING, State.OPEN):
-            assert keeps_request(before, after)
+WAITS = {
+    State.SYNC: {State.SYNC, State.INIT},
+    State.INIT: {State.SYNC, State.INIT},
+    State.DRIVE_OFF: {State.INIT, State.DRIVE_OFF},
+    State.DRIVING_ON: {State.INIT, State.DRIVE_OFF, State.DRIVING_ON},
+    State.CLOSED: set(State) - HAS_SET_POINTS,
+    State.OPENING: set(State),
+    State.OPEN: set(State),
+    State.FREEZING: {State.FREEZING},
+}
+"""States before a transition, by the state after it, in which a request that waits is retained."""
 
-    @pytest.mark.parametrize("before", [State.INIT, State.DRIVE_OFF])
-    def test_wait_for_the_drive(self, before):
-        assert keeps_request(before, State.DRIVE_OFF)
-        assert keeps_request(before, State.DRIVING_ON)
 
-    @pytest.mark.parametrize(
-        "before", [s for s in RUNNING if s not in (State.INIT, State.DRIVE_OFF)]
-    )
-    def test_never_survive_the_drive_going_off(self, before):
-        assert not keeps_request(before, State.DRIVE_OFF)
-
-    @pytest.mark.parametrize("before", RUNNING)
-    def test_never_survive_a_fault_or_the_end(self, before):
-        assert not keeps_request(before, State.FAULTED)
-        assert not keeps_request(before, State.ENDED)
-
-    def test_do_not_survive_an_opening_that_is_given_up(self):
-        assert not keeps_request(State.OPENING, State.CLOSED)
-
-    @pytest.mark.parametrize("before", [s for s in RUNNING if s is not State.FREEZING])
-    def test_do_not_survive_a_pause_that_begins(self, before):
-        assert not keeps_request(before, State.FREEZING)
-
-    def test_made_in_a_pause_wait_for_its_end(self):
-        assert keeps_request(State.FREEZING, State.FREEZING)
-
-    def test_survive_the_first_init_but_no_later_one(self):
-        assert keeps_request(State.SYNC, State.INIT)
-        assert not keeps_request(State.CLOSED, State.INIT)
+@pytest.mark.parametrize("before", State)
+def test_requests_that_wait_are_retained(before):
+    for after in State:
+        assert keeps_request(before, after) == (before in WAITS.get(after, ())), after
 
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "state_machine.py"
@@ -167,7 +147,7 @@ drawing = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(drawing)
 
 
-def test_page_and_picture_are_those_made_from_the_table():
+def test_page_and_picture_are_generated_from_the_table():
     assert drawing.PAGE.read_text() == drawing.page(), "run: python docs/state_machine.py"
     assert drawing.TARGET.read_text() == drawing.svg(), "run: python docs/state_machine.py"
 
@@ -191,15 +171,15 @@ def read_back(text: str) -> dict[tuple[State, Input], State]:
     return found
 
 
-def test_the_arrows_say_all_that_the_table_says_and_nothing_else():
+def test_arrows_of_the_picture_are_the_table():
     table = {
         (before, what): after for before, row in TRANSITIONS.items() for what, after in row.items()
     }
     assert read_back(drawing.svg()) == table
 
 
-def test_every_input_has_a_meaning_and_every_state_is_drawn():
+def test_inputs_have_meanings_and_states_are_in_the_picture():
     assert set(drawing.meanings()) == set(Input)
     assert all(text.endswith(".") for text in drawing.meanings().values())
-    drawn = drawing.TARGET.read_text()
-    assert all(f">{drawing.label(state)}</text>" in drawn for state in State)
+    picture = drawing.TARGET.read_text()
+    assert all(f">{drawing.label(state)}</text>" in picture for state in State)

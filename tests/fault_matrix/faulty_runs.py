@@ -174,7 +174,7 @@ class JudgedSession(Judged):
             threshold=limits.following_error, current=limits.current, period=PERIOD,
             max_gap=MAX_GAP,
         )  # fmt: skip
-        self.hear(
+        self.set_up(
             logged._session, logged._ring, conduct, n_axes=N, max_gap=MAX_GAP, silence=SILENCE,
             period=PERIOD, inits={},
         )  # fmt: skip
@@ -201,10 +201,10 @@ class JudgedSession(Judged):
 
     def _silent_by(self, now: float) -> None:
         if now >= self._logged.deadline:
-            self.silence_heard()
+            self.record_silence()
 
     def events(self) -> list[Any]:
-        self.take_events()
+        self.read_events()
         events, self._logged.pending = self._logged.pending, []
         return events
 
@@ -214,7 +214,7 @@ class JudgedSession(Judged):
 
     def stop(self, reason: str) -> None:
         self._logged.stop(reason)
-        self.take_events()
+        self.read_events()
         self.conduct.stopping = self.conduct.entitled
 
 

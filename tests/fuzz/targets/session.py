@@ -204,7 +204,7 @@ class Conversation(Judged):
             threshold=np.full(arm.n, 2.0), current=np.full(arm.n, 20.0), period=arm.period,
             max_gap=max_gap,
         )  # fmt: skip
-        self.hear(
+        self.set_up(
             session, ring, conduct, n_axes=len(arm.axes), max_gap=max_gap, silence=SILENCE,
             period=arm.period, inits={arm.init: True, arm.other: False},
         )  # fmt: skip
@@ -342,8 +342,8 @@ class Conversation(Judged):
         for _ in range(self._draw.below(3)):
             self.now += 400.0
             self.session.tick(self.now)
-            self.silence_heard()
-            self.take_events()
+            self.record_silence()
+            self.read_events()
         self.deliver(self.controller.packet(), elapsed=400.0)
 
     def start_over(self) -> None:
@@ -401,7 +401,7 @@ class Conversation(Judged):
 
     def stop(self) -> None:
         self.session.stop()
-        self.take_events()
+        self.read_events()
         self.conduct.stopping = self.conduct.entitled
         self.run(1)
 
