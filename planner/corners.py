@@ -101,12 +101,9 @@ How = Literal["stopped", "flown", "reduced"]
 class Corner(NamedTuple):
     """Passage of a via point.
 
-    Attributes:
-        leave: Time cut from the end of the previous move [s].
-        enter: Time cut from the beginning of the next move [s].
-        join: Motion in their place; None where the arm stops.
-        share: Share of the ramps that the corner takes.
-        how: "flown" as requested, "reduced" (rounded less than requested), or "stopped".
+    `leave` and `enter` are the times cut from the end of the previous move and the beginning of the
+    next one [s], `join` the motion in their place (None for a stop), `share` its share of the
+    ramps.
     """
 
     leave: float
@@ -152,17 +149,10 @@ def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Co
 def round_corners(
     moves: StraightMoves, before: Rows, after: Rows, bounds: Allowance, fly: Array
 ) -> list[Corner]:
-    """Round corners between pairs of moves as far as requested and the bounds allow.
+    """Round corners between moves `before` and `after` each, (c,), as far as `fly` (c,) requests.
 
-    A corner takes the same share of the ramps before and after it, so that no part of a move
-    belongs to two corners. It never takes longer than a stop.
-
-    Args:
-        moves: The straight moves.
-        before: Index of the move before each corner (c,).
-        after: Index of the move after it (c,).
-        bounds: Limits of each join (c, n).
-        fly: Requested share of the ramps (c,).
+    A corner takes the same share of the ramps before and after it, within `bounds` (c, n), so that
+    no part of a move belongs to two corners. It never takes longer than a stop.
 
     Raises:
         UnsupportedSolver: a corner is to be rounded with an untested version of ruckig.
@@ -231,12 +221,9 @@ def ranked(savings: Array) -> NDArray[np.intp]:
 class Solutions(NamedTuple):
     """Unchecked solutions of ruckig for many joins.
 
-    Attributes:
-        starts: Position, velocity and acceleration of the joints at each start, (c, n, 3).
-        ends: The same at each end, (c, n, 3); all joints arrive together.
-        times: Unit of time of each (c,) [s].
-        durations: Length in time of each join (c,) [s]; infinite where there is none.
-        found: `ruckig.Trajectory` in normalised units (c,); None where there is none.
+    `starts` and `ends` are position, velocity and acceleration of the joints (c, n, 3); `times` the
+    unit of time of each (c,) [s]; `durations` (c,) [s] are infinite, and `found` (trajectories in
+    normalised units) None, where there is no join.
     """
 
     starts: Array
@@ -254,11 +241,7 @@ class Solutions(NamedTuple):
 def solve_many(starts: Array, ends: Array, times: Array, bounds: Allowance) -> Solutions:
     """Find the fastest motions between states (c, n, 3) under limits (c, n).
 
-    Args:
-        starts: Position, velocity and acceleration of the joints at each start.
-        ends: The same at each end; all joints arrive together.
-        times: Expected duration of each (c,) [s], its unit of time for the solver.
-        bounds: Limits of each.
+    All joints arrive together. `times` are the expected durations (c,) [s].
 
     Raises:
         UnsupportedSolver: ruckig is of another series than `SERIES`.

@@ -42,14 +42,10 @@ def supremum(
     largest: float,
     curvature: float,
 ) -> float:
-    """Return an upper bound, tight to 1e-10 of `largest`, of a function on [start, stop].
+    """Return an upper bound, tight to 1e-10 of `largest`, of a C2 function on [start, stop].
 
-    Args:
-        function: Values at times (m,) of a C2 function, or of its magnitude.
-        start: Start of the interval.
-        stop: Its end, above `start`.
-        largest: Known bound of the function's magnitude.
-        curvature: Known bound of the magnitude of its second derivative.
+    `largest` and `curvature` are known bounds of the magnitudes of the function and of its second
+    derivative.
     """
     if largest < _TINY:
         return largest
@@ -90,11 +86,10 @@ _RAMP_LARGEST = (1.0, 15.0 / 8.0, 10.0 / np.sqrt(3.0), 60.0, 360.0, 720.0)
 
 
 class HarmonicBounds(NamedTuple):
-    """The paper's constraints on a series of W harmonics: |a| < amplitude, |w| < frequency.
+    """The paper's constraints on a series of W harmonics (n,): |a| < amplitude, |w| < frequency.
 
-    Attributes:
-        amplitude: Room around the offset divided by W, (n,) [rad].
-        frequency: Square root of acceleration limit over room, (n,) [rad/s].
+    The amplitude is the room around the offset divided by W [rad], the frequency the square root of
+    acceleration limit over room [rad/s].
     """
 
     amplitude: Array
@@ -137,8 +132,7 @@ class FourierSeries:
         ramp: Duration of each of the two ramps [s]; 0 for none.
 
     Raises:
-        InvalidTrajectory: shapes that do not match, values that are not finite, a length of 0 or
-            less, ramps longer than the motion.
+        InvalidTrajectory: wrong shapes, values that are not finite, ramps longer than the motion.
     """
 
     offset: Array

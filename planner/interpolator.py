@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
 from functools import wraps
 from math import inf, nan
-from numbers import Integral, Real
-from typing import Any, Concatenate, Final, NamedTuple, ParamSpec, TypeVar
+from operator import index
+from typing import Any, Concatenate, Final, NamedTuple, ParamSpec
 
 import numpy as np
 import scipy
@@ -27,6 +26,7 @@ from planner.moves import (
     Move,
     Overrides,
     Stop,
+    checked_shares,
     legs_through,
     passage,
 )
@@ -84,16 +84,13 @@ class MotionQueue:
     """Targets of one motion from rest to rest, planned while it runs.
 
     Corners use the deceleration before and the acceleration after a target, so they never overlap:
-    a new target only replaces the stop at the last one by a corner, as long as the arm has not
-    reached the start of that corner.
+    a new target replaces the stop at the last one by a corner, unless the arm has reached its
+    start. `ahead` has the targets not passed yet.
 
     Args:
         start: Start position of the arm, at rest (n,) [rad].
         limits: Limits of the motion.
         corner: `corner`, or the same in another process.
-
-    Attributes:
-        ahead: Targets not passed yet, the next one first.
     """
 
     def __init__(
@@ -122,11 +119,7 @@ class MotionQueue:
         return path.read(time - begin)[0]
 
     def leg_to(self, move: Move, overrides: Overrides) -> Legs:
-        """Return the leg to a further target, from rest to rest.
-
-        Raises:
-            InvalidSetting: the move has another number of joints.
-        """
+        """Return the leg to a further target, from rest to rest."""
         points = np.stack((self._point, move.target))
         return legs_through(points, [move], self._limits, overrides)
 
@@ -168,15 +161,9 @@ class MotionQueue:
 class MoveSettings:
     """Settings of the next targets.
 
-    Attributes:
-        speed, acceleration, jerk: Shares of the limits of each joint (n,), in (0, 1].
-        flying: Whether via points are flown by.
-        criterion: Criterion of the size of a corner.
-        flyby: Values of the criteria: a percentage, a distance [rad].
-        accuracy: Termination kind.
-        overrides: Overrides of the program.
-        motion_time: Duration of the next move [s]; 0 for the shortest.
-        advance: Number of targets that should be known beyond the next one.
+    `speed`, `acceleration` and `jerk` are shares of the limits of each joint (n,); `flyby` has a
+    percentage and a distance [rad]; `motion_time` is that of the next move [s], 0 for the shortest;
+    `advance` is the number of targets that should be known beyond the next one.
     """
 
     speed: Array
@@ -213,7 +200,6 @@ class _RefusedError(Exception):
 
 
 P = ParamSpec("P")
-E = TypeVar("E", bound=IntEnum)
 
 
 def _service(
@@ -228,9 +214,10 @@ def _service(
             return method(self, *args, **kwargs) or Status.OK
         except _RefusedError as refused:
             status, self.refusal = refused.status, str(refused)
+        except (InvalidSetting, TypeError, ValueError, OverflowError) as error:
+            status, self.refusal = Status.INCONSISTENT, str(error)
         except PlannerError as error:
-            wrong = isinstance(error, InvalidSetting)
-            status, self.refusal = Status.INCONSISTENT if wrong else Status.FATAL, str(error)
+            status, self.refusal = Status.FATAL, str(error)
         return status
 
     return service
@@ -239,19 +226,17 @@ def _service(
 class Interpolator:
     """Plans and interpolates joint moves while they run, with the services of RRS-1.
 
-    Targets are planned by `set_next_target`, before or during the motion. A target set before the
-    arm reaches the start of the corner before it is reached by a fly-by, if that is selected; with
-    a later one the arm stops at the point before. The motion ends at rest at the last target.
-    Targets set before the motion give the motion of `planner.plan_moves`. The same calls return
-    the same steps bit by bit.
+    A target set before the arm reaches the start of the corner before it is reached by a fly-by, if
+    that is selected; with a later one the arm stops at the point before. The motion ends at rest at
+    the last target. Targets set before the motion give the motion of `planner.plan_moves`. The same
+    calls return the same steps bit by bit.
 
-    Services return a `Status` (`get_next_step` a `Step`); a refused service changed nothing. The
-    order of calls is
+    Services return a `Status` (`get_next_step` a `Step`); a refused service changed nothing, and
+    `refusal` is the reason of the last one. The order of calls is
 
         initialize, set_initial_position, {set_next_target | get_next_step}..., terminate
 
-    with settings anywhere after `initialize`. Settings apply to later targets, except GEN_OVR
-    (`set_override_speed`), which acts at once without changing the path.
+    Settings apply to later targets, except GEN_OVR (`set_override_speed`), which acts at once.
 
     Args:
         limits: Limits of the arm.
@@ -261,9 +246,6 @@ class Interpolator:
         stop_bounds: The same while the motion is stopped or continued; not below the others.
         isolated: Plan corners in a child process, whose crash is a FATAL status; without it, a
             corner takes half a millisecond less.
-
-    Attributes:
-        refusal: Reason of the last refusal.
 
     Raises:
         InvalidSetting: a period or a bound outside its range.
@@ -341,11 +323,10 @@ class Interpolator:
     def set_interpolation_time(self, period: float) -> None:
         """Set the time of a step [s]; refused while the arm moves."""
         self._require_rest()
-        seconds = _real(period)
-        self._require(0.0 < seconds < inf, f"interpolation time of {period} s")
-        self._period = seconds
+        self._require(0.0 < period < inf, f"interpolation time of {period} s")
+        self._period = float(period)
         time, rate = self._law.motion_time, self._law.rate
-        self._law = TimeLaw(seconds)
+        self._law = TimeLaw(self._period)
         self._law.restart(time, rate)
 
     # -- settings --------------------------------------------------------------------------
@@ -353,15 +334,14 @@ class Interpolator:
     @_service
     def select_motion_type(self, motion_type: int) -> None:
         """Select the kind of path; only `MotionType.JOINT` is implemented."""
-        joint = _member(MotionType, motion_type) is MotionType.JOINT
+        joint = MotionType(motion_type) is MotionType.JOINT
         self._require(joint, f"motion type {motion_type} is not JOINT (1)")
 
     @_service
     def set_advance_motion(self, count: int) -> None:
         """Set the number of targets beyond the next one below which NEED_MORE_DATA is returned."""
-        targets = _whole(count)
-        self._require(targets is not None and targets >= 0, f"advance of {count} targets")
-        self._set(advance=targets)
+        self._require(index(count) >= 0, f"advance of {count} targets")
+        self._set(advance=index(count))
 
     @_service
     def set_joint_speeds(self, percent: ArrayLike, joints: Sequence[int] | None = None) -> None:
@@ -388,9 +368,8 @@ class Interpolator:
 
         The path at fly-by corners can change.
         """
-        share, overrides = _real(percent) / 100.0, self._settings.overrides
-        scaled = _member(AccelerationKind, kind)
-        self._require(0.0 < share <= 1.0, f"acceleration override of {percent} %")
+        share, overrides = percent / 100.0, self._settings.overrides
+        scaled = AccelerationKind(kind)
         if scaled is not AccelerationKind.DECELERATION:
             overrides = replace(overrides, acceleration=share)
         if scaled is not AccelerationKind.ACCELERATION:
@@ -400,66 +379,59 @@ class Interpolator:
     @_service
     def select_flyby_mode(self, on: bool) -> None:
         """Select whether the arm flies by later targets or stops there."""
-        known = isinstance(on, bool | np.bool_) or _whole(on) in (0, 1)
-        self._require(known, f"fly-by {on!r} is neither on nor off")
+        self._require(on in (0, 1), f"fly-by {on!r} is neither on nor off")
         self._set(flying=bool(on))
 
     @_service
     def select_flyby_criteria(self, criterion: int) -> None:
         """Select the `FlybyCriterion` of the size of corners."""
-        self._set(criterion=_member(FlybyCriterion, criterion))
+        self._set(criterion=FlybyCriterion(criterion))
 
     @_service
     def set_flyby_criteria_parameter(self, criterion: int, value: float) -> None:
         """Set the size of corners: FLY_PER in 0..100 %, or a distance in joint space [rad]."""
-        self._set_flyby(_member(FlybyCriterion, criterion), value)
+        self._set_flyby(FlybyCriterion(criterion), value)
 
     @_service
     def set_point_accuracy_parameter(self, criterion: int, value: float) -> None:
         """Set the size of corners and select its criterion, as COMAU maps this service."""
-        named = _member(FlybyCriterion, criterion)
+        named = FlybyCriterion(criterion)
         self._set_flyby(named, value)
         self._set(criterion=named)
 
     @_service
     def cancel_flyby_criteria(self, criterion: int) -> None:
         """Reset the value of a criterion; if it is selected, select the percentage."""
-        cancelled, selected = _member(FlybyCriterion, criterion), self._settings.criterion
+        cancelled, selected = FlybyCriterion(criterion), self._settings.criterion
         self._set_flyby(cancelled, _FLYBY[cancelled])
         self._set(criterion=FlybyCriterion.PERCENT if selected is cancelled else selected)
 
     @_service
     def select_point_accuracy(self, accuracy: int) -> None:
         """Select the `PointAccuracy` of later targets; it does not change set-points."""
-        self._set(accuracy=_member(PointAccuracy, accuracy))
+        self._set(accuracy=PointAccuracy(accuracy))
 
     @_service
     def set_motion_time(self, seconds: float) -> None:
-        """Set the time of the move to the next target, from rest to rest [s]; 0 for the shortest.
-
-        `set_next_target` returns TIME_TOO_SHORT if it is too short. Fly-bys shorten the move.
-        """
-        self._require(0.0 <= _real(seconds) < inf, f"motion time of {seconds} s")
-        self._set(motion_time=_real(seconds))
+        """Set the duration of the next move, from rest to rest [s]; 0 for the shortest."""
+        self._require(0.0 <= seconds < inf, f"motion time of {seconds} s")
+        self._set(motion_time=float(seconds))
 
     # -- targets ---------------------------------------------------------------------------
 
     @_service
     def set_next_target(self, target_id: int, position: ArrayLike) -> Status:
-        """Add a target (n,) [rad] with the present settings.
+        """Add a target (n,) [rad] with the present settings; OK or NEED_MORE_DATA.
 
-        Returns OK, or NEED_MORE_DATA while fewer targets are known than `set_advance_motion`
-        requests. Refusals: INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where
-        no motion was found; the motion to the targets before it continues.
+        Refusals are INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where no motion
+        was found; the motion to the targets before it continues.
         """
-        queue, number = self._queue, _whole(target_id)
+        queue = self._queue
         if queue is None:
             raise _RefusedError("no initial position is set")
         self._require(not self._cancelling, "the cancelled motion still comes to rest")
-        if number is None:
-            raise _RefusedError(f"target id {target_id!r} is not an integer")
         move = _timed(queue, self._settings, self._position_of(position))
-        queue.append(number, move, self._settings.overrides, self._law.motion_time)
+        queue.append(index(target_id), move, self._settings.overrides, self._law.motion_time)
         self._set(motion_time=0.0)
         return self._wanted(queue)
 
@@ -473,12 +445,12 @@ class Interpolator:
     def get_next_step(self, output_format: int = OutputFormat.JOINT) -> Step:
         """Return the next step of the motion.
 
-        Its status is OK; NEED_MORE_DATA while fewer targets are known than requested (the motion
-        continues to the last one); FINAL_STEP at the end of the motion and while it is stopped;
-        NO_TARGET without targets; OUTPUT_FORMAT for any format but joint positions.
+        OK; NEED_MORE_DATA while fewer targets are known than requested; FINAL_STEP at the end of
+        the motion and while it is stopped; NO_TARGET without targets; OUTPUT_FORMAT for another
+        format.
         """
         queue, law = self._queue, self._law
-        if _whole(output_format) != OutputFormat.JOINT:
+        if output_format != OutputFormat.JOINT:
             return self._no_step(Status.OUTPUT_FORMAT, "only joint positions are available")
         if queue is None:
             return self._no_step(Status.INCONSISTENT, "no initial position is set")
@@ -508,15 +480,13 @@ class Interpolator:
         self, percent: float, correction: SpeedCorrection = SpeedCorrection.GENERAL
     ) -> None:
         """Set GEN_OVR, in 0..100 %, which acts at once; or PROG_SPD_OVR, in (0, 100] %."""
-        general = _member(SpeedCorrection, correction) is SpeedCorrection.GENERAL
-        share = _real(percent) / 100.0
-        valid = 0.0 <= share <= 1.0 and (general or share > 0.0)
-        self._require(valid, f"speed override of {percent} %")
-        if general:
+        share = percent / 100.0
+        if SpeedCorrection(correction) is SpeedCorrection.PROGRAM:
+            self._set(overrides=replace(self._settings.overrides, speed=share))
+        else:
+            self._require(0.0 <= share <= 1.0, f"speed override of {percent} %")
             self._override = share
             self._run(self._overriding)
-        else:
-            self._set(overrides=replace(self._settings.overrides, speed=share))
 
     @_service
     def stop_motion(self) -> None:
@@ -598,28 +568,21 @@ class Interpolator:
 
     def _set_flyby(self, criterion: FlybyCriterion, value: float) -> None:
         largest = 100.0 if criterion is FlybyCriterion.PERCENT else _WIDEST
-        size = _real(value)
-        self._require(0.0 <= size <= largest, f"fly-by criterion {criterion} of {value}")
-        self._set(flyby={**self._settings.flyby, criterion: size})
+        self._require(0.0 <= value <= largest, f"fly-by criterion {criterion} of {value}")
+        self._set(flyby={**self._settings.flyby, criterion: float(value)})
 
     def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> None:
         shares = np.array(getattr(self._settings, name))
-        named = range(len(shares)) if joints is None else joints
-        try:
-            chosen = [joint if (joint := _whole(each)) is not None else -1 for each in named]
-        except TypeError:
-            chosen = [-1]
+        chosen = [index(joint) for joint in (range(len(shares)) if joints is None else joints)]
         known = all(0 <= joint < len(shares) for joint in chosen)
         self._require(known, f"joints {joints!r} are not of the arm's 0 to {len(shares) - 1}")
-        each = _reals(percent) / 100.0
-        valid = each.shape in ((), (len(chosen),)) and np.all((each > 0.0) & (each <= 1.0))
-        self._require(bool(valid), f"joint {name} of {percent!r:.80} % for {len(chosen)} joints")
-        shares[chosen] = each
+        each = np.divide(percent, 100.0)
+        shares[chosen] = checked_shares(f"joint {name}", each, len(chosen))
         self._set(**{name: read_only(shares)})
 
     def _position_of(self, position: ArrayLike) -> Array:
         """Return a position (n,) checked to be inside the limits."""
-        point, lower, upper = _reals(position), self._limits.lower, self._limits.upper
+        point, lower, upper = read_only(position), self._limits.lower, self._limits.upper
         inside = point.shape == lower.shape and np.all((point >= lower) & (point <= upper))
         self._require(bool(inside), f"position {position!r:.200} is not in the limits")
         return point
@@ -692,30 +655,3 @@ def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move:
     if slow < 1.0:
         slow = float(scipy.optimize.brentq(excess, slow, 1.0, xtol=1e-300, rtol=1e-15))
     return settings.move_to(target, slow)
-
-
-def _real(value: Any) -> float:
-    """Return a number as a float; NaN, which fails every check of a range, if it is none."""
-    try:
-        return float(value) if isinstance(value, Real) and not isinstance(value, bool) else nan
-    except OverflowError:
-        return nan
-
-
-def _reals(values: Any) -> Array:
-    """Return numbers as a read-only array, NaN for entries that are none."""
-    raw = np.asarray(values, dtype=object)
-    return read_only(np.array([_real(value) for value in raw.flat]).reshape(raw.shape))
-
-
-def _whole(value: Any) -> int | None:
-    """Return an integer of Python or numpy; None if it is none."""
-    return int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
-
-
-def _member(kind: type[E], value: Any) -> E:
-    """Return the member of an enumeration with this number."""
-    number = _whole(value)
-    if number is None or number not in kind._value2member_map_:
-        raise _RefusedError(f"{value!r:.80} is not a {kind.__name__}")
-    return kind(number)

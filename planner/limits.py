@@ -36,14 +36,7 @@ class Allowance(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """Limits of every joint, each (n,) and read-only.
-
-    Attributes:
-        lower: Smallest position [rad].
-        upper: Largest position [rad].
-        velocity: Largest |velocity| [rad/s].
-        acceleration: Largest |acceleration| [rad/s²].
-        jerk: Largest |jerk| [rad/s³].
+    """Limits of every joint, each (n,), read-only, in SI units; rates are magnitudes.
 
     Raises:
         InvalidLimits: shapes differ, a value is not finite, lower >= upper, a rate outside
@@ -101,10 +94,7 @@ def position_rounding(limits: Bounds) -> Array:
 
 
 def jump_rounding(limits: Bounds, duration: float | Array) -> Array:
-    """Return the tolerances on jumps of position, velocity, acceleration, (..., n, 3).
-
-    Durations (...) [s] and limits (..., n) are of one motion or of many.
-    """
+    """Return the tolerances on jumps of position, velocity, acceleration, (..., n, 3)."""
     # Times of knots are rounded in proportion to the duration.
     tick = 4.0 * np.spacing(np.asarray(duration, dtype=np.float64))[..., None]
     return np.stack(

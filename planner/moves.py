@@ -70,20 +70,11 @@ Fly: TypeAlias = FlyPercent | FlyDistance | Stop
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """Straight joint-space move to a target, all joints in phase.
+    """Straight joint-space move to a target (n,) [rad], all joints in phase.
 
-    Shares of limits multiply, with each other and with the overrides; the slowest joint determines
-    the time.
-
-    Attributes:
-        target: Target position (n,) [rad].
-        speed: Share of all velocity limits, in (0, 1].
-        acceleration: Share of all acceleration limits, in (0, 1], for both ramps.
-        joint_speed: Share of each velocity limit (n,); None for 1.
-        joint_acceleration: Share of each acceleration limit (n,); None for 1.
-        fly: Passage of the target; the last target of a motion is always a stop.
-        termination: See `Termination`.
-        joint_jerk: Share of each jerk limit (n,); None for 1.
+    Shares of limits lie in (0, 1] and multiply, with each other and with the overrides; those named
+    after a joint are (n,), None for 1. The slowest joint determines the time. The last target of a
+    motion is a stop, whatever its `fly` is.
 
     Raises:
         InvalidSetting: a value is outside its range or of the wrong shape.
@@ -116,15 +107,11 @@ class Move:
 
 @dataclass(frozen=True, eq=False)
 class Overrides:
-    """Overrides at planning time, each of one quantity; fly-by paths may change with them.
+    """Overrides at planning time, shares in (0, 1]; fly-by paths may change with them.
 
-    The override that does not change the path is `TrajectoryPlayer.override`.
-
-    Attributes:
-        speed: Share of all velocity limits, in (0, 1].
-        acceleration: Share of the acceleration limits while speeding up, in (0, 1].
-        deceleration: Share of the acceleration limits while slowing down, in (0, 1].
-        joint: Share of each joint's velocity limit, a number or (n,).
+    `acceleration` scales the limits while speeding up, `deceleration` while slowing down, `joint`
+    (a number or (n,)) the velocity limit of each joint. The override that does not change the path
+    is `TrajectoryPlayer.override`.
 
     Raises:
         InvalidSetting: a value is outside its range.
@@ -172,13 +159,7 @@ SEGMENT_JERK: Final = 0.98
 
 
 class Legs(NamedTuple):
-    """Moves planned from rest to rest.
-
-    Attributes:
-        moves: The straight motions.
-        bounds: Limits of each (s, n).
-        deceleration: Acceleration limits while slowing down (s, n) [rad/s²].
-    """
+    """Moves planned from rest to rest, with limits and those of deceleration (s, n) [rad/s²]."""
 
     moves: StraightMoves
     bounds: Allowance
@@ -335,14 +316,10 @@ def legs_through(
 
 @dataclass(frozen=True)
 class TargetPassage:
-    """Passage of the target of one move.
+    """Passage of the target of move `index` [s, rad].
 
-    Attributes:
-        index: Number of the move, from 0.
-        time: Time at which the path is nearest to the target [s].
-        distance: Euclidean distance between path and target in joint space [rad].
-        how: "flown" as requested, "reduced" (rounded less than requested), or "stopped".
-        fly: Share of the ramps before and after the target that the corner takes, 0 for a stop.
+    `time` is when the path is nearest to the target, at a Euclidean `distance` in joint space;
+    `fly` is the share of the ramps before and after the target that the corner takes, 0 for a stop.
     """
 
     index: int
@@ -358,10 +335,6 @@ class MotionPlan:
 
     Attributes:
         start: Start position (n,) [rad].
-        moves: Moves as requested.
-        limits: Limits satisfied at every instant.
-        overrides: Overrides of the plan.
-        trajectory: The motion.
         durations: Duration of each move from rest to rest [s].
         corners: Corner at each target but the last.
     """
@@ -466,12 +439,6 @@ def plan_moves(
     faster if rounded less, is rounded less or becomes a stop; see `MotionPlan.targets`. The motion
     never takes longer than one with a stop at every target.
 
-    Args:
-        start: Start position (n,) [rad].
-        moves: At least one, targets inside the limits.
-        limits: Limits, satisfied at every instant within rounding.
-        overrides: Shares for all moves.
-
     Raises:
         InvalidViaPoints: start (via point 0) or a target (via point i of the i-th move) is of the
             wrong shape, not finite, or out of limits.
@@ -499,14 +466,11 @@ def plan_moves(
 def plan(
     via_points: ArrayLike, limits: JointLimits, *, speed: ArrayLike = 1.0, fly: float = 0.5
 ) -> PiecewiseCubic:
-    """Plan a motion through via points, from rest to rest: `plan_moves` with equal settings.
+    """Plan a motion through via points (n_points, n_joints) [rad], from rest to rest.
 
-    Args:
-        via_points: Positions (n_points, n_joints) [rad], at least two, inside the limits.
-        limits: Limits, satisfied at every instant within rounding.
-        speed: Share of each joint's velocity limit, in (0, 1], a number or (n,).
-        fly: Share of each deceleration that the next acceleration overlaps, from 0 (stop at
-            every via point) to 1 (the corner begins with the deceleration).
+    `speed` is a share of each joint's velocity limit, in (0, 1], a number or (n,); `fly` the share
+    of each deceleration that the next acceleration overlaps, from 0 (stop at every via point) to 1
+    (the corner begins with the deceleration).
 
     Raises:
         InvalidSetting: speed or fly outside its range.
@@ -527,16 +491,9 @@ def plan_chunk(
 ) -> list[PiecewiseCubic | PlannerError]:
     """Plan the motions of many individuals of a search together.
 
-    ruckig can crash the process, so searches call this in `planner.worker` processes.
-
-    Args:
-        individuals: Via points (n_points, n_joints) [rad] of each; their number may differ.
-        speed: Share of each joint's velocity limit, in (0, 1], one row (n,) for each.
-        limits: Limits of all motions.
-        fly: Share of each deceleration that the next acceleration overlaps, 0 to 1.
-
-    Returns:
-        For each individual its motion, or the error that `plan` would raise.
+    ruckig can crash the process, so searches call this in `planner.worker` processes. Via points of
+    individuals may differ in number; `speed` has one row (n,) for each; `fly` as of `plan`. Returns
+    for each individual its motion, or the error that `plan` would raise.
     """
     planned: dict[int, PiecewiseCubic | PlannerError] = {}
     alike: dict[int, list[tuple[int, Array]]] = {}

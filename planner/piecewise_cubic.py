@@ -197,10 +197,8 @@ def _check_table(knots: Sequence[Array], coefficients: Sequence[Array]) -> None:
 class Block(NamedTuple):
     """Cubic pieces of many motions, the same number m for every joint of each.
 
-    Attributes:
-        knots: Times from 0 to the duration of each motion, (c, n, m + 1) [s].
-        coefficients: As of a `PiecewiseCubic`, (c, n, m, 4).
-        end: Position, velocity, acceleration at the end, (c, n, 3).
+    `knots` (c, n, m + 1) [s] and `coefficients` (c, n, m, 4) are as of a `PiecewiseCubic`; `end` is
+    position, velocity, acceleration at the end, (c, n, 3).
     """
 
     knots: Array

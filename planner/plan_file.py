@@ -50,35 +50,9 @@ _ANGLES: Mapping[str, frozenset[str]] = {
 """Fields of each table that are angles or their rates."""
 
 
-def to_toml(data: Mapping[str, Any]) -> str:
-    """Return the data of a plan file as TOML."""
-    marked = _with_angles("", data)
-    if "limits" in data:
-        marked["limits"] = _with_angles("limits", data["limits"])
-    marked["moves"] = [_with_angles("moves", move) for move in data["moves"]]
-    if "motion" in data:
-        lists = {name: Rows(data["motion"][name]) for name in ("knots", "coefficients")}
-        marked["motion"] = {**data["motion"], **lists}
-    return to_text(marked, {"": _HEAD, "motion": _MOTION})
-
-
-def _with_angles(table: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+def _with_angles(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
     angles = _ANGLES[table]
-    return {name: Angles(value) if name in angles else value for name, value in fields.items()}
-
-
-def from_toml(text: str) -> dict[str, Any]:
-    """Return the data of a plan file in SI units from TOML.
-
-    Raises:
-        InvalidPlanFile: the text is not TOML, or an angle is not a number.
-    """
-    try:
-        return from_text(text, _ANGLES)
-    except tomllib.TOMLDecodeError as error:
-        raise InvalidPlanFile(f"not TOML: {error}") from error
-    except DAMAGED as error:
-        raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
+    return {name: Angles(value) if name in angles else value for name, value in values.items()}
 
 
 FORMAT: Final = "joint motion plan"
@@ -131,13 +105,6 @@ class _MoveData(_Data):
         return Move(fly=Stop() if distance is None else FlyDistance(distance), **fields)
 
 
-class _OverridesData(_Data):
-    speed: float = 1.0
-    acceleration: float = 1.0
-    deceleration: float = 1.0
-    joint: float | list[float] = 1.0
-
-
 class _LimitsData(_Data):
     lower: list[float]
     upper: list[float]
@@ -146,12 +113,15 @@ class _LimitsData(_Data):
     jerk: list[float]
 
 
+_Override = Literal["speed", "acceleration", "deceleration", "joint"]
+
+
 class _FileData(_Data):
     format: Literal["joint motion plan"]
     version: Annotated[int, Field(ge=VERSION, le=VERSION)]
     joints: list[str]
     start: list[float]
-    overrides: _OverridesData = _OverridesData()
+    overrides: dict[_Override, float | list[float]] = {}
     limits: _LimitsData | None = None
     moves: list[_MoveData]
     motion: dict[str, Any] | None = None
@@ -159,16 +129,7 @@ class _FileData(_Data):
 
 @dataclass(frozen=True, eq=False)
 class PlanFile:
-    """Content of a plan file.
-
-    Attributes:
-        joint_names: Names of the joints, in their order.
-        start: Start position (n,) [rad].
-        moves: Moves in order.
-        overrides: Overrides of the plan.
-        limits: Limits of the plan; None in some files written by hand.
-        trajectory: The motion; None in files written by hand.
-    """
+    """Content of a plan file; `limits` and `trajectory` may be None in files written by hand."""
 
     joint_names: tuple[str, ...]
     start: Array
@@ -201,10 +162,7 @@ class PlanFile:
         )
 
     def plan(self, limits: JointLimits | None = None) -> MotionPlan:
-        """Return the plan with the checked stored motion, or a new one.
-
-        Args:
-            limits: Plan the moves for these, in place of the stored limits and motion.
+        """Return the plan with the checked stored motion; for given `limits` a new one.
 
         Raises:
             InvalidPlanFile: no limits are given or stored, or the stored motion breaks its limits
@@ -224,8 +182,7 @@ class PlanFile:
     def to_dict(self) -> dict[str, Any]:
         """Return lists in SI units, from which `from_dict` restores the same bits."""
         overrides = {
-            name: np.asarray(getattr(self.overrides, name)).tolist()
-            for name in _OverridesData.model_fields
+            name: np.asarray(share).tolist() for name, share in vars(self.overrides).items()
         }
         data: dict[str, Any] = {
             "format": FORMAT,
@@ -236,8 +193,7 @@ class PlanFile:
         if any(np.any(np.asarray(share) != 1.0) for share in overrides.values()):
             data["overrides"] = overrides
         if self.limits is not None:
-            rates = _LimitsData.model_fields
-            data["limits"] = {name: getattr(self.limits, name).tolist() for name in rates}
+            data["limits"] = {name: bound.tolist() for name, bound in vars(self.limits).items()}
         data["moves"] = [_MoveData.of(move).model_dump(exclude_none=True) for move in self.moves]
         if self.trajectory is not None:
             data["motion"] = self.trajectory.to_dict()
@@ -252,12 +208,12 @@ class PlanFile:
         """
         try:
             read = _FileData.model_validate(data)
-            overrides, limits = read.overrides.model_dump(), read.limits
+            limits = read.limits
             return cls(
                 joint_names=tuple(read.joints),
                 start=read_only(read.start),
                 moves=tuple(move.move() for move in read.moves),
-                overrides=Overrides(**overrides),
+                overrides=Overrides(**read.overrides),  # type: ignore[arg-type]
                 limits=None if limits is None else JointLimits(**limits.model_dump()),
                 trajectory=None if read.motion is None else PiecewiseCubic.from_dict(read.motion),
             )
@@ -272,7 +228,15 @@ class PlanFile:
 
     def to_toml(self) -> str:
         """Return the file as TOML, angles in degrees."""
-        return to_toml(self.to_dict())
+        data = self.to_dict()
+        marked = _with_angles("", data)
+        if "limits" in data:
+            marked["limits"] = _with_angles("limits", data["limits"])
+        marked["moves"] = [_with_angles("moves", move) for move in data["moves"]]
+        if "motion" in data:
+            lists = {name: Rows(data["motion"][name]) for name in ("knots", "coefficients")}
+            marked["motion"] = {**data["motion"], **lists}
+        return to_text(marked, {"": _HEAD, "motion": _MOTION})
 
     @classmethod
     def from_toml(cls, text: str) -> PlanFile:
@@ -281,7 +245,13 @@ class PlanFile:
         Raises:
             InvalidPlanFile: the text is not TOML, or not a plan.
         """
-        return cls.from_dict(from_toml(text))
+        try:
+            data = from_text(text, _ANGLES)
+        except tomllib.TOMLDecodeError as error:
+            raise InvalidPlanFile(f"not TOML: {error}") from error
+        except DAMAGED as error:
+            raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
+        return cls.from_dict(data)
 
 
 def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
@@ -350,11 +320,7 @@ def to_csv(trajectory: Trajectory, rate: float, joint_names: Sequence[str]) -> s
     columns = np.stack(trajectory.sample(time), axis=2).reshape(len(time), -1)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        [
-            "time [s]",
-            *(f"{name}.{quantity}" for name in joint_names for quantity in _QUANTITIES),
-        ]
-    )
+    heads = (f"{name}.{quantity}" for name in joint_names for quantity in _QUANTITIES)
+    writer.writerow(["time [s]", *heads])
     writer.writerows(np.column_stack((time, columns)).tolist())
     return text.getvalue()

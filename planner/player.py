@@ -119,7 +119,7 @@ class TrajectoryPlayer:
     `override`     the fraction                             of an override
     `hold`         0, until `resume`                        of a stop
     `resume`       the fraction of the override             of a stop
-    `stop`         0, where the motion ends; so `cancel`    of a stop
+    `stop`         0, where the motion ends                 of a stop
     =============  =======================================  ==============
 
     Each may be called between any two cycles, also while the rate changes. An override during a
@@ -131,12 +131,9 @@ class TrajectoryPlayer:
         trajectory: Motion within `limits`.
         period: Time between two set-points [s].
         limits: Limits of the trajectory, to which the factors refer.
-        override_acceleration: Largest acceleration while an override changes, as a multiple (> 1)
-            of the limits.
-        override_jerk: Largest jerk while an override changes, as a multiple.
-        stop_acceleration: Largest acceleration during a stop, as a multiple; not below the
-            override's.
-        stop_jerk: Largest jerk during a stop, as a multiple; not below the override's.
+        override_acceleration, override_jerk: Largest acceleration and jerk while an override
+            changes, as multiples (> 1) of the limits.
+        stop_acceleration, stop_jerk: The same during a stop; not below those of an override.
         start_tolerance: Largest distance of a joint from the start of the trajectory [rad].
 
     Attributes:
@@ -227,13 +224,10 @@ class TrajectoryPlayer:
         return self._given * self._period if self._tabled else self._law.motion_time
 
     def begin(self, position: Array) -> None:
-        """Start the motion from its beginning, at the present set-point of the arm.
+        """Start the motion from its beginning, at the set-point of the resting arm (n,) [rad].
 
         The small difference to the planned start is added to the whole motion, so that a rounded
         set-point does not become a jerk. A hold or stop is cleared, an override is not.
-
-        Args:
-            position: First set-point (n,) [rad], at rest.
 
         Raises:
             StartMismatch: a joint is farther from the planned start than the tolerance.
@@ -270,14 +264,10 @@ class TrajectoryPlayer:
     def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
         """Continue from a set-point to which the controller extrapolated the motion in a gap.
 
-        The motion continues at the nearest point of the path, with the velocity along it; the
-        velocity across it decays linearly in `cycles`. The distance from the path remains for the
-        rest of the motion, like that at the start.
-
-        Args:
-            position: Set-point of the controller (n,) [rad].
-            velocity: Its velocity (n,) [rad/s].
-            cycles: Number of set-points with a part of the velocity across the path.
+        The motion continues at the point of the path nearest to `position` (n,) [rad], with the
+        share of `velocity` (n,) [rad/s] along it; the velocity across the path decays linearly in
+        `cycles`. The distance from the path remains for the rest of the motion, like that at the
+        start.
 
         Raises:
             StartMismatch: a joint is farther from the path than the tolerance.
@@ -396,10 +386,6 @@ class TrajectoryPlayer:
         self._aim(0.0, "stop")
         self.bounds = "stop"
         self.finished = self._settled
-
-    def cancel(self) -> None:
-        """Stop the motion for good, as `stop` does."""
-        self.stop()
 
     def _aim(self, target: float, ramp: Literal["override", "stop"]) -> None:
         """Change the rate to a target within the bounds of an override or a stop."""

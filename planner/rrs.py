@@ -99,13 +99,9 @@ class Event(NamedTuple):
 class Step(NamedTuple):
     """One interpolation step.
 
-    Attributes:
-        status: OK, NEED_MORE_DATA, FINAL_STEP, or an error.
-        position: Set-point (n,) [rad], read-only; the last one after an error, NaN before the
-            first one.
-        elapsed_time: Time since the last motion ended [s], to a fraction of a step.
-        joint_limits: Bit j is set while joint j is at an end of its range.
-        events: Events since the previous step, in order.
+    `position` is the set-point (n,) [rad], read-only, the last one after an error and NaN before
+    the first; `elapsed_time` [s] counts since the last motion ended, to a fraction of a step; bit j
+    of `joint_limits` is set while joint j is at an end of its range.
     """
 
     status: Status

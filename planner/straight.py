@@ -25,8 +25,7 @@ class StraightMoves(NamedTuple):
         direction: Change of the joints per unit of path, largest entry 1, (s, n).
         knots: Times of the profile (s, 8) [s].
         pieces: Path and its two rates at the start of each piece, and its jerk, (s, 7, 4).
-        speeding_up: Time from rest to the highest speed (s,) [s].
-        slowing_down: Time from the highest speed to rest (s,) [s].
+        speeding_up, slowing_down: Time from rest to the highest speed and back (s,) [s].
     """
 
     start: Array

@@ -39,14 +39,7 @@ class _Piece(NamedTuple):
 
 
 class Ramp(NamedTuple):
-    """A change of rate to a constant target.
-
-    Attributes:
-        duration: Time until the target is reached [s].
-        motion_time: Motion time that passes meanwhile [s].
-        target: Rate afterwards.
-        pieces: The three pieces of constant r''.
-    """
+    """A change of rate to a constant target; `motion_time` [s] passes in its `duration` [s]."""
 
     duration: float
     motion_time: float
@@ -108,16 +101,9 @@ def ramp(rate: float, slope: float, target: float, bounds: RateBounds) -> Ramp:
 
 
 class TimeLaw:
-    """Motion time, advanced period by period at a rate whose target may change.
+    """Motion time s [s], advanced period by period at a rate r whose target may change.
 
-    Args:
-        period: Time between two advances [s].
-
-    Attributes:
-        motion_time: s [s].
-        rate: r.
-        slope: r' [1/s].
-        settled: Whether the rate has reached its target.
+    `slope` is r' [1/s]; `settled` means that the rate has reached its target.
     """
 
     __slots__ = ("_began", "_period", "_ramp", "_ticks", "motion_time", "rate", "settled", "slope")
@@ -171,13 +157,8 @@ def slowing_bounds(
         jerk = q''' r³ + 3 q'' r r' + q' r''
 
     are worst at r = 1 with all terms of one sign. The jerk left over is divided between the terms
-    in r' and r'' such that a change from full rate to rest takes the least time.
-
-    Args:
-        limits: Limits of the path, to which the multiples refer.
-        acceleration: Multiple of the acceleration limits.
-        jerk: Multiple of the jerk limits.
-        extrema: Extremes of the path, where known; else the limits are assumed.
+    in r' and r'' such that a change from full rate to rest takes the least time. Without `extrema`
+    of the path the limits are assumed.
     """
     v, a, j = limits.velocity, limits.acceleration, limits.jerk
     spare_acceleration, spare_jerk = (acceleration - 1.0) * a, (jerk - 1.0) * j

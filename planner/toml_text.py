@@ -38,11 +38,9 @@ class Rows:
 
 
 def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
-    """Return data as TOML.
+    """Return tables, lists of tables, lists, numbers and texts as TOML; None is left out.
 
-    Args:
-        data: tables, lists of tables, lists, numbers, texts; None is left out.
-        comments: lines before the table of each (dotted) name; "" for the first table.
+    `comments` are lines before the table of each (dotted) name; "" for the first table.
     """
     return "\n".join(_table("", data, comments))
 
@@ -50,10 +48,8 @@ def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
 def from_text(text: str, angles: Mapping[str, Collection[str]] | None = None) -> dict[str, Any]:
     """Return the data of a TOML text, angles in rad with names without `_deg`.
 
-    Args:
-        text: of the file.
-        angles: fields of each table (by its name, "" for the first) that are angles; None for all
-            whose names end in `_deg`.
+    `angles` are the fields of each table (by its name, "" for the first) that are angles; None for
+    all whose names end in `_deg`.
 
     Raises:
         ValueError: the text is not TOML, or an angle is not a number or given twice.

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 
 from planner.errors import LimitExceeded, NotSmooth
+from planner.fourier import FourierSeries
 from planner.limits import Bounds, jump_rounding, position_rounding
-from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory
 
 
-class Bounded(Protocol):
-    """A motion with rigorous bounds of its extremes."""
-
-    def extrema(self) -> Extrema:
-        """Return bounds of the extremes over all time."""
-        ...
-
-
-def check_limits(trajectory: Bounded, limits: Bounds) -> None:
+def check_limits(trajectory: PiecewiseCubic | FourierSeries, limits: Bounds) -> None:
     """Check analytically that a trajectory satisfies its limits at every instant.
 
     Raises:

@@ -140,17 +140,11 @@ T = TypeVar("T")
 
 
 class WorkerProcess:
-    """A child process that calls functions, one at a time.
+    """A child process that calls functions of importable modules, one at a time.
 
-    Functions must belong to an importable module. Arguments and results are copied. A fork of
-    this process that uses the object gets its own child.
-
-    Args:
-        timeout: Longest duration of a call [s].
-
-    Attributes:
-        deadline: Deadline of the present call on the monotonic clock [s].
-        connection: Readable when `receive` can return or raise.
+    Arguments and results are copied. A fork of this process that uses the object gets its own
+    child. A call takes up to `timeout` s, the present one until `deadline` on the monotonic clock
+    [s]; `connection` is readable when `receive` can return or raise.
 
     Raises, in `call`, `send` and `receive`:
         PlannerCrashed: the child died and is restarted.
@@ -299,22 +293,14 @@ _warm: list[WorkerProcess] = []
 def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
     """Return the result of a function called in a shared child process, within 10 s.
 
-    Calls from several threads are made one after the other.
-
-    Raises:
-        PlannerCrashed, PlannerNotStarted, PlanningTimedOut, Exception: as `WorkerProcess`.
+    Calls from several threads are made one after the other. Raises as `WorkerProcess`.
     """
     with _lock:
         return _warm_child().call(function, *args, **kwargs)
 
 
 def in_child_now(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Return the result as `in_child` does, without restarting a dead child, which takes time.
-
-    Raises:
-        PlannerCrashed: the child died, in this call or before it.
-        Exception: as `in_child`.
-    """
+    """Return the result as `in_child` does, without restarting a child that died before."""
     with _lock:
         child = _warm_child()
         child.send(function, *args, **kwargs)
@@ -397,12 +383,8 @@ def stream_in_children(
         arguments: returns the arguments of the function for a chunk.
         done: called with the number of newly finished items.
 
-    Yields:
-        Each index with its result or its own error, in any order.
-
-    Raises:
-        PlannerNotStarted: a child died before its first call, several times.
-        Exception: raised by the function.
+    Yields each index with its result or its own error, in any order; raises PlannerNotStarted if a
+    child died before its first call several times, and what the function raises.
     """
     fresh, again = iter(chunks), deque[Chunk]()
     crashed, not_started = set[int](), Counter[int]()

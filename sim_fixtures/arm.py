@@ -27,11 +27,8 @@ _ROWS: dict[DisturbanceKind, int] = {"jam": 0, "load": 1, "slip": 2}
 class Disturbances:
     """Jams, external loads and encoder errors of the axes, each for a number of cycles.
 
-    Args:
-        motor_torque: largest torque of each motor at its joint, (n,) [N m].
-
-    Attributes:
-        changed: whether jams have changed since the last cycle.
+    `motor_torque` is the largest torque of each motor at its joint, (n,) [N m]; `changed` whether
+    jams have changed since the last cycle.
     """
 
     def __init__(self, motor_torque: Sequence[float]) -> None:
@@ -42,14 +39,10 @@ class Disturbances:
         self._any = False
 
     def begin(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
-        """Disturb one axis for some cycles.
+        """Disturb one axis (0-based) for some cycles.
 
-        Args:
-            kind: "jam": the axis is stuck; "load": an external torque; "slip": an encoder error.
-            axis: 0-based.
-            size: load as a share of the motor's largest torque; slip in motor revolutions; not used
-                for a jam.
-            cycles: duration.
+        "jam": the axis is stuck; "load": an external torque, `size` as a share of the motor's
+        largest torque; "slip": an encoder error, `size` in motor revolutions.
         """
         row = _ROWS[kind]
         self._size[row, axis] = size
@@ -96,16 +89,14 @@ class UnmodelledEffects:
 
     On a fast motion of the NS 16 at default sizes, the torque of the true rigid model differs from
     the converted current (both low-passed at 30 Hz) by about: ripple 1-2 %, drift 1-4 % (cold arm),
-    elasticity 1.5 % on axis 1, delay below 0.3 %. The springs are at the stiff end of those of
-    precision gears of this size (580 and 230 N m per arc minute).
+    elasticity 1.5 % on axis 1, delay below 0.3 %.
 
     Attributes:
         torque_ripple: amplitude of a torque with two periods per motor turn, as a share of the
             Coulomb torque of the joint.
         friction_drift: relative decrease of all friction between cold and hot. The truth is the
             friction of a half-warm joint; a run starts cold.
-        elasticity: compliance of the spring between gear and link [rad/(N m)], (n,) or empty; 0 is
-            rigid.
+        elasticity: compliance of the spring between gear and link [rad/(N m)], (n,) or empty.
         delay: additional delay of the target current [s], rounded to sub-steps of the plant.
     """
 
@@ -195,12 +186,8 @@ class NoiseSource:
 class SimulatedArm:
     """Plant, drives and encoders of the arm, at rest with closed brakes.
 
-    The arguments are those of `SimulatedController`.
-
-    Attributes:
-        plant: the mechanics.
-        currents: currents in the last sub-step, (n,) [A].
-        disturbances: external disturbances.
+    The arguments are those of `SimulatedController`; `currents` (n,) [A] are those of the last sub-
+    step.
     """
 
     def __init__(

@@ -24,13 +24,10 @@ START_PATIENCE: Final = 0.25
 
 
 class CanControllerLink:
-    """`sim_fixtures.serve.ControllerLink` on a CAN bus.
+    """`sim_fixtures.serve.ControllerLink` on a CAN bus, which `close` closes.
 
-    Args:
-        bus: python-can bus; closed by `close`.
-        rates: profile and bit rates.
-        start_patience: least timeout of `receive` after a packet sent as segments [s].
-        clock: time of arrival of frames without time stamp [s].
+    After a packet sent as segments, the timeout of `receive` is at least `start_patience` [s];
+    `clock` [s] times frames without time stamp.
     """
 
     def __init__(
@@ -47,9 +44,7 @@ class CanControllerLink:
         self._awaited = False
 
     def send(self, packet: bytes) -> None:
-        """Send one packet of the controller.
-
-        What the bus refuses is lost; an empty packet is not sent.
+        """Send one packet of the controller unless it is empty; what the bus refuses is lost.
 
         Raises:
             CanError: an init packet of a session that the profile or the bus cannot carry.
@@ -88,12 +83,7 @@ class CanControllerLink:
 def open_controller_link(
     spec: CanSpec, mode: int | None = None, *, start_patience: float = START_PATIENCE
 ) -> CanControllerLink:
-    """Open the controller's end on a bus of python-can.
-
-    Args:
-        spec: of the bus.
-        mode: open mode of the session; None where no axis is opened.
-        start_patience: s that the answer to a start packet is waited for.
+    """Open the controller's end on a bus of python-can; `mode` is None where no axis is opened.
 
     Raises:
         ControllerLinkError: it cannot be opened, or cannot carry the session (`CanError` as cause).

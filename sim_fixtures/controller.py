@@ -64,16 +64,8 @@ _FOREIGN = {
 class Layout:
     """Axis blocks of this arm and of others, and the packets with them.
 
-    Args:
-        n_axes: axes of this arm.
-        settings: arm, slots, foreign axes, long packets.
-        tail: random bytes that fill long packets.
-
-    Attributes:
-        axes: (n_slots,) the axis blocks of the next packet.
-        own: slot of each axis of this arm, as an array.
-        slots: the same as a tuple.
-        n_slots: axis blocks in a packet.
+    `tail` are random bytes that fill long packets; `axes` (n_slots,) the axis blocks of the next
+    packet; `slots` (and `own`, as an array) the slot of each axis of this arm.
 
     Raises:
         SettingError: more axes than slots in a packet, or slots that are not distinct or out of
@@ -197,7 +189,9 @@ def duration(distance: Array, speed: Array) -> float:
 
 
 class OwnMotion:
-    """Moves of the controller's own program through postures, synchronised in all joints.
+    """Moves of the controller's own program through postures (n,) [rad], joints synchronised.
+
+    The set-point of the present cycle is `position` [rad] and `velocity` [rad/s], (n,).
 
     Args:
         postures: joint angles (n,) [rad] each.
@@ -205,9 +199,6 @@ class OwnMotion:
         period: cycle [s].
         dwell: rest in each posture [s].
         repeats: move back through the list and forth again until `end`.
-
-    Attributes:
-        position, velocity: set-point of the present cycle, (n,) [rad], [rad/s].
 
     Raises:
         SettingError: a posture of another size, or a speed that is not finite and positive.
@@ -298,13 +289,10 @@ _ADDS_CURRENT = (1, 2, 9)
 
 
 class Demand(NamedTuple):
-    """Input of the servo for one cycle; motor side, (n,) each.
+    """Input of the servo for one cycle, motor side, (n,) each.
 
-    Attributes:
-        target: rev.
-        delta: rev per cycle.
-        speed: added to the demanded speed, rev per cycle.
-        current: added to the target current, A.
+    Position [rev], its change [rev per cycle], and what is added to the demanded speed [rev per
+    cycle] and to the target current [A].
     """
 
     target: list[float]
@@ -316,9 +304,8 @@ class Demand(NamedTuple):
 class Targets:
     """Computes the demand of each cycle from the own program and the replies.
 
-    Attributes:
-        own: targets that the controller reports, (n,) [motor rev].
-        own_delta: their speed, (n,) [motor rev per cycle].
+    `own` and `own_delta` are the targets that the controller reports, (n,) [motor rev], and their
+    speed [motor rev per cycle].
     """
 
     def __init__(
@@ -465,13 +452,6 @@ class SimulatedController:
         gravity: m/s2 in the base frame.
         stated: drive train in the init packet, in place of `drive`.
         faults: faults of controller and robot, by packet number.
-
-    Attributes:
-        truth, settings: as given.
-        period: cycle [s].
-        rejected_replies: number of replies with a wrong number, length or content.
-        plant: the mechanics with the true position, velocity, acceleration, friction.
-        servo: the servo loops.
 
     Raises:
         SettingError: sizes that do not match, or a fault of an axis that the arm does not have.

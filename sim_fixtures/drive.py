@@ -40,8 +40,7 @@ class SimulatedDrive:
     Attributes:
         gear_ratio: signed motor revolutions per joint revolution.
         calibration: motor revolutions at controller angle zero.
-        joint_sign: +1 or -1; controller angle = joint_sign * q + joint_offset.
-        joint_offset: rad.
+        joint_sign, joint_offset: controller angle = joint_sign * q + joint_offset [rad].
         torque_constant: N m/A on the motor side.
         current_limit: A.
         following_error: threshold in motor revolutions.

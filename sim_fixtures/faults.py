@@ -66,12 +66,8 @@ _OF_LINK: Final = ("lose", "delay", "duplicate", "reorder", "corrupt")
 class ControllerFault:
     """One fault of the controller or its robot; see `GRAMMAR` for the kinds.
 
-    Attributes:
-        kind: as in the text.
-        cycle: cycle of its beginning.
-        axis: from 1; 1 for kinds without axis.
-        count: duration in cycles; 1 for kinds without count.
-        word: option of the kind; "" without one.
+    `cycle` is that of its beginning, `axis` counts from 1, `count` is its duration in cycles,
+    `word` the option of the kind, "" without one.
     """
 
     kind: str

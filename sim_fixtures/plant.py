@@ -38,7 +38,6 @@ class PlantTruth:
         coulomb: N m.
         viscous: N m s/rad.
         third: N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic").
-        third_law: law of the third term.
         inertia_scale: factor on mass, first moment and tensor of each link of the URDF; (1,) for
             one factor of all.
 
@@ -133,12 +132,8 @@ def resolve_dry_friction(
 ) -> DryFriction:
     """Return the friction torques of one step and the velocities they leave.
 
-    Args:
-        free_velocity: velocities at the end of the step without dry friction, (n,) [rad/s].
-        inverse_inertia: A, (n, n), symmetric, positive definite.
-        coulomb: Coulomb torques f0, (n,) [N m].
-        step: h [s].
-        guess: initial torques of the iteration, (n,) [N m].
+    `free_velocity` are the velocities without dry friction (n,) [rad/s], `coulomb` the Coulomb
+    torques and `guess` the initial torques of the iteration (n,) [N m], `step` in s.
     """
     coupling = inverse_inertia * step
     rows: list[list[float]] = coupling.tolist()
@@ -219,19 +214,15 @@ def joint_inertia(model: pin.Model, data: pin.Data, q: Array) -> Array:
 class Plant:
     """A rigid arm under joint torques, initially at rest.
 
+    The state is `position`, `velocity` and `acceleration` (n,) [rad, rad/s, rad/s2], the last one a
+    mean over the last step, and `time` [s].
+
     Args:
         urdf: URDF text.
         truth: rotor inertias, friction and link inertias.
         gravity: m/s2 in the base frame.
         position: joint angles [rad]; zero by default.
         brake_torque: dry friction of the closed brake of each joint [N m].
-
-    Attributes:
-        truth: as given.
-        model: pinocchio's model, with the rotor inertias as armature.
-        position, velocity, acceleration: state (n,), rad, rad/s, rad/s2. The acceleration is the
-            mean over the last step.
-        time: simulated time [s].
     """
 
     def __init__(
@@ -402,10 +393,8 @@ MAX_STEP_ANGLE = 1.0  # largest natural frequency times step [rad] of a stable i
 class ElasticPlant(Plant):
     """A plant with springs behind the gears of some axes, initially loaded by gravity.
 
-    Args:
-        urdf, truth, gravity, position, brake_torque: as of `Plant`.
-        elasticity: compliance of each gear (n,) [rad/(N m)]; 0 is rigid.
-        step: step of the simulation [s].
+    `elasticity` is the compliance of each gear (n,) [rad/(N m)], 0 for a rigid one; `step` that of
+    the simulation [s]. The other arguments are those of `Plant`.
 
     Raises:
         SettingError: no elastic axis, one without a rotor, or a resonance too fast for `step`.

@@ -77,11 +77,8 @@ def _cycles(count: int) -> str:
 class Answer(NamedTuple):
     """Requests in one reply of the PC.
 
-    Attributes:
-        valid: a reply came, with the right number and length.
-        exit: end of open mode requested (status byte 1).
-        drive_off: mode 505 on some axis.
-        following_error: mode 508 on some axis.
+    A `valid` reply has the right number and length; `exit` requests the end of open mode (status
+    byte 1), `drive_off` is mode 505 on some axis, `following_error` mode 508.
     """
 
     valid: bool = False
@@ -97,9 +94,6 @@ class LoopProgram:
     """Phase of the controller, cycle by cycle.
 
     Attributes:
-        phase: the present one.
-        powered: whether the drive is on (status DRIVE_ON).
-        braked: whether the brakes are closed.
         wanted_axes: axes that the program opens, (n,).
         listening: whether targets of open axes are read from the PC.
         open_axes: axes in open mode in the packet of this cycle, (n,).
@@ -178,13 +172,7 @@ class LoopProgram:
         return program
 
     def advance(self, answer: Answer, at_rest: bool, own_motion_done: bool = False) -> None:
-        """End the cycle.
-
-        Args:
-            answer: content of the reply.
-            at_rest: whether the targets of all axes are at rest.
-            own_motion_done: whether the own motion has ended.
-        """
+        """End the cycle; `at_rest` means that the targets of all axes are at rest."""
         self._age += 1
         self._missed = 0 if answer.valid else self._missed + 1
         if self._missed >= self._settings.silence_limit and self.phase < Phase.SHUTDOWN:

@@ -58,12 +58,7 @@ class ControllerLink(Protocol):
 
 
 class ControllerLinkError(SimulationError):
-    """The controller's end of a link cannot be opened.
-
-    Attributes:
-        place: address or device.
-        problem: reason.
-    """
+    """The controller's end of a link, at an address or device, cannot be opened."""
 
     def __init__(self, place: str, problem: str) -> None:
         self.place = place
@@ -81,11 +76,9 @@ class UdpControllerLink:
     from any other address or port are dropped.
 
     Attributes:
-        foreign: number of datagrams from other addresses.
-        last_foreign: "host:port" of the last of them; "" if there was none.
+        foreign: number of datagrams from other addresses; `last_foreign` is "host:port" of one.
         waited: time of the last packet in the kernel's queue [s]; 0 if unknown.
-        unsent: number of packets that the network refused.
-        problem: reason of the last refusal; "" if there was none.
+        unsent: number of packets that the network refused; `problem` is the last reason.
 
     Raises:
         ControllerLinkError: no such host, or the local port is in use.
@@ -202,12 +195,10 @@ class ServeCounts:
         late: answers after their cycle, not accepted.
         surplus: further answers in an answered cycle.
         rejected: answers of wrong length, number or content.
-        stretched: cycles extended to wait for their answer.
+        stretched: cycles extended to wait for their answer, by up to `stretch_max` s.
         own_late: cycles that began late by a tenth of the period or more although the answer before
-            was in time.
-        slips: those of them that were late by a period or more.
+            was in time; `slips` of them by a period or more.
         ended: whether the controller has ended its session (504).
-        stretch_max: longest extension of a cycle, s.
         answer: times from the packet to its answer.
         cost: computing times of a cycle of controller and arm.
     """
@@ -379,23 +370,18 @@ def serve(
     patience: float = PATIENCE,
     stretch: float = 0.0,
 ) -> ServeCounts:
-    """Run a controller on a real link until its session has ended.
+    """Run a controller on a real link until its session has ended; the link stays open.
 
     The first packet is repeated once a second until a PC answers, so that either program may be
-    started first.
+    started first. Cycle 0 of `faults` is that of the first packet.
 
-    Args:
-        peer: the controller.
-        link: its link, left open.
-        faults: faults of the link; cycle 0 is that of the first packet.
-        request: called every cycle. At `END` the controller ends its session; if the arm does not
-            stop within `patience` s, its drive is switched off. At `ABORT` it stops at once.
-        watch: called once per cycle with the counts so far.
-        clock: clock of the machine by default.
-        patience: see `request`, s.
-        stretch: largest extension of a cycle without an answer, s. Real controllers do not extend
-            cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer
-            within an extension is not waited for until it answers again.
+    `request` is called every cycle. At `END` the controller ends its session; if the arm does not
+    stop within `patience` s, its drive is switched off. At `ABORT` it stops at once. `watch` is
+    called once per cycle with the counts so far.
+
+    A cycle without an answer is extended by up to `stretch` s. Real controllers do not extend
+    cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer within an
+    extension is not waited for until it answers again.
     """
     server = _Server(peer, Wire(link, faults, clock), clock, watch, stretch)
     if server.await_pc(request):

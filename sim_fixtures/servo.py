@@ -31,14 +31,8 @@ COULOMB_SPEED = 0.02  # width of the sign change of the model's Coulomb torque [
 class NominalModel:
     """Inverse dynamics with random relative errors of links, rotors and friction.
 
-    Mass, first moment and tensor of a link have the same error.
-
-    Args:
-        urdf: URDF text of the arm.
-        truth: true rotor inertias, friction and link inertias.
-        gravity: m/s2 in the base frame.
-        error: smallest and largest relative error; signs are random.
-        rng: source of the errors.
+    `error` is the smallest and largest relative error; signs are random. Mass, first moment and
+    tensor of a link have the same error. `gravity` in m/s2 in the base frame.
     """
 
     def __init__(
@@ -83,10 +77,8 @@ class Servo:
     """Position and velocity loops; per-axis values are lists (n,), motor side.
 
     Attributes:
-        target: demanded position of the present cycle [motor rev].
-        delta: its speed [motor rev per cycle].
-        measured: encoder position of the present cycle [motor rev].
-        measured_delta: difference to the previous cycle [motor rev per cycle].
+        target, delta: demanded position of the present cycle [motor rev] and its speed [per cycle].
+        measured, measured_delta: encoder position and difference to the previous cycle [motor rev].
         current: target current computed in the last cycle [A].
         model_current: the dynamic model's share of it [A].
         inertia: diagonal of the model's inertia matrix on the *joint* side [kg m2].
@@ -157,9 +149,7 @@ class Servo:
     def advance(self, target: Sequence[float], delta: Sequence[float]) -> list[float]:
         """Return the target currents of the cycle, (n,) [A].
 
-        Args:
-            target: position of the next cycle, (n,) [motor rev].
-            delta: its speed, (n,) [motor rev per cycle].
+        The target is that of the next cycle, position [motor rev] and speed [motor rev per cycle].
         """
         self.model_current = self._feed_forward(target, delta)
         self.current = self._close_loops(self._gains)
@@ -242,15 +232,9 @@ def _within(limit: float, value: float) -> float:
 
 
 class CurrentLoop:
-    """Actual current: the target through a delay and a first-order lag, plus noise.
+    """Actual current: the target through a delay and a first-order lag [s], plus noise.
 
-    Currents are means over a sub-step, so that the lag does not depend on its length.
-
-    Args:
-        n_axes: number of axes.
-        lag: time constant [s].
-        substep: duration of a sub-step [s].
-        delay_substeps: sub-steps before a target takes effect.
+    Currents are means over a sub-step [s], so that the lag does not depend on its length.
     """
 
     def __init__(self, n_axes: int, *, lag: float, substep: float, delay_substeps: int) -> None:

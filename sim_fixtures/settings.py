@@ -41,8 +41,7 @@ class ServoSettings:
             above the resonance of the gear.
         integral_rate: of the integral part of the velocity loop, 1/s.
         current_lag: time constant of the current loop, s.
-        model_error: smallest and largest relative error of each inertia and friction parameter of
-            the built-in dynamic model, of random sign.
+        model_error: smallest and largest relative error of the built-in dynamic model.
         deadband_counts: position error in encoder counts below which a resting axis does not
             integrate.
     """

@@ -23,13 +23,10 @@ TENSOR_KEYS = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Inertial parameters of a link about O_{i-1}, in the axes of link frame i.
+    """Inertial parameters of a link about O_{i-1}, in the axes of link frame i: kg, kg m, kg m2.
 
-    Attributes:
-        mass: kg.
-        first_moment: mass times centre of mass, kg m.
-        tensor: (xx, xy, xz, yy, yz, zz) of the inertia tensor, kg m2; off-diagonal entries are
-            minus the products of inertia.
+    `first_moment` is mass times centre of mass; off-diagonal entries of `tensor` (xx, xy, xz, yy,
+    yz, zz) are minus the products of inertia.
     """
 
     mass: float
@@ -62,12 +59,9 @@ class LinkInertia:
 class Ns16Truth:
     """True parameters of the simulated NS 16.
 
-    Attributes:
-        links: inertial parameters of links 1 ... 6.
-        rotor_inertia: on the link side, kg m2.
-        coulomb: N m.
-        viscous: N m s/rad; the unit of the printed values is assumed to be N m s/deg.
-        third: factor of sgn(qd) qd^2, N m s2/rad2.
+    Rotor inertias on the link side [kg m2], Coulomb friction [N m], viscous friction [N m s/rad]
+    (the unit of the printed values is assumed to be N m s/deg), `third` the factor of sgn(qd) qd^2
+    [N m s2/rad2].
     """
 
     links: tuple[LinkInertia, ...]
