@@ -51,7 +51,7 @@ LINES = {
 
 
 @pytest.mark.parametrize(("line", "fault"), LINES.items())
-def test_a_line_says_which_fault(line: str, fault: object) -> None:
+def test_a_line_is_read_as_its_fault(line: str, fault: object) -> None:
     assert parse_fault(line) == fault
 
 
@@ -62,10 +62,7 @@ def test_a_line_says_which_fault(line: str, fault: object) -> None:
         ("lose", "is not KIND@CYCLE"),
         ("lose@-3", "is not KIND@CYCLE"),
         ("lose@1200x0", "not positive"),
-        ("lose@1x1000000001", "count is more than 1000000000"),
-        ("lose@1x100000000000000000000", "count is more than"),
-        ("saturate@1x2000000000:axis=1", "count is more than"),
-        ("e-stop@1000000001", "cycle is more than"),
+        ("saturate@1x1000000001:axis=1", "count is more than 1000000000"),
         ("lose@" + "9" * 5000, "cycle is more than"),
         ("lose@1200:sideways", "no option 'sideways'"),
         ("loose@1200", "none of lose, delay"),
@@ -81,7 +78,7 @@ def test_a_line_says_which_fault(line: str, fault: object) -> None:
         ("pause@7:503", "no option"),
     ],
 )
-def test_a_line_that_is_none_says_why_and_lists_the_grammar(line: str, reason: str) -> None:
+def test_an_invalid_line_is_refused_with_reason_and_grammar(line: str, reason: str) -> None:
     with pytest.raises(FaultScriptError, match=re.escape(reason)) as caught:
         parse_fault(line)
     assert GRAMMAR in str(caught.value)
@@ -95,7 +92,7 @@ def test_every_example_of_the_grammar_is_a_fault() -> None:
         parse_fault(line)
 
 
-def test_faults_of_link_and_controller_are_told_apart() -> None:
+def test_faults_of_link_and_controller_are_separated() -> None:
     faults = [parse_fault(line) for line in ("lose@1", "e-stop@2", "reorder@3", "restart@4")]
     assert split_faults(faults) == ((faults[0], faults[2]), (faults[1], faults[3]))
 
@@ -104,7 +101,7 @@ N = small_cell.N
 
 
 class Holding:
-    """A PC that gives every target back, moved by `step` [rev per cycle] while axes are open."""
+    """A PC that returns every target, moved by `step` [rev per cycle] while axes are open."""
 
     def __init__(self, controller: SimulatedController, step: float = 0.0) -> None:
         self.controller = controller
@@ -117,6 +114,12 @@ class Holding:
             assert packet is not None, self.controller.reason
             self.packets.append(packet)
             self.controller.accept(self._answer(packet) if packet else None)
+
+    def run_to_end(self) -> None:
+        while (packet := self.controller.next_packet()) is not None:
+            self.packets.append(packet)
+            self.controller.accept(self._answer(packet))
+        assert self.controller.phase is Phase.ENDED
 
     def _answer(self, packet: bytes) -> bytes:
         if is_init(packet) or len(packet) == 732:
@@ -170,19 +173,19 @@ def test_a_warm_restart_is_the_init_packet_next() -> None:
     assert pc.cyclic(101).status[0] == 0
 
 
-def test_one_axis_leaves_and_the_others_stay() -> None:
-    pc = run(110, "axis-leaves@100:axis=2")
-    assert pc.cyclic(99).axes["mode"].tolist() == [4, 4]
-    assert pc.cyclic(100).axes["mode"].tolist() == [4, 0]
-    assert pc.cyclic(109).axes["mode"].tolist() == [4, 0]
+@pytest.mark.parametrize(
+    ("fault", "modes"),
+    [
+        ("axis-leaves@100:axis=2", [(4, 4), (4, 0), (4, 0), (4, 0)]),
+        ("pause@100x20", [(4, 4), (502, 502), (502, 502), (0, 0)]),
+    ],
+)
+def test_modes_change_in_the_cycles_of_the_fault(fault: str, modes: list[tuple[int]]) -> None:
+    pc = run(140, fault)
+    assert [tuple(pc.cyclic(k).axes["mode"].tolist()) for k in (99, 100, 119, 120)] == modes
 
 
-def test_a_pause_shows_for_as_long_as_it_lasts() -> None:
-    pc = run(140, "pause@100x20")
-    assert [pc.cyclic(k).axes["mode"][0] for k in (99, 100, 119, 120)] == [4, 502, 502, 0]
-
-
-def test_a_jam_shows_only_in_motion_and_trips_the_drive_there() -> None:
+def test_a_jam_trips_the_drive_in_motion_only() -> None:
     at_rest = run(400, "following-error@100:axis=1")
     assert at_rest.controller.reason == ""
     moving = run(400, "following-error@100:axis=1", step=0.01)
@@ -191,15 +194,15 @@ def test_a_jam_shows_only_in_motion_and_trips_the_drive_there() -> None:
     assert clear.controller.reason == ""
 
 
-def test_a_slip_shows_in_what_is_reported_and_nowhere_else() -> None:
-    pc, plain = run(160, "following-error@100x50:axis=2:slip"), run(160)
+def test_a_slip_changes_the_reported_position_only() -> None:
+    pc, faultless = run(160, "following-error@100x50:axis=2:slip"), run(160)
     for k, slip in ((99, 0.0), (100, 1.5), (149, 1.5), (150, 0.0)):
-        d, expected = pc.cyclic(k).axes["d"].copy(), plain.cyclic(k).axes["d"].copy()
+        d, expected = pc.cyclic(k).axes["d"].copy(), faultless.cyclic(k).axes["d"].copy()
         expected[1, 2] += slip * small_cell.FOLLOWING_ERROR
         np.testing.assert_allclose(d, expected, atol=1e-6)
 
 
-def test_a_load_drives_the_current_near_its_limit_and_goes_away_again() -> None:
+def test_a_load_raises_the_current_while_it_lasts() -> None:
     pc = run(700, "saturate@100x300:axis=1")
     current = np.array([pc.cyclic(k).axes["d"][0, 4] for k in range(90, 700)])
     limit = small_cell.TABLE["current_limit"][0]
@@ -213,7 +216,7 @@ def test_closed_brakes_bear_the_load() -> None:
     np.testing.assert_array_equal(pc.controller.plant.position, small_cell.HOME)
 
 
-def test_an_axis_that_the_arm_has_not_is_refused() -> None:
+def test_an_axis_beyond_those_of_the_arm_is_refused() -> None:
     with pytest.raises(SettingError, match=r"axes 1\.\.2"):
         run(1, "axis-leaves@100:axis=3")
 
@@ -224,9 +227,7 @@ class TestOwnMotion:
     def test_it_moves_with_closed_axes_and_ends_the_session(self) -> None:
         controller = small_cell.controller(own_motion=self.POSTURES, own_speed=0.8)
         pc = Holding(controller)
-        while (packet := controller.next_packet()) is not None:
-            pc.packets.append(packet)
-            controller.accept(pc._answer(packet))
+        pc.run_to_end()
         rows = [pc.cyclic(k) for k in range(12, len(pc.packets))]
         assert {mode for row in rows for mode in row.axes["mode"].tolist()} == {0, 501, 504}
         np.testing.assert_allclose(controller.plant.position, self.POSTURES[-1], atol=1e-3)
@@ -236,33 +237,25 @@ class TestOwnMotion:
         assert np.ptp(target[:, 0]) > 5.0
         assert np.abs(target - measured).max() < 0.3 * small_cell.FOLLOWING_ERROR
 
-    def test_repeated_it_goes_on_until_told_to_finish(self) -> None:
+    def test_a_repeated_one_continues_until_the_session_ends(self) -> None:
         changes = {"own_motion": self.POSTURES, "own_speed": 1.0, "own_motion_repeats": True}
         pc = run(5000, **changes)  # once through the list takes less than half of that
         assert pc.controller.phase is Phase.MOVING
         pc.controller.finish()
-        while (packet := pc.controller.next_packet()) is not None:
-            pc.controller.accept(pc._answer(packet))
-        assert pc.controller.phase is Phase.ENDED
+        pc.run_to_end()
 
-    def test_the_answers_of_the_pc_do_not_matter_to_it(self) -> None:
+    def test_replies_of_the_pc_have_no_effect(self) -> None:
         def last(step: float) -> bytes:
             return run(900, own_motion=self.POSTURES, step=step).packets[-1]
 
         assert last(0.0) == last(0.01)
 
-    def test_after_a_trip_it_is_over(self) -> None:
-        pc = run(400, "e-stop@300", own_motion=self.POSTURES)
-        pc.run(200)
+    def test_it_ends_with_a_trip(self) -> None:
+        pc = run(600, "e-stop@300", own_motion=self.POSTURES)
         np.testing.assert_array_equal(pc.controller.plant.velocity, 0.0)
         pc.controller.drive_on()
         there = pc.controller.plant.position.copy()
-        for _ in range(200):
-            packet = pc.controller.next_packet()
-            if packet is None:
-                break
-            pc.controller.accept(pc._answer(packet))
-        assert pc.controller.phase is Phase.ENDED
+        pc.run_to_end()
         np.testing.assert_allclose(pc.controller.plant.position, there, atol=1e-3)
 
     def test_in_a_mode_that_only_corrects_it_moves_with_open_axes(self) -> None:
@@ -272,19 +265,8 @@ class TestOwnMotion:
 
 
 def test_one_seed_is_one_run_with_faults_too() -> None:
-    faults = ("following-error@90x10:axis=2:slip", "pause@110x20", "restart@200:warm")
-    settings = {"encoder_noise": 0.5, "current_noise": 0.02, "foreign_axes": 3}
-    assert run(60, **settings).packets == run(60, **settings).packets
-    first = _raw(faults, settings)
-    assert first == _raw(faults, settings)
+    def packets() -> list[bytes]:
+        faults = ("following-error@90x10:axis=2:slip", "pause@110x20", "restart@200:warm")
+        return run(400, *faults, encoder_noise=0.5, current_noise=0.02).packets
 
-
-def _raw(faults: tuple[str, ...], settings: dict[str, Any]) -> list[bytes]:
-    controller = small_cell.controller(faults=[*map(parse_fault, faults)], **settings)
-    packets = []
-    for _ in range(400):
-        packet = controller.next_packet()
-        assert packet
-        packets.append(packet)
-        controller.accept(echo(packet))
-    return packets
+    assert packets() == packets()

@@ -49,13 +49,6 @@ def test_pinocchio_reads_the_planted_standard_parameters(model: pin.Model) -> No
         np.testing.assert_allclose(read, [planted[k] for k in keys], rtol=1e-12, atol=1e-12)
 
 
-def test_every_link_is_a_possible_rigid_body(model: pin.Model) -> None:
-    for inertia in list(model.inertias)[1:]:
-        moments = np.linalg.eigvalsh(inertia.inertia)
-        assert moments[0] > 0.0
-        assert moments[2] < moments[0] + moments[1]
-
-
 def test_an_impossible_body_is_refused() -> None:
     with pytest.raises(FixtureError, match="link_9"):
         inertial(LinkInertia(1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0, 0.1, 0.0, 0.1)), "link_9")
@@ -149,7 +142,6 @@ def test_a_folded_arm_collides(collisions: Collisions) -> None:
     assert collisions.smallest_distance(dh([0.0, 0.0, -165.0, 0.0, 0.0, 0.0])) <= 0.0
 
 
-PRINT_PRECISION = 0.0005  # the table prints three decimals
 FACTOR_PRECISION = 0.001  # and cuts factors off after three
 TENSOR_ORDER = ("xx", "xy", "yy", "xz", "yz", "zz")  # of pinocchio's parameter vector
 
@@ -187,9 +179,6 @@ def test_there_are_58_rows_in_order() -> None:
 def test_the_planted_base_vector_is_column_c_of_all_forty_rows() -> None:
     base = ns16.base_from_standard(ns16.standard_parameters())
     printed = np.array([row.pi_c for row in ns16.TABLE2[: ns16.N_ESSENTIAL]])
-    assert base.shape == (40,)
-    np.testing.assert_allclose(base, printed, rtol=0.0, atol=PRINT_PRECISION)
-    # the planted member of the feasible family fits the printed figures far better than they print
     np.testing.assert_allclose(base, printed, rtol=0.0, atol=1e-6)
 
 
@@ -201,14 +190,6 @@ def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> Non
     np.testing.assert_allclose(np.radians(truth.viscous), per_degree, rtol=1e-14)
     # Coulomb friction falls with the size of the axis, which is how the interleaving shows
     assert truth.coulomb[0] > truth.coulomb[2] > truth.coulomb[3] > truth.coulomb[5]
-
-
-def test_factors_are_exact_products_of_the_link_lengths() -> None:
-    rows = {row.id: row for row in ns16.TABLE2}
-    assert rows[29].terms["m5"] == 0.624
-    assert rows[30].terms["m6"] == pytest.approx(0.624**2 - 0.185**2, rel=1e-15)
-    assert rows[31].terms["mc4y"] == -0.185
-    assert rows[23].terms["m4"] == pytest.approx(0.3**2 + 0.7**2 + 0.185**2, rel=1e-15)
 
 
 @pytest.mark.parametrize("row_id", range(23, 41))
@@ -227,7 +208,7 @@ def test_the_print_names_the_same_terms_rounded(row_id: int) -> None:
     assert printed == pytest.approx(dict(row.terms), abs=FACTOR_PRECISION)
 
 
-def test_forty_columns_are_independent_and_nothing_else_is(model: pin.Model) -> None:
+def test_forty_columns_are_independent_and_no_more(model: pin.Model) -> None:
     rng = np.random.default_rng(1)
     states = [rng.uniform(-2.0, 2.0, (3, 6)) for _ in range(40)]
     full = np.vstack([full_regressor(model, *s) for s in states])
@@ -255,7 +236,7 @@ def test_the_planted_figures_are_those_of_the_truth() -> None:
 
 
 class TestNominal:
-    """Law: figures known before the arm moves are 10 to 20 % off the planted ones, both ways."""
+    """Values known before the arm moves are 10 to 20 % off the true ones, up and down."""
 
     @pytest.mark.parametrize("name", ["rotor_inertia", "coulomb", "viscous"])
     def test_drives(self, name: str) -> None:
@@ -292,24 +273,18 @@ def test_the_limits_and_signs_are_those_of_the_geometry() -> None:
 
 
 def test_nothing_of_the_drive_train_is_trivial() -> None:
-    """Zeros would hide mistakes in coupling and calibration."""
+    """Zeros would hide errors in coupling and calibration."""
     train = CELL["drive_train"]
     assert all(train[k] for k in ("k54", "k64", "k65"))
     assert all(train["calibration"])
     assert len({np.sign(ratio) for ratio in train["gear_ratio"]}) == 2
 
 
-def test_every_assumed_field_exists() -> None:
-    for path in CELL["cell"]["assumed"]:
-        section, name = path.split(".")
-        assert name in CELL[section], path
-
-
-def test_everything_unpublished_about_the_drives_is_marked_assumed() -> None:
-    assumed = set(CELL["cell"]["assumed"])
+def test_unpublished_values_of_the_drives_are_marked_assumed() -> None:
+    assumed = {*CELL["cell"]["assumed"]}
     published = {"joint_sign", "joint_offset_deg"}
-    for name in set(CELL["drive_train"]) - published:
-        assert f"drive_train.{name}" in assumed
+    assert assumed >= {f"drive_train.{name}" for name in {*CELL["drive_train"]} - published}
+    assert all(name in CELL[table] for table, name in (path.split(".") for path in assumed))
 
 
 def test_the_stated_current_delay_is_that_of_the_default_servo() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import pi
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -55,7 +54,7 @@ def swing(truth: PlantTruth, step: float, duration: float = 1.0) -> tuple[Plant,
     return plant, worst
 
 
-def test_energy_is_kept_to_second_order_in_the_step() -> None:
+def test_energy_is_conserved_to_second_order_in_the_step() -> None:
     plant, worst = swing(FRICTIONLESS, STEP)
     kinetic = 0.5 * plant.velocity @ full_inertia(plant) @ plant.velocity
     assert kinetic > 100.0  # the fall is a real one
@@ -64,15 +63,15 @@ def test_energy_is_kept_to_second_order_in_the_step() -> None:
     assert coarse / worst == pytest.approx(4.0, rel=0.2)
 
 
-def test_simulated_accelerations_need_the_torques_that_made_them() -> None:
-    """Inverse dynamics at the middle of a step: applied torque = rigid bodies + friction."""
+def test_inverse_dynamics_of_a_step_give_the_applied_torque() -> None:
+    """At the middle of a step: applied torque = rigid bodies + friction."""
     plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     rng = np.random.default_rng(3)
     plant.set_state(START, rng.uniform(0.3, 1.5, 6) * rng.choice([-1.0, 1.0], 6))
     torque = rng.uniform(-1.0, 1.0, 6) * [400.0, 600.0, 200.0, 30.0, 40.0, 30.0]
     data = plant.model.createData()
     smooth_steps = 0
-    settled = np.zeros(6, dtype=bool)  # no kink in this joint's motion since the last step
+    steady = np.zeros(6, dtype=bool)  # no kink in this joint's motion since the last step
     for _ in range(400):
         q, v = plant.position.copy(), plant.velocity.copy()
         plant.step(torque, STEP)
@@ -80,14 +79,14 @@ def test_simulated_accelerations_need_the_torques_that_made_them() -> None:
         rigid = pin.rnea(plant.model, data, *middle, plant.acceleration)
         straight = v * plant.velocity > 0.0
         error = np.abs(rigid + plant.friction_torque - torque)
-        if straight.all() and settled.all():
+        if straight.all() and steady.all():
             smooth_steps += 1
             assert error.max() < 2e-3  # N m, of some hundred
             np.testing.assert_allclose(
                 plant.friction_torque, TRUTH.friction(middle[1]), rtol=1e-3, atol=0.0
             )
         assert error.max() < 0.5  # also where a joint stops, turns or starts
-        settled = straight
+        steady = straight
     assert smooth_steps > 50
 
 
@@ -104,7 +103,7 @@ def test_rotors_count_as_armature() -> None:
         )
 
 
-def test_stiction_holds_a_resting_arm_for_good() -> None:
+def test_stiction_holds_a_resting_arm() -> None:
     plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     push = 0.95 * TRUTH.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
     torque = gravity_torque(plant) + push
@@ -172,39 +171,26 @@ def test_warm_friction_is_scaled() -> None:
     np.testing.assert_allclose(plant.friction_torque, 0.5 * TRUTH.friction(np.ones(6)), rtol=1e-6)
 
 
-def test_a_run_that_leaves_the_numbers_is_an_error() -> None:
+def test_a_state_that_is_not_finite_is_an_error() -> None:
     plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     with pytest.raises(PlantDiverged):
         for _ in range(10):
             plant.step(np.full(6, np.nan), STEP)
 
 
-def test_links_have_the_planted_share_of_the_inertia_of_the_urdf() -> None:
-    """Mass, first moment and tensor alike, whatever the arm does."""
+def test_the_inertia_scale_applies_to_mass_moment_and_tensor() -> None:
     scale = np.array([1.2, 0.8, 1.1, 0.9, 1.15, 0.85])
-    plain = Plant(ns16.urdf_text(), TRUTH).model
-    scaled = Plant(ns16.urdf_text(), replace(TRUTH, inertia_scale=scale)).model
-    for body, own, factor in zip(
-        list(scaled.inertias)[1:], list(plain.inertias)[1:], scale, strict=True
-    ):
-        np.testing.assert_allclose(
-            body.toDynamicParameters(), factor * own.toDynamicParameters(), rtol=1e-12, atol=1e-14
-        )
+    truths = TRUTH, replace(TRUTH, inertia_scale=scale)
+    unscaled, scaled = (
+        [body.toDynamicParameters() for body in list(Plant(ns16.urdf_text(), t).model.inertias)[1:]]
+        for t in truths
+    )
+    np.testing.assert_allclose(scaled, scale[:, None] * unscaled, rtol=1e-12, atol=1e-14)
 
 
-def test_nothing_is_on_unless_asked_for() -> None:
-    none = UnmodelledEffects()
-    assert (none.torque_ripple, none.friction_drift, none.delay) == (0.0, 0.0, 0.0)
-    assert not none.is_elastic
-
-
-def test_the_cell_file_documents_the_default_sizes() -> None:
-    sizes = UnmodelledEffects.default_sizes(6)
-    planted = CELL["simulation"]
-    assert sizes.torque_ripple == planted["torque_ripple"]
-    assert sizes.friction_drift == planted["friction_drift"]
-    assert sizes.elasticity == tuple(planted["elasticity"])
-    assert sizes.delay == planted["delay"]
+def test_the_cell_file_has_the_default_sizes_of_effects() -> None:
+    for name, size in vars(UnmodelledEffects.default_sizes(6)).items():
+        np.testing.assert_array_equal(CELL["simulation"][name], size, err_msg=name)
 
 
 def test_ripple_repeats_twice_per_motor_turn_with_the_stated_amplitude() -> None:
@@ -330,12 +316,14 @@ GRAVITY = (0.0, 0.0, -9.81)
 POSTURE = [0.2, -1.2, 2.5, 0.3, 1.0, 0.2]
 
 
-def make_servo(resolution: float = 0.0, **gains: Any) -> Servo:
-    settings = ServoSettings(**gains)
-    model = NominalModel(
-        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=settings.model_error,
-        rng=np.random.default_rng(2),
-    )  # fmt: skip
+def nominal(low: float, high: float) -> NominalModel:
+    rng = np.random.default_rng(3)
+    return NominalModel(ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(low, high), rng=rng)
+
+
+def make_servo(resolution: float = 0.0) -> Servo:
+    settings = ServoSettings()
+    model = nominal(*settings.model_error)
     servo = Servo(DRIVE, model, settings, period=0.001, current_resolution=resolution)
     servo.start_at(DRIVE.motor_revolutions(POSTURE))
     return servo
@@ -345,33 +333,26 @@ def hold(servo: Servo) -> list[float]:
     return servo.advance(servo.target, [0.0] * 6)
 
 
-def test_a_servo_at_rest_asks_for_the_model_current_alone() -> None:
+def test_the_current_of_a_servo_at_rest_is_that_of_the_model() -> None:
     servo = make_servo()
     assert hold(servo) == servo.model_current
     assert servo.model_current[1] != 0.0  # gravity
 
 
-def test_an_error_of_position_calls_for_current_that_reduces_it() -> None:
-    servo = make_servo()
-    target = [p + 0.01 for p in servo.measured]
-    servo.advance(target, [0.0] * 6)
-    current = np.array(servo.advance(target, [0.0] * 6))
-    assert np.all(current > servo.model_current)  # positive current turns a motor forward
-
-
-def test_the_integral_takes_over_what_stays() -> None:
+def test_a_position_error_raises_the_current_and_its_integral() -> None:
     servo = make_servo()
     target = [p + 0.01 for p in servo.measured]
     first, *_, last = [servo.advance(target, [0.0] * 6) for _ in range(50)]
     assert np.all(np.array(last) > np.array(first))
+    assert np.all(np.array(last) > servo.model_current)  # positive current turns a motor forward
 
 
 def test_within_the_deadband_nothing_is_integrated() -> None:
     servo = make_servo()
     target = [p + 2.0 / DRIVE.encoder_counts for p in servo.measured]
     currents = [servo.advance(target, [0.0] * 6) for _ in range(50)]
-    settled = currents[INERTIA_CYCLES + 1]  # the gains are those of the new posture by then
-    np.testing.assert_allclose(currents[-1], settled, rtol=1e-12)
+    # By then the gains are those of the new posture.
+    np.testing.assert_allclose(currents[-1], currents[INERTIA_CYCLES + 1], rtol=1e-12)
 
 
 def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
@@ -394,31 +375,16 @@ def test_target_currents_come_in_steps() -> None:
 
 
 def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
-    model = NominalModel(
-        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.05, 0.10), rng=np.random.default_rng(3)
-    )
+    model, exact = nominal(0.05, 0.10), nominal(0.0, 0.0)
     off = np.abs(model.rotor_inertia / TRUTH.rotor_inertia - 1.0)
     assert np.all((off >= 0.05) & (off <= 0.10))
-    exact = NominalModel(
-        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
-    )
     q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
-    truly = exact.torque(q, qd, qdd)
-    error = np.abs(model.torque(q, qd, qdd) - truly).max() / np.abs(truly).max()
-    assert 0.01 < error < 0.5
-
-
-def test_without_errors_the_model_is_the_plants() -> None:
-    import pinocchio as pin
-
-    exact = NominalModel(
-        ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(0.0, 0.0), rng=np.random.default_rng(3)
-    )
-    plain = pin.buildModelFromXML(ns16.urdf_text())
-    q, qd, qdd = np.array(POSTURE), np.ones(6), np.full(6, 2.0)
-    rigid = pin.rnea(plain, plain.createData(), q, qd, qdd) + TRUTH.rotor_inertia * qdd
-    np.testing.assert_allclose(exact.torque(q, qd, qdd), rigid + TRUTH.friction(qd), rtol=1e-12)
-    inertia = np.diag(pin.crba(plain, plain.createData(), q)) + TRUTH.rotor_inertia
+    true = exact.torque(q, qd, qdd)
+    assert 0.01 < np.abs(model.torque(q, qd, qdd) - true).max() / np.abs(true).max() < 0.5
+    rigid = pin.buildModelFromXML(ns16.urdf_text())
+    torque = pin.rnea(rigid, rigid.createData(), q, qd, qdd) + TRUTH.rotor_inertia * qdd
+    np.testing.assert_allclose(true, torque + TRUTH.friction(qd), rtol=1e-12)
+    inertia = np.diag(pin.crba(rigid, rigid.createData(), q)) + TRUTH.rotor_inertia
     np.testing.assert_allclose(exact.diagonal_inertia(q), inertia, rtol=1e-12)
 
 
@@ -467,18 +433,10 @@ def test_power_at_the_motors_is_power_at_the_joints(qd: list[float], currents: l
 
 
 @given(torques=numbers)
-def test_currents_give_the_torques_asked_for(torques: list[float]) -> None:
+def test_joint_torques_invert_currents(torques: list[float]) -> None:
     np.testing.assert_allclose(
         DRIVE.joint_torques(DRIVE.currents(torques)), torques, rtol=1e-12, atol=1e-10
     )
-
-
-def test_coupling_acts_on_4_and_5_and_nowhere_else() -> None:
-    plain = make_drive(k54=0.0, k64=0.0, k65=0.0)
-    one_ampere = [1.0] * 6
-    difference = np.subtract(DRIVE.joint_torques(one_ampere), plain.joint_torques(one_ampere))
-    np.testing.assert_allclose(difference[[0, 1, 2, 5]], 0.0, atol=0.0)
-    assert np.all(np.abs(difference[[3, 4]]) > 0.1)
 
 
 def test_encoders_read_whole_counts() -> None:
@@ -491,18 +449,12 @@ def test_encoders_read_whole_counts() -> None:
     np.testing.assert_allclose((shifted - read) * DRIVE.encoder_counts, 2.0, atol=1e-6)
 
 
-def test_an_arm_without_a_wrist_needs_no_coupling() -> None:
-    two = [1.0, 1.0]
-    drive = SimulatedDrive([100.0, -50.0], [0.5, 0.0], two, [0.0, 0.1], two, two, two, 4096)
-    np.testing.assert_allclose(drive.joint_angles(drive.motor_revolutions([0.3, 0.4])), [0.3, 0.4])
-
-
 TWO = (1.0, 1.0)
 SIMPLE = PlantTruth.frictionless(np.ones(6))
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("make", "text"),
     [
         (lambda: Plant(ns16.urdf_text(), PlantTruth.frictionless(TWO)), "6 degrees of freedom"),
         (lambda: Plant(ns16.urdf_text(), SIMPLE, position=np.zeros(5)), "position"),
@@ -544,6 +496,6 @@ SIMPLE = PlantTruth.frictionless(np.ones(6))
         (lambda: SimulatedDrive(TWO, TWO, TWO, TWO, TWO, TWO, TWO, 4096, k54=0.1), "below six"),
     ],
 )
-def test_figures_that_cannot_be_are_refused_by_name(make, words) -> None:
-    with pytest.raises(SettingError, match=words):
+def test_impossible_values_are_refused_by_name(make, text) -> None:
+    with pytest.raises(SettingError, match=text):
         make()

@@ -1,4 +1,4 @@
-"""A controller served in real time: who is to blame for a missing answer, and what is an answer."""
+"""A controller served in real time: valid answers, and causes of missing ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ T = 0.001
 
 
 class VirtualClock:
-    """Time that passes only where somebody waits; `stalls` are naps the machine takes itself."""
+    """Time that passes only while a caller waits; `stalls` are additional pauses of the machine."""
 
     def __init__(self) -> None:
         self.time = 100.0
@@ -40,7 +40,7 @@ class VirtualClock:
 
 
 class Cabinet:
-    """A controller without a robot: numbered packets, and a list of what it was given."""
+    """A controller without a robot: numbered packets, and a list of the replies."""
 
     def __init__(self, clock: VirtualClock, cycles: int = 50, cost: float = 0.0) -> None:
         self.period = T
@@ -50,12 +50,12 @@ class Cabinet:
         self.finished = self.stopped = False
         self.silent_in: set[int] = set()
         self.ends_in = -1
-        self.stands = True
+        self.at_rest = True
         self._clock, self._cycles, self._cost = clock, cycles, cost
         self._number = 1
 
     def next_packet(self) -> bytes | None:
-        over = self.finished and (self.stands or self.stopped)
+        over = self.finished and (self.at_rest or self.stopped)
         if over or len(self.accepted) >= self._cycles:
             return None
         self.sent_at.append(self._clock.time)
@@ -82,13 +82,20 @@ Answer = Callable[[int, bytes], list[tuple[float, bytes]]]
 
 
 def prompt(index: int, packet: bytes) -> list[tuple[float, bytes]]:
-    """What a good PC does: the right answer, soon."""
+    """Give the right answer soon."""
     del index
     return [(0.1 * T, echo(packet))]
 
 
+def slow(late: dict[int, float]) -> Answer:
+    """Answer some packets after so many periods, the others soon."""
+    return lambda index, packet: [(late.get(index, 0.1) * T, echo(packet))]
+
+
 class VirtualLink:
-    """A far end with a PC behind it that answers packet `index` as `answer` says."""
+    """The controller's end of a link; `answer` gives the replies to packet `index`, with delays."""
+
+    waited = 0.0
 
     def __init__(self, clock: VirtualClock, answer: Answer = prompt) -> None:
         self.sent: list[tuple[float, bytes]] = []
@@ -117,62 +124,68 @@ class VirtualLink:
     def close(self) -> None: ...
 
 
-def served(answer: Answer = prompt, *, cycles: int = 50, cost: float = 0.0, **keywords):
+def served(
+    answer: Answer = prompt,
+    *,
+    cycles: int = 50,
+    cost: float = 0.0,
+    link: type[VirtualLink] = VirtualLink,
+    cabinet: type[Cabinet] = Cabinet,
+    stalls: list[tuple[float, float]] | None = None,
+    request: Callable[[Cabinet], Request] = lambda _: Request.CONTINUE,
+    options: dict[str, object] | None = None,
+    **keywords,
+):
+    """Serve a `Cabinet` with these attributes (`options`); its counts, the cabinet, its link."""
     clock = VirtualClock()
-    clock.stalls = keywords.pop("stalls", [])
-    cabinet = Cabinet(clock, cycles, cost)
-    cabinet.silent_in = keywords.pop("silent_in", set())
-    cabinet.stands = keywords.pop("standing", True)
-    link = VirtualLink(clock, answer)
-    summary = serve(cabinet, link, clock=clock, **keywords)
-    return summary, cabinet, link
+    clock.stalls = stalls or []
+    served_one = cabinet(clock, cycles, cost)
+    vars(served_one).update(options or {})
+    wire = link(clock, answer)
+    counts = serve(served_one, wire, clock=clock, request=lambda: request(served_one), **keywords)
+    return counts, served_one, wire
 
 
 def gaps(cabinet: Cabinet) -> list[float]:
     return [b - a for a, b in pairwise(cabinet.sent_at)]
 
 
-def test_an_answer_counts_from_when_the_kernel_had_it():
-    """What lay in the queue while this program did not look is no lateness of the PC."""
-    clock = VirtualClock()
-    cabinet, link = Cabinet(clock, 50), VirtualLink(clock, lambda _, p: [(0.6 * T, echo(p))])
-    link.waited = 0.5 * T
-    summary = serve(cabinet, link, clock=clock)
+def test_time_in_the_queue_of_the_kernel_is_not_that_of_the_pc():
+    class Queued(VirtualLink):
+        waited = 0.5 * T
+
+    summary, _, _ = served(lambda _, packet: [(0.6 * T, echo(packet))], link=Queued)
     assert summary.answer.largest == pytest.approx(0.1 * T, rel=0.1)
 
 
-def test_a_datagram_that_lay_in_the_queue_says_for_how_long():
+def test_a_link_knows_how_long_a_datagram_was_queued():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as pc:
         pc.bind(("127.0.0.1", 0))
-        far_end = UdpControllerLink("127.0.0.1", pc.getsockname()[1])
-        for text in (b"first", b"answer"):  # the kernel begins to stamp soon after it is asked to
-            pc.sendto(text, ("127.0.0.1", far_end.source_port))
+        link = UdpControllerLink("127.0.0.1", pc.getsockname()[1])
+        for text in (b"first", b"answer"):  # time stamps begin some time after they are requested
+            pc.sendto(text, ("127.0.0.1", link.source_port))
             time.sleep(0.05)
-            assert far_end.receive(1.0) == text
-        far_end.close()
-    assert 0.04 <= far_end.waited < 5.0
+            assert link.receive(1.0) == text
+        link.close()
+    assert 0.04 <= link.waited < 5.0
 
 
 def test_the_packet_that_ends_the_session_needs_no_answer():
-    clock = VirtualClock()
-    cabinet = Cabinet(clock, 20)
-    cabinet.ends_in = 19
-    link = VirtualLink(clock, lambda index, packet: prompt(index, packet) if index < 19 else [])
-    summary = serve(cabinet, link, clock=clock)
+    def answer(index, packet):
+        return prompt(index, packet) if index < 19 else []
+
+    summary, _, _ = served(answer, cycles=20, options={"ends_in": 19})
     assert (summary.cycles, summary.replies, summary.missed) == (20, 19, 0)
 
 
-def test_an_answer_after_its_cycle_is_late_and_not_taken():
-    def answer(index, packet):
-        return [(1.3 * T if index == 20 else 0.1 * T, echo(packet))]
-
-    summary, cabinet, _ = served(answer)
+def test_an_answer_after_its_cycle_is_late_and_not_accepted():
+    summary, cabinet, _ = served(slow({20: 1.3}))
     assert (summary.missed, summary.late, summary.rejected) == (1, 1, 0)
     assert [k for k, reply in enumerate(cabinet.accepted) if reply is None] == [20]
     assert packet_number(cabinet.accepted[21]) == 23
 
 
-def test_only_the_first_of_several_answers_is_taken():
+def test_only_the_first_of_several_answers_is_accepted():
     def answer(index, packet):
         second = bytearray(echo(packet))
         second[4] = 1
@@ -185,7 +198,7 @@ def test_only_the_first_of_several_answers_is_taken():
 
 
 @pytest.mark.parametrize("junk", [b"", b"\0" * 5, struct.pack("<i", 0) * 12, b"\xff" * 48])
-def test_junk_before_the_answer_is_counted_and_does_not_replace_it(junk: bytes):
+def test_junk_before_the_answer_is_rejected(junk: bytes):
     summary, _, _ = served(lambda k, packet: [(0.05 * T, junk), *prompt(k, packet)])
     assert (summary.replies, summary.missed) == (50, 0)
     assert summary.rejected == 50
@@ -201,9 +214,7 @@ def test_a_flood_of_junk_ends_with_the_cycle():
             self._clock.time += 0.001 * T
             return packet
 
-    clock = VirtualClock()
-    cabinet = Cabinet(clock)
-    summary = serve(cabinet, SlowLink(clock, answer), clock=clock)
+    summary, cabinet, _ = served(answer, link=SlowLink)
     assert summary.cycles == 50
     assert max(gaps(cabinet)) < 1.3 * T
 
@@ -214,20 +225,19 @@ def test_an_answer_the_controller_finds_wrong_counts_as_missing():
             super().accept(reply)
             self.rejected_replies += len(self.accepted) % 10 == 0
 
-    clock = VirtualClock()
-    summary = serve(Picky(clock), VirtualLink(clock), clock=clock)
+    summary, _, _ = served(cabinet=Picky)
     assert (summary.replies, summary.missed, summary.rejected) == (45, 5, 5)
 
 
-@pytest.mark.parametrize("nap", [0.6 * T, 3 * T, 200 * T])
-def test_a_server_that_slept_does_not_blame_the_pc(nap: float):
-    summary, cabinet, _ = served(stalls=[(100.0 + 20 * T, nap)])
+@pytest.mark.parametrize("stall", [0.6 * T, 3 * T, 200 * T])
+def test_a_stall_of_the_server_is_not_counted_as_the_pcs(stall: float):
+    summary, cabinet, _ = served(stalls=[(100.0 + 20 * T, stall)])
     assert (summary.replies, summary.missed) == (50, 0)
     assert summary.own_late >= 1
     assert None not in cabinet.accepted
 
 
-def test_what_arrived_during_a_nap_in_the_middle_of_a_cycle_is_seen():
+def test_an_answer_during_a_stall_within_a_cycle_is_accepted():
     def answer(index, packet):
         return [(0.3 * T, b"junk"), (0.5 * T, echo(packet))]
 
@@ -235,28 +245,25 @@ def test_what_arrived_during_a_nap_in_the_middle_of_a_cycle_is_seen():
     assert (summary.missed, summary.slips) == (0, 1)
 
 
-def test_packets_owed_after_a_long_nap_are_not_sent_in_a_burst():
+def test_packets_are_not_sent_in_a_burst_after_a_long_stall():
     summary, cabinet, _ = served(stalls=[(100.0 + 20 * T, 30 * T)])
     assert summary.slips == 1
     assert min(gaps(cabinet)[1:]) > 0.5 * T
 
 
-def test_a_short_delay_is_made_up_for():
+def test_a_short_delay_does_not_shift_later_cycles():
     _, cabinet, _ = served(stalls=[(100.0 + 20 * T, 0.5 * T)])
     assert cabinet.sent_at[-1] - cabinet.sent_at[1] == pytest.approx(48 * T)
 
 
-def test_a_controller_too_slow_for_its_cycle_is_its_own_fault():
+def test_a_controller_too_slow_for_its_cycle_misses_no_answer():
     summary, _, _ = served(cost=1.2 * T)
     assert summary.missed == 0
     assert summary.own_late > 40
 
 
 def test_a_stretched_cycle_waits_for_its_answer_and_the_next_begins_after_it():
-    def answer(index, packet):
-        return [((30.0 if index == 20 else 0.1) * T, echo(packet))]
-
-    summary, cabinet, _ = served(answer, stretch=0.5)
+    summary, cabinet, _ = served(slow({20: 30.0}), stretch=0.5)
     assert (summary.replies, summary.missed, summary.late) == (50, 0, 0)
     assert (summary.stretched, summary.own_late) == (1, 0)
     assert summary.stretch_max == pytest.approx(29.0 * T)
@@ -265,32 +272,29 @@ def test_a_stretched_cycle_waits_for_its_answer_and_the_next_begins_after_it():
     assert max(waited[:20] + waited[21:]) <= T + 1e-12
 
 
-def test_patience_ends_and_what_comes_then_is_missing():
-    def answer(index, packet):
-        return [((300.0 if index == 20 else 0.1) * T, echo(packet))]
-
-    summary, cabinet, _ = served(answer, stretch=0.1, cycles=400)
+def test_an_answer_after_the_stretched_cycle_is_missing():
+    summary, cabinet, _ = served(slow({20: 300.0}), stretch=0.1, cycles=400)
     assert (summary.missed, summary.late) == (1, 1)
     assert summary.stretched == 1
     assert summary.stretch_max == pytest.approx(0.1)
     assert cabinet.accepted[20] is None
 
 
-def test_at_the_end_a_pc_that_has_left_is_waited_for_once():
-    wishes = iter([Request.CONTINUE] * 5)
+def test_at_the_end_a_silent_pc_is_waited_for_once():
+    requests = iter([Request.CONTINUE] * 5)
     summary, cabinet, _ = served(
         lambda k, p: prompt(k, p) if k < 10 else [],
-        request=lambda: next(wishes, Request.END),
+        request=lambda _: next(requests, Request.END),
         stretch=0.5,
         patience=1.0,
-        standing=False,
+        options={"at_rest": False},
         cycles=10_000,
     )
     assert (summary.stretched, summary.missed) == (1, len(cabinet.accepted) - 10)
     assert len(cabinet.accepted) > 400
 
 
-def test_the_first_packet_is_repeated_until_somebody_listens():
+def test_the_first_packet_is_repeated_until_it_is_answered():
     def answer(index, packet):
         return [] if index < 3 else prompt(index, packet)
 
@@ -303,57 +307,44 @@ def test_the_first_packet_is_repeated_until_somebody_listens():
     assert [packet_number(packet) for _, packet in link.sent[3:]] == list(range(1, 51))
 
 
-def test_a_wish_to_end_before_anybody_answered_ends_at_once():
-    asked = iter(range(100))
-    summary, cabinet, _ = served(
-        lambda k, p: [],
-        request=lambda: Request.END if next(asked) > 10 else Request.CONTINUE,
-    )
-    assert not summary.ended
-    assert (summary.cycles, cabinet.accepted) == (0, [])
+class TestRequest:
+    @staticmethod
+    def after(cycles: int, request: Request) -> Callable[[Cabinet], Request]:
+        return lambda cabinet: request if len(cabinet.accepted) > cycles else Request.CONTINUE
+
+    def test_end_before_the_first_answer_ends_at_once(self):
+        polls = iter(range(100))
+        summary, cabinet, _ = served(
+            lambda k, p: [],
+            request=lambda _: Request.END if next(polls) > 10 else Request.CONTINUE,
+        )
+        assert not summary.ended
+        assert (summary.cycles, cabinet.accepted) == (0, [])
+
+    def test_end_finishes_the_session(self):
+        request = self.after(50, Request.END)
+        summary, cabinet, _ = served(request=request, cycles=10_000)
+        assert summary.ended
+        assert cabinet.finished and not cabinet.stopped
+
+    def test_an_arm_not_at_rest_after_the_patience_loses_its_drive(self):
+        summary, cabinet, _ = served(
+            request=self.after(5, Request.END),
+            patience=0.5,
+            cycles=10_000,
+            options={"at_rest": False},
+        )
+        assert summary.ended and cabinet.stopped
+        assert cabinet.reason == "the arm did not stand within 0.5 s of the end"
+        assert cabinet.sent_at[-1] - cabinet.sent_at[5] == pytest.approx(0.5, abs=0.01)
+
+    def test_abort_stops_at_once(self):
+        summary, _, _ = served(request=self.after(6, Request.ABORT), cycles=10_000)
+        assert (summary.cycles, summary.ended) == (7, False)
 
 
-def test_a_wish_to_end_lets_the_controller_finish():
-    clock = VirtualClock()
-    cabinet = Cabinet(clock, cycles=10_000)
-    summary = serve(
-        cabinet,
-        VirtualLink(clock),
-        clock=clock,
-        request=lambda: Request.END if clock.time > 100.05 else Request.CONTINUE,
-    )
-    assert summary.ended
-    assert cabinet.finished and not cabinet.stopped
-
-
-def test_an_arm_that_never_stands_loses_its_drive_when_patience_is_over():
-    clock = VirtualClock()
-    cabinet = Cabinet(clock, cycles=10_000)
-    cabinet.stands = False
-
-    def request() -> Request:
-        return Request.END if len(cabinet.accepted) > 5 else Request.CONTINUE
-
-    summary = serve(cabinet, VirtualLink(clock), clock=clock, request=request, patience=0.5)
-    assert summary.ended and cabinet.stopped
-    assert cabinet.reason == "the arm did not stand within 0.5 s of the end"
-    assert cabinet.sent_at[-1] - cabinet.sent_at[5] == pytest.approx(0.5, abs=0.01)
-
-
-def test_giving_up_stops_in_the_middle():
-    clock = VirtualClock()
-    cabinet = Cabinet(clock, cycles=10_000)
-    summary = serve(
-        cabinet,
-        VirtualLink(clock),
-        clock=clock,
-        request=lambda: Request.ABORT if len(cabinet.accepted) == 7 else Request.CONTINUE,
-    )
-    assert (summary.cycles, summary.ended) == (7, False)
-
-
-def test_a_silent_controller_sends_nothing_and_nobody_is_blamed():
-    summary, cabinet, link = served(silent_in={10, 11, 12})
+def test_cycles_of_a_silent_controller_are_not_missed():
+    summary, cabinet, link = served(options={"silent_in": {10, 11, 12}})
     assert (summary.cycles, summary.replies, summary.missed) == (50, 47, 0)
     assert len(link.sent) == 47
     assert cabinet.accepted[10:13] == [None] * 3
@@ -400,7 +391,7 @@ def test_a_fault_of_the_first_cycle_strikes_once():
     copies=st.lists(st.integers(0, 3), min_size=30),
     naps=st.lists(st.tuples(st.floats(0.0, 0.03), st.floats(0.0, 0.02)), max_size=4),
 )
-def test_whatever_the_pc_does_each_cycle_takes_at_most_one_answer_of_its_own(delays, copies, naps):
+def test_each_cycle_accepts_at_most_one_answer_of_its_own(delays, copies, naps):
     def answer(index, packet):
         if index == 0:
             return prompt(index, packet)
@@ -428,11 +419,11 @@ def test_a_quantile_is_the_duration_to_the_width_of_a_bin(durations: list[float]
     assert histogram.quantile(1.0) <= histogram.largest == ordered[-1]
 
 
-def test_the_memory_of_a_tally_does_not_grow():
-    tally = ServeCounts()
+def test_the_memory_of_counts_does_not_grow():
+    counts = ServeCounts()
     for number in range(5000):
-        tally.count_reply(number, valid=True)
-        tally.count_missing(number)
-    tally.count_discarded(4999)
-    tally.count_discarded(3)
-    assert (tally.late, tally.rejected) == (1, 1)
+        counts.count_reply(number, valid=True)
+        counts.count_missing(number)
+    counts.count_discarded(4999)
+    counts.count_discarded(3)
+    assert (counts.late, counts.rejected) == (1, 1)
