@@ -1,4 +1,4 @@
-"""A player: set-points a period apart; overrides, holds and stops as the guard sees them."""
+"""Set-points of a player; overrides, holds and stops checked by the guard."""
 
 from __future__ import annotations
 
@@ -40,31 +40,25 @@ def motions():
 
 
 def play(player, stop_after=None, extra=5, times=None):
-    """Everything a link would see: the first set-point, then one per cycle."""
-    positions, velocities = [player._last], [np.zeros(6)]
+    """Positions and velocities: the first set-point, then one per cycle, some after the end."""
+    rows = [(player._last, np.zeros(6))]
     times = [] if times is None else times
     times.append(player.motion_time)
-    while not player.finished:
-        if len(positions) - 1 == stop_after:
+    while not player.finished or extra:
+        if len(rows) - 1 == stop_after:
             player.stop()
             stop_after = None
             continue
-        position, velocity = player.advance()
-        positions.append(position)
-        velocities.append(velocity)
+        extra -= player.finished
+        rows.append(player.advance())
         times.append(player.motion_time)
-        assert len(positions) < 100_000
-    for _ in range(extra):
-        position, velocity = player.advance()
-        positions.append(position)
-        velocities.append(velocity)
-        times.append(player.motion_time)
-    return np.array(positions), np.array(velocities)
+        assert len(rows) < 100_000
+    return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
 @given(seed=st.integers(0, 10**6))
 @settings(max_examples=20)
-def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, seed):
+def test_the_distance_from_the_start_remains(motions, seed):
     offset = np.random.default_rng(seed).uniform(-1e-3, 1e-3, 6)
     reference = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     reference.begin(reference.start)
@@ -76,7 +70,7 @@ def test_what_separates_the_arm_from_the_start_is_carried_unchanged(motions, see
 
 
 @pytest.mark.parametrize("away", [1.001e-3, -0.5, np.nan, np.inf])
-def test_an_arm_that_is_elsewhere_is_refused(motions, away):
+def test_an_arm_away_from_the_start_is_refused(motions, away):
     player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     position = player.start.copy()
     position[3] += away
@@ -94,9 +88,7 @@ def test_an_arm_that_is_elsewhere_is_refused(motions, away):
 @example(which=0, share=0.0, period=0.002)
 @example(which=0, share=1.0, period=0.002)
 @example(which=6, share=0.5, period=0.001)
-def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
-    motions, which, share, period
-):
+def test_a_stop_stays_on_the_path_and_within_its_bounds(motions, which, share, period):
     motion, limits = motions[which], SIX_AXES
     player = TrajectoryPlayer(motion, period, limits)
     offset = np.linspace(-9e-4, 9e-4, 6)
@@ -104,7 +96,7 @@ def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
     played = int(share * motion.duration / period)
     positions, velocities = play(player, played, extra=10, times=(times := []))
 
-    # Exactly what a guard sees: differences of consecutive set-points, at rest before and after.
+    # As a guard does: differences of consecutive set-points, at rest before and after.
     seen = np.concatenate((np.tile(positions[0], (5, 1)), positions))
     slack = 1 + 1e-5
     for order, bound in (
@@ -114,22 +106,22 @@ def test_a_stop_at_any_instant_stays_on_the_path_and_within_the_stop_bounds(
     ):
         assert np.all(np.abs(np.diff(seen, order, axis=0)) / period**order <= bound * slack)
     assert np.all(np.abs(velocities) <= limits.velocity * slack)
-    # What is sent as velocity is the slope of what is sent as position.
+    # The velocity is the slope of the positions.
     slope = (positions[2:] - positions[:-2]) / (2.0 * period)
     assert np.all(np.abs(slope - velocities[1:-1]) <= 3.0 * limits.jerk * period**2 / 6.0 + 1e-9)
 
-    # At rest in the end, and for as long as anyone asks.
+    # At rest after the end.
     assert player.finished
     np.testing.assert_array_equal(positions[-11:], np.tile(positions[-1], (11, 1)))
     assert not np.any(velocities[-11:])
 
-    # On the path, which is what it was at some time that only moves on.
+    # On the path, at times that do not decrease.
     q = motion.sample(np.array(times))[0] + offset
     assert np.all(np.diff(times) >= 0.0)
     np.testing.assert_allclose(positions[1 + played :], q[1 + played :], rtol=0, atol=1e-12)
 
 
-def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions):
+def test_a_stop_before_the_first_step_holds_the_arm(motions):
     player = TrajectoryPlayer(motions[1], PERIOD, SIX_AXES)
     player.begin(player.start + 5e-4)
     player.stop()
@@ -139,7 +131,7 @@ def test_a_stop_before_the_first_step_keeps_the_arm_where_it_is(motions):
     assert not np.any(velocity)
 
 
-def test_beginning_again_plays_the_whole_motion_again(motions):
+def test_begin_restarts_the_motion(motions):
     player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
     player.begin(player.start)
     first = play(player)[0]
@@ -152,40 +144,25 @@ def test_beginning_again_plays_the_whole_motion_again(motions):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("settings", "text"),
     [
-        ("period", 0.0),
-        ("period", np.inf),
-        ("period", np.nan),
-        ("override_acceleration", 1.0),
-        ("override_jerk", np.nan),
-        ("stop_acceleration", 1.0),
-        ("stop_jerk", 0.9),
-        ("start_tolerance", -1e-3),
+        *(({"period": period}, "period") for period in (0.0, np.inf, np.nan)),
+        ({"override_acceleration": 1.0}, "override_acceleration"),
+        ({"override_jerk": np.nan}, "override_jerk"),
+        ({"stop_jerk": 0.9}, "stop_jerk"),
+        ({"override_acceleration": 4.0, "stop_acceleration": 3.9}, "stop_acceleration = 3.9 .* at"),
+        ({"override_jerk": 4.0, "stop_jerk": 3.9}, "stop_jerk = 3.9 .* override_jerk"),
+        ({"start_tolerance": -1e-3}, "start_tolerance"),
+        ({"limits": JointLimits([-1.0], [1.0], [1.0], [1.0], [1.0])}, "limits .* joints"),
     ],
 )
-def test_settings_outside_their_range_are_refused(motions, name, value):
-    settings = {"period": PERIOD, name: value}
-    with pytest.raises(InvalidSetting) as refusal:
-        TrajectoryPlayer(motions[0], limits=SIX_AXES, **settings)
-    assert refusal.value.name == name
-
-
-@pytest.mark.parametrize("quantity", ["acceleration", "jerk"])
-def test_a_stop_must_not_be_gentler_than_an_override(motions, quantity):
-    settings = {f"override_{quantity}": 4.0, f"stop_{quantity}": 3.9}
-    with pytest.raises(InvalidSetting, match=f"stop_{quantity} = 3.9 .* override_{quantity}"):
-        TrajectoryPlayer(motions[0], PERIOD, SIX_AXES, **settings)
-
-
-def test_limits_of_another_arm_are_refused(motions):
-    limits = JointLimits([-1.0], [1.0], [1.0], [1.0], [1.0])
-    with pytest.raises(InvalidSetting, match="joints"):
-        TrajectoryPlayer(motions[0], PERIOD, limits)
+def test_settings_outside_their_range_are_refused(motions, settings, text):
+    with pytest.raises(InvalidSetting, match=text):
+        TrajectoryPlayer(motions[0], **{"period": PERIOD, "limits": SIX_AXES} | settings)
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables(motions, moved):
+def test_a_copy_in_another_process_plays_the_same_with_read_only_tables(motions, moved):
     player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
     if moved:
         player.begin(player.start)
@@ -218,7 +195,7 @@ def test_it_goes_on_the_same_in_another_process_which_cannot_write_to_its_tables
     assert not copy._path._pieces.flags.writeable
 
 
-def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused():
+def test_a_start_that_moves_the_motion_out_of_its_range_is_refused():
     upper = SIX_AXES.upper
     points = np.array([np.zeros(6), upper, np.zeros(6)])
     motion = plan(points, SIX_AXES, fly=0.0)
@@ -234,21 +211,26 @@ def test_a_start_that_would_carry_the_motion_out_of_its_range_is_refused():
     assert np.max(np.array(reached) - upper) <= 1e-12
 
 
-class TestCarriedOn:
-    """A controller took the motion on by itself: `k` steps as long as the last one, or to rest."""
+def begun(motion, cycles):
+    """A player after some cycles, and its last two set-points."""
+    player = TrajectoryPlayer(motion, PERIOD, SIX_AXES)
+    player.begin(player.start)
+    before, last = [player.advance()[0] for _ in range(cycles)][-2:]
+    return player, before, last
 
-    LONG = 0.7  # of the motion, in which the arm moves fast
+
+class TestResumeFrom:
+    """The controller extrapolated the motion by `k` steps as long as the last one, or to rest."""
 
     @pytest.fixture
-    def carried(self, motions):
-        player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
-        player.begin(player.start)
-        given = [player.advance()[0] for _ in range(int(self.LONG * player.duration / PERIOD))]
-        return player, given[-1], given[-1] - given[-2]
+    def extrapolated(self, motions):
+        # 0.7 of the motion, where the arm moves fast
+        player, before, last = begun(motions[2], int(0.7 * motions[2].duration / PERIOD))
+        return player, last, last - before
 
     @pytest.mark.parametrize("k", [0, 1, 3, 5])
-    def test_it_stops_on_its_path_within_the_bounds(self, carried, motions, k):
-        player, last, step = carried
+    def test_it_stops_on_its_path_within_the_bounds(self, extrapolated, motions, k):
+        player, last, step = extrapolated
         player.resume_from(last + k * step, step / PERIOD, 2 * k)
         player.stop()
         given = [last + (k - 1) * step, last + k * step]
@@ -260,15 +242,13 @@ class TestCarriedOn:
         assert cKDTree(planned).query(given)[0].max() < 2e-3
 
     @pytest.mark.parametrize("k", [3, 5])
-    def test_gap_after_gap_it_is_at_rest_as_many_set_points_later(self, k):
-        """Else somebody's stop would be void on a link that answers every fourth packet."""
+    def test_a_stop_with_gaps_takes_at_most_twice_as_many_set_points(self, k):
+        """Else a stop has no effect on a link on which every fourth packet is answered."""
         cruise = replace(SIX_AXES, velocity=np.full(6, 0.5))
         line = plan([np.zeros(6), np.full(6, 1.8)], cruise)
 
         def set_points_to_rest(gaps):
-            player = TrajectoryPlayer(line, PERIOD, SIX_AXES)
-            player.begin(player.start)
-            before, last = ([player.advance()[0] for _ in range(int(0.2 / PERIOD))])[-2:]
+            player, before, last = begun(line, int(0.2 / PERIOD))
             player.stop()
             count = 0
             while not player.finished:
@@ -282,13 +262,10 @@ class TestCarriedOn:
 
         assert set_points_to_rest(True) <= 2 * set_points_to_rest(False)
 
-    def test_however_many_gaps_it_stays_within_twice_the_tolerance(self, motions):
-        """A controller that leads it 0.4 mrad aside at each gap is not followed without end."""
-        player = TrajectoryPlayer(motions[2], PERIOD, SIX_AXES)
-        player.begin(player.start)
+    def test_many_gaps_stay_within_twice_the_tolerance(self, motions):
+        """A controller that shifts it by 0.4 mrad at each gap is not followed without limit."""
+        player, before, last = begun(motions[2], int(0.3 * motions[2].duration / PERIOD))
         aside = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 4e-4])
-        played = [player.advance()[0] for _ in range(int(0.3 * player.duration / PERIOD))]
-        before, last = played[-2:]
         with pytest.raises(StartMismatch, match=r"tolerance is 0\.002 rad"):
             for _ in range(30):
                 player.resume_from(last + aside, (last - before) / PERIOD, 2)
@@ -296,13 +273,10 @@ class TestCarriedOn:
 
     @pytest.mark.parametrize("left", [18, 22, 26, 30])
     def test_near_the_end_it_comes_to_rest_within_bounds(self, left):
-        """There the path slows down, stands still at last, and its direction says nothing."""
+        """There the path slows down to rest, and has no direction."""
         points = random_points(0, 4)
         closed = plan([*points, points[0]], SIX_AXES)
-        player = TrajectoryPlayer(closed, PERIOD, SIX_AXES)
-        player.begin(player.start)
-        cycles = round(closed.duration / PERIOD) - left
-        before, last = [player.advance()[0] for _ in range(cycles)][-2:]
+        player, before, last = begun(closed, round(closed.duration / PERIOD) - left)
         step = last - before
         guard = Arm(closed, SIX_AXES).guard
         for one in (guard, player):
@@ -313,8 +287,8 @@ class TestCarriedOn:
             guard.check_set_point(*player.advance(), player.bounds, cycle)
         assert player.finished
 
-    def test_brought_to_rest_it_stays_there(self, carried):
-        player, last, step = carried
+    def test_brought_to_rest_it_stays_there(self, extrapolated):
+        player, last, step = extrapolated
         player.resume_from(last + step, 0.0 * step, 2)
         player.stop()
         position, velocity = player.advance()
@@ -322,28 +296,22 @@ class TestCarriedOn:
         np.testing.assert_array_equal(position, last + step)
         assert not velocity.any()
 
-    def test_away_from_its_path_it_is_refused(self, carried):
-        player, last, step = carried
+    def test_away_from_its_path_it_is_refused(self, extrapolated):
+        player, last, step = extrapolated
         with pytest.raises(StartMismatch, match="the motion at"):
             player.resume_from(last + 3 * step + 2e-3, step / PERIOD, 6)
 
 
 class TestPathReader:
-    """One motion time at a time, as a cycle reads it."""
+    """Evaluation at one motion time, as in each cycle."""
 
-    @given(which=st.integers(0, 5), share=st.floats(0.0, 1.0))
-    def test_it_reads_what_the_table_holds(self, motions, which, share):
+    @pytest.mark.parametrize("which", range(6))
+    def test_it_agrees_with_samples_of_cubics(self, motions, which):
+        """Also at every knot of every joint."""
         motion = motions[which]
-        s = share * motion.duration
-        position, velocity = PathReader(motion).read(s)
-        q, qd, _ = motion.sample_one(s)
-        np.testing.assert_allclose(position, q, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(velocity, qd, rtol=0, atol=1e-12)
-
-    def test_it_reads_at_every_knot_of_every_joint(self, motions):
-        motion = motions[0]
         reader = PathReader(motion)
-        for s in np.concatenate(motion.knots):
+        times = [*np.linspace(0.0, motion.duration, 99), *np.concatenate(motion.knots)]
+        for s in times:
             for near in (np.nextafter(s, 0.0), s, min(np.nextafter(s, np.inf), motion.duration)):
                 q, qd, _ = motion.sample_one(float(near))
                 position, velocity = reader.read(float(near))
@@ -355,7 +323,7 @@ class TestPathReader:
         share=st.floats(0.0, 1.0),
         ramp=st.sampled_from([0.0, 1e-3, 1.5, 4.0]),
     )
-    def test_it_reads_what_a_sum_of_sines_says(self, seed, share, ramp):
+    def test_it_agrees_with_samples_of_sines(self, seed, share, ramp):
         random = np.random.default_rng(seed)
         series = FourierSeries(
             offset=random.uniform(-1.0, 1.0, 6),
@@ -371,22 +339,9 @@ class TestPathReader:
         # A slope of rounding in u is one of rounding / ramp in time.
         np.testing.assert_allclose(velocity, qd, rtol=0, atol=1e-12 / min(ramp or 1.0, 1.0))
 
-    def test_a_trajectory_of_another_kind_is_asked_itself(self):
-        class Line:
-            duration = 2.0
-            n_joints = 2
-
-            def sample(self, t):
-                slope = np.array([1.0, -2.0])
-                return np.outer(t, slope), np.tile(slope, (len(t), 1)), np.zeros((len(t), 2))
-
-        position, velocity = PathReader(Line()).read(0.5)
-        np.testing.assert_array_equal(position, [0.5, -1.0])
-        np.testing.assert_array_equal(velocity, [1.0, -2.0])
-
 
 class Smooth:
-    """A motion from rest to rest that is no table of cubics: a polynomial of degree 7."""
+    """A motion from rest to rest of another kind: a polynomial of degree 7."""
 
     n_joints = 6
 
@@ -406,7 +361,7 @@ class Smooth:
 
 
 def all_at_their_limits(limits):
-    """Every joint at its limits of jerk, acceleration and velocity, there and back."""
+    """Every joint at its limits of jerk, acceleration and velocity, forth and back."""
     rise = limits.acceleration / limits.jerk
     flat = limits.velocity / limits.acceleration - rise
     lengths = [rise, flat, rise, np.full(6, 0.1), rise, flat, rise]
@@ -422,7 +377,7 @@ def all_at_their_limits(limits):
 
 
 class Motions(list):
-    """So many numbers that a failing test should not print them."""
+    """A list whose many numbers a failing test does not print."""
 
     def __repr__(self):
         return "the live_motions"
@@ -430,7 +385,7 @@ class Motions(list):
 
 @pytest.fixture(scope="module")
 def live_motions():
-    """Fast and slow, long and microscopic, of cubics and not, at the very limits and below."""
+    """Fast and slow, long and microscopic, of cubics and not, at the limits and below."""
     limits = SIX_AXES
     short = random_points(0, 1) + np.array([[0.0], [1e-4]])
     middle = (limits.lower + limits.upper) / 2
@@ -450,7 +405,7 @@ def live_motions():
 
 
 class Arm:
-    """Sends what a player gives, as the session would: within what was granted, past the guard."""
+    """Sends the set-points of a player through the guard, within the bounds requested so far."""
 
     def __init__(self, motion, limits, period=PERIOD, offset=0.0):
         bounds = GuardLimits(
@@ -475,7 +430,7 @@ class Arm:
         return self
 
     def run(self, cycles):
-        """Take set-points until there are so many, or the motion ends."""
+        """Send some set-points, or fewer if the motion ends."""
         for _ in range(cycles):
             if self.player.finished:
                 return self
@@ -500,14 +455,14 @@ class Arm:
         return self
 
     def rest(self):
-        """Whatever happens after the end."""
+        """Send some set-points after the end."""
         for _ in range(5):
             position, velocity = self.player.advance()
             self.guard.check_set_point(position, velocity, self.player.bounds, len(self.times))
             assert not np.any(velocity)
 
     def off_the_path(self):
-        """Largest distance of any set-point to the path, which it runs along forwards."""
+        """Largest distance of a set-point from the path; motion time does not decrease."""
         times = np.array(self.times)
         assert np.all(np.diff(times) >= 0.0)
         q = self.motion.sample(times)[0] + self.offset
@@ -539,7 +494,7 @@ waits = st.one_of(st.integers(0, 5), st.integers(0, 400))
 @example(
     6, 0.001, [(1, ("hold", 0.0)), (0, ("override", 0.2)), (0, ("resume", 0.0))], "stop", 5e-288
 )
-def test_nothing_that_can_be_asked_for_is_refused_by_the_guard(
+def test_no_sequence_of_requests_is_refused_by_the_guard(
     live_motions, which, period, script, end, before
 ):
     arm = Arm(live_motions[which], SIX_AXES, period, offset=np.linspace(-9e-4, 9e-4, 6))
@@ -564,7 +519,7 @@ def test_nothing_that_can_be_asked_for_is_refused_by_the_guard(
         assert arm.player.rate == 0.0
 
 
-def test_bounds_say_what_each_set_point_keeps(live_motions):
+def test_bounds_are_those_that_each_set_point_satisfies(live_motions):
     arm = Arm(live_motions[0], SIX_AXES).begin().run(300)
     assert set(arm.bounds) == {"plan"}
     allowed = slowing_bounds(SIX_AXES, 1.3, 1.7, live_motions[0].extrema())
@@ -588,9 +543,7 @@ def test_bounds_say_what_each_set_point_keeps(live_motions):
     assert arm.player.bounds == "stop"
 
 
-def test_an_override_asked_for_while_resuming_keeps_the_wider_bounds_only_where_it_must(
-    live_motions,
-):
+def test_an_override_while_resuming_has_wider_bounds_only_if_necessary(live_motions):
     gentle = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("hold").run(500).ask("resume")
     gentle.run(3).ask("override", 0.4).run(1000)
     assert gentle.bounds[-1] == "plan"
@@ -610,7 +563,7 @@ def test_nothing_resumes_after_a_stop(live_motions):
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.3])
-def test_at_rest_at_the_start_a_rate_is_taken_up_at_once(live_motions, fraction):
+def test_a_rate_at_the_start_applies_at_once(live_motions, fraction):
     arm = Arm(live_motions[0], SIX_AXES).begin().ask("override", fraction).run(100)
     assert set(arm.bounds) == {"plan"}
     np.testing.assert_allclose(arm.times, fraction * PERIOD * np.arange(1, 101), atol=1e-15)
@@ -620,7 +573,7 @@ def test_at_rest_at_the_start_a_rate_is_taken_up_at_once(live_motions, fraction)
     np.testing.assert_array_equal(held.times[100:], arm.times)
 
 
-def test_an_override_lasts_from_one_beginning_to_the_next_and_a_hold_does_not(live_motions):
+def test_begin_clears_a_hold_and_keeps_an_override(live_motions):
     arm = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("override", 0.5).ask("hold").run(9)
     arm.begin()
     assert arm.player.rate == 0.5
@@ -631,7 +584,7 @@ def test_an_override_lasts_from_one_beginning_to_the_next_and_a_hold_does_not(li
 
 
 @pytest.mark.parametrize("fraction", [-1e-9, 1.0 + 1e-9, np.nan, np.inf])
-def test_a_fraction_that_is_none_is_refused_and_changes_nothing(live_motions, fraction):
+def test_an_override_out_of_range_changes_nothing(live_motions, fraction):
     arm = Arm(live_motions[0], SIX_AXES).begin().run(300)
     with pytest.raises(InvalidSetting, match="override"):
         arm.player.override(fraction)
@@ -639,7 +592,7 @@ def test_a_fraction_that_is_none_is_refused_and_changes_nothing(live_motions, fr
     assert arm.player.rate == 1.0
 
 
-def test_the_session_may_override_and_stop_it(live_motions):
+def test_the_session_overrides_and_stops_it(live_motions):
     player = TrajectoryPlayer(live_motions[0], PERIOD, SIX_AXES)
     stop_cycles = int(0.5 / PERIOD)
     execution = MotionExecution(player, 6, settle_cycles=3, stop_cycles=stop_cycles)
@@ -655,12 +608,12 @@ def test_the_session_may_override_and_stop_it(live_motions):
     assert execution.override(1.5) is not None
 
 
-def test_a_motion_that_ends_in_the_middle_of_a_hold_is_over(live_motions):
+def test_a_motion_that_ends_during_a_hold_has_ended(live_motions):
     cycles = int(live_motions[1].duration / PERIOD)
     arm = Arm(live_motions[1], SIX_AXES).begin().run(cycles - 10).ask("hold").run(1000)
     assert arm.player.finished
     rate, bounds = arm.player.rate, arm.player.bounds
-    assert rate > 0.0  # of a time that moves nothing any more
+    assert rate > 0.0  # of motion time after the end
     for request in ("resume", "hold", "stop"):
         arm.ask(request)
         assert (arm.player.rate, arm.player.bounds) == (rate, bounds)

@@ -25,20 +25,20 @@ bounds_of_any_size = st.builds(RateBounds, st.floats(0.01, 100.0), st.floats(0.0
 
 @st.composite
 def states(draw):
-    """Bounds and a state that they admit, often one at the edge of what they do."""
+    """Bounds and a state that they admit, often a limiting one."""
     bounds = draw(bounds_of_any_size)
-    settles = draw(fractions)
-    # The slope can be as large as it takes to settle there from 0, or from 1 for a falling one.
-    most = min(bounds.slope, (2.0 * bounds.change * settles) ** 0.5)
-    least = -min(bounds.slope, (2.0 * bounds.change * (1.0 - settles)) ** 0.5)
+    final = draw(fractions)
+    # The slope can be as large as one that ends there from 0, or from 1 if it is negative.
+    most = min(bounds.slope, (2.0 * bounds.change * final) ** 0.5)
+    least = -min(bounds.slope, (2.0 * bounds.change * (1.0 - final)) ** 0.5)
     slope = draw(st.one_of(st.just(0.0), st.just(most), st.just(least), st.floats(least, most)))
-    return bounds, settles - slope * abs(slope) / (2.0 * bounds.change), slope
+    return bounds, final - slope * abs(slope) / (2.0 * bounds.change), slope
 
 
 @given(states(), fractions)
 @example((RateBounds(1.0, 10.0), 0.0, 0.0), 5e-324)
 @example((RateBounds(1.0, 10.0), 1.0, 0.0), 1.0)
-def test_a_ramp_is_smooth_keeps_its_bounds_and_ends_at_the_target(state, target):
+def test_a_ramp_is_smooth_within_its_bounds_to_the_target(state, target):
     bounds, rate, slope = state
     way = ramp(rate, slope, target, bounds)
     assert way.sample(0.0) == (0.0, rate, slope) or way.duration == 0.0
@@ -49,7 +49,7 @@ def test_a_ramp_is_smooth_keeps_its_bounds_and_ends_at_the_target(state, target)
         assert abs(piece.change) <= bounds.change
         x = end - begin
         assert abs(piece.slope) <= bounds.slope * (1 + 1e-12)
-        # Where the next piece begins, or the target: what this one comes to, without a jump.
+        # No jump to the next piece or the target.
         after = way.sample(end)
         assert after[2] == pytest.approx(piece.slope + x * piece.change, abs=1e-10 * size)
         assert after[1] == pytest.approx(
@@ -67,7 +67,7 @@ def test_a_ramp_is_smooth_keeps_its_bounds_and_ends_at_the_target(state, target)
 @given(states(), fractions)
 def test_no_ramp_is_faster(state, target):
     bounds, rate, slope = state
-    # The reference is known to crash at states on their limit, and not to care below 1e-8.
+    # The reference is known to crash at states on their limit, and is exact to 1e-8.
     slope = float(np.clip(slope, -0.9 * bounds.slope, 0.9 * bounds.slope))
     problem = ruckig.InputParameter(1)
     problem.control_interface = ruckig.ControlInterface.Velocity
@@ -85,7 +85,7 @@ moments = st.one_of(st.just(0.0), st.floats(0.0, 3.0))
 
 
 @given(states(), st.lists(st.tuples(fractions, moments, st.booleans()), min_size=1, max_size=12))
-def test_no_sequence_of_targets_and_wider_bounds_leaves_the_range(state, changes):
+def test_targets_and_wider_bounds_stay_in_the_range(state, changes):
     bounds, rate, slope = state
     seen = []
     for target, share, widen in changes:
@@ -113,11 +113,11 @@ def test_a_state_outside_its_bounds_is_not_admitted(state, rising):
     assert not admits(bounds, 0.75 if rising else 0.25, too_steep if rising else -too_steep)
 
 
-def test_wider_bounds_leave_a_state_that_narrower_ones_do_not_admit_and_still_end_it():
+def test_narrower_bounds_end_a_state_that_they_do_not_admit():
     steep, gentle = RateBounds(4.0, 40.0), RateBounds(1.0, 10.0)
     _, rate, slope = ramp(0.0, 0.0, 1.0, steep).sample(0.15)
     assert not admits(gentle, rate, slope)
-    way = ramp(rate, slope, 0.3, gentle)  # all that can be done is not to make it worse
+    way = ramp(rate, slope, 0.3, gentle)  # the slope must not grow further
     slopes = [way.sample(t)[2] for t in np.linspace(0.0, way.duration, 100)]
     assert max(slopes) <= slope
     assert way.sample(way.duration)[1:] == (0.3, 0.0)
@@ -151,8 +151,8 @@ def limits_of(velocity, acceleration, jerk):
 
 
 @given(joints, rates, rates)
-def test_the_worst_conceivable_path_just_keeps_the_bounds(joints, more, much_more):
-    # All of velocity, acceleration and jerk at their limits at once, signs chosen against us.
+def test_the_worst_path_just_satisfies_the_bounds(joints, more, much_more):
+    # Velocity, acceleration and jerk at their limits at once, with the worst signs.
     velocity, acceleration, jerk = np.array(joints).T
     bounds = slowing_bounds(limits_of(velocity, acceleration, jerk), 1.0 + more, 1.0 + much_more)
     assert bounds.slope > 0.0
@@ -160,16 +160,16 @@ def test_the_worst_conceivable_path_just_keeps_the_bounds(joints, more, much_mor
     used_acceleration = (acceleration + velocity * bounds.slope) / acceleration
     used_jerk = (jerk + 3 * acceleration * bounds.slope + velocity * bounds.change) / jerk
     assert np.all(used_acceleration <= (1.0 + more) * (1 + 1e-9))
-    # At least one joint uses all the jerk that it may, or there would be a faster change.
+    # At least one joint uses all its jerk, or there would be a faster change.
     assert np.max(used_jerk) == pytest.approx(1.0 + much_more)
 
 
 @given(joints, st.tuples(shares, shares, shares), rates, rates)
 @example([(1.0, 1.0, 1.0)], (0.0, 2.2250738585e-313, 0.0), 1.0, 1.0)
-def test_a_path_that_uses_less_than_its_limits_may_slow_faster(joints, used, more, much_more):
+def test_a_path_below_its_limits_may_slow_faster(joints, used, more, much_more):
     velocity, acceleration, jerk = np.array(joints).T
     limits = limits_of(velocity, acceleration, jerk)
-    # Above 1 a path breaks its limits; what it breaks is nothing to count on, nor to divide by.
+    # Above 1 a path breaks its limits.
     v, a, j = (share * q for share, q in zip(used, (velocity, acceleration, jerk), strict=True))
     extrema = Extrema(limits.lower, limits.upper, v, a, j)
     bounds = slowing_bounds(limits, 1.0 + more, 1.0 + much_more, extrema)
@@ -197,7 +197,7 @@ def motions():
     to_rate=st.floats(0.0, 1.0),
 )
 @settings(max_examples=60)
-def test_a_change_of_rate_keeps_its_bounds_between_the_set_points_too(
+def test_bounds_are_satisfied_between_set_points_too(
     motions, which, share, factors, from_rate, to_rate
 ):
     motion, limits = motions[which], SIX_AXES
