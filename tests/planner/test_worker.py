@@ -50,7 +50,7 @@ print("asked", flush=True)
 ruckig.Ruckig(1).calculate(problem, ruckig.Trajectory(1))
 """
 
-# A solver that takes its process with it when a joint is asked to creep.
+# A solver that aborts its process for a very slow joint.
 ABORTING = """
 import os, sys
 from importlib.util import module_from_spec, spec_from_file_location
@@ -99,14 +99,14 @@ def gone(pid: int, within: float) -> bool:
             state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()
         except (FileNotFoundError, ProcessLookupError):
             return True
-        if state[0] == "Z":  # ended; nobody in this container may reap it
+        if state[0] == "Z":  # ended, but not reaped in this container
             return True
         time.sleep(0.02)
     return False
 
 
 def test_the_solver_crashes_on_legal_input():
-    """Why everything in this file exists. Should it fail, the solver has been mended."""
+    """The reason for child processes; if this fails, the solver was repaired."""
     done = subprocess.run(
         [sys.executable, "-c", DIRECT_CALL, json.dumps(CRASH)], capture_output=True, text=True
     )
@@ -114,7 +114,7 @@ def test_the_solver_crashes_on_legal_input():
     assert done.returncode == -signal.SIGSEGV
 
 
-def test_the_states_that_crash_the_solver_are_not_asked_for():
+def test_states_that_crash_the_solver_are_not_passed_to_it():
     limits = JointLimits(
         [-3.0], [3.0], [CRASH["max_velocity"]], [CRASH["acceleration"]], [CRASH["max_jerk"]]
     )
@@ -122,7 +122,7 @@ def test_the_states_that_crash_the_solver_are_not_asked_for():
     assert join(np.array([[p, -v, a]]), np.array([[p, v, a]]), limits, 0.1) is None
 
 
-def test_planning_in_a_child_is_planning():
+def test_plans_of_a_child_are_the_same_and_read_only():
     points = random_points(3)
     motion = plan_in_child(points, SIX_AXES, fly=0.25)
     assert same(motion, plan(points, SIX_AXES, fly=0.25))
@@ -130,16 +130,13 @@ def test_planning_in_a_child_is_planning():
     assert not motion.coefficients[0].flags.writeable
 
 
-def test_errors_come_back_whole():
+def test_errors_have_their_attributes_and_the_traceback_of_the_child():
     with pytest.raises(InvalidSetting, match="fly = 2") as caught:
         plan_in_child(random_points(3), SIX_AXES, fly=2.0)
     assert (caught.value.name, caught.value.value) == ("fly", 2.0)
-
-
-def test_an_unexpected_error_tells_where_it_happened():
-    with pytest.raises(ZeroDivisionError) as caught:
+    with pytest.raises(ZeroDivisionError) as unexpected:
         in_child(divmod, 1, 0)
-    assert "in the planning process" in caught.value.__notes__[0]
+    assert "in the planning process" in unexpected.value.__notes__[0]
 
 
 def test_without_a_child_it_would_end_this_process(aborting_solver):
@@ -158,13 +155,13 @@ plan([one, -one, one / 2], JointLimits(-one, one, one, one, one), speed={CREEP})
 
 @contextmanager
 def workers(count):
-    """Worker processes, ended at last."""
+    """Worker processes, ended afterwards."""
     with ExitStack() as stack:
         yield [stack.enter_context(WorkerProcess()) for _ in range(count)]
 
 
 def together(children, points, limits, speed=None):
-    """Motions through points that workers planned in chunks, as searches have them planned."""
+    """Motions through points, planned by workers in chunks as in a search."""
     shares = np.ones((len(points), limits.n_joints)) if speed is None else speed
 
     def arguments(chunk):
@@ -177,7 +174,7 @@ def test_a_solver_that_aborts_ends_the_child_only(aborting_solver):
     points = random_points(5)
     with WorkerProcess() as child:
         before = child.call(os.getpid)
-        assert child.call(os.getpid) == before == child.pid  # kept warm
+        assert child.call(os.getpid) == before == child.pid
         for _ in range(2):
             with pytest.raises(PlannerCrashed, match="signal 6") as caught:
                 child.call(plan, points, SIX_AXES, speed=CREEP)
@@ -190,7 +187,7 @@ def test_a_solver_that_aborts_ends_the_child_only(aborting_solver):
     assert same(plan_in_child(points, SIX_AXES), plan(points, SIX_AXES))
 
 
-def test_a_process_that_cannot_start_is_an_error_of_its_own(tmp_path, monkeypatch):
+def test_a_process_that_cannot_start_has_its_own_error(tmp_path, monkeypatch):
     (tmp_path / "ruckig.py").write_text("raise SystemExit(3)", encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     with workers(2) as children, pytest.raises(PlannerNotStarted, match="status 3"):
@@ -213,7 +210,7 @@ def test_a_call_that_takes_too_long_is_ended():
 
 
 @pytest.mark.parametrize("task", ["", "child.send(time.sleep, 60.0)"], ids=["idle", "busy"])
-def test_a_child_ends_with_its_parent_even_while_it_works(task):
+def test_a_child_ends_with_its_parent(task):
     script = f"""
 import os, signal, time
 from planner.worker import WorkerProcess
@@ -240,7 +237,7 @@ def test_a_crash_costs_a_search_one_individual(aborting_solver):
         for index in sorted({*range(80)} - {*deadly}):
             (alone,) = plan_chunk(points[[index]], speed[[index]], SIX_AXES, 0.5)
             assert same(planned[index], alone)
-        again = together(children, points[:40], SIX_AXES)  # both are whole
+        again = together(children, points[:40], SIX_AXES)
         assert not any(isinstance(motion, Exception) for motion in again)
 
 
@@ -262,10 +259,10 @@ with WorkerProcess() as one, WorkerProcess() as other:
         pids = [int(pid) for pid in search.stdout.readline().split()]
         time.sleep(0.3)
         os.killpg(search.pid, signal.SIGINT)
-        _, said = search.communicate(timeout=10.0)
+        _, errors = search.communicate(timeout=10.0)
     assert search.returncode == -signal.SIGINT
-    assert said.count("Traceback") == 1
-    assert said.rstrip().endswith("KeyboardInterrupt")
+    assert errors.count("Traceback") == 1
+    assert errors.rstrip().endswith("KeyboardInterrupt")
     assert len(pids) == 2
     assert all(gone(pid, 5.0) for pid in pids)
 
@@ -289,20 +286,7 @@ def in_fork(check) -> bool:
     return False
 
 
-def test_a_fork_has_a_child_of_its_own_and_leaves_the_other_alone():
-    with WorkerProcess() as child:
-        theirs = child.call(os.getpid)
-
-        def has_its_own() -> bool:
-            own = child.pid is None and child.call(os.getpid)
-            child.close()
-            return own not in (False, theirs)
-
-        assert in_fork(has_its_own)
-        assert child.call(os.getpid) == theirs
-
-
-def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
+def test_a_fork_cannot_receive_the_result_of_its_parent():
     with WorkerProcess() as child:
         child.send(os.getpid)
 
@@ -317,22 +301,25 @@ def test_a_fork_cannot_take_the_answer_that_its_parent_waits_for():
         assert child.receive() == child.pid
 
 
-def test_a_worker_used_on_both_sides_of_a_fork_gives_each_its_own_motions():
+def test_a_worker_used_in_a_fork_gets_another_child():
     points = np.array([random_points(seed) for seed in range(64)])
     with workers(1) as children:
-        before = together(children, points, SIX_AXES)
+        before, pid = together(children, points, SIX_AXES), children[0].pid
 
         def backwards() -> bool:
+            other = children[0].pid is None and children[0].call(os.getpid)
             motions = together(children, points[::-1], SIX_AXES)
             children[0].close()
-            return all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
+            unchanged = all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
+            return unchanged and other not in (False, pid)
 
         assert in_fork(backwards)
         after = together(children, points, SIX_AXES)
         assert all(same(a, b) for a, b in zip(after, before, strict=True))
+        assert children[0].pid == pid
 
 
-def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
+def test_a_fork_while_a_thread_plans_can_plan_and_end():
     in_child(os.getpid)
     busy = threading.Thread(target=in_child, args=(time.sleep, 1.0))
     busy.start()
@@ -349,19 +336,19 @@ def test_a_fork_taken_while_a_thread_plans_can_plan_and_end():
 
 @pytest.fixture
 def importable(monkeypatch):
-    """A child finds the functions of these tests under the name that they have here."""
+    """Make the functions of these tests importable in a child."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
 
 
-def test_results_come_in_order_whoever_was_free():
-    with WorkerProcess() as one, WorkerProcess() as other:
+def test_results_are_in_order():
+    with workers(2) as children:
         results = map_in_children(
-            [one, other], np.negative, chunks_of(50, 3), lambda chunk: (np.array(chunk),)
+            children, np.negative, chunks_of(50, 3), lambda chunk: (np.array(chunk),)
         )
     assert results == [-index for index in range(50)]
 
 
-def test_what_the_function_raises_ends_the_map():
+def test_an_exception_of_the_function_ends_the_map():
     with WorkerProcess() as child:
         with pytest.raises(ZeroDivisionError):
             map_in_children([child], operator.truediv, chunks_of(3, 2), lambda _: (1, 0))
@@ -369,7 +356,7 @@ def test_what_the_function_raises_ends_the_map():
 
 
 def killed_so_often(indices, folder, often):
-    """Negate, but for the item 5, end the process so many times as if from outside."""
+    """Negate; end the process some times at item 5, as if from outside."""
     for index in indices:
         count = len(list(Path(folder).iterdir()))
         if index == 5 and count < often:
@@ -380,7 +367,7 @@ def killed_so_often(indices, folder, often):
 
 @pytest.mark.parametrize(("size", "often"), [(1, 1), (4, 2), (1, 99)])
 def test_an_item_killed_from_outside_is_tried_again(size, often, tmp_path, importable):
-    """Alone as much as in company; what ends every process is believed at last."""
+    """Alone and within a chunk; an item that ends every process is an error."""
     with WorkerProcess() as child:
         results = map_in_children(
             [child],
@@ -395,38 +382,38 @@ def test_an_item_killed_from_outside_is_tried_again(size, often, tmp_path, impor
 
 
 def test_a_child_killed_while_it_starts_is_started_again():
-    with WorkerProcess() as one, WorkerProcess() as other:
-        os.kill(one.pid, signal.SIGKILL)
-        results = map_in_children([one, other], list, chunks_of(9, 3), lambda chunk: (chunk,))
+    with workers(2) as children:
+        os.kill(children[0].pid, signal.SIGKILL)
+        results = map_in_children(children, list, chunks_of(9, 3), lambda chunk: (chunk,))
     assert results == list(range(9))
 
 
-def test_what_is_done_is_told_as_it_comes():
-    told = []
+def test_progress_is_reported_by_chunk():
+    numbers = []
     with WorkerProcess() as child:
-        map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=told.append)
-    assert told == [3, 3, 1]
+        map_in_children([child], list, chunks_of(7, 3), lambda chunk: (chunk,), done=numbers.append)
+    assert numbers == [3, 3, 1]
 
 
 class TestStreamInChildren:
-    def test_asks_for_a_chunk_when_a_child_is_free(self):
-        asked = []
+    def test_a_chunk_is_requested_when_a_child_is_free(self):
+        requested = []
 
         def chunks():
             for index in range(50):
-                asked.append(index)
+                requested.append(index)
                 yield [index]
 
         with WorkerProcess() as child:
             results = stream_in_children([child], list, chunks(), lambda chunk: (chunk,))
             assert next(results) == (0, 0)
-            assert asked == [0, 1]
+            assert requested == [0, 1]
             assert sorted(results) == [(index, index) for index in range(1, 50)]
 
-    def test_a_break_costs_no_child_that_is_idle(self):
-        with WorkerProcess() as one, WorkerProcess() as other:
-            results = stream_in_children([one, other], list, [[0]], lambda chunk: (chunk,))
+    def test_an_early_end_closes_no_idle_child(self):
+        with workers(2) as children:
+            results = stream_in_children(children, list, [[0]], lambda chunk: (chunk,))
             assert next(results) == (0, 0)
-            pids = one.pid, other.pid
+            pids = [child.pid for child in children]
             results.close()
-            assert (one.pid, other.pid) == pids
+            assert [child.pid for child in children] == pids
