@@ -1,8 +1,4 @@
-"""Reading of untrusted files: regular files only, of limited size.
-
-A pipe without a writer or a device would block without end. Refusals are `OSError` with the reason
-as `strerror`.
-"""
+"""Reading of untrusted files: regular ones of limited size. A pipe or a device could block."""
 
 from __future__ import annotations
 
@@ -20,7 +16,17 @@ from hil.errors import InputError
 
 _FIRST: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _LAST: Final = datetime(2200, 1, 1, tzinfo=UTC)
-"""Range of times that calendars and time zones support."""
+LARGEST_PORT: Final = 65535
+_MOST_DIGITS: Final = 18  # of a number that fits into 64 bits
+LONGEST_TEXT: Final = 1 << 28  # bytes of the longest text that is read
+_DEEPEST: Final = 32  # nesting of tables and lists
+_NO_FILE: Final = "it is a pipe or a device, not a file"
+_ABSENT: Final = frozenset(
+    {
+        *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
+        errno.EINVAL,  # a pipe or a device, or no path
+    }
+)
 
 
 def parse_time(when: str) -> datetime | None:
@@ -31,11 +37,6 @@ def parse_time(when: str) -> datetime | None:
     except (ValueError, OverflowError):
         return None
     return at if _FIRST <= at < _LAST else None
-
-
-LARGEST_PORT: Final = 65535
-_MOST_DIGITS: Final = 18
-"""Digits of a number that fits into 64 bits."""
 
 
 def parse_count(text: str | None) -> int | None:
@@ -49,19 +50,6 @@ def parse_port(text: str) -> int | None:
     """Return the number of a UDP or TCP port, 1 to 65535; None where the text is none."""
     port = parse_count(text)
     return port if port is not None and 0 < port <= LARGEST_PORT else None
-
-
-LONGEST_TEXT: Final = 1 << 28
-"""Bytes of the longest text that is read; own files have at most a hundredth of it."""
-_DEEPEST: Final = 32
-"""Nesting of tables and lists; own files have four levels."""
-_NO_FILE: Final = "it is a pipe or a device, not a file"
-_ABSENT: Final = frozenset(
-    {
-        *(errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENXIO),
-        errno.EINVAL,  # a pipe or a device, or no path
-    }
-)
 
 
 def open_file(path: Path) -> BufferedReader:
@@ -95,7 +83,7 @@ def read_text(path: Path, longest: int = LONGEST_TEXT) -> str:
 
 
 def is_not_a_file(error: OSError) -> bool:
-    """Return whether the error means that there is no regular file, not that reading failed."""
+    """Return whether there is no regular file, and not a failure of reading."""
     return error.errno in _ABSENT
 
 
@@ -104,22 +92,17 @@ def path_exists(path: Path) -> bool:
     return path.is_symlink() or path.exists()
 
 
-def _remedy(error: OSError | UnicodeDecodeError, otherwise: str) -> str:
-    """Return the remedy for a file that `read_text` refuses."""
-    if isinstance(error, UnicodeDecodeError):
-        return "save it as UTF-8"
-    return "write it to a file first, and name that" if error.strerror == _NO_FILE else otherwise
-
-
 def read_input(path: Path, otherwise: str = "name another file") -> str:
     """Return the text of a file named by the user, or raise InputError."""
     try:
         return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise InputError(
-            path, f"cannot be read ({why})", remedy=_remedy(error, otherwise)
-        ) from error
+        reason = str(error) if isinstance(error, UnicodeDecodeError) else error.strerror
+        if isinstance(error, UnicodeDecodeError):
+            otherwise = "save it as UTF-8"
+        elif reason == _NO_FILE:
+            otherwise = "write it to a file first, and name that"
+        raise InputError(path, f"cannot be read ({reason})", remedy=otherwise) from error
 
 
 def parse_json(text: str | bytes) -> Any:

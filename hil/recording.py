@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from hil.campaign.operator import Stop
 
 KINDS = ("excitation", "validation", "standstill")
-"""Kinds of recordings."""
 
 
 def record(
@@ -37,16 +36,9 @@ def record(
 ) -> Recorded:
     """Record the session of the controller from its first cycle, without requesting any motion.
 
-    Args:
-        link: to the controller.
-        cell: stored in the archive.
-        path: of the archive, which must not exist.
-        kind: one of `KINDS`.
-        stop: ends the recording, as does the end of the session.
-        duration: of the controller's time [s]; None for no limit.
-        wait: time limit for the controller to start [s]; None for none.
-        watch: receives the progress.
-        durable: whether each flush waits for the disk.
+    The kind is one of `KINDS`. `stop` ends the recording, as do the end of the session and the
+    `duration` [s] of the controller's time. `wait` limits the time for the controller to start [s].
+    With `durable` each flush waits for the disk.
 
     Raises:
         ControllerFault: the controller did not start in time, or does not match the cell.
@@ -68,12 +60,8 @@ def archive_spec(
 ) -> ArchiveSpec:
     """Return the specification of an archive with cell, URDF, drive train and plan attached.
 
-    Args:
-        cell: of the arm.
-        path: of the archive.
-        metadata: added to the name of the cell.
-        plan: of the motion; None for one of the controller's own program.
-        durable: whether each flush waits for the disk.
+    A motion of the controller's own program has no plan. The name of the cell is added to the
+    metadata. With `durable` each flush waits for the disk.
     """
     attachments = {
         "cell.toml": cell.text.encode(),
@@ -103,9 +91,8 @@ def archive_path(output: Path, kind: str) -> Path:
             raise InputError(output, "exists already", remedy="archives are never overwritten")
         name = ArchiveName.parse(output)
         if name is not None and name.kind != kind:
-            raise InputError(
-                output, f"is the name of a {name.kind}", remedy=f"add --kind {name.kind}"
-            )
+            problem = f"is the name of a {name.kind}"
+            raise InputError(output, problem, remedy=f"add --kind {name.kind}")
         make_folder(output.parent)
         return output
     make_folder(output)
@@ -125,10 +112,8 @@ def origin_of(
 ) -> dict[str, str]:
     """Return origin, date (none in virtual time) and software of a recording as metadata.
 
-    Args:
-        cell: of the arm.
-        only_simulated: whether only a simulated arm can move; by default by the cell's link.
-        virtual: whether time is virtual; by default by the cell's link.
+    Whether only a simulated arm can move and whether time is virtual follow from the cell's link
+    by default.
     """
     if only_simulated is None:
         only_simulated = cell.only_simulated

@@ -1,8 +1,7 @@
 """Cache of results of archives between runs: small files with checksum, replaced atomically.
 
-In a folder ``.hil-cache`` beside the archives a file is named by its key, a digest of everything
-that the content depends on, so no entry is ever out of date. An entry with a wrong checksum or key
-is ignored; the content of any other is not validated again.
+A file is named by its key, a digest of everything that the content depends on, so no entry is ever
+out of date. An entry with a wrong checksum or key is ignored.
 """
 
 from __future__ import annotations
@@ -44,8 +43,7 @@ from .types import ArchiveRef, Bundle, CacheError, Summary
 
 T = TypeVar("T")
 
-BESIDE: Final = ".hil-cache"
-"""Name of the folder beside the archives."""
+BESIDE: Final = ".hil-cache"  # folder beside the archives
 
 _MAGIC: Final = b"HILCACH3"
 _HEAD: Final = struct.Struct("<8sII")  # magic, length of the JSON text, checksum of what follows
@@ -58,8 +56,7 @@ _TYPES: Final[dict[str, type[Any]]] = {
     )
 }
 
-LIBRARIES: Final = ("numpy", "scipy", "pin")
-"""Packages that determine the numbers."""
+LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 
 
 @dataclass(frozen=True)
@@ -124,11 +121,9 @@ class Store:
             with replace_file(path) as temporary, temporary.open("xb") as file:
                 file.write(encoded(key, content))
         except OSError as error:
-            raise CacheError(
-                path,
-                f"cannot be written ({error.strerror})",
-                remedy="name another folder with --cache, or none",
-            ) from error
+            problem = f"cannot be written ({error.strerror})"
+            remedy = "name another folder with --cache, or none"
+            raise CacheError(path, problem, remedy=remedy) from error
 
     def remove(self, key: str) -> None:
         """Remove an entry, if it is there and can be removed."""

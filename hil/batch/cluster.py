@@ -1,7 +1,6 @@
-"""Re-identification on a Dask cluster: archives are read on its workers.
+"""Re-identification on a Dask cluster, whose workers may join, leave and die.
 
-Workers may join, leave and die; Dask computes the results of a dead worker again. Dask is imported
-only when it is used.
+Dask is imported only when it is used.
 """
 
 from __future__ import annotations
@@ -36,12 +35,9 @@ from .workers import (
 
 T = TypeVar("T")
 
-_POLL: Final = 2.0
-"""Interval of polling the cluster while no result arrives, s."""
-_RETRIES: Final = 3
-"""Number of times that a task is repeated because its worker failed."""
-_AHEAD: Final = 8
-"""Tasks submitted per thread of the cluster: no thread waits, few futures are held."""
+_POLL: Final = 2.0  # s, between polls of the cluster while no result arrives
+_RETRIES: Final = 3  # of a task whose worker failed
+_AHEAD: Final = 8  # tasks submitted per thread of the cluster
 
 _LOST: Final = Unused("", "ended every worker that read it")
 
@@ -194,24 +190,18 @@ class DaskWorkers(Workers):
 
 def _connected(address: str, patience: float) -> Any:
     if find_spec("distributed") is None:
-        raise InputError(
-            None,
-            "a cluster needs the package distributed, which is not installed",
-            field="--dask",
-            remedy=f"install it with: {install_command('cluster')}",
-        )
+        problem = "a cluster needs the package distributed, which is not installed"
+        remedy = f"install it with: {install_command('cluster')}"
+        raise InputError(None, problem, field="--dask", remedy=remedy)
     from distributed import Client
 
     client: Any = Client
     try:
         return client(address, timeout=patience, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise InputError(
-            None,
-            f"no Dask scheduler answers at {address} ({str(error) or type(error).__name__})",
-            field="--dask",
-            remedy="start one with: dask scheduler",
-        ) from error
+        problem = f"no Dask scheduler answers at {address} ({str(error) or type(error).__name__})"
+        remedy = "start one with: dask scheduler"
+        raise InputError(None, problem, field="--dask", remedy=remedy) from error
 
 
 # On a worker
@@ -237,12 +227,9 @@ def version_differences(here: Mapping[str, str], there: Mapping[str, str] | Exce
 def perform_task(
     task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]
 ) -> T | Unused:
-    """Run a task in a child process of a worker.
+    """Run a task in a child process of a worker, for at most `timeout` [s].
 
-    Args:
-        task: to run.
-        timeout: longest time [s].
-        expected: `software_versions` of the client.
+    `expected` are the `software_versions` of the client.
 
     Raises:
         WorkerSoftwareError: the worker has other software.

@@ -1,8 +1,4 @@
-"""Search for archives below folders and URLs, and selection of those that are fitted.
-
-Workers hash each archive and read its metadata, no samples. The result is cached, and valid until
-the file or the programs change.
-"""
+"""Search for archives below folders and URLs, and selection of those that are fitted."""
 
 from __future__ import annotations
 
@@ -42,8 +38,7 @@ _FOR_VIEWERS: Final = "/annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _UNTOUCHED: Final = 2_000_000_000
-"""Age of a file's time stamps from which on they are trusted to show the next change, ns: some file
-systems have steps of two seconds."""
+"""Age of time stamps [ns] from which on they show the next change; some have steps of 2 s."""
 
 
 class Discovery(NamedTuple):
@@ -63,7 +58,8 @@ def discover(
 ) -> Discovery:
     """Find every archive at or below some places.
 
-    An archive whose file has not changed since the last search is not opened.
+    Workers hash each archive and read its metadata. One whose file has not changed since the last
+    search is not opened.
 
     Raises:
         InputError: a place does not exist, an address cannot be read, or there is no archive.
@@ -119,21 +115,15 @@ class Location(NamedTuple):
 
     @property
     def stamp(self) -> Stamp | None:
-        """Stamp of the file now; None of a remote one.
-
-        Raises:
-            ArchiveError: there is no such file.
-        """
+        """Stamp of the file now; None of a remote one."""
         return None if is_url(self.location) else stamp_of(Path(self.location))
 
 
 def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], list[Unused]]:
-    """Find every archive at or below some folders, archives, or URLs of either.
+    """Return the archives at or below some folders, archives, or URLs of either, by location.
 
-    Links are followed; a folder reached by several links is searched once, under its own name.
-
-    Returns:
-        Archives sorted by location; folders and files that cannot be read; broken links.
+    Further, folders and files that cannot be read, and broken links. Links are followed; a folder
+    reached by several links is searched once, under its own name.
 
     Raises:
         InputError: a place does not exist, or an address cannot be read.
@@ -313,7 +303,6 @@ def _select(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
             and one.use in USES
             and ArchiveName.parse(place.name)
         ):
-            # A run that was killed may have closed it without judging it.
             reason = (
                 "is not listed in its campaign's manifest.json: its quality was not checked (the "
                 "run was killed; the next run adds it)"
@@ -356,11 +345,7 @@ def _manifests(places: Iterable[Location]) -> tuple[dict[str, dict[str, Entry]],
 
 
 def _replaced(place: Location, latest: _Attempts) -> str:
-    """Return why an unusable archive is not needed; "" if it is.
-
-    A run that was killed, or whose disk was full, leaves truncated archives; the next run repeats
-    the motion.
-    """
+    """Return why an unusable archive, such as one of a killed run, is not needed; "" if it is."""
     name = ArchiveName.parse(place.name)
     if place.folder.endswith(_FOR_VIEWERS):
         return "is a copy for viewers"

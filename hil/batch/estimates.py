@@ -35,8 +35,7 @@ from .types import ArchiveRef, BatchEstimator, Bundle, Level, LevelEstimate, Sum
 
 Array = NDArray[np.float64]
 
-_NAMED: Final = 12
-"""Number of different warnings that are listed."""
+_NAMED: Final = 12  # different warnings that are listed
 
 
 @dataclass(eq=False)
@@ -103,8 +102,7 @@ class Estimator:
     def of_archive(self, summary: Summary, centre: Array | None) -> Estimate:
         """Return the estimate from one archive, shrunk towards the centre of all.
 
-        The consistent estimator returns the unconstrained estimate, as `hil identify` does: the
-        scatter of repetitions describes noise. A summary has no blocks of time: the covariance is
+        That of the consistent estimator is unconstrained, as in `hil identify`. The covariance is
         that of the unconstrained estimate, shrunk by the same factor.
         """
         own, total = summary.fit, summary.total.total
@@ -118,16 +116,15 @@ class Estimator:
         share = solution.inverse @ equations.A
         known = np.where(np.isfinite(own.covariance), own.covariance, 0.0)
         covariance = share @ known @ share.T
-        covariance += (
-            max(1.0, summary.design_effect) * (solution.inverse * prior) @ solution.inverse
-        )
+        effect = max(1.0, summary.design_effect)
+        covariance += effect * (solution.inverse * prior) @ solution.inverse
         mark_undetermined(covariance, solution.determined)
-        words = own.method.partition(", ")[2]
+        intervals = own.method.partition(", ")[2]
         return replace(
             shrunk,
             covariance=covariance,
             interval_factor=own.interval_factor,
-            method=f"weighted least squares, {self._shrinkage.describe()}; {words}",
+            method=f"weighted least squares, {self._shrinkage.describe()}; {intervals}",
         )
 
     def of_group(self, group: Group, centre: Array | None) -> Estimate:
@@ -173,7 +170,7 @@ def repetition_level(
 ) -> LevelEstimate:
     """Return the estimate of one archive, shrunk towards the centre of its group.
 
-    It references no other arrays: a batch may have very many.
+    Its arrays are copies: a batch may have very many.
     """
     ref, model = summary.ref, estimator.model
     found = estimator.of_archive(summary, centre)
@@ -208,13 +205,7 @@ def sum_level(
 ) -> LevelEstimate:
     """Return the estimate of a campaign, or of all campaigns of an arm.
 
-    Args:
-        level: "campaign" or "pooled".
-        estimator: of the arm.
-        group: its archives.
-        centre: see `Estimator.centre`.
-        warnings: further warnings.
-        payload: stated by the cell.
+    For the centre see `Estimator.centre`; `payload` is that stated by the cell.
 
     Raises:
         IdentificationError: there is no estimate.

@@ -1,7 +1,4 @@
-"""Tasks of a worker: open an archive, decide settings, reduce archives to factors.
-
-All are pure functions of the bytes of archives and of settings.
-"""
+"""Tasks of a worker: open an archive, decide settings, reduce archives to factors."""
 
 from __future__ import annotations
 
@@ -46,17 +43,11 @@ from .remote import local_file
 from .types import ArchiveRef, Bundle, ChangedError, Stamp, Summary, Unused
 
 BUNDLE: Final = 16
-"""Number of archives of a campaign in one entry of the cache: a summary of each and one sum of all,
-which is fifty times the size of a summary."""
+"""Archives in one entry of the cache: a summary of each and one sum, fifty times its size."""
 
 _FIELDS: Final = (
-    "cycle",
-    "gap",
-    "position",
-    "torque",
-    "target_current",
-    "motor_current",
-    "commanded_position",
+    *("cycle", "gap", "position", "torque"),
+    *("target_current", "motor_current", "commanded_position"),
 )
 
 
@@ -85,11 +76,7 @@ def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
 
 
 def require_complete(archive: Archive, location: str) -> None:
-    """Refuse a damaged archive.
-
-    Raises:
-        ArchiveError: with the command of the repair.
-    """
+    """Raise an `ArchiveError` with the command of the repair if an archive is damaged."""
     if archive.damage is not None:
         remedy = f"hil archive repair {location}"
         raise ArchiveError(location, str(archive.damage), remedy=remedy)
@@ -102,11 +89,7 @@ def _require_same(path: Path, ref: ArchiveRef) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    Raises:
-        ArchiveError: it cannot be read.
-    """
+    """Return the SHA-256 of a file, or raise an `ArchiveError`."""
     try:
         return file_digest(path)
     except OSError as error:
@@ -114,11 +97,7 @@ def digest_of(path: Path) -> str:
 
 
 def stamp_of(path: Path) -> Stamp:
-    """Return size, times and inode of a file.
-
-    Raises:
-        ArchiveError: there is none.
-    """
+    """Return size, times and inode of a file, or raise an `ArchiveError`."""
     try:
         found = path.stat()
     except OSError as error:
@@ -290,8 +269,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
         filter(None, (cached_bundle(refs[:count], settings, cache) for count in counts)), None
     )
     found = begun or Bundle(())
-    known = len(found.refs)
-    if known == len(refs):
+    if (known := len(found.refs)) == len(refs):
         return found
     summaries, broken, phase = list(found.summaries), dict(found.broken), found.phase
     lasting = True  # whether errors are due to the bytes of the archives

@@ -1,7 +1,4 @@
-"""Archives in an object store or on a web server, at any address that fsspec supports.
-
-Some need a further package, which the error names. fsspec is imported with the first address.
-"""
+"""Archives at any address that fsspec supports; it is imported with the first address."""
 
 from __future__ import annotations
 
@@ -26,29 +23,23 @@ def is_url(text: str) -> bool:
 
 
 def archives_below(url: str) -> list[tuple[str, str]]:
-    """Return every archive at or below an address, sorted.
+    """Return address and version of every archive at or below an address, sorted.
 
-    Args:
-        url: of an archive, or of a folder (of a web server: one that lists its folders as links).
-
-    Returns:
-        Address and version of each. The version changes when the object does; it is "" where the
-        store states none.
+    The version changes when the object does; it is "" where the store states none. A web server
+    must list its folders as links.
 
     Raises:
         InputError: it cannot be read, or a package for it is missing.
     """
+    found = []
     with _store(url) as (store, root):
         alone = root.endswith(_SUFFIX)
         infos = {root: store.info(root)} if alone else store.find(root, detail=True)
-        return sorted(
-            (
-                str(store.unstrip_protocol(path)),
-                next((str(info[name]) for name in _VERSIONS if info.get(name)), ""),
-            )
-            for path, info in infos.items()
-            if path.endswith(_SUFFIX)
-        )
+        for path, info in infos.items():
+            if path.endswith(_SUFFIX):
+                version = next((str(info[name]) for name in _VERSIONS if info.get(name)), "")
+                found.append((str(store.unstrip_protocol(path)), version))
+    return sorted(found)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Any, Final, TypeVar, cast, get_args
+from typing import Any, TypeVar, cast, get_args
 
 from hil.cell import Cell
 from hil.errors import InputError
@@ -37,8 +37,6 @@ from .workers import ArchiveTask, Workers
 
 T = TypeVar("T")
 
-_TITLE: Final = "reading archives and estimating"
-
 
 def reidentify(
     roots: Sequence[str],
@@ -54,13 +52,8 @@ def reidentify(
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
     They depend neither on the order in which archives are found nor on the workers.
 
-    Args:
-        roots: folders, archives, or URLs of either.
-        options: with a `BatchEstimator`; a single recording is never split.
-        workers: that read the archives.
-        reporter: of progress.
-        cache: location of the cache.
-        check: receives the archives found, before samples are read, and may raise.
+    The roots are folders, archives, or URLs of either. A single recording is never split. `check`
+    receives the archives found, before samples are read, and may raise.
 
     Raises:
         InputError: a place does not exist, no archive can be fitted, or the estimator is not one of
@@ -213,7 +206,7 @@ class _Batch:
         repetitions: list[LevelEstimate] = []
         name = cast(BatchEstimator, self.options.estimator)
         archives = sum(len(refs) for one in campaigns for refs, _ in one.bundles)
-        with self.reporter.task(_TITLE, archives) as progress:
+        with self.reporter.task("reading archives and estimating", archives) as progress:
             for digest, own in groupby(campaigns, lambda one: one.key.arm):
                 members = list(own)
                 settings = members[0].ready
@@ -228,23 +221,26 @@ class _Batch:
                         everything.add(group)
                 estimated += levels
                 repetitions += everything.repetitions
-                if len({ref.key for ref in everything.refs}) == 1:
+                keys = {ref.key for ref in everything.refs}
+                if len(keys) == 1:
                     pooled += [
                         replace(one, level="pooled", campaign="", payload=None) for one in levels
                     ]
                 elif everything.phase is not None:
                     with self._failing(f"arm {digest[:8]}"):
-                        centre = estimator.centre(everything.phase)
-                        apart = _setups({ref.key for ref in everything.refs})
+                        centre, apart = estimator.centre(everything.phase), _setups(keys)
                         pooled.append(sum_level("pooled", estimator, everything, centre, apart))
         # Some reasons begin with the path.
-        broken = tuple(
-            dict.fromkeys(
-                Unused(path, reason.removeprefix(f"{path}: ")) for path, reason in self.broken
-            )
-        )
+        reasons = (Unused(path, text.removeprefix(f"{path}: ")) for path, text in self.broken)
+        broken = tuple(dict.fromkeys(reasons))
         if not repetitions:
-            raise _nothing_to_fit(broken)
+            problem = "there is no excitation and no imported recording that can be fitted"
+            if broken:
+                path, reason = broken[0]
+                first = f"{len(broken)} could not be used, the first of them {path}: {reason}"
+                alone = f"{path} could not be used: {reason}"
+                problem += f"; {first if len(broken) > 1 else alone}"
+            raise InputError(None, problem)
         return BatchResult(
             estimator=self.options.estimator,
             arms=arms,
@@ -300,16 +296,6 @@ class _Batch:
             return factors.cell_in(archive)
 
 
-def _nothing_to_fit(broken: Sequence[Unused]) -> InputError:
-    problem = "there is no excitation and no imported recording that can be fitted"
-    if broken:
-        path, reason = broken[0]
-        which = f"{len(broken)} could not be used, the first of them " if len(broken) > 1 else ""
-        unused = "" if len(broken) > 1 else " could not be used"
-        problem += f"; {which}{path}{unused}: {reason}"
-    return InputError(None, problem)
-
-
 def _setups(keys: Collection[GroupKey]) -> list[str]:
     """Return warnings about campaigns whose cells state different setups."""
     counts = Counter(key.setup for key in keys)
@@ -319,7 +305,5 @@ def _setups(keys: Collection[GroupKey]) -> list[str]:
         f"{setup or 'nothing'} ({plural(count, 'campaign')})"
         for setup, count in sorted(counts.items())
     )
-    return [
-        f"pooled over campaigns whose cells state different payloads or delays, which are "
-        f"compensated: {stated}"
-    ]
+    text = "pooled over campaigns whose cells state different payloads or delays, which are"
+    return [f"{text} compensated: {stated}"]

@@ -28,8 +28,7 @@ SCHEMA_VERSION: Final = 1
 
 Row = dict[str, Any]
 
-# Rows in memory at a time.
-_PORTION = 20_000
+_PORTION: Final = 20_000  # rows in memory at a time
 
 
 class Table(NamedTuple):
@@ -71,19 +70,17 @@ def has_parquet() -> bool:
 def _levels(result: BatchResult) -> Iterator[tuple[LevelEstimate, Row]]:
     """Yield estimates, each with the columns that all its rows share."""
     for level in (*result.repetitions, *result.campaigns, *result.pooled):
-        yield (
-            level,
-            {
-                "level": level.level,
-                "arm": result.arms[level.arm].name,
-                "arm_digest": level.arm,
-                "campaign": level.campaign,
-                "setup": level.setup,
-                "archive": level.archive,
-                "archive_sha256": level.sha256,
-                "when": parse_time(level.when),
-            },
-        )
+        shared = {
+            "level": level.level,
+            "arm": result.arms[level.arm].name,
+            "arm_digest": level.arm,
+            "campaign": level.campaign,
+            "setup": level.setup,
+            "archive": level.archive,
+            "archive_sha256": level.sha256,
+            "when": parse_time(level.when),
+        }
+        yield level, shared
 
 
 def _parameter_rows(result: BatchResult) -> Iterator[Row]:

@@ -75,7 +75,7 @@ class ArchiveRef:
 
     @property
     def key(self) -> GroupKey:
-        """The group of the archive."""
+        """Group of the archive."""
         return GroupKey(self.arm, self.campaign, self.setup)
 
     @property
@@ -95,7 +95,7 @@ class Unused(NamedTuple):
 class Summary:
     """Cached results of one archive, beside the sum of several."""
 
-    ref: ArchiveRef  #: the archive
+    ref: ArchiveRef
     total: PhaseFactor  #: its factor as one block
     #: the estimate from it alone, with cluster-robust covariance; None of a validation run
     fit: Estimate | None
@@ -135,11 +135,10 @@ class Arm:
 class LevelEstimate:
     """Parameters from one repetition, one campaign, or all campaigns of an arm.
 
-    Names, units, values, noise, samples, condition and method are those of
-    :class:`identification.factor.factor.Estimate`.
+    Fields of the same name are those of :class:`identification.factor.factor.Estimate`.
     """
 
-    level: Level  #: which of these
+    level: Level
     arm: str  #: digest of the arm, a key of `BatchResult.arms`
     campaign: str  #: folder; "" if pooled
     #: location and digest of the archive of a repetition; "" otherwise
@@ -179,7 +178,7 @@ class LevelEstimate:
 class BatchResult:
     """Result of a batch."""
 
-    estimator: str  #: by name
+    estimator: str
     arms: Mapping[str, Arm]  #: by digest
     repetitions: tuple[LevelEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
     campaigns: tuple[LevelEstimate, ...]  #: likewise, by arm and time

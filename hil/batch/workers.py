@@ -23,10 +23,8 @@ T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
 Done = Callable[[int], None]
 
-TIMEOUT: Final = 300.0
-"""Longest time for one bundle of archives [s]."""
-_START: Final = 60.0
-"""Longest time in which a new process imports its modules on a busy machine, s."""
+TIMEOUT: Final = 300.0  # s, of one bundle of archives
+_START: Final = 60.0  # s, in which a new process imports its modules on a busy machine
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +110,14 @@ class LocalWorkers(Workers):
                 while k not in early:
                     other, result = next(found)
                     early[other] = result
-                yield self._named(task, early.pop(k))
+                result = early.pop(k)
+                if isinstance(result, PlanningTimedOut):
+                    result = Unused(task.path, f"took longer than {self._timeout:g} s")
+                elif isinstance(result, PlannerCrashed):
+                    status = result.status
+                    end = f"signal {-status}" if status < 0 else f"status {status}"
+                    result = Unused(task.path, f"ended its process, twice, with {end}")
+                yield result
         finally:
             found.close()
             self._idle += [child for child in children if child in self._children]
@@ -122,15 +127,6 @@ class LocalWorkers(Workers):
             self._idle.append(WorkerProcess(timeout=self._timeout + _START))
             self._children += self._idle
         return self._idle.pop()
-
-    def _named(self, task: ArchiveTask[Any], result: Any) -> Any:
-        if isinstance(result, PlanningTimedOut):
-            return Unused(task.path, f"took longer than {self._timeout:g} s")
-        if isinstance(result, PlannerCrashed):
-            status = result.status
-            end = f"signal {-status}" if status < 0 else f"status {status}"
-            return Unused(task.path, f"ended its process, twice, with {end}")
-        return result
 
 
 def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Unused]:
