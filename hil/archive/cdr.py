@@ -1,9 +1,8 @@
 """CDR messages of constant size as numpy structures.
 
 A ROS 2 message in CDR begins with four bytes of encapsulation; every primitive is aligned to its
-own size, counted from after those four bytes. Where names and array lengths are constant, as in a
-recording of JointState messages, all messages of a channel have the same bytes at the same places:
-encoding fills the columns of a structured array, decoding is a view.
+own size, counted from after those four bytes. Where names and array lengths are constant, all
+messages of a channel have the same layout: encoding fills a structured array, decoding is a view.
 """
 
 from __future__ import annotations
@@ -154,12 +153,10 @@ def joint_state_layout(
 
 @lru_cache(maxsize=64)
 def fixed_layout(definition: str) -> MessageLayout:
-    """Return the layout of messages of numbers and fixed arrays; a header is optional.
+    """Return the layout of messages of numbers and fixed arrays, with or without a header.
 
-    The stamp of the header has the fields ``sec`` and ``nanosec``.
-
-    Raises:
-        LayoutError: the size of a field depends on the message, or its type is unknown.
+    The header's stamp has the fields ``sec`` and ``nanosec``. `LayoutError` where the size of a
+    field depends on the message, or its type is unknown.
     """
     layout = _laid_out("", definition, None)
     names = layout.dtype.names or ()
@@ -168,12 +165,10 @@ def fixed_layout(definition: str) -> MessageLayout:
 
 
 def layout_of(kind: str, definition: str, message: bytes) -> MessageLayout:
-    """Return the layout of messages like this one, fields named by their paths.
+    """Return the layout of messages like this little-endian one, fields named by their paths.
 
-    `definition` is ros2msg text with all dependencies, the message is little-endian CDR.
-
-    Raises:
-        LayoutError: the definition is not supported, or the message does not fit it.
+    `definition` is ros2msg text with all dependencies. `LayoutError` if it is not supported, or the
+    message does not fit it.
     """
     if message[:4] != ENCAPSULATION:
         raise LayoutError("its messages are not little-endian CDR")

@@ -80,12 +80,7 @@ class Check:
 
 
 def check_archive(path: str | PathLike[str]) -> Check:
-    """Check whether a file conforms to the profile.
-
-    Raises:
-        NotAnArchiveError: it is of another kind.
-        ArchiveError: it cannot be read.
-    """
+    """Check whether a file conforms to the profile; ArchiveError if it cannot be read."""
     path = Path(path)
     checker = _Checker()
     found, add = scan_file(path, checker.visit), checker.add
@@ -318,12 +313,7 @@ class Overview:
 
 
 def read_overview(path: str | PathLike[str]) -> Overview:
-    """Return the overview of an archive.
-
-    Raises:
-        NotAnArchiveError: another kind of file.
-        ArchiveError: it cannot be read.
-    """
+    """Return the overview of an archive; ArchiveError if it cannot be read."""
     archive, found = open_archive(path, fields=()), scan_file(Path(path))
     header, outcome, stamp = archive.header, archive.outcome, archive.columns["stamp"]
     ended, lost = _ended(outcome)

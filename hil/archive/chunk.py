@@ -129,12 +129,9 @@ class ChunkParser:
             raise Damage(record.offset, f"defines {again} a second time, differently")
 
     def messages(self, chunk: Content, offset: int) -> dict[int, Messages]:
-        """Return the messages of one chunk or of several consecutive ones, by channel.
+        """Return the messages of one chunk, or of several consecutive ones, by channel.
 
-        `offset` is where its record begins in the file.
-
-        Raises:
-            Damage: the chunk has truncated records, or contradictory definitions.
+        `offset` is its place in the file. `Damage` if records are truncated or definitions differ.
         """
         found: dict[int, Messages] = {}
         recent: deque[Content] = deque(maxlen=_LONGEST_PATTERN)

@@ -272,11 +272,8 @@ def chunk_data(head: Chunk, offset: int) -> bytes:
 def decompress(head: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> bytes:
     """Return the records of a chunk at `offset`, their checksum not verified.
 
-    At most one byte more than declared is decompressed: a corrupt frame fills no memory.
-
-    Raises:
-        Damage: the size is above `largest` or `MOST_INFLATION`, not as stated, or the data cannot
-            be decompressed.
+    At most one byte more than declared is decompressed: a corrupt frame fills no memory. `Damage`
+    if the size is above `largest` or `MOST_INFLATION`, not as declared, or the data are corrupt.
     """
     size, data = head.uncompressed_size, head.data
     if size > min(largest, MOST_INFLATION * len(data)):

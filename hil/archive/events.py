@@ -65,11 +65,7 @@ class ArchivedEvent:
 
     @classmethod
     def decode(cls, message: bytes) -> Self:
-        """Decode CDR bytes; a second line that is not a JSON object is part of the text.
-
-        Raises:
-            LayoutError: they are not a log message.
-        """
+        """Decode a log message, else `LayoutError`; a second line that is no JSON is text."""
         if message[: len(ENCAPSULATION)] != ENCAPSULATION:
             raise LayoutError("the message is not little-endian CDR")
         try:

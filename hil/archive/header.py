@@ -134,12 +134,7 @@ def _readable_or_default(
 
 
 class Findings(BaseModel):
-    """What the import of a recording found.
-
-    Attributes:
-        lines: the time base, and the range of each joint.
-        warnings: possible errors of the column map, in sentences.
-    """
+    """Results of an import: time base and ranges; possible errors of the column map."""
 
     model_config = ConfigDict(frozen=True, strict=True)
 
@@ -205,11 +200,7 @@ class ArchiveHeader(BaseModel):
 
     @classmethod
     def of(cls, entries: Mapping[str, str]) -> Self:
-        """Parse the entries of the ``hil`` record.
-
-        Raises:
-            HeaderError: some of them are invalid.
-        """
+        """Parse the entries of the ``hil`` record; `HeaderError` if some are invalid."""
         try:
             return cls.model_validate({**entries, "entries": entries})
         except ValidationError as error:

@@ -68,11 +68,7 @@ class LiveView:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse HOST:PORT, or PORT for connections from this computer only.
-
-        Raises:
-            LiveViewError: the text is neither.
-        """
+        """Parse HOST:PORT, or PORT for connections from this computer only; else LiveViewError."""
         match = _ADDRESS.fullmatch(text.strip())
         if match is None or int(match["port"]) > LARGEST_PORT:
             remedy = f"e.g. {LOOPBACK}:{PORT}"
@@ -173,10 +169,7 @@ class LivePublisher:
 
 
 class ViewerClock:
-    """Converts stamps to this computer's clock, evenly spaced as the controller's cycles.
-
-    Stamps start at zero in each session, which viewers cannot display.
-    """
+    """Converts stamps, from zero in each session, to this computer's clock, evenly spaced."""
 
     def __init__(self) -> None:
         self._offset: int | None = None

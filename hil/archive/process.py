@@ -125,7 +125,6 @@ class Job:
         accepted, ended_count: of the control block at its begin.
         last_record, ended: times of the last record and of the end of the motion, monotonic s.
         flushed: whether all records were written to the disk.
-        exchange_silent: whether silence of the exchange was recorded.
     """
 
     number: int
@@ -170,18 +169,17 @@ class ArchiveProcess:
     def run(self) -> None:
         """Work until the end is commanded, or supervisor and exchange have ended."""
         threading.Thread(target=self._send_heartbeats, daemon=True).start()
-        while not (self._leaving and self._job is None):
-            self._progress = time.monotonic()
-            self._run_command()
-            self._transfer()
-            if self._commands is None and self._job is None and self._exchange_ended():
-                return
-            self._watch_exchange()
-
-    def close_view(self) -> None:
-        """End the live view."""
-        if self._live is not None:
-            self._live.close()
+        try:
+            while not (self._leaving and self._job is None):
+                self._progress = time.monotonic()
+                self._run_command()
+                self._transfer()
+                if self._commands is None and self._job is None and self._exchange_ended():
+                    return
+                self._watch_exchange()
+        finally:
+            if self._live is not None:
+                self._live.close()
 
     def leave(self, _signum: int, _frame: FrameType | None) -> None:
         """Handle SIGTERM: complete the open archive, then end."""
@@ -401,10 +399,7 @@ def main() -> None:
         PacketReader(packets[0]) if packets else None,
     )
     signal.signal(signal.SIGTERM, process.leave)
-    try:
-        process.run()
-    finally:
-        process.close_view()
+    process.run()
 
 
 if __name__ == "__main__":

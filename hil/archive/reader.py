@@ -128,11 +128,7 @@ class Archive:
         return found
 
     def cycles(self) -> Rows:
-        """Return the cycle records as the session wrote them, of type `drivers.cycle_dtype`.
-
-        Raises:
-            ArchiveError: the archive was opened without all fields, or has no cycles.
-        """
+        """Return the cycle records, of type `drivers.cycle_dtype`; ArchiveError if fields lack."""
         rows = np.zeros(self.n_samples, cycle_dtype(len(self.joint_names)))
         for name in rows.dtype.names or ():
             if name in self.columns:

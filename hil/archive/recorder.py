@@ -121,11 +121,7 @@ class ArchiveSpec:
     packets: bool = False
 
     def open(self) -> ArchiveWriter:
-        """Create the file.
-
-        Raises:
-            ArchiveWriteError: it exists, cannot be written, or the metadata are invalid.
-        """
+        """Create the file; ArchiveWriteError if it exists or cannot be written."""
         return ArchiveWriter(**{one.name: getattr(self, one.name) for one in fields(self)})
 
 
@@ -161,12 +157,7 @@ class Recorded:
 class Recorder:
     """Fills one archive from records and events, and closes it with the true outcome.
 
-    A file contains cycles of one session with the controller; those of a later session are left
-    out.
-
-    Args:
-        writer: the archive.
-        drive_train: of the link; converts target currents to joint torques.
+    It contains cycles of one session with the controller; those of a later one are left out.
 
     Attributes:
         ended: end of the motion, None before.
@@ -174,7 +165,6 @@ class Recorder:
         link_lost: whether the link was lost meanwhile.
         refused: the last refusal of the session meanwhile, None without one.
         records: number of archived records.
-        newest: cycle of the newest archived record, -1 before the first.
     """
 
     def __init__(self, writer: ArchiveWriter, drive_train: DriveTrain) -> None:
@@ -184,11 +174,9 @@ class Recorder:
         self.link_lost = False
         self.refused: Refused | None = None
         self.records = 0
-        self.newest = -1
         self._records_lost = 0
         self._events_lost = 0
         self._packets_lost = 0
-        self._missed = 0
         self._late = 0
         self._not_accepted = 0
         self._drive_train = drive_train
@@ -197,10 +185,7 @@ class Recorder:
         self._packets_cut = False
 
     def record_packets(self, packets: Records, lost: int = 0) -> None:
-        """Archive raw packets, `lost` of which were overwritten before; call it before `record`.
-
-        An archive without packets drops them.
-        """
+        """Archive raw packets, `lost` of which were overwritten, before their records."""
         if not self.writer.with_packets:
             return
         self._packets_lost += lost
@@ -216,9 +201,6 @@ class Recorder:
 
         The records must include those up to the newest event. Events are archived up to the init
         packet that begins another session, that one included.
-
-        Raises:
-            ArchiveWriteError: the file cannot be written.
         """
         restarts = [k for k, event in enumerate(events) if isinstance(event, InitReceived)]
         own = () if self.restarted else events[: restarts[0] + 1] if restarts else events
@@ -238,7 +220,9 @@ class Recorder:
 
     def motion_ended(self, outcome: Outcome, interval: int) -> None:
         """Record that the motion ended when its event was lost."""
-        ended = MotionEnded(outcome, "the event with the reason was lost", interval, self.newest)
+        ended = MotionEnded(
+            outcome, "the event with the reason was lost", interval, self.writer.newest
+        )
         self.update([ended])
         self._archive(ended)
 
@@ -250,7 +234,7 @@ class Recorder:
     def lacks_packets(self) -> bool:
         """Whether raw packets of the newest archived record are missing."""
         expected = self.writer.with_packets and not self._packets_cut
-        return expected and self._newest_packet < self.newest
+        return expected and self._newest_packet < self.writer.newest
 
     @property
     def complete(self) -> bool:
@@ -259,7 +243,7 @@ class Recorder:
             return False
         if _at_rest(self.ended) or self._cut or self.restarted:
             return True
-        return self.newest >= self._last_cycle
+        return self.writer.newest >= self._last_cycle
 
     def close(self, outcome: str, reason: str = "") -> Recorded:
         """Complete the archive, and return what it contains."""
@@ -277,11 +261,11 @@ class Recorder:
             outcome=outcome,
             reason=reason,
             interval=-1 if self.ended is None else self.ended.interval,
-            seconds=(self.newest + 1) * self.writer.period,
+            seconds=(self.writer.newest + 1) * self.writer.period,
             records=self.records,
             records_lost=self._records_lost,
             events_lost=self._events_lost,
-            missed=self._missed,
+            missed=self.writer.missed,
             late=self._late,
             not_accepted=self._not_accepted,
             disk_waited=self.writer.file.slowest_flush,
@@ -322,13 +306,11 @@ class Recorder:
         """Archive the records up to the end of the session and of the aftermath."""
         if self._cut or not len(records):
             return
-        records, self._cut = self._own_rows(records, self.newest, least=1)
+        records, self._cut = self._own_rows(records, self.writer.newest, least=1)
         if not len(records):
             return
         self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
         self.records += len(records)
-        self._missed += int(records["gap"].sum())
-        self.newest = int(records["cycle"][-1])
 
 
 _DATA: Final[Mapping[type, Sequence[str]]] = {

@@ -29,11 +29,7 @@ Visit = Callable[[Scan, Mapping[str, Messages], int], None]
 
 
 def scan_file(path: Path, visit: Visit = lambda *_: None) -> Scan:
-    """Scan a whole file, past its damages; `visit` gets each valid chunk, see `Scan`.
-
-    Raises:
-        ArchiveError: it cannot be read.
-    """
+    """Scan a whole file, past its damages; ArchiveError if it cannot be read."""
     try:
         with open_file(path) as stream:
             return Scan(stream, visit, past_damage=True)
@@ -47,8 +43,7 @@ class Repair:
 
     Attributes:
         output: the repaired file, None where nothing had to be written.
-        intact: whether the archive had no fault.
-        losses: what is lost, one sentence each; empty if all that was written is there.
+        losses: one sentence each; empty if all that was written is there.
         samples, samples_lost: in the repaired file, and lost; None where unknown.
     """
 
@@ -138,12 +133,8 @@ def _rewrite(
 ) -> None:
     """Write the valid content of an archive to `target`, which may be the source.
 
-    The output is on the disk when this returns, and has the mode of its source. `outcome` has
-    entries of the outcome to replace.
-
-    Raises:
-        ArchiveWriteError: the output cannot be written.
-        ArchiveError: the output cannot be read back; it is removed.
+    The output has the mode of its source, and is on the disk when this returns; one that cannot be
+    read back is removed. `outcome` has entries of the outcome to replace.
     """
     try:
         with path.open("rb") as stream, replace_file(target) as temporary:

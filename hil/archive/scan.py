@@ -297,11 +297,7 @@ class Scan:
             self.faults.append(fault)
 
     def _add(self, record: Record) -> None:
-        """Verify the next record, and add what it contains.
-
-        Raises:
-            Damage: it is not the next record that was written.
-        """
+        """Verify the next record, and add its content; `Damage` if it is not the next one."""
         self.record, offset = record, record.offset
         if record.opcode == container.CHUNK:
             if self.metadata is None:
@@ -360,11 +356,7 @@ class Scan:
                 self._flush()
 
     def _flush(self) -> None:
-        """Decode the buffered chunks: all at once, or one by one where that fails.
-
-        Raises:
-            Damage: one of them does not follow those before.
-        """
+        """Decode the buffered chunks: all at once, or one by one where that fails."""
         pending, self._pending = self._pending, []
         if len(pending) > 1:
             try:
@@ -524,7 +516,7 @@ def _data_end(stream: BinaryIO, size: int) -> int | None:
 def _chunks_outside(summary: Summary | None, times: tuple[int, int]) -> Collection[int]:
     """Return the places of chunks without messages of these times, by the index.
 
-    If that is all of them, the first is read anyway: it defines the columns.
+    If all are outside, the first is read anyway: it defines the columns.
     """
     if summary is None or times == ALWAYS:
         return ()

@@ -309,13 +309,10 @@ def _filled(
 def message_layout(
     topic: str, joints: Sequence[str], record: Schema | None, first: bytes
 ) -> MessageLayout:
-    """Return the layout of the messages of a topic of numbers.
+    """Return the layout of the messages of a topic of numbers, else `LayoutError`.
 
     `record` is the schema in the file, None where it has none; `first` is one of the messages:
     joint states may lack quantities.
-
-    Raises:
-        LayoutError: a number is missing, or of another type or length than in the profile.
     """
     n = len(joints)
     if topic in (MEASURED, COMMANDED):
@@ -355,7 +352,7 @@ def description_messages(urdf: bytes) -> dict[Channel, bytes]:
         text = urdf.decode()
         builder.string(text)
         root = fromstring(text)
-        poses = [*_base_poses(root), *_fixed_poses(root)]
+        poses = [*_poses(root)]
         transforms.count(len(poses))
         for k, (parent, child, _) in enumerate(poses):
             transforms.variable(f"stamp{k}", "uint32", 2)  # zero: at all times
@@ -374,18 +371,22 @@ _Pose = tuple[str, str, tuple[float, ...]]
 """Parent, child, and the child's origin [m] and quaternion (x, y, z, w) in the parent."""
 
 
-def _base_poses(root: Element) -> Iterator[_Pose]:
-    links = [link.get("name", "") for link in root.findall("link")]
+def _poses(root: Element) -> Iterator[_Pose]:
+    """Yield the base in the world, then the fixed joints."""
+
+    def link(joint: Element, end: str) -> str:
+        found = joint.find(end)
+        return "" if found is None else found.get("link", "")
+
+    links = [one.get("name", "") for one in root.findall("link")]
     if not links:
         raise ValueError("it has no link")
-    children = {_link(joint, "child") for joint in root.findall("joint")}
+    joints = root.findall("joint")
+    children = {link(joint, "child") for joint in joints}
     for base in links:
         if WORLD not in links and base not in children:
             yield WORLD, base, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-def _fixed_poses(root: Element) -> Iterator[_Pose]:
-    for joint in root.findall("joint"):
+    for joint in joints:
         if joint.get("type") == "fixed":
             origin = joint.find("origin")
             stated = {} if origin is None else origin.attrib
@@ -393,12 +394,7 @@ def _fixed_poses(root: Element) -> Iterator[_Pose]:
                 map(float, stated.get(key, "0 0 0").split()) for key in ("xyz", "rpy")
             )
             pose = (x, y, z, *_quaternion(roll, pitch, yaw))
-            yield _link(joint, "parent"), _link(joint, "child"), pose
-
-
-def _link(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    return "" if found is None else found.get("link", "")
+            yield link(joint, "parent"), link(joint, "child"), pose
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:

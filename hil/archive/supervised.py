@@ -26,10 +26,8 @@ from hil.archive.recorder import ArchiveSpec, Recorded
 class Open:
     """Open an archive; one that is open is closed as interrupted.
 
-    Attributes:
-        from_now: leave out earlier records; otherwise begin with the oldest buffered one of the
-            session.
-        until_ended: close it when the motion has ended; otherwise only on `Close`.
+    Without `from_now` it begins with the oldest buffered record of the session. With `until_ended`
+    it is closed at the end of the motion; otherwise only on `Close`.
     """
 
     job: int
@@ -109,12 +107,7 @@ class Channel:
         return self._socket.fileno()
 
     def send(self, message: Any) -> None:
-        """Send a message.
-
-        Raises:
-            TimeoutError: the peer does not receive it; the channel cannot be used further.
-            OSError: the peer has closed its end.
-        """
+        """Send a message; TimeoutError if the peer does not receive it, and the channel is lost."""
         data = pickle.dumps(message, protocol=5)
         parts = range(0, len(data), self.PART)
         self._socket.sendall(len(parts).to_bytes(4, "little"))
@@ -122,11 +115,7 @@ class Channel:
             self._socket.sendall(data[start : start + self.PART])
 
     def receive(self) -> Any:
-        """Wait for the next message and return it.
-
-        Raises:
-            EOFError: the peer has closed its end, or stopped within a message.
-        """
+        """Wait for the next message; EOFError if the peer has closed, or stopped within one."""
         head = self._part()
         return pickle.loads(b"".join(self._part() for _ in range(int.from_bytes(head, "little"))))
 
@@ -165,10 +154,6 @@ class SharedMemory(Protocol):
     control_fd: int
 
 
-def _import_paths() -> list[str]:
-    return [path or str(Path.cwd()) for path in sys.path]
-
-
 @dataclass(eq=False)
 class ArchiveProcessHandle:
     """Starts, commands and ends the archive process, a child in its own process session."""
@@ -184,11 +169,7 @@ class ArchiveProcessHandle:
     def start(
         cls, memory: SharedMemory, n_joints: int, packets_fd: int = -1
     ) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory; `packets_fd` if packets are stored.
-
-        Raises:
-            OSError: the process, a socket or memory cannot be created.
-        """
+        """Start the process on the exchange's shared memory; `packets_fd` if packets are stored."""
         control = ControlBlock(memory.control_fd)
         monitor = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
@@ -201,6 +182,7 @@ class ArchiveProcessHandle:
             passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno(), exchange)
             packets = () if packets_fd < 0 else (packets_fd,)
             numbers = map(str, (*passed, n_joints, *packets))
+            import_paths = [path or str(Path.cwd()) for path in sys.path]
             process = subprocess.Popen(
                 [sys.executable, "-m", "hil.archive.process", *numbers],
                 pass_fds=(*passed, *packets),
@@ -208,7 +190,7 @@ class ArchiveProcessHandle:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=stderr,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(_import_paths())},
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(import_paths)},
             )
             undo.pop_all()
             os.close(exchange)

@@ -267,6 +267,8 @@ class ArchiveWriter:
 
     Attributes:
         file: counts of messages, time of the slowest flush, and whether it is closed.
+        newest: the last cycle added, -1 before the first.
+        missed: packets lost by the link, by the records.
 
     Raises:
         ArchiveWriteError: the file exists or cannot be written, or the metadata are invalid.
@@ -291,8 +293,8 @@ class ArchiveWriter:
         self._pending: list[tuple[Rows, Array]] = []
         self._pending_packets: list[Rows] = []
         self._first: int | None = None
-        self._newest = 0
-        self._lost = 0
+        self.newest = -1
+        self.missed = 0
         self.file = ArchiveFile(
             self.path,
             joint_names=joint_names,
@@ -306,7 +308,7 @@ class ArchiveWriter:
     @property
     def chunk_ends_in(self) -> float:
         """Time of the controller until the chunk in progress is complete and written [s]."""
-        begun = 0 if self._first is None else self._newest + 1 - self._first
+        begun = 0 if self._first is None else self.newest + 1 - self._first
         return (self._cycles_per_chunk - begun % self._cycles_per_chunk) * self.period
 
     def write(self, records: Rows, torque: Array | None = None) -> None:
@@ -333,15 +335,15 @@ class ArchiveWriter:
         self._check_growth(cycles)
         if self._first is None:
             self._first = int(cycles[0])
-        self._newest = int(cycles[-1])
-        self._lost += int(records["gap"].sum())
+        self.newest = int(cycles[-1])
+        self.missed += int(records["gap"].sum())
         self._pending.append((records, torques))
         oldest = int(self._pending[0][0]["cycle"][0])
-        if self._slot(oldest) != self._slot(self._newest + 1):
+        if self._slot(oldest) != self._slot(self.newest + 1):
             self._emit(everything=False)
 
     def _check_growth(self, cycles: NDArray[np.int64]) -> None:
-        before = int(cycles[0]) - 1 if self._first is None else self._newest
+        before = int(cycles[0]) - 1 if self._first is None else self.newest
         falling = np.flatnonzero(np.diff(cycles, prepend=before) <= 0)
         if not falling.size:
             return
@@ -359,9 +361,6 @@ class ArchiveWriter:
 
         Each is written with the chunk of its cycle; one whose chunk was written goes into the next.
         They are referenced until then, so pass a copy.
-
-        Raises:
-            ValueError: the archive was opened without packets.
         """
         if not self.with_packets:
             raise ValueError("this archive was opened without packets")
@@ -382,7 +381,7 @@ class ArchiveWriter:
         `cycle` is that of the controller in which it happened, None for the newest one written;
         `data` are JSON values.
         """
-        time = (self._newest if cycle is None else cycle) * self.period
+        time = (self.newest if cycle is None else cycle) * self.period
         self.file.add_event(ArchivedEvent(time, name, text, level, data or {}))
 
     def flush(self) -> None:
@@ -394,26 +393,23 @@ class ArchiveWriter:
     def close(
         self, outcome: str, *, reason: str = "", details: Mapping[str, str] | None = None
     ) -> None:
-        """Write the outcome and close the archive.
+        """Write the outcome, such as ``completed``, and close the archive.
 
-        Args:
-            outcome: how the interval ended, such as ``completed``, ``stopped``, ``refused``.
-            reason: why it did not complete.
-            details: further entries of the ``hil.outcome`` record.
+        `details` are further entries of the ``hil.outcome`` record.
         """
         if self.file.closed:
             return
         self._emit(everything=True)
-        self._emit_packets(None if self._first is None else self._newest)
+        self._emit_packets(None if self._first is None else self.newest)
         counts = self.file.counts
         cycles = {
             "samples": counts[CYCLE],
             "events": counts[EVENTS],
-            "lost_packets": self._lost,
+            "lost_packets": self.missed,
             **({"packets": counts[PACKETS]} if self.with_packets else {}),
         }
         if self._first is not None:
-            cycles |= {"first_cycle": self._first, "last_cycle": self._newest}
+            cycles |= {"first_cycle": self._first, "last_cycle": self.newest}
         texts = {key: str(value) for key, value in cycles.items()}
         self.file.finish({**(details or {}), "outcome": outcome, "reason": reason, **texts})
 
@@ -438,7 +434,7 @@ class ArchiveWriter:
         torque = np.concatenate([part for _, part in self._pending])
         slots = (records["cycle"] - (self._first or 0)) // self._cycles_per_chunk
         cuts = [0, *(np.flatnonzero(np.diff(slots)) + 1).tolist(), len(records)]
-        if not everything and self._slot(self._newest + 1) == slots[-1]:
+        if not everything and self._slot(self.newest + 1) == slots[-1]:
             cuts.pop()
         for start, stop in pairwise(cuts):
             part = records[start:stop]

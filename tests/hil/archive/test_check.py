@@ -1,7 +1,6 @@
-"""Conformance check: each rule of docs/archive-format.md, violated one at a time.
+"""Conformance check, each rule of docs/archive-format.md violated once; commands `hil archive`.
 
-The files are written by the mcap library, not by the own writer. Also the commands of `hil
-archive`: text, JSON and exit statuses.
+The files are written by the mcap library, not by the own writer.
 """
 
 from __future__ import annotations
@@ -142,7 +141,7 @@ def test_violated_rule_is_named(what, content, written, tmp_path):
         assert "/joint_states unlike its cycles" in check.faults["joint_states"][0]
 
 
-def test_imported_recordings_are_checked_by_their_own_rules(tmp_path):
+def test_imported_recording_conforms(tmp_path):
     position = np.random.default_rng(1).normal(size=(2500, 2))
     stamp = 7 + np.arange(2500, dtype=np.int64) * 8_000_000
     samples = Samples(stamp, position, motor_current=position)
@@ -151,7 +150,7 @@ def test_imported_recordings_are_checked_by_their_own_rules(tmp_path):
     assert check.conforms, check.faults
 
 
-def test_a_damaged_description_is_a_fault_of_an_archive(written, tmp_path):
+def test_damaged_description_is_a_fault(written, tmp_path):
     description = next(r for r in written.records if r.opcode == container.METADATA)
     path = tmp_path / written.path.name
     path.write_bytes(written.changed(description, -3, mask=1))
@@ -188,7 +187,7 @@ def run(*arguments: str | Path):
 
 
 @pytest.fixture
-def torn(tmp_path, written) -> Path:
+def truncated(tmp_path, written) -> Path:
     path = tmp_path / written.path.name
     path.write_bytes(written.data[: written.chunks[2].end])
     return path
@@ -201,26 +200,20 @@ def text_file(tmp_path) -> Path:
 
 
 class TestCheck:
-    def test_conforming_archive(self, written):
-        done = run("check", written.path)
-        assert done.exit_code == 0
+    def test_text_names_faults_and_repair(self, written, truncated, text_file):
+        done = run("check", written.path, truncated, text_file)
+        assert done.exit_code == 2
         assert "conforms to profile 1, 43 samples" in done.stdout
-
-    def test_damaged_archive_names_the_repair(self, torn, written, text_file):
-        done = run("check", torn)
-        assert done.exit_code == 5
         assert "the outcome is missing" in done.stdout
-        assert f"hil archive repair {torn}" in done.stdout
-        done = run("check", written.path, torn, text_file)
-        assert done.exit_code == 2
+        assert f"hil archive repair {truncated}" in done.stdout
         assert f"{text_file}: is not an MCAP file" in done.stderr
+        assert [run("check", path).exit_code for path in (written.path, truncated)] == [0, 5]
 
-    def test_json_has_a_line_per_file(self, written, torn, text_file):
-        done = run("check", "--json", written.path, torn, text_file)
+    def test_json_has_a_line_per_file(self, written, truncated, text_file):
+        done = run("check", "--json", written.path, truncated, text_file)
         assert done.exit_code == 2
-        whole, cut, other = (json.loads(line) for line in done.stdout.splitlines())
-        assert whole["keeps"]
-        assert all(aspect["keeps"] for aspect in whole["aspects"].values())
+        intact, cut, other = (json.loads(line) for line in done.stdout.splitlines())
+        assert all([intact["keeps"], *(one["keeps"] for one in intact["aspects"].values())])
         assert not cut["keeps"]
         assert cut["aspects"]["outcome"]["faults"] == ["the outcome is missing"]
         assert other["archive"] is False
@@ -236,17 +229,17 @@ class TestRepair:
         assert f"wrote {repaired}: 43 samples, none lost" in done.stdout
         assert repaired.read_bytes() == written.data
 
-    def test_loss_is_printed_and_sets_the_exit_status(self, torn, tmp_path):
+    def test_loss_is_printed_and_sets_the_exit_status(self, truncated, tmp_path):
         output = tmp_path / "out.mcap"
-        done = run("repair", torn, "-o", output)
+        done = run("repair", truncated, "-o", output)
         assert done.exit_code == 3
         assert "lost: the outcome is missing" in done.stderr
         assert open_archive(output).n_samples == 30
-        before = torn.read_bytes()
-        run("repair", torn)
-        assert torn.read_bytes() == before
-        assert run("repair", torn, "--in-place").exit_code == 3
-        assert open_archive(torn).complete
+        before = truncated.read_bytes()
+        run("repair", truncated)
+        assert truncated.read_bytes() == before
+        assert run("repair", truncated, "--in-place").exit_code == 3
+        assert open_archive(truncated).complete
 
     def test_nothing_to_repair_or_to_save(self, written, text_file):
         done = run("repair", written.path)
@@ -258,7 +251,7 @@ class TestRepair:
 
 
 class TestInfo:
-    def test_prints_the_content(self, written, torn, text_file):
+    def test_prints_the_content(self, written, truncated, text_file):
         done = run("info", written.path)
         assert done.exit_code == 0
         for words in (
@@ -272,7 +265,7 @@ class TestInfo:
             "tick: text",
         ):
             assert words in done.stdout
-        done = run("info", torn)
+        done = run("info", truncated)
         assert done.exit_code == 0
         assert "30 samples" in done.stdout
         assert "hil archive repair" in done.stdout

@@ -1,4 +1,4 @@
-"""Parts of an archive: columns, channels and times, without decoding or holding the rest."""
+"""Parts of an archive: columns, channels and times, without decoding the rest."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ instants = st.none() | st.floats(49.5, 51.0) | st.integers(4999, 5050).map(lambd
 
 class TestTimes:
     @given(instants, instants, st.booleans(), st.sampled_from([0, 1 << 20]))
-    def test_a_range_holds_what_is_in_it_and_no_more(self, written, start, stop, torn, batch):
-        """Of a torn file what it still has."""
+    def test_range_selects_samples_and_events(self, written, start, stop, truncated, batch):
+        """Of a truncated file what is left."""
         path, sound = written.path, 43
-        if torn:
-            path, sound = path.with_name("torn.mcap"), 30
+        if truncated:
+            path, sound = path.with_name("truncated.mcap"), 30
             path.write_bytes(written.data[: written.chunks[3].offset])
         with mock.patch("hil.archive.scan._BATCH", batch):  # bytes of chunks decoded at once
             archive = open_archive(path, start=start, stop=stop)
@@ -46,10 +46,10 @@ class TestTimes:
         starts = np.array([0, 15, 30])
         inside = starts[within(FIRST + starts, start, stop) & (starts < sound)]
         assert [event.data["start"] for event in archive.events] == inside.tolist()
-        assert archive.complete != torn
+        assert archive.complete != truncated
 
-    def test_damage_is_missed_inside_the_range_alone(self, written, path):
-        """A damage there stops a full reading, but not this one."""
+    def test_damage_outside_the_range_is_not_read(self, written, path):
+        """It stops a full reading."""
         path.write_bytes(written.changed(written.chunks[1], -5))
         assert open_archive(path).n_samples == 10
         archive = open_archive(path, start=50.2)
@@ -85,7 +85,7 @@ class TestChannels:
             open_archive(written.path, topics=["/joint_states", "/hil/cycle"])
 
 
-def test_a_summary_that_fails_its_checksum_is_not_believed(written, path: Path) -> None:
+def test_damaged_summary_is_ignored(written, path: Path) -> None:
     at = written.records[-1].end + 40
     path.write_bytes(written.data[:at] + bytes([written.data[at] ^ 1]) + written.data[at + 1 :])
     archive = open_archive(path, start=50.2, stop=50.3)
@@ -121,6 +121,6 @@ def test_reading_a_part_takes_little_more_than_the_part(long):
 
 def test_checking_and_repairing_hold_a_chunk_at_a_time(long):
     assert peak(lambda: check_archive(long)) < WORK
-    torn = long.with_name("torn.mcap")
-    torn.write_bytes(long.read_bytes()[:-5000])
-    assert peak(lambda: repair(torn)) < WORK
+    truncated = long.with_name("truncated.mcap")
+    truncated.write_bytes(long.read_bytes()[:-5000])
+    assert peak(lambda: repair(truncated)) < WORK

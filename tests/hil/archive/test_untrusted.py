@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import zstandard
-from mcap.records import Channel
+from mcap.records import Attachment, Channel, Metadata
 from typer.testing import CliRunner
 
 import hil
@@ -25,13 +25,15 @@ from hil.archive import container, header, open_archive, schema
 from hil.archive.cdr import LayoutError, fixed_layout
 from hil.archive.check import check_archive, read_overview
 from hil.archive.container import Record
-from hil.archive.header import ArchiveHeader, HeaderError, format_chunk_list
+from hil.archive.header import ArchiveHeader, HeaderError
 from hil.archive.repair import repair
 from hil.archive.schema import sample_messages
 from hil.archive.writer import ArchiveFile
 from hil.cli import app
 from hil.errors import ArchiveError
 from hil.identify.sources import cell_of, gather_sources
+from tests.fuzz.mutate_mcap import Record as FileRecord
+from tests.fuzz.mutate_mcap import body_of, entries_of, join_file, split_file, split_records
 from tests.hil import mcap_bytes
 from tests.hil.archive.conftest import NAME, peak, records_of
 
@@ -57,31 +59,20 @@ def forged(
     chunk: Callable[[bytes], bytes] = bytes,
 ) -> Path:
     """Write the small archive with other content, valid checksums and index."""
-    made, described = mcap_bytes.Indexed(), ""
     given = {"hil": metadata or {}, "hil.outcome": outcome or {}}
-    for record in written.records:
-        data = record.data
-        if record.opcode in (container.MESSAGE_INDEX, container.DATA_END):
-            continue
-        if record.opcode == container.METADATA:
-            name, entries = container.parse_metadata(record)
-            del entries["checksum"]
-            chunks = format_chunk_list(made.checksums)
-            seals = {header.CHUNKS: chunks, header.DESCRIPTION: described}
-            entries |= {key: seals[key] for key in seals.keys() & entries.keys()}
-            entries |= given[name]
-            described = described or header.checksum(entries)
-            data = mcap_bytes.metadata(name, header.with_checksum(entries))
-        elif record.opcode == container.CHUNK:
-            head = container.parse_chunk(record)
-            content = chunk(container.chunk_data(head, record.offset))
-            data = mcap_bytes.chunk(content, (head.message_start_time, head.message_end_time))
-        elif record.opcode == container.ATTACHMENT:
-            found = container.parse_attachment(record)
-            content = (attachments or {}).get(found.name, found.data)
-            data = mcap_bytes.attachment(found.name, content)
-        made.put(data)
-    path.write_bytes(made.ended())
+    records = split_file(written.data)
+    assert records is not None
+    for one in records:
+        if one.opcode == container.METADATA:
+            name, entries = entries_of(one)
+            one.body = body_of(Metadata(name, {**entries, **given[name]}))
+        elif one.opcode == container.CHUNK:
+            one.inside = [FileRecord(*part) for part in split_records(chunk(one.content))]
+        elif one.opcode == container.ATTACHMENT:
+            found = container.parse(Attachment, Record(0, one.opcode, one.body))
+            found.data = (attachments or {}).get(found.name, found.data)
+            one.body = body_of(found)
+    path.write_bytes(join_file(records, index=True))
     return path
 
 
@@ -129,8 +120,8 @@ INVALID = {
 def test_invalid_entry_is_named(field, text, written, tmp_path):
     path = forged(written, tmp_path / NAME, metadata={field: text})
     messages = outcomes(path)
-    for way in READERS.keys() - {"check"}:
-        assert f"{NAME}: {field}: " in messages[way], way
+    for reader in READERS.keys() - {"check"}:
+        assert f"{NAME}: {field}: " in messages[reader], reader
     faults = check_archive(path).faults["metadata"]
     assert len(faults) == 1
     assert faults[0].startswith(f"{field} ")
@@ -216,15 +207,15 @@ class TestEvents:
     def test_texts_are_escaped_and_nested_data_stay_text(self, written, path):
         """Deeply nested data stay text; control characters are not printed."""
 
-        def nested(plain: bytes) -> bytes:
-            return plain.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
+        def nested(chunk: bytes) -> bytes:
+            return chunk.replace(b'{"start": 0}', b"[" * len('{"start": 0}'))
 
         assert open_archive(forged(written, path, chunk=nested)).events[0].data == {}
         path = forged(
             written,
             path,
             metadata={"campaign": "\x1b]0;owned\x07\r<b>"},
-            chunk=lambda plain: plain.replace(b"text\n", b"\x1b[2J\n"),
+            chunk=lambda chunk: chunk.replace(b"text\n", b"\x1b[2J\n"),
         )
         shown = CliRunner().invoke(app, ["archive", "info", str(path)]).output
         assert "owned" in shown
@@ -250,9 +241,9 @@ def another_schema(chunk: bytes) -> bytes:
 
 def without_cycles(chunk: bytes) -> bytes:
     """Return a chunk whose cycles are of an unknown topic."""
-    announced = channel(CYCLE, schema.CYCLE)
-    assert announced in chunk
-    return chunk.replace(announced, channel(CYCLE, "/elsewhere"))
+    defined = channel(CYCLE, schema.CYCLE)
+    assert defined in chunk
+    return chunk.replace(defined, channel(CYCLE, "/elsewhere"))
 
 
 def with_cycles(chunk: bytes) -> bytes:
@@ -277,7 +268,7 @@ class TestDefinitions:
         ],
     )
     def test_defined_again_as_something_else(self, second, why, written, tmp_path):
-        # Where cycles are counted, a gap shows, and what is behind it stands.
+        # With cycle numbers a gap is visible, and what follows is saved.
         self.assert_first_alone(written, tmp_path, [bytes, second], why, repaired=33)
 
     def test_defined_again_as_it_was(self, written, path):
@@ -302,9 +293,9 @@ class TestDefinitions:
         done = repair(path)
         assert done.samples == repaired
         assert done.losses
-        mended = open_archive(done.output)
-        assert mended.damage is None
-        assert {len(column) for column in mended.columns.values()} == {repaired}
+        again = open_archive(done.output)
+        assert again.damage is None
+        assert {len(column) for column in again.columns.values()} == {repaired}
 
 
 @pytest.fixture
@@ -326,11 +317,11 @@ def imported(tmp_path) -> Imported:
         file.add(sample_messages(["a", "b"], stamps, {"position": values}, -values))
         file.flush()
     file.finish({"outcome": "completed", "reason": "", "samples": "60", "events": "0"})
-    return Imported(records_of(path))
+    return Imported(path.read_bytes())
 
 
 class Imported(NamedTuple):
-    records: list[Record]
+    data: bytes
 
 
 class TestImported:
@@ -347,7 +338,7 @@ class TestImported:
         assert "channels of different times" in str(open_archive(path).damage)
         self.assert_equally_long(path, 20)
 
-    def test_cycles_that_are_announced_and_never_come(self, imported, tmp_path):
+    def test_channel_of_cycles_without_cycles(self, imported, tmp_path):
         change = in_turn(bytes, lambda chunk: channel(ELSEWHERE, schema.CYCLE) + chunk)
         outcome = {"samples": "20"}
         path = forged(imported, tmp_path / IMPORTED, chunk=change, outcome=outcome)
@@ -380,8 +371,8 @@ class TestNames:
         folder = tmp_path / "folder"
         folder.mkdir()
         name = "../../etc/evil.toml"
-        listed = json.dumps([*sorted(written.attachments), name])
-        path = forged(written, folder / NAME, metadata={"attachments": listed})
+        names = json.dumps([*sorted(written.attachments), name])
+        path = forged(written, folder / NAME, metadata={"attachments": names})
         data, end = path.read_bytes(), records_of(path)[-1].offset
         path.write_bytes(data[:end] + mcap_bytes.attachment(name, b"x") + data[end:])
         assert open_archive(path).attachments[name] == b"x"
@@ -410,7 +401,7 @@ class TestSizes:
     @pytest.mark.parametrize(
         ("stated", "reason"), [(True, "another length than it claims"), (False, "decompressed")]
     )
-    def test_a_frame_that_is_larger_than_its_chunk_says(self, stated, reason, written, path):
+    def test_frame_larger_than_its_chunk_claims(self, stated, reason, written, path):
         """Whether the frame states its own size or not, it is not decompressed, or not far."""
         frame = zstandard.ZstdCompressor(write_content_size=stated).compress(bytes(1 << 27))
         head = struct.pack("<QQQI", 0, 0, 1000, 0) + mcap_bytes.text("zstd")
