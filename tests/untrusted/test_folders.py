@@ -1,7 +1,7 @@
-"""A campaign folder that came from somebody else: nothing outside it is touched, nothing waits.
+"""Untrusted campaign folders: nothing outside is changed, nothing blocks.
 
-Whatever lies in the place of one of its files, the answer is an error of ours or the file is not
-needed; links and pipes are not followed where we write.
+Whatever replaces one of its files, the result is a named error, or the file is not needed; links
+and pipes are not followed in writing.
 """
 
 from __future__ import annotations
@@ -72,12 +72,12 @@ NAMED = (HilError, IdentificationError, PlannerError)
 
 
 class WaitsError(BaseException):
-    """Not caught by what turns every error of a library into one of ours."""
+    """Not caught by code that converts errors of libraries."""
 
 
 @contextmanager
 def within(seconds: float) -> Iterator[None]:
-    """Fail what waits for ever, such as for somebody who writes into a pipe."""
+    """Fail what blocks, such as on a pipe without writer."""
 
     def over(*_: object) -> None:
         raise WaitsError
@@ -92,7 +92,7 @@ def within(seconds: float) -> Iterator[None]:
 
 
 def put(path: Path, what: str) -> None:
-    """Have something else in the place of a file."""
+    """Replace a file by something else."""
     path.unlink(missing_ok=True)
     if what == "a pipe":
         os.mkfifo(path)
@@ -129,42 +129,44 @@ FILES: dict[str, Callable[[Path], object]] = {
 }
 STEPS = {"rehearsal.json": "rehearse", "dry_run.json": "dry run", "warmup.json": "warm-up",
          "results.json": "identify"}  # fmt: skip
-"""Whose file says nothing of the others: the status goes on to them."""
+"""Steps whose files are independent of the others."""
+
+
+def replaced(path: Path) -> Iterator[str]:
+    """Replace a file by each of `THINGS`, for some seconds; remove the last one."""
+    for thing in THINGS:
+        put(path, thing)
+        with within(20.0):
+            yield thing
+        shutil.rmtree(path) if thing == "a folder" else path.unlink()
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_whatever_lies_in_the_place_of_a_file_is_named(name: str, folder: Path) -> None:
-    kept = (folder / name).read_bytes() if (folder / name).exists() else None
-    for thing in THINGS:
-        put(folder / name, thing)
-        with within(20.0), pytest.raises(NAMED) as refused:
+def test_replaced_file_is_named(name: str, folder: Path) -> None:
+    original = (folder / name).read_bytes() if (folder / name).exists() else None
+    for thing in replaced(folder / name):
+        with pytest.raises(NAMED, match=re.escape(name)) as refused:
             FILES[name](folder)
-        told = str(refused.value)
-        assert name in told, thing
-        assert "\n" not in told, thing
-        shutil.rmtree(folder / name) if thing == "a folder" else (folder / name).unlink()
-    if kept is not None:
-        (folder / name).write_bytes(kept)
+        assert "\n" not in str(refused.value), thing
+    if original is not None:
+        (folder / name).write_bytes(original)
         FILES[name](folder)
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_the_status_names_the_file_of_a_step_and_goes_on(
+def test_status_names_the_file_of_a_step(
     name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hil.campaign.status.drift_wanted", lambda cell: 0.1)
-    for thing in THINGS:
-        put(folder / name, thing)
-        with within(20.0):
-            steps = {step.name: step for step in Campaign.open(folder).status().steps}
+    for thing in replaced(folder / name):
+        steps = {step.name: step for step in Campaign.open(folder).status().steps}
         assert steps[STEPS[name]].state != "done", thing
         assert name in steps[STEPS[name]].sentence, thing
-        shutil.rmtree(folder / name) if thing == "a folder" else (folder / name).unlink()
 
 
 @pytest.mark.parametrize("thing", ["a folder", "a link to itself", "a link to nothing"])
-def test_a_manifest_that_cannot_be_read_is_no_missing_one(thing: str, folder: Path) -> None:
-    """As a missing one it would take an edited plan for the one the campaign began with."""
+def test_unreadable_manifest_is_not_a_missing_one(thing: str, folder: Path) -> None:
+    """Otherwise an edited plan would be accepted as the original."""
     put(folder / "manifest.json", thing)
     campaign = Campaign.open(folder)
     for step in (campaign.status, campaign.folder.accept_changes):
@@ -172,20 +174,20 @@ def test_a_manifest_that_cannot_be_read_is_no_missing_one(thing: str, folder: Pa
             step()
 
 
-@pytest.mark.parametrize("away", ["../elsewhere_000_a1.mcap", "../../excitation_000_a1.mcap",
+@pytest.mark.parametrize("name", ["../elsewhere_000_a1.mcap", "../../excitation_000_a1.mcap",
                                   "/tmp/excitation_000_a1.mcap", "", "..", "a/b.mcap"])  # fmt: skip
-def test_a_manifest_names_files_of_its_own_folder_only(away: str, folder: Path) -> None:
+def test_manifest_names_files_of_its_folder_only(name: str, folder: Path) -> None:
     path = folder / "manifest.json"
     content = json.loads(path.read_text())
-    content["archives"] = [{"name": away, "outcome": "completed", "sha256": "0"}]
+    content["archives"] = [{"name": name, "outcome": "completed", "sha256": "0"}]
     path.write_text(json.dumps(content))
     with pytest.raises(CampaignFolderError, match="is not the name of a file in archives/"):
         Campaign.open(folder).folder.manifest()
 
 
 @pytest.mark.parametrize("suffix", ["", ".tmp"])
-def test_what_is_written_goes_through_no_link(suffix: str, folder: Path) -> None:
-    """Neither where the file stands nor where it is written first."""
+def test_writing_follows_no_link(suffix: str, folder: Path) -> None:
+    """Neither at the file nor at its temporary file."""
     own = folder.parent / "profile"
     own.write_text("mine")
     target = folder / "manifest.json"
@@ -198,14 +200,14 @@ def test_what_is_written_goes_through_no_link(suffix: str, folder: Path) -> None
     assert target.read_text() == "new"
 
 
-def test_writing_waits_for_no_pipe(folder: Path) -> None:
+def test_writing_does_not_block_on_a_pipe(folder: Path) -> None:
     os.mkfifo(folder / "manifest.json.tmp")
     with within(20.0):
         write_atomically(folder / "manifest.json", "new")
     assert (folder / "manifest.json").read_text() == "new"
 
 
-def test_a_link_is_no_lock(folder: Path) -> None:
+def test_link_is_no_lock(folder: Path) -> None:
     campaign = Campaign.open(folder)
     own = folder.parent / "not_made"
     (folder / LOCK).unlink(missing_ok=True)
@@ -217,14 +219,6 @@ def test_a_link_is_no_lock(folder: Path) -> None:
     assert not campaign.folder.busy
 
 
-@pytest.mark.parametrize("read", [open_archive, check_archive], ids=["open", "check"])
-@pytest.mark.parametrize("thing", ["a pipe", "a device", "a folder"])
-def test_an_archive_is_a_file(read: Callable[[Path], object], thing: str, tmp_path: Path) -> None:
-    put(tmp_path / "excitation_000_a1.mcap", thing)
-    with within(20.0), pytest.raises(ArchiveError):
-        read(tmp_path / "excitation_000_a1.mcap")
-
-
 RECORDINGS: dict[str, Callable[[Path], object]] = {
     "log.csv": lambda path: Table.read(path, Format()),
     **{f"log{suffix}": ArrayFile.read for suffix in READERS},
@@ -233,6 +227,8 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
     "plan.toml": read_plan_file,
     "results.json": StudyResults.load,
+    "excitation_000_a1.mcap": open_archive,
+    "excitation_001_a1.mcap": check_archive,
 }
 
 
@@ -244,7 +240,7 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     ],
 )
 @pytest.mark.parametrize("name", RECORDINGS)
-def test_a_recording_or_plan_of_somebody_is_a_file(name: str, thing: str, tmp_path: Path) -> None:
+def test_recording_or_plan_must_be_a_file(name: str, thing: str, tmp_path: Path) -> None:
     if thing.endswith("a sparse terabyte") and name == "bag.db3":
         pytest.skip("rows are read one by one")
     put(tmp_path / name, thing)
@@ -254,8 +250,8 @@ def test_a_recording_or_plan_of_somebody_is_a_file(name: str, thing: str, tmp_pa
 
 
 @pytest.mark.parametrize("named", ["/dev/zero", "pipe", ".", "/etc/shadow\0", "missing.urdf"])
-def test_a_cell_file_that_names_no_description(named: str, tmp_path: Path) -> None:
-    """A path may leave the folder (an arm's description often lies elsewhere); it is only read."""
+def test_invalid_path_of_a_description_is_refused(named: str, tmp_path: Path) -> None:
+    """A path may leave the folder; it is only read."""
     cell = fast_cell(tmp_path)
     os.mkfifo(tmp_path / "pipe")
     shown = named.replace("\0", "\\u0000")
@@ -301,13 +297,13 @@ NO_TIME = {
     "another shape": member([1.0]),
     "no shape": member(1.0),
     "texts": member(["a", "b", "c"]),
-    "numbers that no axis shows": member([0.0, 1e308, -1e308]),
+    "numbers too large for an axis": member([0.0, 1e308, -1e308]),
     "a shape too large for any number": claiming((10**30,)),
     "a head without end": b"\x93NUMPY\x01\x00\x04\x00((((",
-}  # What is no time of an example
+}  # Invalid times of an example
 
 
-def test_the_series_of_a_report_are_read_as_they_were_written(folder: Path) -> None:
+def test_series_of_a_report_are_read_as_written(folder: Path) -> None:
     (folder / SERIES).write_bytes(series(MEMBERS))
     assert _load_series(folder / SERIES, 2).example_archive == "one.mcap"
     with pytest.raises(InputError, match="2 columns, not 3"):
@@ -315,7 +311,7 @@ def test_the_series_of_a_report_are_read_as_they_were_written(folder: Path) -> N
 
 
 class Opens:
-    """Leaves a trace where somebody unpickles it."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, trace: Path) -> None:
         self._trace = trace
@@ -324,7 +320,7 @@ class Opens:
         return Path.touch, (self._trace,)
 
 
-def test_the_series_of_a_report_are_numbers_and_not_too_many(
+def test_series_of_a_report_are_numbers_of_limited_size(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trace = folder.parent / "unpickled"
@@ -349,13 +345,13 @@ def test_the_series_of_a_report_are_numbers_and_not_too_many(
 
 
 @pytest.mark.parametrize("thing", ["a pipe", "a device", DEEP])
-def test_what_is_no_text_of_ours_is_said_in_one_kind_of_error(thing: str, tmp_path: Path) -> None:
+def test_invalid_text_is_refused(thing: str, tmp_path: Path) -> None:
     put(tmp_path / "it", thing)
     with within(20.0), pytest.raises((OSError, ValueError)):
         parse_json(read_text(tmp_path / "it"))
 
 
-def test_a_text_that_is_one_is_read_as_ever(tmp_path: Path) -> None:
+def test_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
     (tmp_path / "it").write_bytes("a = 1\r\nb = 'ä'\r".encode())
     assert read_text(tmp_path / "it") == (tmp_path / "it").read_text("utf-8")
     assert parse_toml(read_text(tmp_path / "it")) == {"a": 1, "b": "ä"}
@@ -375,7 +371,7 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_name_is_printed_and_does_not_steer_the_terminal(
+def test_name_does_not_control_the_terminal(
     name: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from hil.cli import main
@@ -384,14 +380,14 @@ def test_a_name_is_printed_and_does_not_steer_the_terminal(
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 2
-    told = capfd.readouterr().err
-    assert told.startswith(f"error: {NAMES[name].split('/')[0]}")
-    assert told.rstrip("\n").isprintable()
+    printed = capfd.readouterr().err
+    assert printed.startswith(f"error: {NAMES[name].split('/')[0]}")
+    assert printed.rstrip("\n").isprintable()
 
 
-def test_a_campaign_with_an_odd_name_is_shown_as_it_is(folder: Path, tmp_path: Path) -> None:
-    odd = folder.rename(tmp_path / "[bold]c\x1b[31m[]")
-    shown = CliRunner().invoke(app, ["status", str(odd)])
+def test_markup_in_the_name_of_a_campaign_is_shown(folder: Path, tmp_path: Path) -> None:
+    renamed = folder.rename(tmp_path / "[bold]c\x1b[31m[]")
+    shown = CliRunner().invoke(app, ["status", str(renamed)])
     assert shown.exit_code == 0, shown.output
     assert "\x1b" not in shown.output
     assert "[bold]c" in shown.output
@@ -402,11 +398,14 @@ ENTRY = {"name": "excitation_000_a1.mcap", "outcome": "completed", "sha256": "00
 
 
 def read(folder: Path) -> list[str]:
-    """What each way into a folder refuses it with; other errors than ours pass through and fail."""
+    """Return the named errors of all readers of a folder; others are raised."""
     refused = []
-    for way in (lambda: Campaign.open(folder).status(), lambda: conduct_of(CampaignFolder(folder))):
+    for read_it in (
+        lambda: Campaign.open(folder).status(),
+        lambda: conduct_of(CampaignFolder(folder)),
+    ):
         try:
-            way()
+            read_it()
         except (HilError, IdentificationError, PlannerError) as error:
             refused.append(str(error))
     return refused
@@ -420,11 +419,11 @@ def doctored(path: Path, *place: str, value: object) -> None:
     path.write_text(json.dumps(content))
 
 
-def test_an_archive_that_cannot_be_read_is_named_and_not_run_again(folder: Path) -> None:
+def test_unreadable_archive_is_named_and_not_repeated(folder: Path) -> None:
     doctored(folder / "manifest.json", "archives", value=[ENTRY])
     archives = folder / "archives"
     archives.mkdir(exist_ok=True)
-    (archives / ENTRY["name"]).symlink_to("/proc/self/mem")  # a file, and reading it fails
+    (archives / ENTRY["name"]).symlink_to("/proc/self/mem")  # a file that cannot be read
     with pytest.raises(CampaignFolderError, match=f"{ENTRY['name']} cannot be read"):
         CampaignFolder(folder).completed("excitation")
     (archives / ENTRY["name"]).unlink()
@@ -433,7 +432,7 @@ def test_an_archive_that_cannot_be_read_is_named_and_not_run_again(folder: Path)
 
 
 @pytest.mark.parametrize("name", [f"excitation_{DIGITS}_a1.mcap", f"move_000_a{DIGITS}.mcap"])
-def test_a_number_without_end_is_none_of_an_archive(name: str) -> None:
+def test_number_of_thousands_of_digits_is_none(name: str) -> None:
     assert ArchiveName.parse(name) is None
 
 
@@ -450,26 +449,26 @@ def test_meshes_that_cannot_be_read_are_missing(mesh: str, folder: Path) -> None
 
 @pytest.fixture
 def imported(tmp_path: Path) -> Path:
-    """Not a recording of a motion that hil made."""
+    """An imported recording."""
     still = Samples(np.arange(50) * 2_000_000, position=np.zeros((50, 2)), torque=np.ones((50, 2)))
     return write_samples(
         tmp_path / "imported.mcap", still, joint_names=("shoulder", "elbow"), metadata={}
     )
 
 
-def test_an_imported_archive_in_the_place_of_a_recorded_one(imported: Path, folder: Path) -> None:
+def test_imported_archive_instead_of_a_recorded_one(imported: Path, folder: Path) -> None:
     campaign = Campaign.open(folder)
     cell, motion = campaign.cell, campaign.plan.excitation.trajectory
     (folder / "archives").mkdir(exist_ok=True)
     shutil.copy(imported, folder / "archives" / "dryrun_000_a1.mcap")
     names = ["dryrun_000_a1.mcap"]
-    for way in (
+    for use in (
         lambda: DryRun.of(campaign.folder, cell, names, plan_hash="", simulated=True),
         lambda: Executed.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
     ):
         with pytest.raises(ArchiveError, match="is not a recording by hil"):
-            way()
+            use()
 
 
 def dry_run(folder: Path) -> DryRun:
@@ -489,7 +488,7 @@ def warm_up(folder: Path) -> WarmUp:
     )
 
 
-def test_what_was_saved_is_read_back_as_it_was(folder: Path) -> None:
+def test_saved_documents_are_read_back(folder: Path) -> None:
     campaign = CampaignFolder(folder)
     found = Criterion(name="excitation", value=float("inf"), bound=1.0, passed=False, sentence="")
     rehearsal = Rehearsal(
@@ -500,7 +499,7 @@ def test_what_was_saved_is_read_back_as_it_was(folder: Path) -> None:
     assert Rehearsal.load(campaign) == rehearsal
     dry, warm = dry_run(folder), warm_up(folder)
     dry.save(folder / "dry_run.json")
-    assert repr(DryRun.load(campaign)) == repr(dry)  # NaN is like no other
+    assert repr(DryRun.load(campaign)) == repr(dry)  # NaN is unequal to itself
     warm.save(folder / "warmup.json")
     assert WarmUp.load(folder / "warmup.json", warm.plan_hash) == warm
 
@@ -558,7 +557,7 @@ LOADED: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture
 def done(folder: Path) -> Path:
-    """The folder with a dry run and a warm-up."""
+    """Add a dry run and a warm-up to the folder."""
     dry_run(folder).save(folder / "dry_run.json")
     warm_up(folder).save(folder / "warmup.json")
     return folder
@@ -567,14 +566,14 @@ def done(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("file", "place", "value"), [(f, *case) for f, cases in BROKEN.items() for case in cases]
 )
-def test_a_changed_value_is_refused_by_its_file(
+def test_changed_value_is_refused(
     file: str, place: tuple[str, ...], value: object, done: Path
 ) -> None:
     if file == "plan.json":
         (done / "manifest.json").unlink(missing_ok=True)
     doctored(done / file, *place, value=value)
-    said = "is not a campaign plan" if file == "plan.json" else f"{file} is damaged"
-    with pytest.raises(InputError, match=re.escape(said)) as refused:
+    message = "is not a campaign plan" if file == "plan.json" else f"{file} is damaged"
+    with pytest.raises(InputError, match=re.escape(message)) as refused:
         LOADED[file](done)
     if file != "plan.json":
         assert isinstance(refused.value, CampaignFolderError)
@@ -584,7 +583,7 @@ def test_a_changed_value_is_refused_by_its_file(
 
 
 @pytest.mark.parametrize(("file", "key", "value"), READ_OR_REFUSED)
-def test_a_changed_value_is_read_or_refused(file: str, key: str, value: object, done: Path) -> None:
+def test_changed_value_is_read_or_refused(file: str, key: str, value: object, done: Path) -> None:
     doctored(done / file, key, value=value)
     read(done)
 
@@ -593,7 +592,7 @@ HEADER = {"kind": "move", "joint_names": '["a"]', "attachments": "[]"}
 
 
 @pytest.mark.parametrize("value", [10**400, True, float("nan"), float("inf"), "1", None])
-def test_planted_values_that_are_no_numbers_are_none(value: object) -> None:
+def test_invalid_true_parameters_are_left_out(value: object) -> None:
     def planted(of_x: object) -> object:
         return ArchiveHeader.of({**HEADER, "planted": json.dumps({"x": of_x})}).planted
 
@@ -601,7 +600,7 @@ def test_planted_values_that_are_no_numbers_are_none(value: object) -> None:
     assert planted(value) == {}
 
 
-def test_a_name_that_is_no_text_is_told_as_json(tmp_path: Path) -> None:
+def test_name_that_is_not_utf8_is_printed_as_json(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "hil", "status", b"x\xff", "--json"],
         cwd=tmp_path,
@@ -613,10 +612,7 @@ def test_a_name_that_is_no_text_is_told_as_json(tmp_path: Path) -> None:
     assert "x\\udcff" in json.loads(done.stdout)["error"]
 
 
-# Records of a study
-
-
-def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: Path) -> None:
+def test_invalid_record_of_a_study_is_ignored(tmp_path: Path) -> None:
     path = tmp_path / "run.json"
     write_record(path, Record(inputs="digest"))
     assert read_record(path, Record, "digest") is not None
@@ -626,10 +622,7 @@ def test_a_study_reads_its_archives_again_where_a_record_does_not_fit(tmp_path: 
         assert read_record(path, Record, "digest") is None
 
 
-# What a search keeps
-
-
-def test_a_journal_full_of_forged_frames_is_read_in_time_that_grows_as_it_does(
+def test_journal_of_forged_frames_is_read_in_linear_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     file = BytesIO()
@@ -641,10 +634,10 @@ def test_a_journal_full_of_forged_frames_is_read_in_time_that_grows_as_it_does(
         file.write(length.to_bytes(8, "little") + bytes(4) + b"\x93NUMPY")
     summed, crc32 = [], zlib.crc32
 
-    def counted(data: bytes) -> int:
+    def crc32_with_count(data: bytes) -> int:
         summed.append(len(data))
         return crc32(data)
 
-    monkeypatch.setattr(zlib, "crc32", counted)
+    monkeypatch.setattr(zlib, "crc32", crc32_with_count)
     Journal(file, {})
     assert sum(summed) < 8 * len(file.getvalue())
