@@ -1,4 +1,4 @@
-"""Drive, open mode, link or answers go away while the arm moves: it always ends in a stop."""
+"""Loss of drive, open mode, link, packets or replies during a motion."""
 
 from __future__ import annotations
 
@@ -98,13 +98,13 @@ class TestLostMotion:
         rig.run_to("completed")
         assert source.begun_at is None
 
-    def test_one_axis_leaving_open_mode_while_moving_asks_for_drive_off(self):
+    def test_axis_that_closes_during_a_motion_is_refused(self):
         rig, _ = moving()
         rig.axes["mode"][2] = Mode.CLOSED
         error = assert_refused(rig, rig.cycle(), AxisNotInMode)
         assert (error.joint, error.mode, error.wanted) == (2, 0, 4)
 
-    def test_one_axis_leaving_open_mode_while_held_lets_the_others_be_held(self):
+    def test_axis_that_closes_without_a_motion(self):
         rig = opened(3)
         rig.axes["mode"][2] = Mode.CLOSED
         answer = rig.cycle()
@@ -122,7 +122,7 @@ class TestLostMotion:
         assert source.advances == advances
         assert rig.records["interval"][-2:].tolist() == [0, -1]
 
-    def test_an_init_in_a_running_session_aborts_the_motion_and_starts_over(self):
+    def test_init_packet_during_a_motion(self):
         rig, source = moving()
         reply = rig.send(rig.init.encode())
         assert reply[:4] == bytes([11, 0, 0, 0])
@@ -146,7 +146,7 @@ class TestLostMotion:
         rig.open()
         assert rig.state is State.OPEN
 
-    def test_a_motion_asked_for_while_axes_of_the_last_are_open_was_in_no_interval(self):
+    def test_interval_of_a_motion_requested_while_leaving(self):
         rig = running(still(3))
         while rig.session.requested:
             rig.cycle()
@@ -177,33 +177,33 @@ def at_speed(cycles: int = 600, speed: float = 1.9, **options) -> Rig:
 
 
 def report_late(rig: Rig) -> None:
-    """From now on the controller takes each answer, and reports its target, a cycle late."""
-    take, late = rig._follow, [rig.axes["d"].copy()]
+    """Make the controller accept replies, and report its target, a cycle late."""
+    follow, late = rig._follow, [rig.axes["d"].copy()]
 
-    def obey(answer):
-        take(answer)
+    def follow_late(answer):
+        follow(answer)
         late.append(rig.axes["d"].copy())
         rig.axes["d"][:] = late[-2]
 
-    rig._follow = obey
+    rig._follow = follow_late
 
 
 def lose(rig: Rig, count: int):
-    """Cycles whose answers never reach the controller, which holds its target."""
-    take = rig._follow
+    """Run cycles whose replies do not reach the controller, which holds its target."""
+    follow = rig._follow
     rig._follow = lambda answer: rig.axes["d"].__setitem__((slice(None), [1, 3]), 0)
     answer = rig.cycle(count)
-    rig._follow = take
+    rig._follow = follow
     return answer
 
 
 class TestNextStep:
-    """After lost answers the motion goes on by one step from the target that is held."""
+    """After lost replies the motion continues by one step from the target that is held."""
 
     @pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
-    @pytest.mark.parametrize(("lost", "goes_on"), [(1, True), (2, True), (5, False)])
-    def test_it_is_one_step_at_every_speed(self, share, lost, goes_on):
-        """Up to the time it is taken, and in each cycle after it, on the way to rest as well."""
+    @pytest.mark.parametrize(("lost", "continues"), [(1, True), (2, True), (5, False)])
+    def test_one_step_at_each_speed(self, share, lost, continues):
+        """Until it is accepted, and in each later cycle up to rest."""
         rig = at_speed(speed=1.9 * share)
         target, last = rig.axes["d"][0, 0], 0.0
         lose(rig, lost)
@@ -216,10 +216,10 @@ class TestNextStep:
         assert rig.session.counters.unanswered == lost
         rig.session.stop()
         rig.run_to("stopped")
-        assert (rig.ended.reason == "a stop was requested") is goes_on
+        assert (rig.ended.reason == "a stop was requested") is continues
 
-    def test_the_motion_waits_and_leaves_nothing_out(self):
-        """Without what was sent again, the set-points are those of a motion that lost nothing."""
+    def test_motion_waits_and_omits_nothing(self):
+        """Except for repetitions, the set-points are those of a motion without losses."""
         rig, other = at_speed(100), at_speed(100)
         lose(rig, 2)
         rig.cycle(60)
@@ -236,8 +236,8 @@ class TestNextStep:
         rig = at_speed()
         np.testing.assert_array_equal(lose(rig, 1).axes, rig.cycle().axes)
 
-    def test_a_link_that_becomes_late_at_speed_comes_to_rest(self):
-        """Its answers are taken a cycle late; the way to rest knows that and goes smoothly."""
+    def test_link_that_becomes_late_stops_the_motion(self):
+        """Replies are accepted a cycle late; coming to rest has no jumps."""
         rig = at_speed()
         report_late(rig)
         rig.run_to("stopped")
@@ -246,14 +246,14 @@ class TestNextStep:
         waits = (np.diff(sent[600:, 0]) == 0.0) & (rig.records["commanded_velocity"][601:, 0] != 0)
         assert waits.sum() == 3
 
-    def test_a_controller_that_takes_none_any_more_is_refused(self):
+    def test_controller_that_accepts_no_reply_is_refused(self):
         rig = at_speed()
         answer = lose(rig, REPETITIONS + 2)
         assert assert_refused(rig, answer, SetPointNotAccepted).joint == 0
 
 
 @pytest.mark.parametrize("lost", [1, 2])
-def test_a_few_are_reported_in_the_cycle_after_the_first(lost):
+def test_losses_are_reported_after_two_cycles(lost):
     rig = at_speed()
     before = rig.records[-1]["cycle"]
     lose(rig, lost)
@@ -264,7 +264,7 @@ def test_a_few_are_reported_in_the_cycle_after_the_first(lost):
 
 
 @pytest.mark.parametrize(("max_gap", "pattern"), [(2, 3), (2, 40), (0, 40), (5, 9)])
-def test_too_many_in_a_hundred_cycles_stop_the_motion_on_its_path(max_gap, pattern):
+def test_many_losses_in_100_cycles_stop_the_motion(max_gap, pattern):
     rig = at_speed(max_gap=max_gap)
     lost = 0
     while lost <= max_gap:
@@ -276,7 +276,7 @@ def test_too_many_in_a_hundred_cycles_stop_the_motion_on_its_path(max_gap, patte
     assert rig.ended.reason == f"{max_gap + 1} answers were lost in 100 cycles"
 
 
-def test_those_of_long_ago_do_not_count():
+def test_earlier_losses_do_not_count():
     rig = at_speed()
     for _ in range(6):
         lose(rig, 1)
@@ -286,10 +286,10 @@ def test_those_of_long_ago_do_not_count():
     assert rig.state is State.OPEN
 
 
-class TestCarriedOn:
-    """A controller that goes on by itself while packets are missing."""
+class TestExtrapolation:
+    """A controller that extrapolates the motion while packets are missing."""
 
-    def carried_on(self, missed: int, extra: float = 0.0, **options) -> Rig:
+    def extrapolated(self, missed: int, extra: float = 0.0, **options) -> Rig:
         """At 50 motor revolutions per second, 0.1 per cycle, and a threshold of one."""
         speed, one = 2.618, np.full(N, 1.0)
         wide = limits(
@@ -309,8 +309,8 @@ class TestCarriedOn:
         return rig
 
     @pytest.mark.parametrize("missed", [1, 2])
-    def test_at_full_speed_a_gap_not_too_long_is_survived(self, missed):
-        rig = self.carried_on(missed)
+    def test_short_gap_at_full_speed(self, missed):
+        rig = self.extrapolated(missed)
         rig.cycle(10)
         assert rig.state is State.OPEN
         assert rig.session.counters.unanswered == 0
@@ -318,13 +318,13 @@ class TestCarriedOn:
         rig.run_to("stopped")
 
     @pytest.mark.parametrize("missed", [3, 4, 5])
-    def test_more_than_a_quarter_of_the_threshold_is_not(self, missed):
-        rig = self.carried_on(missed, max_gap=5)
+    def test_more_than_a_quarter_of_the_threshold(self, missed):
+        rig = self.extrapolated(missed, max_gap=5)
         error = assert_refused(rig, rig.cycle(), SetPointNotAccepted)
         assert (error.value, error.bound) == (pytest.approx(0.1 * missed, rel=1e-3), 0.25)
 
 
-def test_a_controller_that_reports_its_target_a_cycle_late_is_told_of_once():
+def test_late_target_is_reported_once():
     rig = at_speed(0)
     report_late(rig)
     rig.cycle(600)
@@ -332,7 +332,7 @@ def test_a_controller_that_reports_its_target_a_cycle_late_is_told_of_once():
     assert rig.session.counters.unanswered == 1
 
 
-class TestAfterAGapWithoutAMotion:
+class TestGapWithoutMotion:
     """Meanwhile the controller may have left open mode, moved the arm, and come back."""
 
     @pytest.mark.parametrize("leaving", [False, True])
@@ -340,7 +340,7 @@ class TestAfterAGapWithoutAMotion:
         ("columns", "off", "kind"),
         [([0, 2], 1.9, SetPointNotAccepted), ([1], 0.001, VelocityAfterGap), ([], 0.0, None)],
     )
-    def test_an_arm_is_held_on_only_where_it_was_and_at_rest(self, leaving, columns, off, kind):
+    def test_arm_is_held_where_it_was_and_at_rest(self, leaving, columns, off, kind):
         rig = opened(20)
         if leaving:
             rig.session.stop()
@@ -355,7 +355,7 @@ class TestAfterAGapWithoutAMotion:
             assert type(rig.refusal) is kind
             assert rig.refusal.value == pytest.approx(off)
 
-    def test_an_axis_that_has_closed_is_not_asked_for(self):
+    def test_closed_axis_is_not_compared(self):
         rig = exiting()
         rig.miss(10)
         rig.axes["mode"][0] = 0
@@ -380,7 +380,7 @@ def moving_at(share):
 
 
 class TestGaps:
-    def test_motion_goes_on_one_period_after_a_gap(self):
+    def test_motion_advances_one_period_after_a_gap(self):
         rig, source = moving()
         rig.miss(2)
         rig.cycle()
@@ -398,7 +398,7 @@ class TestGaps:
         rig.run_to("stopped")
         assert "3 packets" in rig.ended.reason
 
-    def test_gaps_that_are_small_enough_do_not_add_up(self):
+    def test_short_gaps_do_not_add_up(self):
         rig, source = moving(0)
         for _ in range(20):
             rig.miss(2)
@@ -424,7 +424,7 @@ class TestGaps:
 
 
 class TestLongGaps:
-    """The arm of `Rig` goes on unanswered as if nothing were missed, unless a test stops it."""
+    """The arm of `Rig` continues without replies, unless a test stops it."""
 
     def after_gap(self, missed, change, cycles=300):
         rig, source = moving(cycles)
@@ -435,7 +435,7 @@ class TestLongGaps:
     def held(self, d):
         d[:, [1, 3]] = 0.0
 
-    def test_a_controller_that_held_the_last_target_is_not_run_away_from(self):
+    def test_controller_that_held_its_target_is_refused(self):
         rig, source, answer = self.after_gap(3, self.held)
         step = 0.3 * 120.0 / (2.0 * np.pi) * PERIOD
         error = assert_refused(rig, answer, VelocityAfterGap)
@@ -446,12 +446,12 @@ class TestLongGaps:
         assert source.advances == 300
 
     @pytest.mark.parametrize("factor", [0.0, 0.49, 1.51, -1.0, np.nan])
-    def test_one_whose_target_velocity_is_another_is_not_run_away_from(self, factor):
+    def test_another_target_velocity_is_refused(self, factor):
         rig, _, answer = self.after_gap(3, lambda d: np.multiply.at(d, (0, 1), factor))
         kind = VelocityAfterGap if np.isfinite(factor) else NotFinite
         assert assert_refused(rig, answer, kind).joint == 0
 
-    def test_a_target_carried_on_a_little_further_is_stopped_on_the_path(self):
+    def test_extrapolated_target_is_stopped_on_the_path(self):
         def change(d):
             d[0, [0, 2]] += 3 * d[0, 1]
 
@@ -461,7 +461,7 @@ class TestLongGaps:
 
     @pytest.mark.parametrize(("missed", "cycles"), [(3, 6), (7, 14), (8, 15), (400, 15)])
     def test_jerk_has_no_bound_for_30_ms_at_most(self, missed, cycles):
-        """However far a controller carried the motion on, by the steps it had."""
+        """Depends on the number of steps that the controller extrapolated."""
         rig, source = moving_at(0.1)
         spread = []
 
@@ -500,12 +500,12 @@ class TestLongGaps:
         np.testing.assert_allclose(np.diff(targets[-5:], axis=0), [step] * 4, rtol=0.02, atol=1e-5)
         assert rig.state is State.OPEN
 
-    def test_a_short_gap_is_bridged_even_so(self):
+    def test_short_gap_of_a_held_target(self):
         rig, source, _ = self.after_gap(2, self.held)
         assert rig.state is State.OPEN
         assert (source.advances, source.stops) == (301, 0)
 
-    def test_a_motion_that_was_held_as_it_began_stays_where_it_is(self):
+    def test_motion_held_at_its_begin_stays(self):
         """Slower than what counts as standstill, only its target shows that it was held."""
         rig = running(planned())
         target = rig.axes["d"][:, 0].copy()
@@ -518,18 +518,18 @@ class TestLongGaps:
         np.testing.assert_allclose(rig.cycle().axes["d"][:, 0], target, rtol=0, atol=1e-6)
         rig.run_to("stopped")
 
-    def test_a_motion_that_creeps_below_standstill_may_be_stopped(self):
+    def test_motion_below_standstill_is_stopped(self):
         rig, source, _ = self.after_gap(3, self.held, cycles=5)
         assert rig.state is State.OPEN
         assert source.stops == 1
 
 
 class TestPauses:
-    """The controller's numbers go on without a gap, but its packets come late by the clock."""
+    """Packet numbers have no gap, but packets come late by the clock."""
 
     @pytest.mark.parametrize("share", [0.25, 0.5, 0.8, 1.0])
     @pytest.mark.parametrize("pause", [0.02, 0.9])
-    def test_an_arm_that_came_to_rest_is_not_driven_on(self, share, pause):
+    def test_arm_at_rest_is_refused(self, share, pause):
         """From rest to a full step in one cycle is a jump, however the numbers look."""
         rig, _ = moving_at(share)
         rig.now += pause
@@ -537,15 +537,15 @@ class TestPauses:
         error = assert_refused(rig, rig.cycle(), VelocityAfterPause)
         assert error.bound == pytest.approx(LAG * limits().acceleration[0])
 
-    def test_an_arm_that_lags_behind_by_a_servo_is_driven_on(self):
-        """A loaded computer looks like that: its cycle was stretched, nothing else."""
+    def test_arm_that_lags_behind_continues(self):
+        """As on a busy computer, whose cycle was longer."""
         rig, source = moving_at(1.0)
         rig.now += 0.9
         rig.axes["d"][:, 3] *= 1.0 - 0.9 * LAG * 8.0 / 2.0
         rig.cycle(20)
         assert (rig.state, source.stops) == (State.OPEN, 0)
 
-    def test_an_arm_that_is_only_held_stays_held(self):
+    def test_arm_without_a_motion_is_held(self):
         rig = opened(3)
         rig.now += 0.9
         rig.cycle(3)
@@ -594,7 +594,7 @@ class TestCorruptedNumbers:
         assert rig.session.counters.stale == 1
         assert rig.send(packet) == reply
 
-    def test_no_old_set_point_is_given_out_when_the_numbers_meet(self):
+    def test_equal_number_gets_no_old_reply(self):
         rig, _ = moving()
         true = rig.number
         rig.number = true + 63
@@ -683,24 +683,24 @@ NEAR_TARGETS = [  # step, depth; steps ahead, packets missed; whether it is refu
     # A quarter of the threshold from the last, whatever was sent.
     *((0.2499, 3, ahead, missed, False) for ahead, missed in ((-2.0, 0), (2.0, 2))),
     *((0.2501, 3, ahead, missed, True) for ahead, missed in ((-2.0, 0), (2.0, 2))),
-    # Carried on by as many steps as packets were missed, and by fewer than may be.
+    # Extrapolated by as many steps as packets were missed, less than `depth`.
     *((0.24, 3, ahead, missed, ahead > missed) for ahead in (1.0, 2.0) for missed in range(3)),
     *((0.24, 2, ahead, 5, ahead > 1.0) for ahead in (1.0, 2.0)),
 ]
 
 
-class TestWhere:
+class TestTargets:
     @pytest.mark.parametrize(("step", "depth", "ahead", "missed", "refused"), NEAR_TARGETS)
     def test_a_target_is_near_one_of_those_sent(self, step, depth, ahead, missed, refused):
         assert Sent(step, depth).refuses(ahead, missed) == refused
 
-    def test_the_target_received_first_is_the_one_held(self):
+    def test_first_target(self):
         sent = Sent(0.1, count=0)
         assert sent.check(0.0) == 0
         assert sent.check(2.0, missed=2) == 0
         assert sent.refuses(2.01)
 
-    def test_carried_on_means_by_the_last_step(self):
+    def test_extrapolation_by_the_last_step(self):
         sent = Sent(0.01)
         sent.add(24.0)
         assert not sent.refuses(24.0, missed=1)
@@ -708,13 +708,13 @@ class TestWhere:
         assert sent.refuses(24.0, missed=1)
 
     @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_a_target_that_is_no_number_is_named_as_such(self, value):
+    def test_target_that_is_not_finite(self, value):
         target = np.where(np.arange(N) == 4, value, TURNS)
         with pytest.raises(NotFinite) as caught:
             Sent(0.0).set_points.check(target, 0, 3)
         assert (caught.value.joint, caught.value.cycle) == (4, 3)
 
-    def test_only_the_joints_asked_for_matter(self):
+    def test_selected_joints(self):
         sent, others = Sent(0.24), np.arange(N) != 1
         assert sent.check(9.0, where=others) == 0
         assert sent.check(-1.0, where=others) == 0
@@ -722,23 +722,23 @@ class TestWhere:
             sent.check(9.0, where=~others)
 
 
-class TestHowMany:
+class TestLostReplies:
     @pytest.mark.parametrize(
         ("step", "ahead", "missed", "lost"),
         [
             *((SLOW, -lost, 0, lost) for lost in (1, 2, 3)),
             *((SLOW, ahead, 2, 0) for ahead in (1.0, 2.0)),
-            # Other joints stand where they were, as carried on; this one is behind.
+            # Other joints are at their target; this one is behind.
             (SLOW, -1.01, 1, 1),
-            # What a standing joint moves hides one.
+            # Below standstill one lost reply is hidden.
             *((0.999 * STANDSTILL, -behind, 0, lost) for behind, lost in ((1, 0), (2, 2))),
             (1.01 * STANDSTILL, -1, 0, 1),
         ],
     )
-    def test_as_many_as_the_target_is_behind(self, step, ahead, missed, lost):
+    def test_number_of_lost_replies(self, step, ahead, missed, lost):
         assert Sent(step).check(ahead, missed) == lost
 
-    def test_each_counts_once_however_long_the_target_stays_behind(self):
+    def test_each_is_counted_once(self):
         sent = Sent(SENT_STEP)
         counts = []
         for behind in (0.0, 1.0, 1.0, 2.0, 1.0, 2.0, 0.0, 1.0):
@@ -746,14 +746,14 @@ class TestHowMany:
             sent.add(1.0)
         assert counts == [0, 1, 0, 1, 0, 1, 0, 1]
 
-    def test_a_target_carried_on_past_where_the_joint_was_is_no_answer_lost(self):
+    def test_extrapolated_target_is_no_loss(self):
         sent = Sent(SLOW)
         sent.add(1.0)
         sent.add(2.1)
         sent.add(-1.0)  # one more of these steps is a tenth of a step from two set-points ago
         assert sent.set_points.check(sent.last - sent.step, 1, 7) == 0
 
-    def test_the_joint_furthest_behind_counts(self):
+    def test_joint_furthest_behind(self):
         sent = Sent(SLOW)
         sent.step = SLOW * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
         for _ in range(4):
@@ -763,7 +763,7 @@ class TestHowMany:
 
     @pytest.mark.parametrize("way", [-1.0, 1.0])
     @pytest.mark.parametrize(("step", "lost"), [(0.0, 0), (1.0, 1)], ids=["at rest", "moving on"])
-    def test_an_arm_that_comes_to_rest_behind_is_not_behind_twice(self, step, lost, way):
+    def test_target_behind_at_rest_is_one_loss(self, step, lost, way):
         """At rest a target one behind looks like the last; it is still the same answer lost."""
         sent = Sent(way * SENT_STEP)
         assert sent.check(-1.0) == 1
@@ -773,12 +773,12 @@ class TestHowMany:
         assert sent.check(-1.0) == lost
 
     @pytest.mark.parametrize(("share", "again"), [(3.99, False), (4.01, True)])
-    def test_only_a_step_that_is_not_small_is_sent_again(self, share, again):
+    def test_small_step_is_not_repeated(self, share, again):
         sent = Sent(share * STANDSTILL)
         assert sent.check(-1.0) == 1
         assert sent.set_points.again is again
 
-    def test_sent_again_each_cycle_is_one_more_until_it_is_taken(self):
+    def test_repetition_counts_until_accepted(self):
         sent = Sent(SLOW)
         for _ in range(5):
             assert sent.check(-1.0) == 1
@@ -788,8 +788,8 @@ class TestHowMany:
         assert not sent.set_points.again
 
     @pytest.mark.parametrize("stopping", [False, True])
-    def test_behind_after_a_repetition_is_lost_or_on_the_way_to_rest_late(self, stopping):
-        """Sent again, a set-point looks taken to whoever reports a cycle late."""
+    def test_target_behind_after_a_repetition(self, stopping):
+        """A set-point sent again looks accepted if the target is reported a cycle late."""
         sent = Sent(SLOW)
         sent.check(-1.0)
         sent.set_points.repeat()
@@ -802,14 +802,14 @@ class TestHowMany:
                 sent.set_points.repeat()
                 sent.check(0.0)
 
-    def test_a_controller_that_never_takes_it_is_refused(self):
+    def test_target_never_accepted_is_refused(self):
         sent = Sent(SLOW)
         for _ in range(REPETITIONS):
             sent.check(-1.0)
             sent.set_points.repeat()
         assert sent.refuses(-1.0)
 
-    def test_the_next_time_in_open_mode_begins_anew(self):
+    def test_begin_resets_the_history(self):
         sent = Sent(SLOW)
         assert sent.check(-1.0) == 1
         sent.set_points.begin(TURNS)

@@ -72,7 +72,7 @@ def only_fields_of(mode: int, answer) -> bool:
     return not answer.axes["d"][:, others].any() and not answer.axes["extra"].any()
 
 
-def test_the_table_of_fields_is_that_of_the_documented_modes():
+def test_fields_of_the_documented_modes():
     assert {int(mode): fields for mode, fields in MODE_FIELDS.items() if mode < 10} == {
         1: (1, 2, 4, 5), 2: (4, 5), 4: (1, 2), 5: (1, 2), 7: (1,), 8: (4,), 9: (5,),
     }  # fmt: skip
@@ -86,7 +86,7 @@ def test_the_table_of_fields_is_that_of_the_documented_modes():
 
 class TestEveryMode:
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
-    def test_without_a_motion_the_arm_is_held_with_the_fields_of_the_mode(self, mode):
+    def test_arm_is_held_without_a_motion(self, mode):
         rig = Rig(mode=mode)
         for answer in (rig.open(), rig.cycle(20)):
             assert (answer.axes["mode"] == mode).all()
@@ -106,7 +106,7 @@ class TestEveryMode:
                 Rig(mode=mode).session.request(source)
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
-    def test_an_axis_that_does_not_follow_is_a_fault_even_if_nothing_moves(self, mode):
+    def test_following_error_without_a_motion(self, mode):
         rig = opened(mode=mode)
         rig.axes["d"][3, 2] += 2.01
         answer = rig.cycle()
@@ -115,14 +115,14 @@ class TestEveryMode:
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
     @pytest.mark.parametrize(("column", "kind"), [(2, FirstSetPoint), (1, NotAtStandstill)])
-    def test_open_mode_begins_only_where_the_arm_stands(self, mode, column, kind):
+    def test_open_mode_begins_at_rest(self, mode, column, kind):
         rig = closed(mode=mode)
         rig.axes["d"][1, column] += {1: 6e-4, 2: 0.21}[column]
         assert all_drive_off(rig.cycle(mode=mode))
         assert type(rig.refusal) is kind
 
     @pytest.mark.parametrize("mode", [3, 6, 11, 12, 14, 15, 17])
-    def test_modes_that_are_not_served_are_answered_and_never_moved(self, mode):
+    def test_modes_not_served_are_not_moved(self, mode):
         rig = Rig()
         rig.session.request(Cruise())
         rig.close()
@@ -161,7 +161,7 @@ class TestPositionWithFeedForward:
         assert np.abs(d[:, 3]).max() > 0
         rig.run_to("completed")
 
-    def test_what_the_source_feeds_forward_goes_into_d4_and_d5(self):
+    def test_feed_forward_is_sent_in_d4_and_d5(self):
         move = smooth_move(MOVE, 300)
         speed = 1.1 * move.velocities
         speed[-1] = 0.0
@@ -205,21 +205,15 @@ class TestPositionWithFeedForward:
         assert error.unit == {"velocity": "rad/s", "current": "A"}[part]
 
     @pytest.mark.parametrize("given", [None, (1.0, 2.0), (np.zeros(5), np.zeros(6)), ("a", "b")])
-    def test_feed_forward_that_is_something_else(self, given):
+    def test_invalid_feed_forward(self, given):
         source = WithFeedForward(np.tile(START, (10, 1)))
         source.feed_forward = lambda: given
         assert_refused((rig := begun(1, source)), rig.cycle(), SourceFailed)
 
-    def test_in_other_modes_nobody_asks_for_it(self):
-        source = WithFeedForward(np.tile(START, (10, 1)))
-        source.feed_forward = None
-        rig = begun(4, source)
-        rig.run_to("completed")
-
 
 class TestCorrections:
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_a_whole_correction_from_zero_to_zero_to_exit(self, mode):
+    def test_complete_correction(self, mode):
         source = correction(mode)
         rig = Rig(mode=mode)
         rig.session.request(source)
@@ -240,7 +234,7 @@ class TestCorrections:
         rig.run_to("completed")
         assert source.index == 400
 
-    def test_the_record_holds_velocities_and_offset_targets(self):
+    def test_records_of_velocities_and_offsets(self):
         rig = begun(8, source := correction(8))
         rig.cycle(100)
         np.testing.assert_array_equal(rig.records[-1]["commanded_velocity"], source.motion[99])
@@ -253,7 +247,7 @@ class TestCorrections:
         assert np.isnan(rig.records[-1]["commanded_velocity"]).all()
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_a_stop_takes_it_back_to_zero_and_leaves(self, mode):
+    def test_stop_of_a_correction(self, mode):
         rig = begun(mode, source := correction(mode))
         rig.cycle(50)
         rig.session.stop()
@@ -273,7 +267,7 @@ class TestCorrections:
         assert np.isfinite(answer.axes["d"]).all()
 
     @pytest.mark.parametrize(("mode", "part"), [(7, "current"), (8, "current"), (9, "motion")])
-    def test_what_the_mode_has_no_field_for_is_refused_not_dropped(self, mode, part):
+    def test_values_without_a_field_are_refused(self, mode, part):
         source = correction(mode)
         getattr(source, part)[10, 3] = 1e-6
         rig = begun(mode, source)
@@ -282,7 +276,7 @@ class TestCorrections:
 
     @pytest.mark.parametrize("sign", [-1.0, 1.0])
     @pytest.mark.parametrize("missed", [0, 2])
-    def test_an_offset_and_the_controllers_own_speed_together_have_bounds(self, sign, missed):
+    def test_speed_of_offset_and_target_together(self, sign, missed):
         def after(own: float, offset: float):
             rows = np.zeros((20, N))
             rows[10:, 2] = sign * offset
@@ -304,7 +298,7 @@ class TestCorrections:
         assert (error.joint, error.value) == (2, pytest.approx(2.05, rel=1e-2))
 
     @pytest.mark.parametrize(("share", "state"), [(0.95, State.OPEN), (1.05, State.FAULTED)])
-    def test_the_speed_of_its_first_cycle_is_not_that_since_it_opened(self, share, state):
+    def test_speed_in_the_first_cycle(self, share, state):
         rig = opened(50, mode=7, guard_limits=limits(**UNBOUNDED))
         rig.session.request(Correction(np.zeros((20, N))))
         rig.cycle()
@@ -340,13 +334,13 @@ class TestCorrections:
         assert "change of commanded current in one cycle" in str(error)
 
     @pytest.mark.parametrize("mode", [2, 8, 9])
-    def test_the_controllers_own_target_has_to_stay_inside_the_range_too(self, mode):
+    def test_target_of_the_controller_outside_the_range(self, mode):
         rig = begun(mode, correction(mode), guard_limits=limits(upper=START + 0.005))
         rig.put_arm_at(START + np.array([0, 0, 0, 0, 0.006, 0]))
         assert assert_refused(rig, rig.cycle(), PositionLimit).joint == 4
 
     @pytest.mark.parametrize("sign", [-1, 1])
-    def test_in_mode_9_the_servos_current_and_ours_together_are_limited(self, sign):
+    def test_sum_with_the_servo_current_is_limited(self, sign):
         rows = np.full((400, N), sign * 5.0)
         rig = begun(9, Correction(current=rows), guard_limits=AT_ONCE)
         rig.axes["d"][:, 4] = sign * 15.0
@@ -372,15 +366,7 @@ class TestCorrections:
         assert error.unit == ("A" if mode in CURRENTS else "rad" if mode == 7 else "rad/s")
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_rounding_at_the_end_is_no_correction(self, mode):
-        source = correction(mode)
-        source.motion[-1] += 1e-16 * (mode in MOVED)
-        source.current[-1] += 1e-16 * (mode in CURRENTS)
-        rig = begun(mode, source)
-        rig.run_to("completed")
-
-    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_after_a_long_gap_nothing_tells_whether_it_was_kept(self, mode):
+    def test_correction_is_refused_after_a_long_gap(self, mode):
         rig = begun(mode, correction(mode))
         rig.cycle(50)
         rig.miss(2)
@@ -390,14 +376,14 @@ class TestCorrections:
         assert_refused(rig, rig.cycle(), CorrectionUnconfirmed)
 
     @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
-    def test_after_a_long_gap_one_that_was_zero_is_ended(self, mode):
+    def test_zero_correction_is_stopped_after_a_long_gap(self, mode):
         rig = begun(mode, source := Correction(rows=300))
         rig.cycle(5)
         rig.miss(3)
         rig.run()
         assert (rig.ended.outcome, source.stops) == ("stopped", 1)
 
-    def test_axes_in_other_slots_and_of_other_arms_get_no_correction(self):
+    def test_other_axes_get_no_correction(self):
         axes_map = np.full((4, 10), 0xFF)
         axes_map[0, 0] = 3
         axes_map[1, :N] = [6, 5, 4, 2, 1, 0]
@@ -436,7 +422,7 @@ def playing(cycles: int = 60) -> Rig:
     return rig
 
 
-def nothing(self):
+def do_nothing(self):
     pass
 
 
@@ -446,18 +432,8 @@ def failing(*parts: str, error: BaseException, **others) -> Cruise:
     def fails(self, *_):
         raise error
 
-    methods = {"hold": nothing, "resume": nothing} | dict.fromkeys(parts, fails) | others
-    return type("Odd", (Cruise,), methods)()
-
-
-def held_before_it_began() -> Rig:
-    rig = closed()
-    rig.session.request(player())
-    rig.session.hold()
-    rig.cycle()
-    rig.open()
-    rig.cycle(10)
-    return rig
+    methods = {"hold": do_nothing, "resume": do_nothing} | dict.fromkeys(parts, fails) | others
+    return type("Failing", (Cruise,), methods)()
 
 
 def at_rest(rig: Rig) -> bool:
@@ -465,7 +441,7 @@ def at_rest(rig: Rig) -> bool:
 
 
 class TestHold:
-    def test_the_arm_rests_for_as_long_as_it_takes_and_goes_on_to_the_end(self):
+    def test_hold_without_limit_and_resume(self):
         rig = playing()
         assert not at_rest(rig)
         rig.session.hold()
@@ -490,38 +466,20 @@ class TestHold:
         rig.session.stop()
         rig.run_to("stopped")
 
-    def test_one_that_cannot_hold_is_stopped_on_its_path(self):
+    def test_source_without_hold_is_stopped(self):
         rig, source = moving()
         rig.session.hold()
         rig.run()
         assert source.stops == 1
         assert rig.ended.outcome == "stopped"
         assert "cannot" in rig.ended.reason
-
-    def test_one_that_fails_to_hold_is_stopped(self):
-        source = failing("hold", "resume", error=SystemExit("no"))
-        rig = running(source, 300)
-        with pytest.raises(RequestError, match="SystemExit: no"):
-            rig.session.resume()
-        rig.session.hold()
-        rig.run()
-        assert (rig.ended.outcome, source.stops) == ("stopped", 1)
-        assert "failed to hold: SystemExit: no" in rig.ended.reason
-
-    def test_a_stop_ends_one_that_was_held_before_it_began(self):
-        rig = held_before_it_began()
-        rig.session.stop()
-        rig.run_to("stopped")
-        assert not np.nan_to_num(rig.records["commanded_velocity"]).any()
-
-    def test_one_that_cannot_hold_and_has_not_begun_is_dropped(self):
-        rig = closed()
+        rig = closed()  # one that has not begun is dropped
         rig.session.request(Cruise())
         rig.session.hold()
         rig.cycle()
         assert (rig.ended.outcome, rig.ended.interval) == ("stopped", -1)
 
-    def test_one_that_fails_to_hold_as_it_begins_is_refused(self):
+    def test_failed_hold_at_the_begin_is_refused(self):
         rig = Rig()
         rig.session.request(failing("hold", error=ValueError("no")))
         rig.session.hold()
@@ -530,7 +488,7 @@ class TestHold:
         assert rig.ended.outcome == "refused"
         assert "failed to hold: ValueError: no" in rig.ended.reason
 
-    def test_each_change_is_told_once(self):
+    def test_one_event_per_change(self):
         rig = playing()
         for _ in range(2):
             rig.session.override(0.5)
@@ -543,7 +501,7 @@ class TestHold:
         assert rig.seen(OverrideChanged) == [OverrideChanged(0.5, cycle - 20)]
         assert rig.seen(HoldChanged) == [HoldChanged(True, cycle - 20), HoldChanged(False, cycle)]
 
-    def test_needs_a_motion_and_keeps_nothing_for_one_to_come(self):
+    def test_hold_without_a_motion_is_refused(self):
         rig = opened()
         with pytest.raises(RequestError, match="no hold can be requested in state 'open'"):
             rig.session.hold()
@@ -557,7 +515,7 @@ def no(self):
     raise SystemExit("no")
 
 
-class TestSourcesThatRaiseAnything:
+class TestSourcesThatRaise:
     """A method, or a property where a method should be."""
 
     @pytest.mark.parametrize(
@@ -569,7 +527,7 @@ class TestSourcesThatRaiseAnything:
             (failing("override", error=ZeroDivisionError("not now")), "ZeroDivisionError: not now"),
         ],
     )
-    def test_a_request_is_refused_and_the_motion_goes_on(self, source, words):
+    def test_request_is_refused_and_the_motion_continues(self, source, words):
         rig = running(source, 50)
         with pytest.raises(RequestError, match=words):
             if isinstance(vars(type(source))["resume"], property):
@@ -579,7 +537,7 @@ class TestSourcesThatRaiseAnything:
         rig.cycle(5)
         assert rig.state is State.OPEN
 
-    def test_one_that_fails_to_hold_or_to_be_requested(self):
+    def test_source_that_fails_to_hold_or_to_be_requested(self):
         rig = running(source := failing(error=SystemExit(), hold=property(no)), 50)
         rig.session.hold()
         rig.cycle()
@@ -588,7 +546,7 @@ class TestSourcesThatRaiseAnything:
             Rig().session.request(failing(error=SystemExit(), feed_forward=property(no)))
 
 
-def test_a_defect_of_our_own_asks_for_drive_off_too(monkeypatch):
+def test_internal_error_requests_drive_off(monkeypatch):
     rig, _ = moving()
 
     def fails(*_, **__):
@@ -616,17 +574,13 @@ class Overridable(Unstopped):
         self.bounds = "override"
 
 
-def test_it_may_be_told_before_the_motion_begins():
-    rig = Rig()
-    source = Overridable(np.tile(START, (20, 1)))
-    rig.session.request(source)
+def test_override_and_its_bounds():
+    rig = Rig()  # requested before the motion begins
+    rig.session.request(source := Overridable(np.tile(START, (20, 1))))
     rig.session.override(0.25)
     rig.open()
-    rig.run()
-    assert (source.fractions, rig.ended.outcome) == ([0.25], "completed")
-
-
-def test_the_bounds_of_an_override_are_granted_from_then_on_and_enforced():
+    rig.run_to("completed")
+    assert source.fractions == [0.25]
     for scale, refused in ((0.999, False), (1.001, True)):
         rig = running(Overridable(accelerating(8.0 * 1.3 * scale)), guard_limits=limits(**WIDE))
         rig.session.override(0.5)
@@ -658,7 +612,7 @@ def stopping(source) -> Rig:
 
 
 @pytest.mark.parametrize(("situation", "request_", "words"), NOT_FITTING)
-def test_overrides_and_resumptions_without_a_motion_that_takes_them(situation, request_, words):
+def test_refused_overrides_and_resumptions(situation, request_, words):
     rig = situation()
     state = rig.state
     with pytest.raises(RequestError, match=words):

@@ -1,4 +1,4 @@
-"""From the first datagram to closed axes, and which init packets let an arm move."""
+"""Start of a session, rejected packets, silence, and comparison of init packets with the cell."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from drivers import (
 from drivers.init_check import ControllerLimits, InitCheck, compare, float32_text, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_reply
-from drivers.session import MAX_GAP
 from tests.drivers.rig import (
     MOVE,
     PERIOD,
@@ -64,7 +63,7 @@ class TestHandShake:
     def test_sync_of_any_length_below_init_gets_its_own_length_back(self, length):
         assert len(Rig().sync(1, length)) == length
 
-    def test_a_warm_start_begins_with_init_and_goes_straight_to_cyclic_packets(self):
+    def test_warm_start_begins_with_the_init_packet(self):
         rig = started()
         packet, reply = rig.transcript[0]
         assert len(reply) == INIT_LENGTH
@@ -74,15 +73,22 @@ class TestHandShake:
         assert rig.number == 11
         assert rig.path == [State.INIT, State.DRIVE_OFF]
 
-    def test_a_second_copy_of_init_gets_the_same_bytes_and_starts_nothing(self):
+    def test_duplicates_get_the_same_reply(self):
         rig = started()
-        again = rig.send(rig.init.encode())
-        assert again == rig.transcript[0][1]
+        assert rig.send(rig.init.encode()) == rig.transcript[0][1]
         assert len(rig.seen(InitReceived)) == 1
-        assert rig.session.counters.duplicates == 1
+        rig.close()
+        packet, reply = rig.transcript[-1]
+        for _ in range(3):
+            assert rig.send(packet) == reply
+        assert rig.session.counters.duplicates == 4
+        assert len(rig.records) == 1
+        rig.now += 2.0
+        assert rig.send(packet) == reply, "after a silence it is a new packet"
+        assert (rig.session.counters.duplicates, len(rig.records)) == (4, 2)
 
 
-class TestSafeAnswers:
+class TestSafeReplies:
     """What is answered where nothing moves: field by field."""
 
     def filled(self, mode, status=DRIVE_ON) -> tuple[Rig, CyclicPacket, CyclicPacket]:
@@ -96,12 +102,12 @@ class TestSafeAnswers:
         return rig, CyclicPacket.decode(rig.transcript[-1][0], N), answer
 
     @pytest.mark.parametrize("mode", [500, 502])
-    def test_a_pause_is_a_state_of_its_own_with_a_patient_deadline(self, mode):
+    def test_pause_has_a_long_deadline(self, mode):
         rig, _, _ = self.filled(mode)
         assert rig.state is State.FREEZING
         assert rig.session.deadline == pytest.approx(rig.now + 300.0)
 
-    def test_mode_504_is_answered_once_by_a_zero_frame_then_there_is_silence(self):
+    def test_mode_504_gets_one_reply_of_zeros(self):
         rig, _, answer = self.filled(Mode.END_OF_SESSION)
         assert not words(answer).any()
         assert rig.state is State.ENDED
@@ -117,7 +123,7 @@ class TestSafeAnswers:
         np.testing.assert_array_equal(words(answer), words(packet))
         assert rig.state is State.ENDED
 
-    def test_a_longer_packet_gets_an_answer_of_the_documented_length(self):
+    def test_reply_to_a_longer_packet(self):
         rig = started()
         packet = rig.packet()
         reply = rig.send(packet + b"\xa5" * (732 - len(packet)))
@@ -125,17 +131,8 @@ class TestSafeAnswers:
         assert b"\xa5\xa5\xa5\xa5" not in reply
 
 
-class TestWhoGetsAnAnswer:
-    def test_a_duplicate_gets_the_same_bytes_and_no_record(self):
-        rig = closed()
-        packet, reply = rig.transcript[-1]
-        records = len(rig.records)
-        for _ in range(3):
-            assert rig.send(packet) == reply
-        assert rig.session.counters.duplicates == 3
-        assert len(rig.records) == records
-
-    def test_a_stale_packet_gets_none_and_is_counted(self):
+class TestRejectedPackets:
+    def test_stale_packet(self):
         rig = closed()
         old = rig.transcript[-1][0]
         rig.cycle(3)
@@ -143,7 +140,7 @@ class TestWhoGetsAnAnswer:
         assert rig.session.counters.stale == 1
         assert rig.seen(PacketRejected) == [PacketRejected("stale", 1)]
 
-    def test_a_number_further_ahead_than_silence_allows_is_stale(self):
+    def test_number_too_far_ahead_is_stale(self):
         rig = closed()
         answered = rig.number
         rig.number = answered + 500
@@ -156,7 +153,7 @@ class TestWhoGetsAnAnswer:
         "packet",
         [b"", b"\x0b", struct.pack("<i", 11), struct.pack("<i", 11) + bytes(223), bytes(228)],
     )
-    def test_malformed_packets_get_none_and_change_nothing(self, packet):
+    def test_malformed_packets(self, packet):
         rig = started()
         assert rig.send(packet) is None
         assert rig.state is State.INIT
@@ -164,7 +161,7 @@ class TestWhoGetsAnAnswer:
 
 
 class TestSilence:
-    def test_the_deadline_is_long_before_init_and_short_after(self):
+    def test_deadline_before_and_after_init(self):
         rig = Rig()
         assert rig.session.deadline == np.inf
         rig.session.tick(5.0)
@@ -173,12 +170,27 @@ class TestSilence:
         rig.close()
         assert rig.session.deadline == pytest.approx(rig.now + 1.0)
 
-    def test_duplicates_and_rejected_packets_do_not_move_the_deadline(self):
+    def test_rejected_packets_do_not_move_the_deadline(self):
         rig = closed()
         deadline = rig.session.deadline
         rig.send(rig.transcript[-1][0])
         rig.send(b"nonsense")
         assert rig.session.deadline == deadline
+
+    def test_silence_before_init_drops_requests(self):
+        rig = Rig()
+        rig.session.tick(0.0)
+        rig.session.request(still(3))
+        rig.session.tick(301.0)
+        assert not rig.session.requested
+        ended = [event for event in rig.session.events() if isinstance(event, MotionEnded)]
+        assert [(event.outcome, event.reason) for event in ended] == [
+            ("lost", "nothing was received from the controller")
+        ]
+        rig.session.request(still(3))  # a later request waits
+        rig.now = 500.0
+        rig.close()
+        assert rig.session.requested
 
     def test_silence_is_a_fault_reported_once(self):
         rig = closed()
@@ -190,19 +202,19 @@ class TestSilence:
         assert rig.state is State.FAULTED
         assert rig.seen(LinkLost) == [LinkLost(pytest.approx(1.0), State.CLOSED)]
 
-    def test_nobody_has_to_tick_for_silence_to_be_noticed(self):
+    def test_silence_is_detected_without_tick(self):
         rig = closed()
         rig.now += 5.0
         rig.cycle()
         assert rig.path[-2:] == [State.FAULTED, State.CLOSED]
 
-    def test_after_silence_a_controller_that_goes_on_is_answered_whatever_its_number(self):
+    def test_after_silence_any_number_gets_a_reply(self):
         rig = closed()
         rig.now += 5.0
         rig.number += 9000
         assert rig.cycle() is not None
         assert rig.state is State.CLOSED
-        # How long it was, numbers that wrap around cannot tell.
+        # How long it was, numbers that wrap around cannot fields.
         assert rig.records["gap"][-1] == 0
         assert np.diff(rig.records["cycle"][-2:]) == 1
 
@@ -213,17 +225,8 @@ class TestSilence:
         rig.cycle()
         assert rig.path[-4:] == [State.FAULTED, State.SYNC, State.INIT, State.CLOSED]
 
-    def test_silence_before_init_leaves_the_session_waiting(self):
-        rig = Rig()
-        rig.session.tick(0.0)
-        rig.session.tick(300.0)
-        assert rig.state is State.SYNC
-        rig.now = 400.0
-        rig.close()
-        assert rig.state is State.CLOSED
 
-
-class TestPcThatStartsInMidSession:
+class TestStartInMidSession:
     @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.POSITION, Mode.DELTA_POSITION])
     @pytest.mark.parametrize("arm", range(4))
     def test_a_packet_with_a_drive_on_is_no_sync_packet(self, mode, arm):
@@ -240,60 +243,23 @@ class TestPcThatStartsInMidSession:
         rig.start()
         assert rig.cycle() is not None
 
-    def test_open_axes_after_a_silence_are_asked_to_switch_off(self):
-        rig = opened()
-        rig.now += 60.0
-        rig.number = 2
-        rig.modes = Mode.DELTA_POSITION
-        rig.axes["d"][:, 0] = 0.5
-        assert (rig.cycle().axes["mode"] == Mode.DRIVE_OFF_REQUEST).all()
 
-
-class TestARequestThatWaitsForTheController:
-    def waiting(self) -> Rig:
-        rig = Rig()
-        rig.session.tick(0.0)
-        rig.session.request(still(3))
-        return rig
-
-    def test_is_dropped_when_nothing_comes_for_too_long(self):
-        rig = self.waiting()
-        rig.session.tick(301.0)
-        assert not rig.session.requested
-        ended = [event for event in rig.session.events() if isinstance(event, MotionEnded)]
-        assert [(event.outcome, event.reason) for event in ended] == [
-            ("lost", "nothing was received from the controller")
-        ]
-
-    @pytest.mark.parametrize(
-        ("numbers", "kept"),
-        [
-            ((), True),
-            (range(1, 10), True),
-            (range(1, 8), True),
-            (range(1, 7), False),
-            ((1,), False),
-        ],
-    )
-    def test_is_dropped_when_the_init_packet_is_not_the_one_announced(self, numbers, kept):
-        rig = self.waiting()
-        for number in numbers:
-            rig.sync(number)
-        rig.send(rig.init.encode())
-        assert rig.session.requested is kept
-        if not kept:
-            assert rig.ended.outcome == "lost"
-            assert rig.ended.reason == "the controller restarted: sync packets are missing"
-
-    def test_is_kept_if_made_after_the_silence(self):
-        rig = self.waiting()
-        rig.sync(1)
-        rig.session.tick(400.0)
-        assert not rig.session.requested
-        rig.session.request(still(3))
-        rig.now = 500.0
-        rig.send(rig.init.encode())
-        assert rig.session.requested
+@pytest.mark.parametrize(
+    ("numbers", "retained"),
+    [((), True), (range(1, 10), True), (range(1, 8), True), (range(1, 7), False), ((1,), False)],
+)
+def test_request_before_the_init_packet(numbers, retained):
+    """It is dropped if sync packets before the init packet are missing."""
+    rig = Rig()
+    rig.session.tick(0.0)
+    rig.session.request(still(3))
+    for number in numbers:
+        rig.sync(number)
+    rig.send(rig.init.encode())
+    assert rig.session.requested is retained
+    if not retained:
+        reason = "the controller restarted: sync packets are missing"
+        assert (rig.ended.outcome, rig.ended.reason) == ("lost", reason)
 
 
 class TestConstruction:
@@ -308,13 +274,9 @@ class TestConstruction:
             ),
         ],
     )
-    def test_what_cannot_be_is_named(self, options, words):
+    def test_invalid_options(self, options, words):
         with pytest.raises(ValueError, match=words):
             Rig(**options)
-
-    @pytest.mark.parametrize("max_gap", [0, MAX_GAP])
-    def test_any_patience_within_its_range_will_do(self, max_gap):
-        assert Rig(max_gap=max_gap).open() is not None
 
     def test_parts_for_different_numbers_of_joints_are_refused(self):
         rig = Rig()
@@ -322,7 +284,7 @@ class TestConstruction:
             type(rig.session)(rig.train, rig.guard, type(rig.ring)(5))
 
 
-def test_what_the_link_discarded_is_counted_and_reported_once():
+def test_discarded_packets_are_reported_once():
     session = Rig().session
     for kind, count in (("foreign", 0), ("foreign", -1)):
         session.discarded(kind, count)
@@ -342,22 +304,16 @@ def test_what_the_link_discarded_is_counted_and_reported_once():
 
 
 class TestReasons:
-    """What arrived and was not understood says why it got no answer."""
+    """Reasons of rejected packets."""
 
-    def test_a_packet_that_is_none(self):
+    def test_malformed_packet(self):
         rig = Rig()
         for _ in range(40):
             rig.send(bytes(12))
-        whys = {event.reason for event in rig.seen(PacketRejected)}
-        assert whys == {"12 bytes: packet number is 0; expected 1..32767"}
+        reasons = {event.reason for event in rig.seen(PacketRejected)}
+        assert reasons == {"12 bytes: packet number is 0; expected 1..32767"}
 
-    def test_a_packet_of_a_session_that_began_before(self):
-        rig = Rig()
-        rig.number = 500
-        rig.cycle()
-        assert "no drive on before init" in rig.seen(PacketRejected)[-1].reason
-
-    def test_packets_that_do_not_follow_are_not_silence(self):
+    def test_stale_packets_are_not_silence(self):
         rig = Rig()
         rig.session.request(still(3))
         rig.close()
@@ -371,25 +327,7 @@ class TestReasons:
         assert rig.seen(PacketRejected)[-1].reason.endswith("does not follow 11")
 
 
-def test_the_same_packet_after_a_silence_is_answered_anew():
-    rig = closed()
-    packet = rig.packet()
-    before = rig.send(packet)
-    rig.now += 2.0
-    answered = rig.session.counters.answered
-    assert rig.send(packet) == before
-    assert rig.session.counters.answered == answered + 1
-    assert rig.session.counters.duplicates == 0
-
-
-def test_a_number_before_that_of_the_init_packet_is_no_answer_s():
-    rig = started()
-    rig.number = 8
-    assert rig.cycle() is None
-    assert rig.session.counters.stale == 1
-
-
-def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
+def test_drive_off_has_zeros_for_values_not_finite():
     rig = opened()
     rig.axes["d"][2, :] = np.nan
     rig.axes["d"][4, 2] = np.inf
@@ -411,7 +349,7 @@ def test_where_drive_off_is_asked_for_what_is_no_number_is_zero():
         ((1, 4), [3, 7, DRIVE_ON, 9], False, [3, 0, 0, 9]),
     ],
 )
-def test_slots_of_unknown_arms_are_driven_if_any_drive_is_on(arms, status, powered, back):
+def test_unknown_arms_are_on_if_any_drive_is(arms, status, powered, back):
     """Then nothing is echoed; four status bytes go back, none of which says drive on."""
     modes = np.full(2, Mode.CLOSED, np.int32)
     answer = safe_reply(bytes(status), modes, arms)
@@ -430,17 +368,17 @@ def described(*changes, **build) -> InitPacket:
     return init
 
 
+def received(init: InitPacket, **options) -> tuple[Rig, InitReceived]:
+    rig = started(init=init, **options)
+    return rig, rig.seen(InitReceived)[0]
+
+
 def beside(arm: int, axis: int) -> InitPacket:
     """One with a seventh open axis, of this arm or of another."""
     table = np.full((4, 10), NO_SLOT)
     table[0, :N] = range(N)
     table[arm - 1, axis - 1] = N
     return init_packet(n_axes=N + 1, open_axes_map=table)
-
-
-def announced(init: InitPacket, **options) -> tuple[Rig, InitReceived]:
-    rig = started(init=init, **options)
-    return rig, rig.seen(InitReceived)[0]
 
 
 NOWHERE = np.full((4, 10), 1)
@@ -473,7 +411,7 @@ class TestInit:
             (beside(4, 10), "axis 10 of arm 4 is open"),
         ],
     )
-    def test_with_one_difference_it_is_answered_and_nothing_moved(self, init, words):
+    def test_arm_with_a_difference_is_not_moved(self, init, words):
         rig = Rig(init=init)
         rig.session.request(still(3))
         rig.start()
@@ -488,14 +426,14 @@ class TestInit:
         with pytest.raises(RequestError, match=words):
             rig.session.request(still(3))
 
-    def test_what_float32_rounds_away_is_no_difference(self):
+    def test_rounding_of_float32_is_no_difference(self):
         init = init_packet(arm_1={"calibration": np.array([0.5, -1.25, 2, 1e-8, 0.25, -0.75])})
         up = np.float32(np.inf)
         for name in ("gear_ratio", "calibration", "kinematic_influence"):
             row = init.record[name][0, 0]
             row[:N] = np.where(row[:N] != 0, np.nextafter(row[:N], up), row[:N])
         for one in (init, init_packet(), described(("gear_ratio", 6, np.nan))):
-            _, event = announced(one)
+            _, event = received(one)
             assert (event.differences, event.unusable, event.adopted) == ((), None, False)
 
     @pytest.mark.parametrize(
@@ -530,23 +468,23 @@ class TestInit:
             (init_packet(), {"arm": 3}, [f"axis {k} of arm 3 is not open" for k in range(1, 7)]),
         ],
     )  # fmt: skip
-    def test_every_difference_is_named(self, init, options, differences):
-        _, event = announced(init, **options)
+    def test_differences_are_named(self, init, options, differences):
+        _, event = received(init, **options)
         assert event.unusable.startswith("; ".join(event.differences))
-        for said, words in zip(event.differences, differences, strict=False):
-            assert said.startswith(words)
+        for found, words in zip(event.differences, differences, strict=False):
+            assert found.startswith(words)
         assert len(event.differences) >= len(differences)
 
     @pytest.mark.parametrize(("arm", "axis"), [(1, 7), (2, 1)])
     @pytest.mark.parametrize("accept", [False, True])
-    def test_another_axis_named_or_accepted_is_held_beside_a_motion(self, arm, axis, accept):
+    def test_accepted_other_axis_is_held(self, arm, axis, accept):
         options = {"accept_init": True} if accept else {"other_axes": {(arm, axis)}}
         rig = running(still(3), init=beside(arm, axis), **options)
         (event,) = rig.seen(InitReceived)
         assert (event.unusable, len(event.differences)) == (None, int(accept))
         assert rig.session.drive_train is rig.train
         rig.run_to("completed")
-        _, event = announced(beside(arm, axis), other_axes={(arm, 8), (3, axis)})
+        _, event = received(beside(arm, axis), other_axes={(arm, 8), (3, axis)})
         assert f"axis {axis} of arm {arm}" in event.unusable
 
 
@@ -555,14 +493,14 @@ class TestAcceptedInit:
 
     def adopting(self, *changes) -> Rig:
         """An arm at START by the controller's values."""
-        rig, event = announced(described(*changes), accept_init=True)
+        rig, event = received(described(*changes), accept_init=True)
         assert (event.unusable, event.adopted) == (None, True)
         assert len(event.differences) == len(changes)
         rig.train = rig.session.drive_train
         rig.put_arm_at(START)
         return rig
 
-    def test_the_controllers_values_are_in_force(self):
+    def test_values_of_the_controller_are_used(self):
         rig = self.adopting(self.GEAR, ("calibration", 4, 0.75), ("kinematic_influence", 4, 0.004))
         train, ours = rig.session.drive_train, drive_train()
         np.testing.assert_array_equal(train.gear_ratio, [-120, 150, -111.5, 90, 80, -60])
@@ -571,7 +509,7 @@ class TestAcceptedInit:
         np.testing.assert_array_equal(train.joint_sign, ours.joint_sign)
         np.testing.assert_array_equal(train.torque_constant, ours.torque_constant)
 
-    def test_records_and_set_points_use_them(self):
+    def test_records_and_set_points(self):
         rig = self.adopting(self.GEAR, ("calibration", 4, 0.75))
         rig.session.request(smooth_move(MOVE, 300))
         rig.open()
@@ -602,15 +540,15 @@ class TestAcceptedInit:
             (init_packet(n_axes=5), "axis 6 of arm 1 is not open"),
         ],
     )  # fmt: skip
-    def test_what_is_no_value_and_another_cycle_are_not_accepted(self, init, words):
-        rig, event = announced(init, accept_init=True)
+    def test_invalid_values_are_not_accepted(self, init, words):
+        rig, event = received(init, accept_init=True)
         assert words in event.unusable
         assert not event.adopted
         assert rig.session.drive_train is rig.train
         with pytest.raises(RequestError, match=words):
             rig.session.request(still(3))
 
-    def test_each_init_packet_is_judged_by_itself(self):
+    def test_next_init_packet_is_compared_with_the_cell(self):
         rig = self.adopting(self.GEAR)
         ours = drive_train().gear_ratio
         rig.init = init_packet()
@@ -623,13 +561,17 @@ class TestAcceptedInit:
 @pytest.mark.parametrize(
     ("theirs", "ours", "below"),
     [
-        (np.float32(1.23456514), 1.23457, False),  # six digits, as a person types what he was told
+        (
+            np.float32(1.23456514),
+            1.23457,
+            False,
+        ),  # rounded to six digits
         (np.float32(1.2345), 1.2346, True),
         (np.float32(0.1), 0.1, False),
         (np.float32(np.nan), 1.0, False),
     ],
 )
-def test_a_limit_is_narrower_only_by_more_than_six_digits_round(theirs, ours, below):
+def test_limit_rounded_to_six_digits_is_not_narrower(theirs, ours, below):
     assert is_narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
 
 
@@ -662,7 +604,7 @@ def adopted(ours: DriveTrain, **changes) -> InitCheck:
 
 
 @pytest.mark.parametrize("n", [3, 4, 6])
-def test_a_coupling_is_taken_only_of_axes_that_the_arm_has(n):
+def test_coupling_of_axes_of_the_arm(n):
     ours = arm(n)
     theirs = adopted(ours, calibration=ours.calibration + 0.5)
     assert theirs.adopted
@@ -676,10 +618,10 @@ def test_a_coupling_is_taken_only_of_axes_that_the_arm_has(n):
 
 
 @pytest.mark.parametrize(("k54", "fits"), [(0.0, True), (0.02, False)])
-def test_an_arm_of_five_joints_has_no_wrist_to_couple(k54, fits):
+def test_arm_of_five_joints_has_no_coupling(k54, fits):
     ours = arm(5)
-    told = [0.0, 0.0, 0.0, k54, 0.003, 0.04]
-    theirs = adopted(ours, calibration=ours.calibration + 0.5, kinematic_influence=told)
+    influence = [0.0, 0.0, 0.0, k54, 0.003, 0.04]
+    theirs = adopted(ours, calibration=ours.calibration + 0.5, kinematic_influence=influence)
     assert theirs.adopted == fits
     assert fits or "values cannot be accepted: drive train k54" in theirs.unusable
 
@@ -701,26 +643,24 @@ TURN = np.where(np.arange(6) == 2, arm(6).gear_ratio, 0.0)
           for entry, name in enumerate(("k54", "k64", "k65")) for k in (1.0, -1.0, 1.01)),
     ],
 )  # fmt: skip
-def test_what_is_too_far_off_cannot_be_accepted(changes, words):
+def test_values_far_off_are_not_accepted(changes, words):
     """Twice or half the gear ratio, a turn of the joint, a coupling of 1, and no further."""
     theirs = adopted(arm(6), **changes)
     assert theirs.adopted == (not words)
     assert words in (theirs.unusable or "")
 
 
+def test_shortest_text_of_float32():
+    texts = [float32_text(np.float32(value)) for value in (5.0, -120.0, 0.1, 2.5)]
+    assert texts == ["5", "-120", "0.1", "2.5"]
+
+
 def test_limits_are_those_of_the_arm_and_of_its_joints():
-    tell = {"current_limit": np.arange(1.0, 7.0), "following_error": np.arange(11.0, 17.0)}
-    init = InitPacket.build(6, 2, tell)
+    fields = {"current_limit": np.arange(1.0, 7.0), "following_error": np.arange(11.0, 17.0)}
+    init = InitPacket.build(6, 2, fields)
     found = ControllerLimits.of(init, 1, 4)
     np.testing.assert_array_equal(found.current, [1.0, 2.0, 3.0, 4.0])
     np.testing.assert_array_equal(found.following_error, [11.0, 12.0, 13.0, 14.0])
     assert found.current.dtype == found.following_error.dtype == np.float64
     other = ControllerLimits.of(init, 2, 4)
     assert not np.array_equal(other.current, found.current)
-
-
-def test_a_figure_of_the_wire_is_shown_in_as_few_digits_as_are_that_figure():
-    shortest = [float32_text(np.float32(value)) for value in (5.0, -120.0, 0.1, 2.5)]
-    assert shortest == ["5", "-120", "0.1", "2.5"]
-    for value in np.random.default_rng(1).uniform(0.1, 50.0, 200).astype(np.float32):
-        assert np.float32(float32_text(value)) == value
