@@ -1,7 +1,4 @@
-"""Information of earlier archives, to be added to that of the motion in a sequential design.
-
-It is the Gram matrix of all motions, held out or not, weighted by the torque noise of each joint.
-"""
+"""Information of earlier archives, added to that of the motion in a sequential design."""
 
 from __future__ import annotations
 
@@ -69,7 +66,7 @@ def estimate_earlier(paths: Sequence[Path], cell: Cell, reporter: Reporter) -> E
 
 
 def _information(prepared: Prepared, weights: Array, reporter: Reporter) -> tuple[Array, int]:
-    """Return the information (p, p) of all motions at one sample per SAMPLE_PERIOD, and their N.
+    """Return the weighted Gram (p, p) of all motions at one sample per SAMPLE_PERIOD, and their N.
 
     As for a planned motion without delay and low-pass of the torque.
     """

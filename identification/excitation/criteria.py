@@ -1,7 +1,6 @@
-r"""Excitation criteria of a trajectory: the paper's two measures and condition numbers.
+r"""Excitation criteria: functions of the Gram matrix :math:`\Phi^T\Phi` (p, p) of the regressor.
 
-All are functions of the Gram matrix :math:`\Phi^T\Phi` (p, p) of the unweighted regressor, scaled
-to unit diagonal against overflow. For a singular matrix each returns its worst value.
+It is scaled to unit diagonal against overflow. For a singular matrix each returns its worst value.
 """
 
 from __future__ import annotations

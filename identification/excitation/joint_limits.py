@@ -1,8 +1,4 @@
-"""Joint limits over all time, and rest at both ends.
-
-The extrema of piecewise cubics are exact. A sum of sines deviates between samples by at most
-M h²/8 (M: largest second derivative); where that bound does not suffice, its extrema are computed.
-"""
+"""Joint limits over all time, and rest at both ends."""
 
 from __future__ import annotations
 
@@ -119,7 +115,10 @@ def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
 
 
 def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool:
-    """Whether the samples are farther from all limits than the series deviates between them."""
+    """Whether the samples are farther from all limits than the series deviates between them.
+
+    That is at most M h²/8 (M: largest second derivative); else exact extrema are computed.
+    """
     step = float(np.max(np.diff(motion.time)))
     second, third, fourth = (series.derivative_bound(order) for order in (2, 3, 4))
     # The jerk jumps at the ends of the ramps. If each part of the motion lasts three steps, a pair

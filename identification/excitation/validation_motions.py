@@ -25,7 +25,7 @@ from planner import (
 
 Array = NDArray[np.float64]
 
-_DRAWS_PER_POINT: Final = 50  # of one via point before a path is given up
+_DRAWS_PER_POINT: Final = 50  # of one via point before the path is rejected
 _TRIES_PER_MOTION: Final = 100
 _VALIDATION: Final = 2  # first seed of a random stream that no search uses
 _SPEED: Final = (0.5, 1.0)  # range of the speeds, fraction of the velocity limits

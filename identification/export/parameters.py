@@ -1,8 +1,4 @@
-"""Identified parameters as JSON and CSV, with units (SI), covariance and provenance.
-
-Numbers that are not finite are texts in JSON, "Infinity" and "NaN"; the standard deviation of an
-undetermined parameter is infinite.
-"""
+"""Identified parameters as JSON and CSV, with units (SI), covariance and provenance."""
 
 from __future__ import annotations
 
@@ -190,7 +186,7 @@ def _standard(model: RobotModel, consistent: ConsistentEstimate) -> dict[str, An
 
 
 def _finite(content: Any) -> Any:
-    """Return the content with texts in place of numbers that are not finite."""
+    """Return the content with "Infinity" and "NaN" in place of numbers that are not finite."""
     if isinstance(content, dict):
         return {key: _finite(value) for key, value in content.items()}
     if isinstance(content, list | tuple):

@@ -1,10 +1,4 @@
-"""The identified arm for simulators: MuJoCo's XML (MJCF), SDF, URDF.
-
-Bodies have physically consistent parameters and include fixed links and a stated payload.
-:data:`FORMATS` has the parts of the model that each format supports; :func:`compare` reads a text
-back and computes the torque of the other parts (asymmetry, Stribeck, offset, balancers, ripple,
-velocity reversals).
-"""
+"""The identified arm for simulators: MuJoCo's XML (MJCF), SDF, URDF."""
 
 from __future__ import annotations
 
@@ -246,7 +240,7 @@ class Comparison(NamedTuple):
 
 
 def compare(text: str, form: Format, arm: Arm, motion: Motion) -> Comparison:
-    """Read a text back and compare it with the arm.
+    """Read a text back, compare it with the arm, and compute the torque of parts left out.
 
     Raises:
         WriteBackError: the torque differs at some random state.

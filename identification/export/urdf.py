@@ -1,10 +1,7 @@
 """Write identified inertia and friction into a URDF, everything else unchanged.
 
-Moving links get mass, centre of mass and tensor in the axes of their ``rpy``, ``<dynamics>``
-viscous friction as ``damping`` and Coulomb friction as ``friction``. The inertia of links fixed to
-a moving link is part of that link's and replaced by a comment. Locked joints keep the inertia of
-their links, if the rest of the moving link is consistent. The inverse dynamics of the written text
-are compared with the regressor before it is returned.
+The inertia of links fixed to a moving link is part of that link's and replaced by a comment. Locked
+joints keep the inertia of their links, if the rest of the moving link is consistent.
 """
 
 from __future__ import annotations
@@ -73,7 +70,8 @@ def write_urdf(
     """Return the URDF text of a model with standard parameters (s,), and friction (k,) if given.
 
     A coefficient of NaN leaves its attribute unchanged, None all of ``<dynamics>``; `remarks` are
-    lines of a comment before the robot.
+    lines of a comment before the robot. The inverse dynamics of the text are compared with the
+    regressor before it is returned.
 
     Raises:
         NotConsistentError: a link, a rotor or friction is not physically consistent.

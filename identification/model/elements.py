@@ -1,8 +1,4 @@
-r"""Springs, balancers and torque ripple: torques that depend on the angle q of a joint or motor.
-
-Signs are those of the torque of the *drive*: :math:`F\,dl/dq` for a tension F between anchors at
-the distance l.
-"""
+"""Springs, balancers and torque ripple: torques that depend on the angle q of a joint or motor."""
 
 from __future__ import annotations
 
@@ -37,7 +33,10 @@ class Coefficient(NamedTuple):
 
 @dataclass(frozen=True)
 class Element(ABC):
-    """A torque on one joint: k coefficients times functions of an angle, c of them identified."""
+    r"""A torque of the drive of one joint, :math:`F\,dl/dq` for a tension F at a length l.
+
+    k coefficients times functions of an angle, c of them identified.
+    """
 
     joint: str  # name
 

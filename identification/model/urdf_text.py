@@ -1,8 +1,4 @@
-"""Checks of untrusted URDF text before pinocchio reads it.
-
-Its C++ reader crashes on some texts, needs minutes for others, and ignores the inertia of a link
-of which it cannot read a number.
-"""
+"""Checks of untrusted URDF text, on which pinocchio's reader may crash or ignore inertias."""
 
 from __future__ import annotations
 
@@ -112,12 +108,7 @@ class _Reading:
         self._parser.StartDoctypeDeclHandler = self._doctype
 
     def read(self, text: str) -> None:
-        """Parse a text.
-
-        Raises:
-            _RefusedError: it is refused.
-            expat.ExpatError: it is not XML.
-        """
+        """Parse a text (_RefusedError, or expat.ExpatError if it is not XML)."""
         self._data = text.encode()
         try:
             self._parser.Parse(self._data, True)
@@ -195,9 +186,8 @@ class _Reading:
         for key, count in _NUMBERS[tag].items():
             text = attributes.get(key)
             if text is not None and not (_FORMS[count].fullmatch(text) and _finite(text)):
-                shown = text if len(text) <= 40 else f"{text[:40]}..."
                 wanted = "one number" if count == 1 else f"{count} numbers"
-                return f"link {self._link!r} has {key}={shown!r} {place}; write only {wanted}"
+                return f"link {self._link!r} has {key}={text[:40]!r} {place}; write only {wanted}"
         if tag == "mass" and (mass := float(attributes["value"])) < 0.0:
             return f"link {self._link!r} has a mass of {mass:g} kg; write 0 or more"
         if self._has_blanks():

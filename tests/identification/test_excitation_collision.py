@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import gc
-import pickle
 import time
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -300,35 +299,6 @@ def test_bulges_bound_the_deviation_from_straight_lines(seed):
                 chord = np.outer(end[:, 0], 1.0 - share) + np.outer(end[:, -1], share)
                 left = max(left, float(np.linalg.norm(end - chord, axis=0).max()))
         assert left <= bulge + 1e-12
-
-
-def test_a_pickled_checker_finds_the_same(arm):
-    checker = CollisionChecker(
-        urdf_text(), Workspace(floor=0.1, boxes=(Box((1, 0, 0), (2, 1, 1)),))
-    )
-    again = pickle.loads(pickle.dumps(checker))
-    assert again.pairs == checker.pairs
-    assert again.workspace == checker.workspace
-    q = np.linspace(*postures(arm, 5, 2), 100)
-    assert again.deepest_contact(q) == checker.deepest_contact(q)
-
-
-def test_a_contact_with_the_floor_is_named(arm):
-    # Upper arm straight forward and down, forearm stretched: the wrist is below the ground.
-    into_floor = np.array([0.0, 0.0872, np.pi / 2, 0.0, 0.0, 0.0])
-    upright = np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
-    q = np.linspace(upright, into_floor, 200)
-    high = Workspace(floor=0.3, margin=0.02)
-    contact = CollisionChecker(urdf_text(), high).deepest_contact(q)
-    assert contact is not None
-    # The forearm is level at the end, and the ball of 6 cm about the wrist its lowest part.
-    assert (contact.first, contact.second) == ("link_5", "floor")
-    wrist = joint_poses(chain_from_urdf(urdf_text()), q)[1][5]
-    height = wrist[contact.sample, 2] - 0.06 - 0.3
-    assert contact.distance == pytest.approx(height, abs=1e-6)
-    assert contact.sample == np.argmin(wrist[:, 2])
-    # Without the floor the same path is free.
-    assert CollisionChecker(urdf_text(), NOWHERE).deepest_contact(q) is None
 
 
 def ball_on_a_turntable(radius: float) -> str:

@@ -202,10 +202,6 @@ class TestPreslidingState:
         np.testing.assert_allclose(found, expected, atol=1e-12)
         assert np.all(np.abs(found) <= 1.0)
 
-    def test_at_rest_it_is_constant(self) -> None:
-        position = np.array([0.0, 0.1, 0.1, 0.1, 0.1])
-        np.testing.assert_allclose(presliding_state(position, 1e-4)[1:], 1.0, rtol=1e-12)
-
 
 class TestDirectionOfFriction:
     def test_without_presliding_it_is_the_sign(self) -> None:

@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from identification import (
     Estimate,
@@ -110,15 +108,6 @@ class TestParameters:
             write(RobotModel.from_urdf(URDF), fit[1])
 
 
-LAWS = [
-    FrictionLaw(coulomb, viscous, third, offset)
-    for coulomb in (False, True)
-    for viscous in (False, True)
-    for third in (None, "quadratic", "cubic")
-    for offset in (False, True)
-]
-
-
 def in_source(model: RobotModel, coefficients: np.ndarray) -> dict[str, Any]:
     """Names that the source of a model's friction defines."""
     namespace: dict[str, Any] = {}
@@ -131,17 +120,6 @@ def with_law(law: FrictionLaw = DRY, **options: Any) -> RobotModel:
 
 
 class TestFrictionSource:
-    @given(st.sampled_from(LAWS), st.integers(0, 2**16))
-    @settings(max_examples=30)
-    def test_it_computes_the_friction_at_any_speed(self, law: FrictionLaw, seed: int) -> None:
-        model, rng = with_law(law), np.random.default_rng(seed)
-        coefficients, still = rng.normal(size=2 * len(law.symbols)), np.zeros((1, 2))
-        friction = in_source(model, coefficients)["friction"]
-        values = np.concatenate([np.zeros(model.base.rank), coefficients])
-        for speed in [0.0, 3e-3, -3e-3, *(rng.uniform(0.02, 3.0, 5) * rng.choice([-1.0, 1.0], 5))]:
-            expected = model.torque(values, still, np.full((1, 2), speed), still)[0]
-            assert [friction(j, float(speed)) for j in range(2)] == pytest.approx(list(expected))
-
     @pytest.mark.parametrize("tanh", [None, 0.02])
     def test_it_has_every_term_and_coupled_motors(self, tanh: float | None) -> None:
         model = with_law(

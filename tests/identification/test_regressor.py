@@ -10,7 +10,6 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -25,7 +24,6 @@ from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase
-from identification.model.kinematics import FROM_PINOCCHIO
 from identification.model.motion import Motion
 from identification.model.regressor import CHUNK
 from identification.selection.essential import eliminate
@@ -42,21 +40,6 @@ def model() -> RobotModel:
 def states(m: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6))
     return q, qd, qdd
-
-
-def test_inertial_columns_are_pinocchios(model: RobotModel) -> None:
-    q, qd, qdd = states(30)
-    reference = pin.buildModelFromXML(urdf_text())
-    data = reference.createData()
-    dense = model.regressor(q, qd, qdd).dense(model.n_parameters)
-    for column, standard in enumerate(model.base.pivots):
-        joint, symbol = divmod(int(standard), 11)
-        if symbol == 10:
-            continue
-        theirs = 10 * joint + FROM_PINOCCHIO[symbol]
-        for t in range(len(q)):
-            expected = pin.computeJointTorqueRegressor(reference, data, q[t], qd[t], qdd[t])
-            assert np.abs(dense[t, :, column] - expected[:, theirs]).max() < 1e-12
 
 
 def test_blocks_have_only_columns_that_act_on_the_joint(model: RobotModel) -> None:

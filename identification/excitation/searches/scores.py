@@ -85,10 +85,9 @@ _FEWEST: Final = 2
 class Scale(NamedTuple):
     """Centre and spread of each of `CRITERIA` over random motions.
 
-    The two terms of eq. 7 differ in size (0.7 of the first is about 75 on a six-axis arm, 0.3 of
-    the second about 5), so that its weights have little effect. Here each measure is taken from
-    its median over random motions of the same genome, in units of their interquartile range.
-    Other units of the parameters or of N add a constant to log10 det, which cancels.
+    The two terms of eq. 7 differ in size (about 75 and 5 on a six-axis arm), so that its weights
+    have little effect. Here each measure counts from its median over random motions of the same
+    genome, in units of their interquartile range.
     """
 
     centre: tuple[float, ...]  #: medians (d,)
