@@ -144,26 +144,6 @@ class Designed:
     result: DesignResult
 
 
-def run_search(
-    cell: Cell,
-    settings: DesignSettings,
-    reporter: Reporter,
-    *,
-    workers: int = 2,
-    earlier: EarlierEstimate | None = None,
-    stop: Callable[[], bool] = lambda: False,
-) -> excitation.Design:
-    """Search a motion for a cell; `workers` processes, `stop` as in `identification`'s `search`.
-
-    Raises:
-        NoExcitationError: no motion satisfies all constraints.
-        OperatorStopError: it was stopped before there was a feasible motion.
-        SettingsError, CellError: the settings do not fit the cell.
-    """
-    problem = problem_of(cell, settings, earlier)
-    return _search(problem, cell, settings, reporter, workers, stop)
-
-
 def run_design(
     folder: DesignFolder,
     cell: Cell,
@@ -200,7 +180,15 @@ def run_design(
         with folder.opened_journal() as file:
             journal = _journal(file, identity, reporter)
             try:
-                design = _search(problem, cell, settings, reporter, workers, stop, journal)
+                design = run_search(
+                    cell,
+                    settings,
+                    reporter,
+                    workers=workers,
+                    stop=stop,
+                    problem=problem,
+                    journal=journal,
+                )
             finally:
                 journal.close()
         if journal.recalled:
@@ -222,15 +210,24 @@ def run_design(
     return done
 
 
-def _search(
-    problem: excitation.Problem,
+def run_search(
     cell: Cell,
     asked: DesignSettings,
     reporter: Reporter,
-    workers: int,
-    stop: Callable[[], bool],
+    *,
+    workers: int = 2,
+    stop: Callable[[], bool] = lambda: False,
+    problem: excitation.Problem | None = None,
     journal: excitation.Journal | None = None,
 ) -> excitation.Design:
+    """Search a motion for a cell, or for a given problem of it; other arguments as in `search`.
+
+    Raises:
+        NoExcitationError: no motion satisfies all constraints.
+        OperatorStopError: it was stopped before there was a feasible motion.
+        SettingsError, CellError: the settings do not fit the cell.
+    """
+    problem = problem or problem_of(cell, asked)
     settings, checker = search_settings(asked), problem.constraints.checker
     frame, total = AngleFrame.of(cell), excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:

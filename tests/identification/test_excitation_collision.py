@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import gc
+import struct
 import time
 from dataclasses import replace
 from itertools import combinations, pairwise
@@ -11,6 +12,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 from identification import ShapeError
 from identification.excitation import (
@@ -467,18 +469,12 @@ def test_long_motions_are_checked_in_parts(monkeypatch):
 
 def test_a_mesh_counts_as_its_convex_hull(tmp_path):
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.2 - 0.1
-    facets = [
-        (0, 2, 1), (1, 2, 3), (4, 5, 6), (5, 7, 6), (0, 1, 4), (1, 5, 4),
-        (2, 6, 3), (3, 6, 7), (0, 4, 2), (2, 4, 6), (1, 3, 5), (3, 7, 5),
-    ]  # fmt: skip
-    lines = ["solid cube"]
-    for facet in facets:
-        lines += ["facet normal 0 0 0", "outer loop"]
-        lines += [f"vertex {' '.join(map(str, corners[k]))}" for k in facet]
-        lines += ["endloop", "endfacet"]
+    triangles = corners[ConvexHull(corners).simplices].astype("<f4")
+    facets = [b"\0" * 12 + triangle.tobytes() + b"\0\0" for triangle in triangles]
     folder = tmp_path / "cell" / "meshes"
     folder.mkdir(parents=True)
-    (folder / "cube.stl").write_text("\n".join([*lines, "endsolid cube"]))
+    binary = b"\0" * 80 + struct.pack("<I", len(facets)) + b"".join(facets)
+    (folder / "cube.stl").write_bytes(binary)
 
     def cell(shape):
         return robot(link("base"), link("tip", shape), joint(1, "base", "tip", "0 0 1"))

@@ -28,7 +28,7 @@ from identification.excitation import (
 )
 from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.criteria import fitness_eq7
-from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
+from planner import FourierSeries, JointLimits, plan
 from planner.worker import load, pack
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.searching import NS16_VELOCITY
@@ -110,7 +110,10 @@ def test_criteria_are_the_measures_and_more() -> None:
     criteria = Objective(MODEL).criteria(trajectory, SAMPLE_PERIOD)
     assert criteria.measures == tuple(Objective(MODEL).measures(motion).values())
     assert criteria.n_samples == motion.n_samples
-    assert criteria.condition == pytest.approx(np.linalg.cond(rows_of(motion)), rel=1e-6)
+    columns = rows_of(motion)
+    unit = columns / np.linalg.norm(columns, axis=0)
+    assert criteria.condition == pytest.approx(np.linalg.cond(columns), rel=1e-6)
+    assert criteria.scaled_condition == pytest.approx(np.linalg.cond(unit), rel=1e-6)
 
 
 @pytest.mark.parametrize("last", [[[1.0, 0.5], [-1.0, 0.5]], [[0.0, 0.5]]])
@@ -307,32 +310,12 @@ def test_the_coupling_index_sums_the_correlations(seed: int) -> None:
     assert index <= coupling_index_max(5)
 
 
-def test_condition_numbers_are_those_of_the_regressor() -> None:
-    columns = random_columns(4)
-    unit = columns / np.linalg.norm(columns, axis=0)
-    found = Criteria.of_gram(gram_of(columns), 40)
-    assert found.condition == pytest.approx(np.linalg.cond(columns), rel=1e-6)
-    assert found.scaled_condition == pytest.approx(np.linalg.cond(unit), rel=1e-6)
-
-
-@pytest.fixture(scope="module")
-def model() -> RobotModel:
-    return RobotModel.from_urdf(urdf_text())
-
-
-@pytest.fixture(scope="module", params=range(3))
-def motion(request: pytest.FixtureRequest) -> PiecewiseCubic:
-    """A motion of six joints through eight points, as the interpolator runs it."""
-    velocity = NS16_VELOCITY
+def test_criteria_agree_at_8_ms_and_1_ms() -> None:
+    """Section 3.2 on a planned motion of six joints through eight points."""
+    velocity, model = NS16_VELOCITY, RobotModel.from_urdf(urdf_text())
     limits = JointLimits([-2.8] * 6, [2.8] * 6, velocity, velocity / 0.3, velocity / 0.3 / 0.1)
-    via = np.random.default_rng(request.param).uniform(-2.7, 2.7, (8, 6))
-    return plan(via, limits, speed=0.5, fly=0.5)
-
-
-# Section 3.2 on planned motions.
-
-
-def test_criteria_agree_at_8_ms_and_1_ms(model: RobotModel, motion: PiecewiseCubic) -> None:
+    via = np.random.default_rng(0).uniform(-2.7, 2.7, (8, 6))
+    motion = plan(via, limits, speed=0.5, fly=0.5)
     coarse, fine = (Objective(model).criteria(motion, period) for period in (0.008, 0.001))
     assert fine.n_samples == pytest.approx(8 * coarse.n_samples, rel=0.01)
     # From one random motion to the next they spread by 12 and by 9: a thousandth, a fiftieth.
