@@ -58,7 +58,7 @@ def pinocchio_gram(model: pin.Model, motion: Motion, stacked: Array) -> Array:
 
 def common_columns(model: RobotModel) -> tuple[list[int], list[int]]:
     """Return columns of ours, and the columns of pinocchio's that are the same parameters."""
-    width = len(LINK_SYMBOLS) + model.rotor_inertia
+    width = len(LINK_SYMBOLS) + model.layout.rotor_inertia
     own: list[int] = []
     foreign: list[int] = []
     for column, standard in enumerate(model.base.pivots):

@@ -189,7 +189,7 @@ def _write_variants(
         content,
         standard=variants.standard,
         values=variants.values,
-        standard_names=np.array(arm.model.standard_names),
+        standard_names=np.array(arm.model.layout.names),
         names=np.array(arm.model.parameter_names),
     )
     files: dict[str, str | bytes | None] = {ENSEMBLE: content.getvalue()}

@@ -128,7 +128,7 @@ def replay_motions(found: Identification, reporter: Reporter, ensemble: int = EN
     if (nominal := nominal_of(found.cell)) is not None:  # None where no link has a stated mass
         names.append("nominal")
         bodies, table = model.nominal, found.cell.file.nominal
-        if table is not None and model.rotor_inertia:
+        if table is not None and model.layout.rotor_inertia:
             bodies[model.layout.rotors] = table.rotor_inertia
         standard.append(bodies)
         values.append(nominal.values)

@@ -353,7 +353,7 @@ class Cell:
         standard = model.nominal
         if inertia_scale is not None:
             standard[model.layout.links] *= inertia_scale[:, None]
-        if model.rotor_inertia:
+        if model.layout.rotor_inertia:
             standard[model.layout.rotors] = rotor_inertia
         known = {"coulomb": coulomb, "viscous": viscous, "third": third}
         friction = [

@@ -125,7 +125,7 @@ def projection(
     """
     places = np.flatnonzero(known[: model.base.rank])
     last = model.layout.links[-1]
-    names = [model.standard_names[k] for k in last]
+    names = [model.layout.names[k] for k in last]
     scale = np.array([_SCALE["c" if name.startswith("mc") else name[0]] for name in names])
     grouping = model.base.grouping[np.ix_(places, last)] * scale
     if not grouping.any():

@@ -174,7 +174,7 @@ def cad_prior(cell: Cell) -> GaussianPrior | str:
             values = getattr(table, term.option, None)
             if values and not motor:
                 known[name] = values[owner], FRICTION_SHARE * abs(values[owner])
-    names = {*model.standard_names, *model.friction.names}
+    names = {*model.layout.names, *model.friction.names}
     known = {name: one for name, one in known.items() if one[0] != 0.0 and name in names}
     try:
         if table is None or table.uncertainty == 0.0:

@@ -153,7 +153,7 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> results.Calibrat
 def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.ConsistencyResult:
     """Return the result of a consistency check."""
     found = check.consistent
-    standard = dict(zip(model.standard_names, found.standard.tolist(), strict=True))
+    standard = dict(zip(model.layout.names, found.standard.tolist(), strict=True))
     inertial = found.standard[model.layout.links]
     return results.ConsistencyResult.of(
         check,

@@ -226,7 +226,7 @@ def nominal_prior(
     if not share > 0.0:
         raise IdentificationError(f"the nominal parameters' uncertainty is {share}, not positive")
     others = model.parameter_names[model.base.rank :]
-    names = model.standard_names + others
+    names = model.layout.names + others
     mean = np.concatenate([model.nominal, np.zeros(len(others))])
     std = np.concatenate([_nominal_std(model, share), np.full(len(others), np.inf)])
     for name, (value, deviation) in (known or {}).items():
@@ -234,8 +234,8 @@ def nominal_prior(
             raise IdentificationError(f"the model has no parameter {name!r}")
         mean[names.index(name)], std[names.index(name)] = value, deviation
     combinations = np.zeros((model.n_parameters, len(names)))
-    combinations[: model.base.rank, : len(model.standard_names)] = model.base.grouping
-    combinations[model.base.rank :, len(model.standard_names) :] = np.eye(len(others))
+    combinations[: model.base.rank, : len(model.layout.names)] = model.base.grouping
+    combinations[model.base.rank :, len(model.layout.names) :] = np.eye(len(others))
     extra = f", {len(known)} given" if known else ""
     return GaussianPrior.of_combinations(
         combinations, mean, std, f"nominal parameters to {100.0 * share:g} %{extra}"

@@ -129,7 +129,7 @@ def _joined(urdf: str, root: Element, remarks: Sequence[str]) -> str:
 def not_in_urdf(model: RobotModel) -> tuple[str, ...]:
     """Return descriptions of the model's parameters that a URDF cannot represent."""
     absent = {
-        "rotor inertias": model.rotor_inertia,
+        "rotor inertias": model.layout.rotor_inertia,
         "coupling inertias": bool(model.layout.pairs),
         **{kind.description: not kind.urdf for kind in model.friction.kinds},
         "friction of coupled motors": bool(model.friction.motors),
@@ -250,7 +250,7 @@ def _require_consistent(
 ) -> None:
     """Raise `NotConsistentError` for inconsistent parameters."""
     for index in np.flatnonzero(~np.isfinite(standard)):
-        raise NotConsistentError(f"parameter {model.standard_names[index]} is not finite")
+        raise NotConsistentError(f"parameter {model.layout.names[index]} is not finite")
     _require_consistent_links(model, inertial, "write the physically consistent estimate")
     rotors = model.layout.rotor_matrix(standard)
     for joint, rotor in zip(model.joint_names, np.diag(rotors), strict=True):

@@ -344,7 +344,7 @@ class StandardGram:
                 model.chain,
                 gravity,
                 [list(range(10))] * n,
-                [model.rotor_inertia] * n,
+                [model.layout.rotor_inertia] * n,
                 model.friction,
                 model.layout.pairs,
                 model.elements,

@@ -423,11 +423,6 @@ class JointFriction:
         """The law of all joints, None if they differ."""
         return self.laws[0] if len(set(self.laws)) == 1 else None
 
-    @property
-    def dissipating(self) -> NDArray[np.bool_]:
-        """Which of the k coefficients are friction (k,): all but offsets."""
-        return np.array([term.term.is_friction for term in self.terms], dtype=np.bool_)
-
     def motor_speeds(self) -> Array:
         """Return the speed of each of `motors` per joint speed (len(motors), n)."""
         if self.coupling is None or not self.motors:

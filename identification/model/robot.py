@@ -241,20 +241,10 @@ class RobotModel:
         )
 
     @property
-    def standard_names(self) -> tuple[str, ...]:
-        """Names of the s standard parameters: link by link, then coupling inertias."""
-        return self.layout.names
-
-    @property
-    def rotor_inertia(self) -> bool:
-        """Whether every joint has a rotor inertia."""
-        return self.layout.rotor_inertia
-
-    @property
     def friction_columns(self) -> NDArray[np.bool_]:
         """Which of the p parameters are friction (p,), without offsets."""
         columns = np.zeros(self.n_parameters, dtype=np.bool_)
-        columns[self.friction_part] = self.friction.dissipating
+        columns[self.friction_part] = [one.term.is_friction for one in self.friction.terms]
         return columns
 
     @property

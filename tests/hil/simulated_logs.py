@@ -108,7 +108,7 @@ def planted(robot: RobotModel, simulated: Simulated) -> Array:
     """Parameters (p,) of a model with Coulomb, viscous and offset friction."""
     standard = robot.nominal.copy()
     for joint, size in enumerate(simulated.size, 1):
-        standard[robot.standard_names.index(f"I{joint}m")] = 0.02 * size
+        standard[robot.layout.names.index(f"I{joint}m")] = 0.02 * size
     friction = [0.15 * simulated.size, 0.1 * simulated.size, np.zeros(robot.n_joints)]
     return np.concatenate([robot.base.grouping @ standard, *friction])
 

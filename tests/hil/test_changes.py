@@ -247,8 +247,8 @@ def test_inertia_of_another_link_is_no_payload() -> None:
     arm = model()
     before, after = history(steady, 2, seed=2)
     # The second link gets heavier: a cable guide, not a tool.
-    standard = np.zeros(len(arm.standard_names))
-    standard[arm.standard_names.index("mc2x")] = 8.0
+    standard = np.zeros(len(arm.layout.names))
+    standard[arm.layout.names.index("mc2x")] = 8.0
     moved = after.values.copy()
     moved[: arm.base.rank] += arm.base.grouping @ standard
     found = arm_trend("arm", arm, [before, replace(after, values=moved)])

@@ -24,10 +24,10 @@ def test_the_groups_of_the_ns16_are_those_of_table_2(model: RobotModel) -> None:
     rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
     assert set(model.base.names) == set(rows)
     for name, group in zip(model.base.names, model.base.grouping, strict=True):
-        expected = np.zeros(len(model.standard_names))
+        expected = np.zeros(len(model.layout.names))
         for standard, factor in rows[name].terms.items():
             # Rows 29 and 31 are printed for minus the pivot.
-            expected[model.standard_names.index(standard)] = rows[name].sign * factor
+            expected[model.layout.names.index(standard)] = rows[name].sign * factor
         assert np.abs(group - expected).max() < 1e-10, name
 
 

@@ -137,7 +137,7 @@ def nearest_consistent(column: str) -> tuple[float, float]:
     found = consistent_estimate(model, factor, weights=np.ones(6), prior_weight=1e-6)
     assert_consistent(model, found)
     # With Table 2's own grouping.
-    names = model.standard_names
+    names = model.layout.names
     grouping = np.zeros((40, len(names)))
     for i, row in enumerate(table2()[:40]):
         for name, value in row.terms.items():
@@ -197,7 +197,7 @@ class TestConsistentEstimate:
         root, target = rows_of(factor.weighted(weights))
         excess = float(np.sum((root @ found.estimate.values - target) ** 2))
         assert excess > 100.0
-        rank, s = MODEL.base.rank, len(MODEL.standard_names)
+        rank, s = MODEL.base.rank, len(MODEL.layout.names)
         mapping = np.zeros((MODEL.n_parameters, s + 4))
         mapping[:rank, :s] = MODEL.base.grouping
         mapping[rank:, s:] = np.eye(4)
@@ -261,7 +261,7 @@ class TestConsistentEstimate:
         """The nominal bodies are 5 to 20 % wrong, without rotors."""
         model, planted_rotors = RobotModel.from_urdf(urdf_text()), load_truth()
         named = standard_parameters()
-        standard = np.array([named[name] for name in model.standard_names]).reshape(6, 11)
+        standard = np.array([named[name] for name in model.layout.names]).reshape(6, 11)
         rng = np.random.default_rng(0)
         standard[:, :10] *= 1.0 + rng.uniform(0.05, 0.2, (6, 1)) * rng.choice([-1.0, 1.0], (6, 1))
         friction = (planted_rotors.coulomb, planted_rotors.viscous, planted_rotors.third)
@@ -337,7 +337,7 @@ class TestDrives:
         law = FrictionLaw(third=None)
         model = RobotModel.from_urdf(urdf_text(), friction=law, coupling=Coupling(wrist))
         known = standard_parameters()
-        standard = np.array([known.get(name, 0.0) for name in model.standard_names])
+        standard = np.array([known.get(name, 0.0) for name in model.layout.names])
         standard[model.layout.couplings] = -0.03, 0.01, -0.02
         friction = np.random.default_rng(0).uniform(1.0, 9.0, len(model.friction.terms))
         values = np.concatenate([model.base.grouping @ standard, friction])

@@ -259,11 +259,11 @@ def test_the_ns16_has_three_coupling_inertias(model: RobotModel) -> None:
     assert model.base.gap > 1e10
     rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
     for name, group in zip(model.base.names, model.base.grouping, strict=True):
-        expected = np.zeros(len(model.standard_names))
+        expected = np.zeros(len(model.layout.names))
         terms = rows[name].terms if name in rows else {name: 1.0}
         sign = rows[name].sign if name in rows else 1
         for standard, factor in terms.items():
-            expected[model.standard_names.index(standard)] = sign * factor
+            expected[model.layout.names.index(standard)] = sign * factor
         assert np.abs(group - expected).max() < 1e-10, name
 
 
@@ -280,7 +280,7 @@ def test_rotors_and_motor_friction_act_through_the_coupling(model: RobotModel) -
     q, qd, qdd = states()
     inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
     rotors = wrist().T @ np.diag(inertia) @ wrist()
-    standard = np.zeros(len(model.standard_names))
+    standard = np.zeros(len(model.layout.names))
     standard[model.layout.rotors] = np.diag(rotors)
     standard[model.layout.couplings] = rotors[3, 4], rotors[3, 5], rotors[4, 5]
     np.testing.assert_allclose(model.layout.rotor_matrix(standard), rotors, atol=1e-12)

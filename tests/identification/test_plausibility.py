@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 def parameters(model: RobotModel = MODEL, **changes: float) -> Array:
     """The arm of the description with rotors and friction; standard or friction ones changed."""
-    standard = dict(zip(model.standard_names, model.nominal, strict=True))
+    standard = dict(zip(model.layout.names, model.nominal, strict=True))
     standard |= {"I1m": 0.4, "I2m": 0.1}
     names = model.parameter_names[model.base.rank :]
     friction = dict(zip(names, [4, 2, 1.5, 0.8, 1.0, 1.0], strict=False))

@@ -261,7 +261,7 @@ def test_rotors_and_friction_have_no_nominal_prior() -> None:
     groups = {
         name
         for name, row in zip(model.base.names, model.base.grouping, strict=True)
-        if any(row[model.standard_names.index(f"I{j}m")] != 0.0 for j in range(1, 7))
+        if any(row[model.layout.names.index(f"I{j}m")] != 0.0 for j in range(1, 7))
     }
     assert flat == groups | set(model.parameter_names[model.base.rank :])
     assert {"I3m", "I4m", "f0_1", "f2_6"} <= flat
