@@ -118,9 +118,8 @@ class Constraints:
     ) -> tuple[Violation, ...]:
         """Return the worst violation of each kind and subject, and the deepest contact.
 
-        `motion` are samples of the trajectory, both ends included. Joint limits and contacts are
-        checked between the samples too; contacts only at them if a joint limit is broken, and not
-        at all if the samples are not finite.
+        `motion` are its samples, both ends included. Joint limits and contacts are checked between
+        them too; contacts only at them if a joint limit is broken, not at all if not finite.
 
         Raises:
             ShapeError: samples of another arm.

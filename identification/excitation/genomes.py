@@ -142,10 +142,9 @@ class ViaPointGenome:
 class SineGenome:
     """Sums of W sines per joint (eq. 8), with a ramp at both ends or, as in the paper, without.
 
-    Genes: amplitudes, joint by joint, then frequencies; 2 n W in all. Amplitudes range from
-    -q_max / W to q_max / W, so that the sum stays within the position limits; q_max is the
-    distance from the offset to the nearer limit. Velocity and jerk, and with a ramp acceleration,
-    are not bounded by the genes and must be checked (appendix; Calafiore et al., 2001).
+    Genes: amplitudes, joint by joint, then frequencies; 2 n W in all. Amplitudes are within
+    ± q_max / W (q_max: distance from the offset to the nearer limit). Velocity and jerk, and with
+    a ramp acceleration, are not bounded and must be checked (appendix; Calafiore et al., 2001).
 
     Raises:
         DesignError: an offset outside the limits, or a slowest frequency above the fastest.

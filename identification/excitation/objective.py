@@ -24,10 +24,8 @@ class Objective:
 
     The paper's criteria use all parameters, no weights (section 3.1) and information per sample,
     so that motions of different length compare (section 3.2). In a sequential design (`earlier`)
-    the information of earlier archives is added to that of the new motion. N is then that of the
-    earlier archives, so that additional information never lowers the criterion; the duration is
-    bounded by the constraints. Rows of joints at rest are left out, as in a fit
-    (:meth:`RobotModel.moving`).
+    the information of earlier archives is added. N is then theirs, so that more information never
+    lowers the criterion, and rows of joints at rest are left out (:meth:`RobotModel.moving`).
     """
 
     model: RobotModel  #: the robot, with p parameters

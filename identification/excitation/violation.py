@@ -43,9 +43,8 @@ class Violation:
     def excess(self) -> float:
         """Deviation from the bound (> 0) relative to the scale, comparable between kinds.
 
-        The scale is the limit for rates, torques, currents and durations, the joint's range for
-        positions, the arm's length for collisions. Infinite if not finite; absolute if neither
-        scale nor bound are nonzero.
+        The scale is the limit of rates, torques, currents and durations, the joint's range for
+        positions, the arm's length for collisions, 1 if zero. Infinite if not finite.
         """
         scale = abs(self.bound) if self.scale is None else self.scale
         excess = abs(self.value - self.bound) / (scale or 1.0)
@@ -80,15 +79,11 @@ def excess_by_kind(violations: Iterable[Violation]) -> Array:
 
 
 class NoFeasibleMotionError(IdentificationError):
-    """No evaluated motion satisfies all constraints.
+    """None of `tried` motions satisfies all constraints and excites all parameters.
 
-    Attributes:
-        rejected: number of motions by kind of violated constraint.
-        nearest: smallest violation of each kind.
-        closest: all violations of the motion with the smallest sum of excesses.
-        tried: number of evaluated motions.
-        unexciting: number of feasible motions that leave a parameter without excitation.
-        stopped: whether the search was stopped before its end.
+    `rejected` has their number and `nearest` the smallest violation by kind of constraint,
+    `closest` the violations of the motion with the smallest sum of excesses; `unexciting` motions
+    satisfy all constraints; `stopped`: the search was stopped before its end.
     """
 
     def __init__(

@@ -101,10 +101,7 @@ def torques(speeds, smooth=0.0):
 
 
 def friction_source(model: RobotModel, coefficients: Array) -> str:
-    """Return Python source of ``friction(joint, v)`` and ``torques(speeds)``.
-
-    `friction` is the law of one joint, `torques` friction of all joints with that of coupled
-    motors. Both have an option to make the sign linear at low speed, for simulations.
+    """Return Python source of ``friction(joint, v)`` and, with coupled motors, ``torques(speeds)``.
 
     Raises:
         ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.

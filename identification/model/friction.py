@@ -488,10 +488,8 @@ class Dissipation(NamedTuple):
 def dissipation(friction: JointFriction) -> Dissipation:
     """Return the conditions for friction to dissipate energy.
 
-    - Coulomb friction f0, and with a Stribeck term its value at rest f0 + fs, are not negative;
-    - nor is viscous friction f1, or f1 + fd and f1 - fd if it is asymmetric.
-
-    The third term and the offset, which may be a sensor's, can have any sign.
+    f0, f0 + fs (value at rest of a Stribeck term), f1, or f1 + fd and f1 - fd are not negative. The
+    third term and the offset, which may be a sensor's, can have any sign.
     """
     place = {(t.motor, t.owner, t.symbol): k for k, t in enumerate(friction.terms)}
     combine = np.eye(len(place))

@@ -124,8 +124,8 @@ class Regressor(NamedTuple):
 class RegressorPlan:
     """Layout and computation of the regressor of a chain.
 
-    The torque of joint j is the power of the wrenches of all links that it moves on their twists
-    per unit speed of joint j (:class:`LinkMotion`), one dot product per column and sample.
+    The torque of joint j is the power of the wrenches of its links on their twists per unit speed
+    of joint j (:class:`LinkMotion`).
     Per joint `links` are the used :data:`LINK_SYMBOLS` (0..9), rising, and `rotors` whether its
     rotor inertia has a column; `couplings` are the pairs of joints with a column for their coupling
     inertia. Gravity is an acceleration in base axes (3,) [m/s²]. `columns` has the parameter

@@ -238,7 +238,7 @@ def test_excess_by_kind_is_the_largest(make_currents, swing):
     constraints = Constraints(
         LIMITS.scaled(velocity=0.5),
         max_duration=1.0,
-        checker=CollisionChecker(URDF, Workspace(floor=0.0)),
+        checker=CollisionChecker(URDF, Workspace(floor=0.01, margin=0.06)),
         currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
     )
     motion = sampled(swing)

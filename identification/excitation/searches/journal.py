@@ -143,7 +143,7 @@ def _content(stored: bytes, begin: int) -> bytes | None:
 
 
 def _key(genes: Array) -> bytes:
-    return sha256(repr(genes.shape).encode() + np.asarray(genes, dtype="<f8").tobytes()).digest()
+    return sha256(np.asarray(genes, dtype="<f8").tobytes()).digest()
 
 
 def _difference(stored: bytes | None, identity: bytes) -> str:

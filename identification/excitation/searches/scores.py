@@ -177,10 +177,9 @@ class Front:
         """Return the index of the knee, the motion farthest beyond the chord between the ends.
 
         Das 1999, "On characterizing the knee of the Pareto curve based on normal-boundary
-        intersection". Measures are normalised to the ranges of the front. With `scale` only
-        motions better than the median random motion in all measures count, if there are any. If
-        no motion lies beyond the chord, it is the end with the larger balanced fitness; without
-        `scale`, the first.
+        intersection"; measures relative to the ranges of the front. With `scale` only motions
+        better than the median random motion in all measures count, if any. Of several the knee has
+        the largest balanced fitness; without `scale` it is the first.
 
         Raises:
             ValueError: the front is empty.
