@@ -39,7 +39,7 @@ Command = Callable[[list[str]], int]
         (endurance.main, ["--minutes", "nan"], "--minutes: 'nan' is not"),
     ],
 )
-def test_a_number_that_makes_no_sense_is_refused_by_its_option(
+def test_invalid_numbers_are_refused_with_their_option(
     command: Command,
     arguments: list[str],
     named: str,
@@ -167,7 +167,7 @@ def test_rounds_are_known_by_number_and_the_last_of_one_counts(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("name", "other"), [(name, other) for name in COMMANDS for other in OTHERS if other != name]
 )
-def test_a_command_refuses_what_is_no_journal_of_its_own_and_leaves_it(
+def test_journals_of_other_commands_are_refused_unchanged(
     name: str, other: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "j.jsonl"

@@ -145,7 +145,7 @@ def test_any_arm_in_any_slots_moves_and_no_other(
     ],
     ids=str,
 )
-def test_however_the_controller_goes_about_it_the_motion_completes(settings: dict) -> None:
+def test_a_motion_completes_with_every_controller_variant(settings: dict) -> None:
     controller, _ = run(move(), **settings)
     assert_moved(controller)
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 import typer
-from rich.console import Console
-from rich.status import Status
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
@@ -19,10 +16,9 @@ from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
 from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError
-from hil.progress import say
+from hil.progress import StatusLine, say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
-from hil.terminal_text import printable
 
 LINE_PERIOD = 5.0
 """Time between two lines without a terminal, s."""
@@ -72,18 +68,21 @@ def record(
         LiveLink.open(
             loaded, accept_init=accept_init, live=None if live is None else LiveView.parse(live)
         ) as link,
-        View(loaded, stop, quiet=quiet or json) as view,
     ):
+        view = View(loaded, stop, quiet=quiet or json)
         link.connection.report = view.warn
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
             view.say(link.live.notice)
         for note in link.notes():
             view.say(f"note: {note}")
-        done = record_motion(
-            link, loaded, path,
-            kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
-        )  # fmt: skip
+        try:
+            done = record_motion(
+                link, loaded, path,
+                kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
+            )  # fmt: skip
+        finally:
+            view.clear()
     early = _early_end(path, done, duration)
     figures = _figures(path, done, loaded)
     if not json:
@@ -131,33 +130,17 @@ def _report(path: Path, done: Recorded, cell: Cell) -> None:
     )
 
 
-class View:
+class View(StatusLine):
     """Progress of a recording: a status line on a terminal, else a line every 5 s."""
 
     def __init__(self, cell: Cell, stop: Stop, *, quiet: bool) -> None:
-        self._cell, self._stop, self._quiet = cell, stop, quiet
-        console = Console()
-        live = not quiet and console.is_terminal
-        self._status: Status | None = console.status("") if live else None
+        super().__init__(quiet=quiet)
+        self._cell, self._stop = cell, stop
         self._over, self._next = "", 0.0
-
-    def __enter__(self) -> View:
-        if self._status is not None:
-            self._status.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._status is not None:
-            self._status.stop()
-
-    def say(self, text: str) -> None:
-        """Print a line unless quiet."""
-        if not self._quiet:
-            typer.echo(printable(text))
-            sys.stdout.flush()
 
     def warn(self, text: str) -> None:
         """Print a line to stderr, also when quiet."""
+        self.clear()
         say(text, err=True)
 
     def show(self, progress: Progress) -> None:
@@ -165,16 +148,12 @@ class View:
         if progress.over != self._over:
             self._over = progress.over
             # Also when quiet: the arm still moves, and needs replies.
-            say(
-                f"{progress.over}; replying until the arm is at rest (Ctrl-C to exit at once)",
-                err=self._quiet,
-            )
-        line = self._line(progress)
-        if self._status is not None:
-            self._status.update(line)
-        elif time.monotonic() >= self._next:
+            how = "replying until the arm is at rest (Ctrl-C to exit at once)"
+            (self.warn if self.quiet else self.say)(f"{progress.over}; {how}")
+        self.update(lambda: self._line(progress))
+        if not self.live and time.monotonic() >= self._next:
             self._next = time.monotonic() + LINE_PERIOD
-            self.say(line)
+            self.say(self._line(progress))
 
     def _line(self, progress: Progress) -> str:
         if not progress.connected:

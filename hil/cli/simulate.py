@@ -6,7 +6,6 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
-from select import select
 from typing import Annotated, Final, Literal
 
 import typer
@@ -16,6 +15,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.move import joint_index
+from hil.progress import StatusLine
 from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import plural, printable
@@ -23,9 +23,6 @@ from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.program import Phase
 from sim_fixtures.serve import PATIENCE, Histogram, ServeCounts
-
-REFRESH: Final = 0.25
-WIDTH: Final = 110
 
 WORDS: Final = {
     Phase.START: "starting: sync and init packets",
@@ -48,22 +45,20 @@ _REPEATED: Final = {Phase.CLOSED, Phase.OPENING, Phase.OPEN}
 """Phases that repeat when open mode is lost repeatedly."""
 
 
-class Status:
-    """Progress display: a line for each change of phase, on a terminal also a status line.
+class Status(StatusLine):
+    """Progress of a session: a line for each change of phase, and counts.
 
-    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. Lines that cannot be
-    written at once are dropped, so that the cycle is never delayed. `stretch` is the largest
-    extension of a cycle, s.
+    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. `stretch` is the
+    largest extension of a cycle, s.
     """
 
     def __init__(
         self, place: str, settings: ControllerSettings, *, quiet: bool, stretch: float = 0.0,
         descriptor: int = 1,
     ) -> None:  # fmt: skip
+        super().__init__(quiet=quiet, descriptor=descriptor)
         self._place, self._settings, self._stretch = place, settings, stretch
-        self._quiet, self._out = quiet, descriptor
-        self._terminal = not quiet and os.isatty(descriptor)
-        self._began, self._refresh_at = time.monotonic(), 0.0
+        self._began = time.monotonic()
         self._phase: Phase | None = None
         self._reason, self._cycles = "", -1
 
@@ -82,26 +77,13 @@ class Status:
 
     def watch(self, controller: SimulatedController, tally: ServeCounts) -> None:
         """Print changes since the last cycle."""
-        if self._quiet:
+        if self.quiet:
             return
         if controller.phase is not self._phase or tally.cycles < self._cycles:
             self._phase = controller.phase
             self._say_change(controller)
         self._cycles = tally.cycles
-        if self._terminal and (now := time.monotonic()) >= self._refresh_at:
-            self._refresh_at = now + REFRESH
-            self._write("\r\x1b[K" + self._line(tally)[:WIDTH])
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        if not self._quiet:
-            self.clear()
-            self._write(text + "\n")
-
-    def clear(self) -> None:
-        """Erase the status line."""
-        if self._terminal:
-            self._write("\r\x1b[K")
+        self.update(lambda: self._line(tally))
 
     def _say_change(self, controller: SimulatedController) -> None:
         lost, phase, reason = controller.program.openings_lost, controller.phase, controller.reason
@@ -124,14 +106,6 @@ class Status:
             f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} started late"
             + (f", {tally.stretched} stretched" if self._stretch else "")
         )
-
-    def _write(self, text: str) -> None:
-        if not select([], [self._out], [], 0.0)[1]:
-            return
-        try:
-            os.write(self._out, text.encode())
-        except OSError:
-            self._quiet = True  # the reader has closed the pipe
 
 
 OWN_MOVE: Final = 30.0
@@ -234,14 +208,14 @@ def simulate(
             loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
         )
 
-    far_end = open_controller_link(udp, can, settings, len(loaded.joint_names))
+    link = open_controller_link(udp, can, settings, len(loaded.joint_names))
     status = Status(udp or can or "", settings, quiet=json, stretch=patience)
     try:
         with buttons(duration) as pressed, realtime_process(priority):
             status.introduce(loaded.name)
             served = serve_session(
                 build,
-                far_end,
+                link,
                 pressed,
                 faults=FaultyLink(on_link, settings.period) if on_link else None,
                 # The controller's own program stops at the next posture only.
@@ -250,7 +224,7 @@ def simulate(
                 watch=status.watch,
             )
     finally:
-        far_end.close()
+        link.close()
     if json:
         print_json(_figures(served))
     else:

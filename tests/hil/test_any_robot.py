@@ -97,7 +97,7 @@ def write(path: Path, header: str, table: Array, form: Callable[[float], str] = 
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_seven_axes_in_degrees_at_an_uneven_100_hz_columns_in_another_order(tmp_path: Path) -> None:
+def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     """Time in ms of a wall clock, a column of a gripper, stamps repeated, a second lost."""
     rng = np.random.default_rng(2)
     time = np.cumsum(0.01 * rng.uniform(0.6, 1.4, 4000))
@@ -129,7 +129,7 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz_columns_in_another_order(tmp_
     assert "1 gaps" in notes
 
 
-def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path) -> None:
+def test_currents_are_scaled_by_the_masses_with_a_warning(tmp_path: Path) -> None:
     """One array per joint, mA; gains, one of them negative, are found again where weight acts."""
     simulated = simulate(UR5, np.arange(0.0, 30.0, 2e-3))
     gains = np.array([9.0, 11.0, -10.0, 7.0, 6.0, 5.0])  # N·m/A
@@ -158,7 +158,7 @@ def test_currents_only_get_their_scale_from_the_masses_and_say_so(tmp_path: Path
     assert "shoulder_pan_joint" in warnings  # its axis is vertical: no weight
 
 
-def test_currents_of_a_robot_without_masses_are_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_currents_without_masses_are_refused(tmp_path: Path) -> None:
     simulated = simulate(UR5, np.arange(0.0, 5.0, 4e-3))
     bare = tmp_path / "bare.urdf"
     bare.write_text(re.sub(r"(?s)<inertial>.*?</inertial>", "", simulated.urdf.read_text()))
@@ -170,7 +170,7 @@ def test_currents_of_a_robot_without_masses_are_refused_with_a_remedy(tmp_path: 
         identify(tmp_path, replace(simulated, urdf=bare), "log.npz", columns)
 
 
-def test_a_standstill_gives_the_noise_and_other_recordings_are_predicted(tmp_path: Path) -> None:
+def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
     """Three files of one robot: to be fitted, to be predicted, at rest (positions alone)."""
     time = np.arange(0.0, 12.0, 4e-3)
     robot = Robot.from_urdf(simulate(UR5, time[:2]).urdf, friction=LAW)

@@ -105,7 +105,7 @@ def test_departures(values: list[float], std: float, departing: list[int]) -> No
     assert np.flatnonzero(found.departs).tolist() == departing
 
 
-def test_values_that_stay_away_are_a_new_level() -> None:
+def test_values_that_remain_form_a_new_level() -> None:
     there = [3.0 * one for one in SCATTER]
     found = chart(np.array([*SCATTER, *there, 4.9]), np.zeros(15), 0.01)
     assert found.departs == (False,) * 7 + (True,) * MIN_CAMPAIGNS + (False,) * 2 + (True,)
@@ -115,7 +115,7 @@ def test_values_that_stay_away_are_a_new_level() -> None:
 
 @pytest.mark.parametrize("stay", [1, 3, MIN_CAMPAIGNS, 9])
 @pytest.mark.parametrize("rise_only", [False, True])
-def test_a_figure_that_departs_and_returns_has_changed_twice(stay: int, rise_only: bool) -> None:
+def test_a_value_that_returns_has_changed_twice(stay: int, rise_only: bool) -> None:
     damaged = (3.0 * np.array(SCATTER * 2)[:stay]).tolist()
     values = np.array([*SCATTER, *damaged, *SCATTER])
     found = shifts(chart(values, np.zeros(len(values)), 0.01, rise_only=rise_only))
@@ -123,7 +123,7 @@ def test_a_figure_that_departs_and_returns_has_changed_twice(stay: int, rise_onl
     assert places == [(False, 7, 6 + stay), (True, 7 + stay, 13 + stay)]
 
 
-def test_values_to_both_sides_of_a_history_make_no_level() -> None:
+def test_values_on_both_sides_form_no_level() -> None:
     found = chart(np.array([*SCATTER, *[3.0, -1.0] * 6]), np.zeros(19), 0.01)
     assert set(found.levels) == {0, -1}
     assert all(found.departs[7:])
@@ -212,7 +212,7 @@ def test_wear_and_damage_are_those_of_their_axis_alone() -> None:
     assert which == {name: [] for name in which} | {"joint_3": [10, 11]}
 
 
-def test_only_a_larger_torque_error_counts() -> None:
+def test_only_a_larger_torque_error_is_a_departure() -> None:
     arm = changed()
     departing = {axis.joint: np.flatnonzero(axis.error.departs).tolist() for axis in arm.axes}
     assert departing["joint_5"] == [11]
@@ -222,7 +222,7 @@ def test_only_a_larger_torque_error_counts() -> None:
     assert not any(axis.error.departs[-1] for axis in better.axes)
 
 
-def test_what_is_put_on_is_found_and_weighed() -> None:
+def test_an_added_payload_is_estimated() -> None:
     payload = changed().payload
     assert np.flatnonzero(payload.changed).tolist() == [7]
     assert not any(payload.other)
@@ -257,7 +257,7 @@ def test_inertia_of_another_link_is_no_payload() -> None:
     assert "of which a payload explains only" in findings(found)[0].words
 
 
-def test_the_joint_test_is_rarely_wrong_of_unchanged_arms() -> None:
+def test_the_joint_test_rarely_reports_unchanged_arms() -> None:
     """Parameters drawn from their own covariance: T² must be F distributed, or smaller."""
     one = history(steady, 1, seed=1)[0]
     onto = payload.projection(
@@ -328,7 +328,7 @@ def loaded(
     return trend_of(life, count)
 
 
-def test_a_payload_that_is_put_on_and_stated_is_no_discovery() -> None:
+def test_a_stated_payload_is_no_finding() -> None:
     arm = loaded(lambda k: k >= 2, lambda k: k >= 2)
     assert not any(arm.payload.changed + arm.payload.other)
     statement = arm.payload.statements[2]
@@ -385,7 +385,7 @@ def test_campaigns_are_in_order_of_their_times_or_names() -> None:
     assert "1 campaign (c01) without recording time" in findings(arm)[-1].words
 
 
-def test_axes_of_which_nothing_is_known_are_left_out() -> None:
+def test_axes_without_information_are_left_out() -> None:
     campaigns = []
     for one in history(steady, 2, seed=2):
         std, noise = one.std.copy(), one.noise_std.copy()
@@ -491,7 +491,7 @@ def comparison(folders: dict[str, Path]) -> Comparison:
     return compared(folders["march"], folders["june"])
 
 
-def test_planted_friction_is_found_on_its_axis_and_nowhere_else(comparison: Comparison) -> None:
+def test_changed_friction_is_found_on_its_axis_only(comparison: Comparison) -> None:
     friction = comparison.friction
     assert friction.changed.tolist() == [[False, True], [False, False]]
     change, low, high = friction.shares[0, 1]
@@ -500,7 +500,7 @@ def test_planted_friction_is_found_on_its_axis_and_nowhere_else(comparison: Comp
     assert re.search("shoulder.* 29.9 % higher in june than in march", comparison.findings[0].words)
 
 
-def test_the_first_place_is_what_others_are_compared_with(
+def test_the_first_campaign_is_the_reference(
     folders: dict[str, Path], comparison: Comparison
 ) -> None:
     back = compared(folders["june"] / "results.json", folders["march"])
@@ -513,7 +513,7 @@ def test_the_first_place_is_what_others_are_compared_with(
     assert found[0, 0] == pytest.approx(alone.validation[0].overall_relative_error, rel=0.15)
 
 
-def test_a_script_gets_numbers_and_an_exit_status(folders: dict[str, Path], tmp_path: Path) -> None:
+def test_json_has_numbers_and_an_exit_status(folders: dict[str, Path], tmp_path: Path) -> None:
     pair = [str(folders["march"]), str(folders["june"])]
     page = tmp_path / "pages" / "compare.html"
     done = CliRunner().invoke(app, ["compare", *pair, "--json", "-o", str(page)])
@@ -609,9 +609,7 @@ def test_campaigns_of_one_name_in_different_folders() -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_run_that_was_made_good_is_no_warning(
-    folders: dict[str, Path], tmp_path: Path
-) -> None:
+def test_a_repeated_killed_run_is_no_warning(folders: dict[str, Path], tmp_path: Path) -> None:
     killed = tmp_path / "killed"
     shutil.copytree(folders["june"], killed)
     (whole,) = killed.glob("archives/excitation_001_a1.mcap")
@@ -640,7 +638,7 @@ def test_a_page_of_hostile_names_is_inert() -> None:
     assert_inert(Page(comparison_page(spoilt).decode()))
 
 
-def test_what_cannot_be_known_is_not_judged() -> None:
+def test_undetermined_values_are_not_judged() -> None:
     first, second = arm_histories.history(lambda *_: Condition(), 2, seed=11)
     unknown = replace(second, std=np.full_like(second.std, np.inf), covariance=None)
     arm = Arm("digest", arm_histories.cell())
@@ -656,7 +654,7 @@ def test_what_cannot_be_known_is_not_judged() -> None:
 # The statistics by themselves.
 
 
-def test_variances_and_counts_are_of_what_repetitions_share() -> None:
+def test_variance_and_count_of_correlated_repetitions() -> None:
     apart = np.array([9.0, 10.0, 11.0])
     assert figure(10.0, 0.01, 30.0, apart).variance == pytest.approx(1.0)
     assert figure(10.0, 4.0, 30.0, apart) == figure(10.0, 4.0, 30.0, apart[:1])
@@ -687,7 +685,7 @@ def test_equal_campaigns_rarely_differ(count: int, memory: float) -> None:
 
 
 @given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))
-def test_holm_never_lowers_a_p_value_and_keeps_their_order(values: list[float]) -> None:
+def test_holm_never_lowers_a_p_value(values: list[float]) -> None:
     found = holm(np.array([[np.nan, 0.01], [0.04, 0.03]]))
     np.testing.assert_allclose(found, [[np.nan, 0.03], [0.06, 0.06]])
     adjusted = holm(np.array(values))

@@ -139,7 +139,7 @@ def test_status_takes_at_most_0_8_s_of_processor(campaign: Campaign) -> None:
     assert min(spent) <= 0.8
 
 
-def test_the_demo_leaves_archives_results_and_a_report_and_ends_with_the_verdict(
+def test_the_demo_writes_results_and_ends_with_the_verdict(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "runs" / "demo"

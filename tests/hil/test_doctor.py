@@ -57,7 +57,7 @@ def latency(*seconds: float, length: float = 60.0, name: str = "turnaround") -> 
 
 
 # --- latency and verdict ---------------------------------------------------------------------
-def test_a_stall_costs_as_many_cycles_as_it_is_long() -> None:
+def test_a_stall_counts_each_of_its_cycles() -> None:
     stall = latency(50e-6, 7.95e-3)
     assert stall.late_cycles(1e-3) == 8
     assert stall.late_cycles(2e-3) == 4
@@ -129,7 +129,7 @@ def test_a_bad_check_makes_a_fast_pc_unfit_and_is_named() -> None:
 @pytest.mark.parametrize(("fit", "seconds", "status"), [
     (True, 60.0, 0), (True, 5.0, 5), (False, 60.0, 5),
 ])  # fmt: skip
-def test_the_exit_status_is_0_only_for_a_verdict_to_be_relied_upon(
+def test_the_exit_status_is_0_only_for_a_reliable_fit(
     fit: bool, seconds: float, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def made_up(*_: object, **__: object) -> Diagnosis:
@@ -154,7 +154,7 @@ def page(found: Diagnosis) -> str:
     return console.export_text()
 
 
-def test_page_and_json_say_the_same() -> None:
+def test_page_and_json_agree() -> None:
     text, found = page(diagnosis(PORT)), json.loads(json.dumps(as_json(diagnosis(PORT))))
     assert "in use [by] a" in text and "it is the port" in text
     assert "2000-5000 µs        1 █" in text
@@ -168,7 +168,7 @@ def test_page_and_json_say_the_same() -> None:
 
 # --- probes ----------------------------------------------------------------------------------
 @pytest.fixture
-def far_end() -> Iterator[Callable[[int | None], int]]:
+def echo_port() -> Iterator[Callable[[int | None], int]]:
     """Starts an echo that keeps one question to itself; gives its port."""
     threads = []
     far = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -190,17 +190,17 @@ def far_end() -> Iterator[Callable[[int | None], int]]:
     far.close()
 
 
-def test_a_question_never_answered_counts_its_whole_wait_and_the_next_is_asked(
-    far_end: Callable[[int | None], int], monkeypatch: pytest.MonkeyPatch
+def test_a_lost_packet_counts_its_whole_wait(
+    echo_port: Callable[[int | None], int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(probe, "TIMEOUT", 0.05)
-    took = probe.round_trips(far_end(3), 1e-3, 0.2)
+    took = probe.round_trips(echo_port(3), 1e-3, 0.2)
     assert took[3] == pytest.approx(0.05)
     assert len(took) > 4
     assert np.median(np.delete(took, 3)) < 0.05
 
 
-def test_a_process_that_slept_through_deadlines_shows_it_as_one_long_latency(
+def test_missed_deadlines_are_one_long_latency(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     clock = [0.0]
@@ -226,7 +226,7 @@ def test_a_probe_that_fails_or_hangs_gives_nothing(monkeypatch: pytest.MonkeyPat
     assert measure("no such probe", 1e-3, 0.1, Silent()) is None
 
 
-def test_the_disk_is_tried_where_the_archives_will_be(tmp_path: Path) -> None:
+def test_the_disk_of_the_archives_is_measured(tmp_path: Path) -> None:
     trial = disk_trial(tmp_path / "runs" / "mine")
     assert trial.folder == str(tmp_path)
     assert len(trial.seconds) > 0
@@ -249,7 +249,7 @@ def cell_text(**controller: object) -> str:
     return text.replace('"ns16.urdf"', json.dumps(str(urdf)))
 
 
-def test_of_a_cell_that_is_being_filled_in_the_controller_is_enough(tmp_path: Path) -> None:
+def test_an_incomplete_cell_needs_only_its_controller(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(re.sub(r"(?m)^torque_constant = .*$", 'torque_constant = "?"', cell_text()))
     assert link.controller_in(path).transport == "simulated"
@@ -258,7 +258,7 @@ def test_of_a_cell_that_is_being_filled_in_the_controller_is_enough(tmp_path: Pa
         link.controller_in(path)
 
 
-def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: Path) -> None:
+def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as controller:
         controller.bind(("127.0.0.2", 0))
         port = controller.getsockname()[1]
@@ -281,7 +281,7 @@ def test_the_command_measures_judges_and_sends_the_controller_nothing(tmp_path: 
     assert os.sched_getscheduler(0) == scheduling
 
 
-def test_every_remedy_can_be_typed_as_it_stands(tmp_path: Path) -> None:
+def test_every_remedy_is_valid_shell(tmp_path: Path) -> None:
     far = ControllerTable(transport="udp", cycle_ms=1, host="10.99.99.99", port=999)
     found = examine(far, 1, 0.1, tmp_path, Silent())
     for check in found.checks:
@@ -524,7 +524,7 @@ def test_what_is_found_is_judged(
 
 
 @given(text=st.text())
-def test_nonsense_of_the_kernel_never_stops_the_examination(
+def test_invalid_kernel_files_never_stop_the_examination(
     tmp_path_factory: pytest.TempPathFactory, text: str
 ) -> None:
     tree = Tree(tmp_path_factory.mktemp("nonsense"))
@@ -537,7 +537,7 @@ def test_nonsense_of_the_kernel_never_stops_the_examination(
     assert all(check.found for check in [*checks, link.device_check("eth1", system)])
 
 
-def test_the_preemption_model_is_read_from_the_packed_kernel_configuration(tree: Tree) -> None:
+def test_preemption_is_read_from_the_packed_configuration(tree: Tree) -> None:
     (tree.root / "proc").mkdir()
     packed = gzip.compress(b"# CONFIG_PREEMPT is not set\nCONFIG_PREEMPT_NONE=y\n")
     (tree.root / "proc/config.gz").write_bytes(packed)
@@ -562,7 +562,7 @@ def test_room_and_write_time_are_judged_apart(
     assert [check.status for check in disk_checks(Path("/d"), trial)] == statuses
 
 
-def test_a_command_that_is_not_there_or_hangs_gives_no_answer(
+def test_missing_and_hanging_commands_give_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("hil.doctor.check.COMMAND_TIMEOUT", 0.05)
@@ -584,7 +584,7 @@ def test_a_command_that_is_not_there_or_hangs_gives_no_answer(
         (C4G, {}, UNKNOWN, "iproute2"),
     ],
 )
-def test_the_way_to_the_controller_is_judged(
+def test_the_route_to_the_controller_is_judged(
     host: str, commands: dict[str, Answer], status: Status, word: str, tree: Tree
 ) -> None:
     """An address of this PC, or a wrong way, needs no card; names come from the hosts file only."""
@@ -595,7 +595,7 @@ def test_the_way_to_the_controller_is_judged(
     assert len(others) == (4 if "directly" in first.found else 0)
 
 
-def test_a_port_is_tried_and_who_has_it_is_named(tree: Tree) -> None:
+def test_a_used_port_is_named_with_its_process(tree: Tree) -> None:
     who = Answer(0, 'UNCONN 0 0 0.0.0.0:1000 0.0.0.0:* users:(("orchestra",pid=42,fd=4))\n')
     found = link.port_check("", 1000, errno.EADDRINUSE, tree.system(ss=who)).found
     assert "orchestra (process 42)" in found

@@ -119,9 +119,7 @@ def any_arm(request: pytest.FixtureRequest) -> IdentifiedArm:
     return identified_arm(urdf, f"{robot}\n{tables}")
 
 
-def test_urdf_rotors_and_friction_together_give_the_torque_of_the_model(
-    any_arm: IdentifiedArm, tmp_path: Path
-) -> None:
+def test_urdf_rotors_and_friction_give_the_torque(any_arm: IdentifiedArm, tmp_path: Path) -> None:
     """From the files: pinocchio on the URDF, JSON, friction source in a separate interpreter."""
     parameters = parameters_of(any_arm, tmp_path)
     model, consistent = any_arm.cell.model, any_arm.consistency.consistent

@@ -59,9 +59,7 @@ def two_joints(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_a_urdf_does_not_state_is_unknown_and_all_named(
-    two_joints: Path, tmp_path: Path
-) -> None:
+def test_values_missing_in_a_urdf_are_unknown_and_listed(two_joints: Path, tmp_path: Path) -> None:
     summary = new(two_joints, tmp_path / "cell.toml")
     limits = tomllib.loads((tmp_path / "cell.toml").read_text())["limits"]
     assert limits["frame"] == "urdf"
@@ -136,7 +134,7 @@ def test_prismatic_joints_are_fixed_with_a_note(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("joint", ["panda_finger_joint1", "panda_joint4"])
-def test_a_fixed_joint_leaves_the_dynamics_of_one_that_is_held(joint: str) -> None:
+def test_a_fixed_joint_has_the_dynamics_of_a_locked_one(joint: str) -> None:
     """Against pinocchio's own reduction of the whole model."""
     urdf = described_robot(PANDA).read_text()
     held = 0.021
@@ -175,7 +173,7 @@ def test_an_archive_of_another_arm_is_refused(
     assert not (tmp_path / "c.toml").exists()
 
 
-def test_a_controller_is_asked_over_udp(tmp_path: Path) -> None:
+def test_the_init_packet_is_read_over_udp(tmp_path: Path) -> None:
     port = free_port()
     simulator = subprocess.Popen(
         [*SIMULATE, str(CELL_PATH), "--udp", f"127.0.0.1:{port}", "--json", "--duration", "60"],
@@ -199,7 +197,7 @@ def test_a_controller_is_asked_over_udp(tmp_path: Path) -> None:
     assert json.loads(output.splitlines()[-1])["rejected"] == 0  # every answer was a good one
 
 
-def test_whoever_asks_a_controller_cannot_move_it() -> None:
+def test_reading_the_init_packet_cannot_move_the_arm() -> None:
     """Any drive train but the placeholder makes the session unusable, and no archive is there."""
     settings = _nothing_moves(UdpSpec("127.0.0.1", 1, "127.0.0.1"), 6, 1)
     drives = Cell.load(CELL_PATH).drive_train
@@ -211,7 +209,7 @@ def test_whoever_asks_a_controller_cannot_move_it() -> None:
     assert settings.needs_archive
 
 
-def test_a_controller_that_does_not_come_leaves_no_file(tmp_path: Path) -> None:
+def test_without_a_controller_no_file_is_written(tmp_path: Path) -> None:
     result = CliRunner().invoke(
         app,
         ["new", "--urdf", str(URDF_PATH), "-o", str(tmp_path / "c.toml"), "--wait", "0.2",
@@ -222,7 +220,7 @@ def test_a_controller_that_does_not_come_leaves_no_file(tmp_path: Path) -> None:
     assert not (tmp_path / "c.toml").exists()
 
 
-def test_nothing_is_overwritten_unless_asked_for(two_joints: Path, tmp_path: Path) -> None:
+def test_files_are_replaced_only_with_force(two_joints: Path, tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text("mine")
     arguments = ["new", "--urdf", str(two_joints), "-o", str(path)]
@@ -258,7 +256,7 @@ def test_mimic_joints_are_fixed_with_a_note(two_joints: Path, tmp_path: Path) ->
         (["--from-controller", "a:\N{SUPERSCRIPT TWO}"], "is not HOST or HOST:PORT"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_a_sentence(
+def test_invalid_options_are_refused(
     options: list[str], sentence: str, two_joints: Path, tmp_path: Path
 ) -> None:
     arguments = ["new", "--urdf", str(two_joints), "-o", str(tmp_path / "c.toml"), *options]
@@ -268,7 +266,7 @@ def test_what_cannot_be_meant_is_refused_in_a_sentence(
 
 
 @pytest.mark.parametrize("arm", ["1.0", "7", "true", "nan", '"one"'])
-def test_an_archive_whose_cell_names_no_arm_is_of_the_first(arm: str, tmp_path: Path) -> None:
+def test_an_archive_without_a_valid_arm_is_of_arm_1(arm: str, tmp_path: Path) -> None:
     packet = InitPacket.build(2, 2, {"gear_ratio": [100.0, -80.0]}).encode()
     cell = f"[controller]\narm = {arm}\n".encode()
     path = write_samples(
@@ -300,7 +298,7 @@ def test_pipes_and_other_encodings_are_refused(tmp_path: Path, two_joints: Path)
         cell_of_urdf(two_joints, {})
 
 
-def test_the_command_prints_one_sentence_for_a_file_that_is_no_urdf(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_urdf_gives_one_line(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text("<robot/>")
     done = subprocess.run(
         [sys.executable, "-m", "hil", "new", "--urdf", str(tmp_path / "arm.urdf"), "-o",

@@ -250,7 +250,7 @@ def planned(cell: Cell, count: int, fly: float = 50.0):
     return plan_moves(points[0], [Move(p, fly=FlyPercent(fly)) for p in points[1:]], limits)
 
 
-def test_shaded_corners_are_where_the_motion_leaves_the_straight_lines(cell):
+def test_shaded_corners_are_where_the_motion_is_curved(cell):
     plan = planned(cell, 6)
     points = np.array([plan.start, *(move.target for move in plan.moves)])
     time = np.linspace(0.0, plan.trajectory.duration, 20_001)

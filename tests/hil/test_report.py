@@ -373,7 +373,7 @@ class TestPage:
         assert html.rindex("</details>") > places[-1]
 
     @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
-    def test_has_a_word_and_a_symbol_for_the_verdict(self, good: bool, word: str) -> None:
+    def test_has_word_and_symbol_of_the_verdict(self, good: bool, word: str) -> None:
         verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
         text = render(make_results(verdict=verdict))
         card = text[text.index('<section class="verdict') :].split("</section>")[0]
@@ -394,7 +394,7 @@ class TestPage:
         assert len(set(re.findall(r'(?:href="|url\()#([^")]*)', html))) > 50
         assert len(html.encode()) < 2_000_000
 
-    def test_has_the_same_bytes_whoever_draws(self) -> None:
+    def test_bytes_do_not_depend_on_thread_or_settings(self) -> None:
         settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
         series = make_series(samples=200)
         with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
@@ -402,7 +402,7 @@ class TestPage:
             assert {key: mpl.rcParams[key] for key in settings} == settings
         assert set(pages) == {report_bytes(make_results(), series)}
 
-    def test_starts_nothing_that_an_archive_is_called(self, results: Results) -> None:
+    def test_names_from_archives_are_escaped(self, results: Results) -> None:
         def spoil(value: Any) -> Any:
             if isinstance(value, list):
                 return [spoil(v) for v in value]
@@ -433,7 +433,7 @@ class TestPage:
         declared = set(re.findall(r"(--[a-z0-9-]+):", html))
         assert set(re.findall(r"var\((--[a-z0-9-]+)\)", html)) <= declared
 
-    def test_of_one_joint_without_friction_or_validation_is_made_too(self) -> None:
+    def test_of_one_joint_without_friction_or_validation(self) -> None:
         whole, empty = real_recording(), np.empty((0, 1))
         executed = _criteria(1.0, 1.0) | {"condition": math.inf}
         # fmt: off
@@ -450,7 +450,7 @@ class TestPage:
         found = Page(render(Results.model_validate(alone), series))
         assert "Nothing was held out" in found.text
 
-    def test_turns_no_other_text_round_by_a_name(self) -> None:
+    def test_bidirectional_characters_are_escaped(self) -> None:
         text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
         name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
         shown = text.render(name=name, same=same, number=3)
@@ -460,7 +460,7 @@ class TestPage:
 class TestEstimation:
     """How the estimate was made."""
 
-    def test_is_described_with_what_stands_behind_it(self, whole: Page, results: Results) -> None:
+    def test_is_described_with_its_methods(self, whole: Page, results: Results) -> None:
         for words in (
             results.estimator.words,
             results.estimator.grouping,
@@ -470,7 +470,7 @@ class TestEstimation:
         ):
             assert words in whole.text
 
-    def test_names_what_was_not_tested_or_believed(self) -> None:
+    def test_names_what_was_not_tested(self) -> None:
         whole, recording = make_results(), real_recording()
         estimator = whole.estimator.model_copy(update={"prior": "the URDF gives no inertia"})
         parameters = [p.model_copy(update={"learned": None}) for p in recording.parameters]
@@ -494,7 +494,7 @@ class TestEstimation:
 
 
 class TestParameters:
-    def test_stand_in_a_table(self, whole: Page, results: Results) -> None:
+    def test_are_in_a_table(self, whole: Page, results: Results) -> None:
         rows, parameters = whole.table("Estimate"), results.parameters
         assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
         for row, p in zip(rows, parameters, strict=True):
@@ -520,7 +520,7 @@ class TestParameters:
         remarks = [row["Remark"].replace("\xa0", " ") for row in rows]
         assert remarks[: len(cases)] == [remark for *_, remark in cases]
 
-    def test_have_routes_to_their_deviation(self, whole: Page, results: Results) -> None:
+    def test_have_methods_of_their_deviation(self, whole: Page, results: Results) -> None:
         rows = {row["Method"]: row for row in whole.table("Method")}
         assert [name.endswith("(reported)") for name in rows] == [False, False, True, False]
         pairs = zip(results.parameters, results.uncertainty.least_squares, strict=True)
@@ -553,7 +553,7 @@ class TestErrors:
         assert "median of 12 runs" in median[0]
         assert Page(html).text.count("includes standstill and reversals") == 1
 
-    def test_over_every_row_stand_beside_each_joint(self, results: Results) -> None:
+    def test_over_all_rows_are_given_for_each_joint(self, results: Results) -> None:
         assert page.every_row_errors(results) == [0.06] * N
         assert page.every_row_errors(make_results()) == []
         assert all("all rows 6.00 %" in one.error for one in figures.joints_of(results))
@@ -651,7 +651,7 @@ class TestZoom:
 class TestConduct:
     """How the campaign was run."""
 
-    def test_is_shown_with_what_was_run_again_and_why(self, whole: Page) -> None:
+    def test_shows_rejected_motions_with_reason(self, whole: Page) -> None:
         text = whole.text
         assert "Execution" in text
         assert "6 of 6 criteria passed" in text and "Accepted by ada" in text and "2 late" in text
@@ -663,7 +663,7 @@ class TestConduct:
         assert "0.15 %, threshold 0.2 %" in text
         assert "not warm" not in text
 
-    def test_may_be_missing_or_empty_or_of_a_cold_arm(self) -> None:
+    def test_may_be_missing_empty_or_of_a_cold_arm(self) -> None:
         assert "Execution" not in rendered(make_results()).text
         text = rendered(make_results(conduct=conduct(warm_up=None, recorded=[]))).text
         assert "No archive could be read" in text and "Warm-up" not in text
@@ -678,7 +678,7 @@ class TestConduct:
 
 class TestNumbers:
     @given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e9))
-    def test_read_back_as_what_they_were(self, value: float, std: float) -> None:
+    def test_read_back_unchanged(self, value: float, std: float) -> None:
         assert float(numbers.significant(value)) == pytest.approx(value, rel=0.0051)
         assert abs(float(numbers.beside(value, std)) - value) <= 0.06 * std + 1e-9 * abs(value)
 
@@ -696,7 +696,7 @@ class TestNumbers:
         assert numbers.beside(value, std) == text
 
 
-def test_tables_as_csv_have_the_numbers_of_results_json() -> None:
+def test_csv_tables_have_the_numbers_of_results_json() -> None:
     """A row for each record, a column for each joint, and one per parameter of a matrix."""
     results = make_results()
     rows = {n: list(csv.DictReader(io.StringIO(t))) for n, t in csv_tables(results).items()}
@@ -781,7 +781,7 @@ class TestTrust:
         assert 'id="trust"' in html
         assert "Essential parameters" not in html and 'id="consistency"' not in html
 
-    def test_names_links_bounds_and_what_consistency_moves(self, arm: IdentifiedArm) -> None:
+    def test_names_links_bounds_and_moved_parameters(self, arm: IdentifiedArm) -> None:
         bound = "rotor inertia of elbow would be negative (-0.3)"
         html = Sections(arm, consistency={"bounds": [bound], "moved": ["mc2x", "f0_1"]}).html
         assert bound in html

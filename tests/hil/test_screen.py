@@ -99,7 +99,7 @@ def test_friction_of_the_last_motion_remains() -> None:
         assert "friction changed by 1.7 % (warm below 2 %)" in shown
 
 
-def test_eighty_by_twenty_four_hold_everything() -> None:
+def test_80_by_24_show_everything() -> None:
     screen = screen_lines(80, 24)
     assert len(screen) == 24
     text = "\n".join(screen)
@@ -147,11 +147,11 @@ def test_stop_hold_and_silence_are_shown() -> None:
 
 
 @pytest.mark.parametrize("width", [48, 64, 80])
-@pytest.mark.parametrize("far_end", ["SIMULATED", "10.2.12.150"])
-def test_the_first_line_names_the_controller(width: int, far_end: str) -> None:
-    shown = Shown("a long title " * 6, NAMES, status(), controller=far_end, left="0:42 left")
+@pytest.mark.parametrize("controller", ["SIMULATED", "10.2.12.150"])
+def test_the_first_line_names_the_controller(width: int, controller: str) -> None:
+    shown = Shown("a long title " * 6, NAMES, status(), controller=controller, left="0:42 left")
     first = screen_lines(width, 24, shown)[0]
-    assert far_end in first
+    assert controller in first
     assert first.endswith("0:42 left")
     assert "repetition" in first
 
@@ -185,7 +185,7 @@ def test_in_virtual_time_the_time_left_is_that_of_waiting() -> None:
     assert pace.left(one) == pytest.approx(15.0)
 
 
-def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
+def test_only_a_terminal_wraps_lines() -> None:
     sentence = "one sentence that is [longer] than any line of this terminal is wide :smile:"
     for terminal in (True, False):
         out = StringIO()
@@ -206,7 +206,7 @@ def test_a_terminal_breaks_lines_and_a_file_gets_them_whole() -> None:
         ("1-", 0.1, False), ("10", 1.0, False), ("5h", 0.5, True), ("x", 1.0, False),
     ],
 )  # fmt: skip
-def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
+def test_keys_change_the_request(keys: str, override: float, held: bool) -> None:
     request = OperatorRequest()
     for key in keys:
         request = after(request, key, request.override)
@@ -214,7 +214,7 @@ def test_what_keys_mean(keys: str, override: float, held: bool) -> None:
     assert request.held is held
 
 
-def test_arrows_mean_nothing_and_a_paste_nothing_faster() -> None:
+def test_arrows_and_pasted_keys_are_ignored() -> None:
     assert typed("\x1b[A\x1b[1;5C\x1bOP\x1b[1;") == ""
     assert typed("\x1b[15~-") == "-"
     assert typed("0000000") == ""
@@ -229,7 +229,7 @@ def test_arrows_mean_nothing_and_a_paste_nothing_faster() -> None:
         ("\x1b\x1b[A", "hold"), ("\x1b\x1bs", "stop"), ("\x1b[A\x1bs", "stop"),
     ],
 )  # fmt: skip
-def test_escape_holds_and_takes_nothing_else_away(sent: str, means: str) -> None:
+def test_escape_holds(sent: str, means: str) -> None:
     screen = Screen(NAMES, stop := Stop(), quiet=True)
     for key in typed(sent):
         screen.press(key)
@@ -238,7 +238,7 @@ def test_escape_holds_and_takes_nothing_else_away(sent: str, means: str) -> None
     assert screen.request().override == 1.0
 
 
-def test_a_dry_runs_override_ends_with_it_and_lowers_from_it() -> None:
+def test_the_override_of_a_dry_run_ends_with_it() -> None:
     screen = Screen(NAMES, Stop(), quiet=True)
     for phase in ("dry run", "move"):
         screen.show(RunStatus(phase, 1, 1, 1.0))
@@ -350,7 +350,7 @@ def test_keys_arrive_and_the_screen_survives_a_resize(tmp_path: Path) -> None:
         pytest.param("return", signal.SIGHUP, 0, marks=pytest.mark.slow),
     ],
 )
-def test_the_terminal_is_as_it_was_at_every_end(
+def test_the_terminal_is_restored_at_every_end(
     tmp_path: Path, ending: str, signum: signal.Signals | None, code: int
 ) -> None:
     with terminal(tmp_path, ending) as end:
@@ -388,7 +388,7 @@ def test_a_dry_run_is_accepted_by_one_word_only(
         assert [line["accepted"] for line in end.reported()[:3]] == [False, False, True]
 
 
-def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
+def test_a_blocked_terminal_delays_no_stop(tmp_path: Path) -> None:
     with terminal(tmp_path) as end:
         end.await_seen(b"repetition 3 of 30")
         end.stop_reading()
@@ -400,7 +400,7 @@ def test_a_terminal_that_takes_nothing_delays_no_stop(tmp_path: Path) -> None:
             time.sleep(0.02)
 
 
-def test_keys_that_are_cut_in_two_are_put_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_split_key_sequences_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
     """Over a slow line the parts of an arrow come one by one; none of them is a key."""
     monkeypatch.setattr("hil.screen._SEQUENCE_WAIT", 5.0)  # this machine may be slow, too
     near, far = pty.openpty()
@@ -479,7 +479,7 @@ def test_without_a_terminal_there_are_lines_or_none() -> None:
     assert out.getvalue() == ""
 
 
-def test_a_pipe_that_is_full_holds_nothing_up() -> None:
+def test_a_full_pipe_blocks_nothing() -> None:
     reads, writes = os.pipe()
     fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, 4096)
     with os.fdopen(writes, "w", buffering=1) as file:

@@ -156,7 +156,7 @@ class TestErrors:
         assert forms.own(mean, np.ones(3)) == pytest.approx([away])
         assert np.sqrt(forms.own_kernels(values, np.ones(3)).mean()) == pytest.approx(away)
 
-    def test_the_longer_excitation_is_cut_to_as_much_motion(self) -> None:
+    def test_the_longer_excitation_is_cut_to_equal_duration(self) -> None:
         short = fitted(np.ones((6, 4)))
         fits = {"a": fitted(np.arange(24.0).reshape(6, 4), 20.0), "b": short}  # 120 s and 48 s
         equal = equal_data(fits)
@@ -171,7 +171,7 @@ class TestErrors:
         assert parameter_error(-0.5 * base, base, truth) == pytest.approx(0.5)
         assert parameter_error(truth, base, truth) is None
 
-    def test_the_band_holds_what_other_repetitions_give(self) -> None:
+    def test_the_range_contains_other_repetitions(self) -> None:
         forms, values = {"fly-by": random_forms(5, 4)}, flagged(0, 4, 6, 0.1)
         found = ranges_of("b", values, 1, forms, np.zeros(4), values[0])
         bands = {one.quantity: one for one in found}
@@ -196,7 +196,7 @@ class TestErrors:
 class TestSpread:
     """What other motions and other repetitions would have changed."""
 
-    def test_like_repetitions_leave_the_scatter_of_motions(self) -> None:
+    def test_equal_repetitions_leave_the_scatter_of_motions(self) -> None:
         logs = np.random.default_rng(3).normal(0.1, 0.3, 12)
         same = np.ones((12, 4, 4))
         found = spread(same, same * np.exp(2.0 * logs)[:, None, None], drifts=False, seed=0)
@@ -241,7 +241,7 @@ class TestSpread:
         own = compared_on("fly-by", ("a", "b"), own_errors, drifts=False)
         assert own.ratio == pytest.approx(one.ratio)  # these torques are those of parameters of 0
 
-    def test_repetitions_like_their_neighbours_count_as_blocks(self) -> None:
+    def test_correlated_repetitions_count_as_blocks(self) -> None:
         forms, random = random_forms(10, 4), np.random.default_rng(6)
         slow = np.repeat(random.standard_normal((9, 4)), 3, axis=0)
         other = 1.0 + random.standard_normal((27, 4))
@@ -370,7 +370,7 @@ class TestConclusion:
             ({"ratio": 0.8, "repetitions": 1}, "Too few repetitions or motions"),
         ],
     )
-    def test_what_is_small_or_uncertain_is_called_so(
+    def test_small_or_uncertain_differences_are_labelled(
         self, made: dict[str, Any], verdict: str
     ) -> None:
         results = study(condition(**made))
@@ -391,7 +391,7 @@ class TestConclusion:
         assert verdicts["effects"] == "No." and verdicts["prediction"].startswith("B is better")
 
     @pytest.mark.parametrize(("ratio", "gone"), [(1.0, True), (1.25, False)])
-    def test_more_motion_alone_is_no_better_method(self, ratio: float, gone: bool) -> None:
+    def test_more_motion_alone_is_not_a_better_method(self, ratio: float, gone: bool) -> None:
         """A's motion is the longer one; `ratio` is that of B over as much motion of A."""
         cut = condition(ratio, scatter=0.3 if gone else 0.05).comparisons
         equal = EqualDataResult(
@@ -439,7 +439,7 @@ class TestPlans:
         assert best_sines(both, PRINTED_SINES) == "a-home"
         assert best_sines(found(b=90.0)) is None
 
-    def test_an_excitation_that_the_arm_does_not_bear(self, tmp_path: Path) -> None:
+    def test_ended_campaigns_are_left_out(self, tmp_path: Path) -> None:
         def at(condition: str, key: str) -> Execution:
             return cast(Execution, SimpleNamespace(root=tmp_path / condition / key))
 
@@ -455,7 +455,7 @@ class TestPlans:
             with pytest.raises(StudyError, match=rf"{name}/b: the controller ended .* drive fault"):
                 plans.without({tmp_path / name / B: "drive fault"})
 
-    def test_a_refusal_in_a_child_is_one_sentence(self, tmp_path: Path) -> None:
+    def test_an_error_in_a_child_is_one_sentence(self, tmp_path: Path) -> None:
         calls = [(tmp_path, (tmp_path / "none.toml",))]
         with LocalWorkers(2) as workers, pytest.raises(StudyError, match=r"none\.toml.*resume"):
             in_children(Cell.load, calls, "loading", Silent(), workers, of=1)
@@ -516,7 +516,7 @@ class TestWhole:
     """Searches, campaigns, estimates, tables and page."""
 
     @pytest.mark.slow
-    def test_it_leaves_results_and_one_self_contained_page(self, whole: Whole) -> None:
+    def test_it_writes_results_and_one_self_contained_page(self, whole: Whole) -> None:
         root, found = whole
         assert StudyResults.load(root / "results.json") == found
         page = (root / "report.html").read_text("utf-8")
@@ -573,7 +573,7 @@ class TestWhole:
             assert flies == {{"a": None, "b": True, "b0": False}[key]}
 
     @pytest.mark.usefixtures("no_page")
-    def test_started_again_nothing_whole_is_done_again(
+    def test_a_restart_repeats_nothing_complete(
         self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
     ) -> None:
         root, found = whole
@@ -630,7 +630,7 @@ class TestWhole:
 class TestCommand:
     """`hil study`."""
 
-    def test_ctrl_c_leaves_one_sentence_and_its_exit_status(
+    def test_ctrl_c_gives_one_sentence_and_exit_status(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         def interrupted(*_: object, **__: object) -> None:

@@ -92,7 +92,7 @@ class TestCopies:
         with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
             open_archive(copies[0])
 
-    def test_predicted_and_commanded_stand_beside_the_torque(
+    def test_copies_have_predicted_and_commanded_states(
         self, seen: Messages, found: Identification
     ) -> None:
         """At the same instants, and as far from it as the results say."""
@@ -110,7 +110,9 @@ class TestCopies:
         assert np.isfinite(position).all()
         assert np.isfinite(velocity).all()
 
-    def test_times_are_those_of_the_day(self, short_campaign: Campaign, tmp_path: Path) -> None:
+    def test_times_are_those_of_the_recording_day(
+        self, short_campaign: Campaign, tmp_path: Path
+    ) -> None:
         """Where the archive knows it; a simulated one does not, and keeps its own."""
         archive = open_archive(short_campaign.folder.archives / "excitation_000_a1.mcap")
         n = len(archive.joint_names)
@@ -245,7 +247,7 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
 class TestFrame:
     """Positions, speeds and torques of a page are in one frame, which the page names."""
 
-    def test_a_torque_turns_as_its_joint_does(self, excitation: Path, campaign: Campaign) -> None:
+    def test_torque_has_the_sign_of_its_angle(self, excitation: Path, campaign: Campaign) -> None:
         """Torque times speed is the power of the joint, whoever looks at it."""
         columns = open_archive(excitation).columns
         sign = np.array(campaign.cell.drive_table.joint_sign)
@@ -320,7 +322,7 @@ def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path
         assert b"MotionEnded" in content
 
 
-def test_a_page_holds_every_sample_to_be_zoomed_into(excitation: Path) -> None:
+def test_a_page_has_every_sample_for_the_zoom(excitation: Path) -> None:
     view = view_of(excitation, joints=("2",))
     page = archive_page(view).decode("utf-8")
     (text,) = re.findall(r'data-traces="([^"]*)"', page)
@@ -349,9 +351,7 @@ def test_the_header_counts_missed_packets(excitation: Path) -> None:
     assert "missed" not in header(replace(view, states=(), events=()))
 
 
-def test_shares_of_limits_are_for_scripts_and_other_files_refused(
-    excitation: Path, tmp_path: Path
-) -> None:
+def test_json_has_the_peaks_and_other_files_are_refused(excitation: Path, tmp_path: Path) -> None:
     target = tmp_path / "x.png"
     result = CliRunner().invoke(app, ["plot", str(excitation), "-o", str(target), "--json"])
     assert result.exit_code == 0
