@@ -48,7 +48,7 @@ class _FieldError(DriverError):
 
 
 class PacketError(_FieldError):
-    """Bytes that are not a valid packet."""
+    """Bytes that are not a valid packet: `field`, its value, and what was expected."""
 
     what = "packet"
 
@@ -60,12 +60,7 @@ class DriveTrainError(_FieldError):
 
 
 class RequestError(DriverError):
-    """A motion, or a change of its speed, was requested in a state that does not allow it.
-
-    Attributes:
-        state: name of the session's state.
-        reason: why it is refused, and what has to happen first.
-    """
+    """A motion, or a change of its speed, was requested in a `state` that does not allow it."""
 
     def __init__(self, state: str, reason: str, what: str = "motion") -> None:
         super().__init__(f"no {what} can be requested in state '{state}': {reason}")
@@ -158,7 +153,6 @@ class GuardError(RefusalError):
         joint: index from 0.
         value: what was found, in `unit`.
         bound: largest magnitude allowed (or the nearer position limit), in `unit`.
-        unit: unit of both.
     """
 
     check = "guard"

@@ -38,7 +38,7 @@ class Counters:
 class InitReceived:
     """The controller started a session.
 
-    `unusable` tells why the arm cannot be moved in it, or None; `differences` from the cell name
+    `unusable` is why the arm cannot be moved in it, or None; `differences` from the cell name
     axis and both values; `adopted`: the controller's gear ratios, calibration and coupling are
     used.
     """

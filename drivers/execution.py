@@ -3,8 +3,8 @@
 A source is foreign code inside the cycle: anything it raises (SystemExit included), any array that
 is not (n,) numbers, and bounds wider than allowed become `SourceFailed`. Allowed are the bounds of
 a plan; those of an override from the first change of override on; those of a stop from `stop` or
-the first `hold` on. A correction, whose bounds have no name, may use those of a stop until it is at
-rest. A stop that takes too long is a failure; a hold that does not come to rest becomes a stop.
+the first `hold` on; for a correction, until it is at rest. A stop that takes too long is a failure;
+a hold that does not come to rest becomes a stop.
 """
 
 from __future__ import annotations

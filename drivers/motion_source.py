@@ -56,7 +56,7 @@ class MotionSource(Protocol):
     def stop(self) -> None:
         """Come to rest on the path; then `finished` is true. Calling it again changes nothing.
 
-        The session requests drive-off if that takes longer than `session.STOP_TIMEOUT`.
+        Drive-off is requested if that takes longer than `session.STOP_TIMEOUT`.
         """
 
 
@@ -66,9 +66,8 @@ class FeedForwardSource(MotionSource, Protocol):
     def feed_forward(self) -> tuple[Array, Array]:
         """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
 
-        Called once after each `advance`. Both are zero at the first set-point and when the motion
-        is finished. For a source without this method the velocity fed forward is that of the
-        set-points, and the current zero.
+        Called once after each `advance`; both zero at the first set-point and at the end. Without
+        this method the velocity fed forward is that of the set-points, and the current zero.
         """
 
 

@@ -118,11 +118,7 @@ def cyclic_length(n_axes: int) -> int:
 
 
 def packet_number(packet: bytes) -> int:
-    """Return the sequence number of any packet.
-
-    Raises:
-        PacketError: shorter than a header, or a number outside 1..0x7FFF.
-    """
+    """Return the sequence number of any packet; PacketError outside 1..0x7FFF."""
     if len(packet) < HEADER_LENGTH:
         raise PacketError("length", len(packet), f"at least the {HEADER_LENGTH} bytes of a header")
     number: int = _NUMBER.unpack_from(packet)[0]
@@ -159,11 +155,7 @@ class CyclicPacket:
 
     @classmethod
     def decode(cls, packet: bytes, n_axes: int) -> CyclicPacket:
-        """Decode a packet with `n_axes` slots; bytes behind them are ignored.
-
-        Raises:
-            PacketError: shorter than 12 + 36 n bytes, longer than 732, or number not 1..0x7FFF.
-        """
+        """Decode a packet with `n_axes` slots; the rest is ignored. Raises PacketError."""
         if not HEADER_LENGTH + AXIS_LENGTH * n_axes <= len(packet) <= MAX_CYCLIC_LENGTH:
             raise PacketError(
                 "length",
@@ -227,11 +219,7 @@ class InitPacket:
 
     @classmethod
     def decode(cls, packet: bytes) -> InitPacket:
-        """Decode 1200 bytes.
-
-        Raises:
-            PacketError: wrong length or number, or a number of axes outside 1..20.
-        """
+        """Decode 1200 bytes; raises PacketError."""
         if len(packet) != INIT_LENGTH:
             raise PacketError("length", len(packet), f"{INIT_LENGTH} bytes")
         init = cls(np.frombuffer(packet, INIT_DTYPE))
@@ -303,11 +291,7 @@ class InitPacket:
         return k54, k64, k65
 
     def open_axes(self) -> Sequence[OpenAxis]:
-        """Return the open axes of all arms in slot order.
-
-        Raises:
-            PacketError: the map does not give each of the n_axes slots to exactly one axis.
-        """
+        """Return the open axes of all arms in slot order; PacketError for an invalid map."""
         table = self.open_axes_map
         axes = [
             OpenAxis(arm + 1, axis, int(table[arm, axis]))

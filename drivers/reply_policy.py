@@ -1,33 +1,31 @@
 """The reply to each cyclic packet of one session, given the state it leads to.
 
-In open mode the first set-point is the target received in the packet in which the last wanted axis
-opened, at zero velocity, compared with actual position and standstill. D2 is the step of the motor
-from one sent set-point to the next, computed in float64; `drivers.packets.MODE_FIELDS` gives the
-fields of each open mode. A motion requested while the axes are open begins under the same
-conditions, from the set-point held. While axes are open, following error and current are checked,
-and that the controller accepts the set-points: the target received (D1) is within 10 % of the
-following-error threshold of one of the last `max_gap` + 1 set-points sent, or of the last one
-extrapolated by as many steps as packets were missed, and within 25 % of the last. A target older
-than the last set-point is a lost reply, which is counted and reported. The last set-point is sent
-again until it is accepted, and more than `max_gap` lost replies in 100 cycles stop the motion on
-its path.
+The first set-point is the target received in the packet in which the last wanted axis opened, at
+zero velocity, compared with actual position and standstill. D2 is the step of the motor from one
+sent set-point to the next, computed in float64; `drivers.packets.MODE_FIELDS` gives the fields of
+each open mode. A motion requested while the axes are open begins under the same conditions, from
+the set-point held. Without a requested motion the first set-point is held.
 
-Without replies a controller may hold the last target and so stop the arm, extrapolate it, or leave
-open mode, move the arm and come back; the next set-point at full speed would then be a jump. Hence,
-after a gap longer than `max_gap`, open mode continues only if D1 is within 10 % of the threshold of
-the set-point sent last, or of some steps more, and its velocity (D2) is zero or within half the
-velocity sent last or the standstill threshold; for an arm at rest the same is required of its own
-velocity (D4). The motion comes to rest on its path from D1 and D2, which count as sent. Where
-packets arrive late although none is missing, D4 is compared with the velocity sent last.
-Corrections of targets that the controller generates (modes 2, 7, 8, 9) are refused after such a gap
-unless they were zero. A link may give the age of each value: a value needed for these decisions,
-for the first set-point, or to be returned to an open axis is refused if it was not sent in this
-packet.
+While axes are open, following error and current are checked, and that the target received (D1) is
+within 10 % of the following-error threshold of one of the last `max_gap` + 1 set-points sent, or of
+the last one extrapolated by as many steps as packets were missed, and within 25 % of the last. An
+older target is a lost reply: the last set-point is sent again until it is accepted, and more than
+`max_gap` lost replies in 100 cycles stop the motion on its path.
 
-After the motion the end is held for `settle_cycles`; the next reply asks for the end of open mode
-(status byte 1), and again every `EXIT_RETRY_CYCLES`; after `EXIT_TIMEOUT` that is a fault. The end
-is requested as well where a motion waits that long for the last axis to open. Without a requested
-motion the first set-point is held.
+Without replies a controller may hold the last target, extrapolate it, or leave open mode, move the
+arm and come back; the next set-point at full speed would then be a jump. Hence, after a gap longer
+than `max_gap`, open mode continues only if D1 is within 10 % of the threshold of the set-point sent
+last, or of some steps more, and its velocity (D2) is zero or within half the velocity sent last or
+the standstill threshold; for an arm at rest the same is required of its own velocity (D4). The
+motion comes to rest on its path from D1 and D2, which count as sent. Where packets arrive late
+although none is missing, D4 is compared with the velocity sent last. Corrections of targets that
+the controller generates (modes 2, 7, 8, 9) are refused after such a gap unless they were zero. A
+value needed for these decisions, for the first set-point, or to be returned to an open axis is
+refused if it was not sent in this packet.
+
+The end is held for `settle_cycles`; the next reply asks for the end of open mode (status byte 1),
+and again every `EXIT_RETRY_CYCLES`; after `EXIT_TIMEOUT` that is a fault. The end is requested as
+well where a motion waits that long for the last axis to open.
 """
 
 from __future__ import annotations

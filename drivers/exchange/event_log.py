@@ -2,7 +2,6 @@
 
 A frame is length, checksum, index and one pickled event. The writer stores the new tail, the frame,
 then the new head; a reader copies the frames, then drops those behind the tail valid by then.
-Order of stores as in `drivers.record`.
 """
 
 from __future__ import annotations

@@ -11,13 +11,7 @@ from drivers.errors import DriverError
 
 
 class TransportError(DriverError):
-    """A link that cannot be opened.
-
-    Attributes:
-        link: kind and address.
-        reason: of the failure.
-        remedy: for the operator.
-    """
+    """A link, of this kind and address, that cannot be opened; with reason and remedy."""
 
     def __init__(self, link: str, reason: str, remedy: str) -> None:
         super().__init__(f"{link} cannot be opened: {reason}; {remedy}")
@@ -45,7 +39,7 @@ class Transport(Protocol):
     def ages(self) -> NDArray[np.uint16] | None:
         """Ages of the values of the packet received last, in cycles.
 
-        (n_axes, 8) for D1..D5, extra1..3 of each axis; None if each packet carries all of them.
+        (n_axes, 8) for D1..D5, extra1..3 of each axis; None if each packet has all of them.
         """
 
     def receive(self, timeout: float) -> bytes | None:
@@ -82,8 +76,4 @@ class TransportSpec(Protocol):
     """Settings of a link; pickles, so that another process can open it."""
 
     def open(self) -> Transport:
-        """Open the link.
-
-        Raises:
-            TransportError: it cannot be opened.
-        """
+        """Open the link; raises TransportError."""

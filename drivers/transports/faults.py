@@ -94,12 +94,7 @@ Fault = Lose | Delay | Duplicate | Reorder | Corrupt
 
 
 class FaultyLink:
-    """Deliveries of each packet under scripted faults, without state.
-
-    Args:
-        faults: in any order.
-        period: the controller's cycle, s.
-    """
+    """Deliveries of each packet under scripted faults, without state; `period` in s."""
 
     def __init__(self, faults: Sequence[Fault], period: float) -> None:
         self._period = period

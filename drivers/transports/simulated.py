@@ -39,13 +39,8 @@ class _Delayed(NamedTuple):
 class SimulatedTransport:
     """Carries packets between a session and a peer, one cycle of virtual time per packet.
 
-    Deterministic: the same peer, session and faults give the same bytes at the same times.
-
-    The peer gets at most one reply per cycle, and none that was sent in an earlier cycle.
-
-    Args:
-        peer: the controller.
-        faults: of the link, see `drivers.transports.faults`.
+    Deterministic: the same peer, session and faults give the same bytes at the same times. The peer
+    gets at most one reply per cycle, and none that was sent in an earlier cycle.
 
     Attributes:
         cycle: cycles begun so far.

@@ -66,10 +66,9 @@ class UdpSpec:
 class UdpTransport:
     """A bound UDP port that accepts datagrams of one host; arguments as for `UdpSpec`.
 
-    The first datagram of plausible length from that host, at the beginning and after
-    `forget_peer`, selects its port. Datagrams from other addresses are counted as "foreign",
-    those longer than 1500 bytes as "malformed", those dropped by the kernel because its queue was
-    full as "overrun".
+    The first datagram of plausible length from that host, at the beginning and after `forget_peer`,
+    selects its port. Datagrams from other addresses are counted as "foreign", those longer than
+    1500 bytes as "malformed", those dropped by the kernel because its queue was full as "overrun".
 
     Attributes:
         address: host and port bound.
@@ -77,9 +76,6 @@ class UdpTransport:
         arrived: time at which the kernel received the last datagram, on the clock of `now`, not
             before the previous one; None if unknown. If the system's clock was set in between,
             the time at which it was read.
-
-    Raises:
-        TransportError: unknown address, or the port is in use or not permitted.
     """
 
     def __init__(self, peer_host: str, port: int, bind: str = "0.0.0.0") -> None:
@@ -112,9 +108,6 @@ class UdpTransport:
         """Return the next datagram of the peer, or None after `timeout` s without one.
 
         A queued one is found behind up to `MAX_FOREIGN` of other hosts, also with a time-out of 0.
-
-        Raises:
-            TransportClosed: closed, or the socket failed.
         """
         end = time.monotonic() + timeout
         foreign = 0

@@ -27,7 +27,7 @@ from tests.drivers.rig import MOVE, PERIOD, START, Cruise, N, Rig, closed, movin
 class Controller:
     """Cold start, drive on, axes open one after the other, leaves on request, ends the session.
 
-    Its arm follows the last answer that arrived; numbers and cycles go on whatever is missed.
+    Its arm follows the last answer that arrived; numbers and cycles continue without replies.
     """
 
     period = PERIOD
@@ -128,11 +128,6 @@ class TestExchange:
         for surplus in transport.surplus_replies:
             assert surplus in [reply for _, reply in rig.transcript] or len(surplus) == 228
 
-    def test_duplicated_packets_do_not_change_the_replies(self):
-        clean = run()[1].replies
-        doubled = run([Duplicate(cycle) for cycle in range(400)])[1].replies
-        assert doubled == clean
-
     def test_three_consecutive_losses_stop_the_motion(self):
         rig, _, _ = run([Lose(300, count=3)], source=Cruise())
         assert rig.ended.outcome == "stopped"
@@ -160,7 +155,7 @@ class TestExchange:
 
 
 class Link:
-    """What every link here has, and nothing else."""
+    """Common members of the links below."""
 
     ages = None
 
@@ -175,7 +170,7 @@ class Link:
 
 
 class Backlogged(Link):
-    """A link whose packets pile up now and then: each is there when the test says so."""
+    """A link whose packets arrive in batches."""
 
     def __init__(self, batches):
         self.batches = [list(batch) for batch in batches]
@@ -196,7 +191,7 @@ class Backlogged(Link):
 
 
 class TestBacklog:
-    """What the exchange does with packets that piled up while it was not running."""
+    """Replies to packets that arrived while the exchange was not running."""
 
     def on_time(self, rig):
         """The next packet; those after it report the set-point that answers it."""
@@ -205,7 +200,7 @@ class TestBacklog:
         return packet
 
     def serve(self, rig, on_time, late):
-        """One packet when it is due, so that the exchange knows what that is; then a pile."""
+        """Deliver one packet in time, then a batch."""
         link = Backlogged([[on_time], late])
         link.now = rig.now
         exchange(link, rig.session, until=lambda: False)
@@ -223,13 +218,6 @@ class TestBacklog:
         assert rig.session.counters.missed == 2
         assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
 
-    def test_more_dropped_than_max_gap_stop_the_motion(self):
-        rig, source = moving()
-        on_time = rig.packet()
-        self.serve(rig, on_time, [rig.packet() for _ in range(6)])
-        assert rig.session.counters.discarded == {"late": 5}
-        assert source.stops == 1 or rig.session.state is State.FAULTED
-
     @pytest.mark.parametrize("waiting", [2, 30, 65, 200, 1000])
     @pytest.mark.parametrize("length", [228, 732])
     def test_only_the_newest_of_a_backlog_is_answered(self, waiting, length):
@@ -243,12 +231,7 @@ class TestBacklog:
         assert sent[1][:4] == (rig.number + 1).to_bytes(4, "little")
         assert source.advances <= advances + 2
         assert rig.session.counters.discarded == {"late": waiting - 1}
-
-    def test_only_the_newest_is_answered_with_closed_axes(self):
-        rig = closed()
-        on_time = rig.packet()
-        assert len(self.serve(rig, on_time, [rig.packet() for _ in range(4)])) == 2
-        assert rig.session.counters.discarded == {"late": 3}
+        assert waiting < 4 or source.stops == 1 or rig.session.state is State.FAULTED
 
     def test_bunched_packets_do_not_advance_the_motion(self):
         rig, source = moving()
@@ -289,7 +272,7 @@ class TestBacklog:
     @pytest.mark.parametrize("place", range(4))
     @pytest.mark.parametrize("garbled", [0x10, 0x20, 0x40])
     def test_corrupt_number_does_not_replace_the_newest(self, place, garbled):
-        """Seed 1667: it passed for the newest, and the session would have none of it."""
+        """Once it replaced the newest packet and got no reply."""
         rig, source = moving()
         on_time = self.on_time(rig)
         late = [rig.packet() for _ in range(3)]
@@ -315,7 +298,7 @@ class TestBacklog:
         assert len(link.sent) <= MAX_KINDS
         if packets:
             assert link.sent[-1] == packets[-1]
-        assert len(link.sent) + session.counted.get("late", 0) == len(packets)
+        assert len(link.sent) + session.discards.get("late", 0) == len(packets)
 
     def test_init_packet_in_a_backlog_is_answered(self):
         rig, _ = moving()
@@ -351,7 +334,7 @@ class TestBacklog:
 
 
 class Bunched(Backlogged):
-    """A link that knows when its packets arrived; time is that of the last, or a little more."""
+    """A link with time stamps; packets arrive at the times of a script."""
 
     def __init__(self, script):
         super().__init__([])
@@ -379,14 +362,14 @@ class EchoSession:
     deadline = 1e9
 
     def __init__(self):
-        self.counted = {}
+        self.discards = {}
         self.stops = []
 
     def reply(self, packet, now, ages):
         return packet
 
     def discarded(self, kind, count):
-        self.counted[kind] = self.counted.get(kind, 0) + count
+        self.discards[kind] = self.discards.get(kind, 0) + count
 
     def tick(self, now):
         pass
@@ -396,7 +379,7 @@ class EchoSession:
 
 
 class Paced(Link):
-    """A link whose packets arrive each period, whatever happens, and are answered at a cost.
+    """A link whose packets arrive each period; each reply takes some time.
 
     With `patient`, the controller does not begin a cycle before it has the answer to the last.
     """
@@ -434,29 +417,14 @@ class Paced(Link):
             self.due = max(self.due, self.now + 0.2 * PERIOD)
 
 
-class Rejecting(Paced):
-    """A link that discards a stranger's packet before each of the controller's."""
-
-    def __init__(self, costs):
-        super().__init__(costs)
-        self._strangers = 0
-
-    def receive(self, timeout):
-        self._strangers += 1
-        return super().receive(timeout)
-
-    def rejected(self):
-        strangers, self._strangers = self._strangers, 0
-        return {"foreign": strangers}
-
-
 @pytest.mark.parametrize("end", ["asked for", "closed link"])
 def test_last_rejections_of_the_link_are_counted(end):
-    link, session = Rejecting([0.1] * 7), EchoSession()
+    link, session = Paced([0.1] * 7), EchoSession()
+    link.rejected = lambda: {"foreign": 1}
     session.reply = link.reply
     exchange(link, session, until=lambda: end == "asked for" and not link.costs)
     assert len(link.answered) == 7
-    assert session.counted["foreign"] >= 7
+    assert session.discards["foreign"] == 1  # at the end: fewer packets than between two readings
 
 
 @pytest.mark.parametrize("stamped", [True, False], ids=["stamped", "unstamped"])
@@ -471,14 +439,14 @@ class TestLateness:
     @pytest.mark.parametrize("cost", [0.1, 0.9, 0.99])
     def test_replies_within_their_cycle_are_not_late(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
-        assert session.counted.get("answered late", 0) == 0
+        assert session.discards.get("answered late", 0) == 0
         assert link.answered == list(range(1, 51))
         assert session.stops == []
 
     @pytest.mark.parametrize("cost", [1.05, 1.1, 1.3, 1.49, 1.6, 3.5])
     def test_slight_overload_stops_the_motion(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
-        assert session.counted["answered late"] >= 49
+        assert session.discards["answered late"] >= 49
         if stamped:
             assert session.stops[0] == "3 consecutive replies left too late"
         else:
@@ -489,21 +457,19 @@ class TestLateness:
     @pytest.mark.parametrize("state", [State.CLOSED, State.DRIVING_ON, State.EXITING])
     def test_late_replies_are_counted_in_every_state(self, state, stamped):
         _, session = self.run([1.2] * 50, state=state, stamped=stamped)
-        assert session.counted["answered late"] >= 49
-        assert session.stops == []
-
-    def test_two_consecutive_late_replies_do_not_stop(self, stamped):
-        _, session = self.run([1.2, 1.2, 0.1, 0.1] * 10, stamped=stamped)
-        assert session.counted["answered late"] >= 20
+        assert session.discards["answered late"] >= 49
         assert session.stops == []
 
     def test_controller_that_waits_for_replies_is_not_stopped(self, stamped):
+        _, session = self.run([1.2, 1.2, 0.1, 0.1] * 10, stamped=stamped)
+        assert session.discards["answered late"] >= 20
+        assert session.stops == []  # at most two late replies are consecutive
         _, session = self.run([1.5] * 50, patient=True, stamped=stamped)
         assert session.stops == []
 
 
 class Drifting(Paced):
-    """A link that cannot say when packets arrived, of a controller a little slow, always busy."""
+    """A link without time stamps, of a controller with a slightly longer cycle."""
 
     def __init__(self, costs, slower):
         super().__init__(costs, stamped=False)
@@ -523,7 +489,7 @@ def test_estimated_arrivals_count_no_reply_as_late(slower):
     arrivals = []
     session.reply = lambda packet, now, ages: arrivals.append(now) or link.reply(packet, now, ages)
     exchange(link, session, until=lambda: False)
-    assert session.counted.get("answered late", 0) == 0
+    assert session.discards.get("answered late", 0) == 0
     assert session.stops == []
     assert np.diff(arrivals).min() > 0.9 * PERIOD, "they are recorded as they were received"
 
@@ -555,19 +521,15 @@ class TestFullQueue:
         assert rig.session._machine.cycle == cycle
         assert rig.session.counters.discarded == {"late": 20}
 
-    def test_newest_of_a_recent_backlog_gets_a_reply(self):
-        rig, _ = moving()
-        link = self.serve(rig, [rig.packet() for _ in range(20)], 1.0)
-        assert len(link.sent) == 1
-        assert rig.session.counters.discarded["late"] == 19
-
-    def test_single_old_packet_gets_a_reply(self):
-        rig, _ = moving()
-        assert len(self.serve(rig, [rig.packet()], 100.0).sent) == 1
-
-    def test_old_packet_gets_a_reply_with_closed_axes(self):
-        rig = closed()
-        assert len(self.serve(rig, [rig.packet() for _ in range(20)], 100.0).sent) == 1
+    @pytest.mark.parametrize(
+        ("is_open", "count", "since"),
+        [(True, 20, 1.0), (True, 1, 100.0), (False, 20, 100.0)],
+        ids=["recent", "single", "closed axes"],
+    )
+    def test_newest_gets_a_reply(self, is_open, count, since):
+        rig = moving()[0] if is_open else closed()
+        assert len(self.serve(rig, [rig.packet() for _ in range(count)], since).sent) == 1
+        assert rig.session.counters.discarded.get("late", 0) == count - 1
 
     def test_init_packet_of_an_old_backlog_is_answered(self):
         rig, _ = moving()
@@ -597,7 +559,7 @@ class TestDeadline:
 
 
 class CountingForgets(Backlogged):
-    """A link that says how often it was told to listen to all ports."""
+    """A link that records the calls of `forget_peer`."""
 
     def __init__(self, batches):
         super().__init__(batches)
@@ -608,7 +570,7 @@ class CountingForgets(Backlogged):
 
 
 class Quiet(CountingForgets):
-    """After its packets it is silent for so long."""
+    """A link that is silent for some time after its packets, s."""
 
     def __init__(self, batches, silence):
         super().__init__(batches)

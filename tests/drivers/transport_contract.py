@@ -1,6 +1,6 @@
 """What every transport has to do; a test of one subclasses this and has a fixture `link`.
 
-The fixture gives a transport (`Transport`) and its far end (`FarEnd`).
+The fixture gives a transport (`Transport`) and the controller's end (`FarEnd`).
 
 The controller's end is driven by the test: `far.send` lets the controller send a packet, and
 `far.replies` is what reached it, in order. `far.wait` gives real links the time they need.

@@ -92,9 +92,7 @@ def slow_value(index: int, words: Words, functionality: bytes) -> bytes:
 class SlowStore:
     """Latest slow values (one is sent per cycle, in turn), and their ages.
 
-    Attributes:
-        ages: (n, 8) cycles since each of D1..D5, extra1..3 was sent, `NEVER` before the first.
-        functionality: four bytes, zero before the first.
+    `ages` (n, 8) are cycles since each of D1..D5, extra1..3 was sent, `NEVER` before the first.
     """
 
     def __init__(self, n_axes: int) -> None:
@@ -262,13 +260,10 @@ class UpSet(NamedTuple):
 
 
 class Codec(ABC):
-    """Frames of one profile for 1..6 axes.
+    """Frames of one profile for 1..6 axes, with identifiers and bytes of each.
 
-    Attributes:
-        up_ids, down_ids: identifiers of the frames of a cycle.
-        lengths: bytes of each.
-        up_modulus, down_modulus: modulus of the cycle numbers in the frames.
-        span_cycles: time within which a set must be complete; its number repeats.
+    Cycle numbers in frames are modulo `up_modulus` and `down_modulus`; a set must be complete
+    within `span_cycles`, because its number repeats.
     """
 
     up_ids: tuple[int, ...]
@@ -489,11 +484,7 @@ class ClassicCodec(Codec):
         return frames
 
     def read_down(self, payloads: Sequence[bytes], sent: Sent) -> Reply:
-        """Decode a reply; the step of a set-point is that from the previous one.
-
-        Raises:
-            PacketError: an unknown code, or a set-point out of range.
-        """
+        """Decode a reply; PacketError for an unknown code or a set-point out of range."""
         number = next_number(sent.number)
         leaving = False
         axes = []

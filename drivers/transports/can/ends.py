@@ -204,8 +204,7 @@ def require_carried(init: InitPacket, rates: BusRates) -> None:
     """Check that the session of this init packet fits the profile.
 
     Raises:
-        CanAxesError: more than six axes, or axes of another arm.
-        CanBusLoadError: the cycle is too short.
+        CanAxesError, CanBusLoadError: too many axes, another arm, or too short a cycle.
         PacketError: the axis map is invalid.
     """
     arms = {axis.arm for axis in init.open_axes()}
@@ -305,11 +304,7 @@ class End(ABC):
 
 
 class PcEnd(End):
-    """The PC's end: frames of the controller to packets, replies to frames.
-
-    Attributes:
-        ages: (n_axes, 8) of the packet returned last; None if it came as segments.
-    """
+    """The PC's end; `ages` (n_axes, 8) of the last packet, None if it came as segments."""
 
     _upwards = True
 
@@ -381,11 +376,7 @@ class PcEnd(End):
 
 
 class ControllerEnd(End):
-    """The controller's end: its packets to frames, frames of the PC to replies.
-
-    Attributes:
-        segmented: whether the packet sent last went as segments.
-    """
+    """The controller's end; `segmented` tells whether the last packet went as segments."""
 
     _upwards = False
 

@@ -147,13 +147,7 @@ def fd_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
 
 @dataclass(frozen=True)
 class BusRates:
-    """Profile and bit rates of a bus.
-
-    Attributes:
-        profile: "fd" or "classic".
-        bitrate: bit/s, of the arbitration phase on FD.
-        data_bitrate: bit/s of the data phase on FD.
-    """
+    """Profile and bit rates, bit/s; on FD `bitrate` is that of the arbitration phase."""
 
     profile: ProfileName
     bitrate: int = 1_000_000
@@ -177,11 +171,7 @@ class BusRates:
         return sum(self.duration(size, stuffed=stuffed) for size in payloads) / period
 
     def require_load(self, n_axes: int, period: float) -> None:
-        """Check that the frames of a cycle fit.
-
-        Raises:
-            CanBusLoadError: their share exceeds `LOAD_LIMIT` with worst-case stuffing.
-        """
+        """Check that the frames of a cycle fit `LOAD_LIMIT`; raises CanBusLoadError."""
         load = self.load(n_axes, period)
         if load > LOAD_LIMIT:
             count = len(self.cycle_payloads(n_axes))

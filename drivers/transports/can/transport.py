@@ -190,11 +190,7 @@ class Port:
         return self._end.receive(frame, message.timestamp or self._clock())
 
     def send(self, frames: Sequence[Frame]) -> None:
-        """Send frames in order; if the bus does not accept one, the rest is dropped and counted.
-
-        Raises:
-            TransportClosed: closed, or the bus failed.
-        """
+        """Send frames in order; if the bus does not accept one, the rest is dropped and counted."""
         self._require_open()
         for frame in frames:
             segment = frame.id in (SEGMENT_UP, SEGMENT_DOWN)
@@ -239,11 +235,7 @@ _IN_PROCESS: Final = "virtual"
 
 
 class BusLock:
-    """An advisory lock of a bus among programs of hil; released when the process ends.
-
-    Raises:
-        TransportError: another program has the bus, or the lock cannot be created.
-    """
+    """An advisory lock of a bus among programs of hil; TransportError if another has it."""
 
     def __init__(self, interface: str, channel: str) -> None:
         self._fd = -1
@@ -337,8 +329,7 @@ class CanTransport:
         """Return the next packet, or None after `timeout` s without one.
 
         Raises:
-            TransportClosed: closed, the bus failed, or it cannot carry the session of the
-                controller (the cause is a `CanError`).
+            TransportClosed: closed, the bus failed, or it cannot carry the session.
         """
         try:
             return self._port.receive(timeout)
@@ -350,8 +341,8 @@ class CanTransport:
         """Send the reply to the packet received last.
 
         Raises:
-            TransportClosed: closed, the bus failed, or it cannot carry the reply (the cause is a
-                `CanError`; drive-off was requested instead).
+            TransportClosed: closed, the bus failed, or it cannot carry the reply: drive-off was
+                requested instead.
         """
         try:
             frames = self._end.reply(packet)
@@ -391,7 +382,6 @@ class CanSpec:
         bitrate: bit/s; None for 1 Mbit/s.
         data_bitrate: bit/s of the data phase on FD; None for 5 Mbit/s.
         period: cycle in s.
-        n_axes: axes of the robot.
         options: further arguments of the python-can bus.
     """
 
