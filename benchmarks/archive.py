@@ -1,23 +1,22 @@
 """Time of decoding archives: ours against the readers that others use, in one run.
 
 Run with ``python -m benchmarks.archive [--json] [--folder FOLDER] [--sizes]``: 30 repetitions of
-16 s at 1 kHz with 6 joints (480 000 cycles), made once by our writer; `--folder` keeps them.
+16 s at 1 kHz with 6 joints (480 000 cycles), made once by our writer; `--folder` stores them.
 
 All decode the columns that identification reads, from the channel ``/hil/cycle`` to contiguous
 arrays:
 
 - ours: `hil.archive.open_archive`, checksums verified;
 - mcap: the messages of the library's reader, joined and viewed as one numpy structure, which is
-  the least that can be done with them. Of its two readers the faster one counts, and of the ways
-  to the columns this one (``decode_ratio_to_mcap``) and `struct` message by message;
+  the least that can be done with them (``decode_ratio_to_mcap``, of the faster of its two
+  readers), and `struct` message by message;
 - typed: `mcap-ros2-support`, each message an object.
 
 ``archives_to_estimate_s`` is the processor time of one thread from these archives to an estimate
 with covariance, each repetition's among them (`benchmarks.batch`).
 
 None of the others verifies checksums. One thread, whose processor time counts; the readers take
-turns, and medians are compared. With `--sizes` the chunks of one archive are compressed anew in
-several ways.
+turns, and medians are compared. `--sizes` compares compressions of the chunks of one archive.
 """
 
 from __future__ import annotations
@@ -170,7 +169,7 @@ def measure(paths: Sequence[Path], turns: int) -> dict[str, Any]:
 
 
 def sizes(path: Path) -> list[dict[str, Any]]:
-    """The chunks of an archive under several compressions: size, and time both ways."""
+    """Return size, compression and decompression time of an archive's chunks by method."""
     decompressor = zstandard.ZstdDecompressor()
     with path.open("rb") as stream:
         size = path.stat().st_size
@@ -181,15 +180,15 @@ def sizes(path: Path) -> list[dict[str, Any]]:
         ]
         chunks = [container.chunk_data(*one) for one in packed_chunks]
     rest = size - sum(len(one.data) for one, _ in packed_chunks)
-    ways: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
+    methods: dict[str, tuple[Callable[[bytes], bytes], Callable[[bytes], bytes]]] = {
         "none": (bytes, bytes),
         "lz4": (lz4.frame.compress, lz4.frame.decompress),
     }
     for level in (-5, -1, 1, 3, 6, 12):
         compressor = zstandard.ZstdCompressor(level=level)
-        ways[f"zstd {level}"] = (compressor.compress, decompressor.decompress)
+        methods[f"zstd {level}"] = (compressor.compress, decompressor.decompress)
     table = []
-    for name, (pack, unpack) in ways.items():
+    for name, (pack, unpack) in methods.items():
         start = time.process_time()
         packed = [pack(chunk) for chunk in chunks]
         middle = time.process_time()
@@ -211,7 +210,7 @@ def sizes(path: Path) -> list[dict[str, Any]]:
 def main() -> None:
     """Measure, and print the figures."""
     parser = parser_of(__doc__)
-    parser.add_argument("--folder", type=Path, help="where the archives are kept")
+    parser.add_argument("--folder", type=Path, help="folder of the archives")
     parser.add_argument("--sizes", action="store_true", help="compare compressions as well")
     parser.add_argument("--repetitions", type=int, default=REPETITIONS, help="archives")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="turns of each reader")

@@ -35,13 +35,13 @@ _FIRST = 3000  # cycle in which an excitation of a campaign begins, about
 def repetitions(
     folder: Path, count: int, *, first: int = 0, cycles: int = CYCLES, recorded_at: str = ""
 ) -> list[Path]:
-    """Archives of `count` repetitions of one excitation in `folder`; those there are kept.
+    """Write archives of `count` repetitions of one excitation into `folder`, if missing.
 
     Args:
         folder: of the archives.
         count: of them.
         first: number of the first among all repetitions, no two of which have the same noise.
-        cycles: of each that are kept.
+        cycles: of each that are stored.
         recorded_at: time of recording, ISO 8601.
     """
     folder.mkdir(parents=True, exist_ok=True)

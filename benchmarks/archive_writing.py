@@ -6,7 +6,7 @@ recorded excitation (`benchmarks.archive_files`). The archive process drains, en
 and writes it to the disk of the present folder with fdatasync, as on a real link. Its processor
 time, that of both its threads, from the opening of the archive to its closing is set against the
 time it took: ``writing_share_of_core``, and ``writing_share_of_core_with_packets`` where raw
-packets of both directions are kept as well.
+packets of both directions are stored as well.
 """
 
 from __future__ import annotations
@@ -139,15 +139,15 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each archive")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
-        plain, rich = (
+        ordinary, with_packets = (
             measure(Path(folder), arguments.seconds, packets=packets) for packets in (False, True)
         )
     result = {
-        "writing_share_of_core": round(plain["share"], 4),
-        "writing_share_of_core_with_packets": round(rich["share"], 4),
-        "megabytes_per_minute": round(plain["megabytes_per_minute"], 1),
-        "megabytes_per_minute_with_packets": round(rich["megabytes_per_minute"], 1),
-        "records_lost": plain["records_lost"] + rich["records_lost"],
+        "writing_share_of_core": round(ordinary["share"], 4),
+        "writing_share_of_core_with_packets": round(with_packets["share"], 4),
+        "megabytes_per_minute": round(ordinary["megabytes_per_minute"], 1),
+        "megabytes_per_minute_with_packets": round(with_packets["megabytes_per_minute"], 1),
+        "records_lost": ordinary["records_lost"] + with_packets["records_lost"],
         "seconds": arguments.seconds,
         "cycles_per_second": round(1.0 / PERIOD),
     }

@@ -1,15 +1,15 @@
-"""Time, memory and disk of a batch: from archives to estimates, and from what was kept of them.
+"""Time, memory and disk of a batch: from archives to estimates, and from cached factors.
 
 Run with ``python -m benchmarks.batch FOLDER... [--workers N] [--json]`` on folders of archives, or
 with ``python -m benchmarks.batch --archives 1000 [--seconds 12] [--json]`` on archives made for it:
 campaigns of 25 repetitions at 1 kHz with 6 joints, each with a noise of its own, so that no two
 hold the same. They lie in a temporary folder (0.45 MB per second of motion) and are deleted, unless
-``--folder`` names one to keep them in. A hundred, four hundred and all of them are run, each in a
+``--folder`` names a folder for them. A hundred, four hundred and all of them are run, each in a
 process of its own, whose memory is then that of so many.
 
-The first run keeps nothing beforehand, the second one estimates otherwise from what the first has
-kept. Wall times are those of the machine as it is; the processor time, of this process and its
-children, does not depend on what else runs.
+The first run begins with an empty cache, the second estimates from the cache of the first. Wall
+times are those of the machine as it is; the processor time, of this process and its children, does
+not depend on what else runs.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
     """Processor time from archives to an estimate with covariance, one thread [s].
 
     With finding, hashing, decoding, smoothing, factors, the estimates of each repetition and of
-    all, and writing what is kept of them.
+    all, and writing the cache.
     """
     with tempfile.TemporaryDirectory() as cache:
         start = time.process_time()
@@ -79,7 +79,7 @@ def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
         second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
         hands.close()
         second_cpu = first_own + second_own + _children() - first_cpu
-        kept = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
+        cached = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
     count = first.read
     if not count or second.read or first.broken:
         raise SystemExit(
@@ -98,7 +98,7 @@ def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
         "second_processor_ms_per_archive": round(second_cpu / count * 1e3, 3),
         "cached_ratio_wall": round(first_wall / second_wall, 1),
         "cached_ratio_processor": round(first_cpu / second_cpu, 1),
-        "kept_kB_per_archive": round(kept / count / 1e3, 1),
+        "kept_kB_per_archive": round(cached / count / 1e3, 1),
         "largest_parent_MB": round(_largest_own(), 1),
         "largest_child_MB": round(_largest(resource.RUSAGE_CHILDREN), 1),
         "load": round(os.getloadavg()[0], 1),

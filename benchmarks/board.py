@@ -1,4 +1,4 @@
-"""Identification by default settings beside a plain fit, on real recordings and on spoilt ones.
+"""Identification by default settings beside an ordinary fit, on real recordings and on spoilt ones.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
 [--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
@@ -107,7 +107,7 @@ def identified_parts(parts: Parts, folder: Path) -> Identified:
 
 
 def plain_errors(parts: Parts) -> tuple[float, list[float]]:
-    """Errors of the plain fit over all joints, and by joint."""
+    """Errors of the ordinary fit over all joints, and by joint."""
     fitted = plain_fit.fit(parts.fitted.pinocchio_model(), parts.fitted.measured)
     torque, predicted = parts.predicted.torque, fitted.predicted_torque(parts.predicted.measured)
     joints = [
@@ -291,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _line(row: Row) -> str:
-    """Names, errors and what is said of them."""
+    """Return names, errors and remarks of a row."""
     shown = [f"{row['data']:11} {row.get('split') or row['case']:30}"]
     errors = [key for key in ("hil", "plain", "undegraded") if row.get(key) is not None]
     shown += [f"{key} {row[key]:.2%}" for key in errors]

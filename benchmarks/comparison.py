@@ -1,4 +1,4 @@
-"""What `hil compare` says of simulated campaigns: one arm unchanged, then with more friction.
+"""Result of `hil compare` for simulated campaigns: one arm unchanged, then with more friction.
 
 Three short campaigns of one plan on the simulated NS 16, with other noise in each; in the last one
 Coulomb and viscous friction of axis 3 are raised by 35 %.

@@ -130,7 +130,7 @@ def turned_sign(log: JointLog) -> JointLog:
 
 
 def payload_in_second_half(log: JointLog) -> JointLog:
-    """A sphere on the flange during the second half, which nobody has said."""
+    """A sphere on the flange during the second half, not stated in the cell."""
     bare, loaded = log.pinocchio_model(), log.pinocchio_model()
     body = pin.Inertia.FromSphere(PAYLOAD_SHARE * log.rated_payload, _PAYLOAD_RADIUS)
     loaded.inertias[loaded.njoints - 1] += body.se3Action(pin.SE3(np.eye(3), _PAYLOAD_OFFSET))

@@ -2,7 +2,7 @@
 
 Run with ``python -m benchmarks.identification [--json] [--figaroh PYTHON]``: 16 000 samples of the
 NS 16, 6 joints. Processor time of one thread; repetitions alternate between all that is compared,
-and medians are told, with smallest and largest beside them.
+and medians are printed, with smallest and largest.
 
 - ``fit_ms``: regressor, block factor, weighted least squares (eq. 4) and cluster-robust covariance
   of 58 parameters: 40 base, and viscous, Coulomb and offset friction. ``large_fit_ms``: the same
@@ -11,7 +11,7 @@ and medians are told, with smallest and largest beside them.
 - ``prepared_fit_ms``: the fit and what is before it: positions smoothed by the spline whose
   tolerance is the noise's variance, masks, derivatives.
 - ``ratio_to_figaroh``: figaroh 1.0.2 on the same samples with the same 58 parameters, by the
-  faster of the two ways in which it finds its base parameters, over ``fit_ms``: regressor, pivoted
+  faster of its two methods of finding base parameters, over ``fit_ms``: regressor, pivoted
   QR, weighted least squares, relative standard deviations (``figaroh_pivoting_ms``). That of its
   `BaseIdentification.solve` is ``figaroh_double_ms``; with base columns known beforehand, as ours
   are once a model has been built, ``figaroh_known_ms``. Its covariance is the classical one.

@@ -67,7 +67,7 @@ class JointLog:
 
     @property
     def measured(self) -> Measured:
-        """These rows for a plain fit."""
+        """Return these rows for an ordinary fit."""
         return Measured(self.time, self.position, self.velocity, self.torque)
 
     def pinocchio_model(self) -> Any:

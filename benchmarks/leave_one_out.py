@@ -4,8 +4,8 @@ Run with ``python -m benchmarks.leave_one_out [--data FOLDER] [--only NAME ...] 
 FOLDER as in `benchmarks.board`.
 
 Each default of :mod:`identification.selection.inner_prediction` is varied alone. For each robot,
-the value with the least geometric mean of held-out errors over all *other* robots is taken and
-judged on this one: on the first held-out split, all rows, as a ratio to the error of
+the value with the least geometric mean of held-out errors over all *other* robots is
+applied to this one: on the first held-out split, all rows, as a ratio to the error of
 `benchmarks.plain_fit`. If a default were fitted to these recordings, the mean of the ratios with a
 robot left out would be larger than that of the present values.
 """

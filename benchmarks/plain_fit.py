@@ -1,4 +1,4 @@
-"""A plain fit of an arm's dynamics, to compare with: pinocchio, numpy and scipy, nothing of ours.
+"""Ordinary fit of an arm's dynamics by pinocchio, numpy and scipy, independent of `hil`.
 
 Positions, and velocities where they were measured, go through a zero-phase Butterworth filter;
 derivatives are differences. Every row is fitted, by least squares of minimum norm on pinocchio's

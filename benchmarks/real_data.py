@@ -2,8 +2,8 @@
 
 Run with ``python -m benchmarks.real_data --data DIR [--json]``, where DIR is a folder that is
 named like a file of ``benchmarks/recordings`` (``ur10_unisa``, ``tx40``). Errors are
-||tau - tau_hat|| / ||tau|| over all joints and over all rows of the part in question, standing
-still and first and last rows included:
+||tau - tau_hat|| / ||tau|| over all joints and over all rows of the part in question, those at
+rest and first and last rows included:
 
 - *in sample*: the whole recording fitted and predicted;
 - *held out*: the first 70 % fitted, the last 30 % predicted; *held out first*: the last 70 %
@@ -16,9 +16,9 @@ elimination; "chosen on it" means on the very part that is predicted, as the too
 it, "chosen inside" on the last two sevenths of the part that is fitted, which is then fitted whole:
 only that is a prediction.
 
-`torque_bandwidth` is that of the low-pass the torque has come through before it was logged, found
-on the fitted part alone; "plain" does without. The headline figures are not from these tables: they
-are those of `hil identify` with its default settings, in sample and held out.
+`torque_bandwidth` is that of the low-pass of the logged torque, found on the fitted part alone;
+"plain" does without. The headline figures are not from these tables: they are those of `hil
+identify` with its default settings, in sample and held out.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Split(NamedTuple):
 
 
 def splits_of(recording: Recording) -> dict[str, Split]:
-    """The three ways to divide a recording."""
+    """The three divisions of a recording."""
     m = recording.n_samples
     cut = round(FITTED_SHARE * m)
     return {
@@ -184,7 +184,7 @@ def model_table(case: Case, splits: dict[str, Split]) -> dict[str, Any]:
                 row["in_sample_ols"] = round(found.overall, 5)
                 row["in_sample_ols_by_joint"] = [round(e, 4) for e in found.relative.tolist()]
             if not options.smooth_torque:
-                row[f"plain_{kind}"] = _plain(model, split)
+                row[f"plain_{kind}"] = _without_lowpass(model, split)
                 row[f"{kind}_torque_bandwidth"] = options.torque_bandwidth
         table[name] = row
     return table
@@ -217,14 +217,14 @@ def essential_table(
             PhaseFactor.from_samples(model, prepare(one, model, options=options))
             for one in (part.between(0, cut), part.between(cut, part.n_samples))
         ]
-        kept = eliminate(model, *inner).estimate.names
+        essential = eliminate(model, *inner).estimate.names
         table[kind] = {
             "parameters": model.n_parameters,
             "all": error(model, ESTIMATORS["wls"](model, fitted), predicted),
             "chosen_on_it": error(model, flattered.values, predicted),
             "chosen_on_it_parameters": len(flattered.estimate.names),
-            "chosen_inside": error(model, _refitted(model, whole, kept), predicted),
-            "chosen_inside_parameters": len(kept),
+            "chosen_inside": error(model, _refitted(model, whole, essential), predicted),
+            "chosen_inside_parameters": len(essential),
         }
     return table
 
@@ -255,7 +255,7 @@ def default_errors(folder: Path) -> dict[str, float]:
 
 
 def load_case(folder: Path) -> Case:
-    """The first recording of a folder, imported as its configuration says, and its coupling."""
+    """The first recording of a folder, imported by its configuration, and its coupling."""
     published = Published.named(folder.name)
     with tempfile.TemporaryDirectory() as scratch:
         archive = Path(scratch) / "imported.mcap"
@@ -302,17 +302,17 @@ def _coupled_motors(recording: Recording) -> Array | None:
     return matrix if np.any(matrix != np.diag(np.diag(matrix))) else None
 
 
-def _plain(model: RobotModel, split: Split) -> float:
-    """Error if the torque is believed to have come through no low-pass."""
+def _without_lowpass(model: RobotModel, split: Split) -> float:
+    """Return the error without a low-pass of the torque."""
     fitted, predicted = (prepare(part, model) for part in split)
     return error(model, ESTIMATORS["wls"](model, fitted), predicted)
 
 
-def _refitted(model: RobotModel, whole: PhaseFactor, kept: Collection[str]) -> Array:
+def _refitted(model: RobotModel, whole: PhaseFactor, essential: Collection[str]) -> Array:
     """Weighted least squares of some parameters (p,), zero for the others."""
     total = whole.total
     equations = total.weighted(joint_weights(total))
-    index = np.flatnonzero([name in kept for name in model.parameter_names])
+    index = np.flatnonzero([name in essential for name in model.parameter_names])
     values = np.zeros(model.n_parameters)
     values[index] = solve(
         NormalEquations(

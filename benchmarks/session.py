@@ -2,11 +2,11 @@
 
 A first run records what a controller with a perfect arm sends while periodic joint sinusoids run;
 the timed runs replay these packets, period after period with running numbers, so that only
-`Session.reply` (with the motion source's table look-up inside) stands between the two clock
-readings. `--warm` cycles at the beginning are left out.
+`Session.reply` (with the motion source's table look-up inside) is timed. `--warm` cycles at the
+beginning are left out.
 
 With enough cycles for it, the cost of the first and of the last `--window` cycles are compared,
-and a further run says what memory was allocated in between and not given back.
+and a further run measures what memory was allocated in between and not released.
 
     python -m benchmarks.session [--json] [--cycles N] [--runs N] [--window N]
 """
@@ -137,10 +137,7 @@ def init_packet(period_ms: int) -> bytes:
 
 
 def record() -> list[bytes]:
-    """Init and cyclic packets of a controller whose arm is where it was told to be.
-
-    The last `LOOP` of them may be repeated for ever.
-    """
+    """Return packets of a controller with an ideal arm; the last `LOOP` may be repeated."""
     session = new_session(64)
     init = init_packet(PERIOD_MS)
     packets = [init]
@@ -158,9 +155,9 @@ def record() -> list[bytes]:
         packets.append(packet)
         reply = session.reply(packet, cycle * PERIOD_MS / 1000.0)
         assert reply is not None
-        told = CyclicPacket.decode(reply, N).axes["d"]
-        axes["d"][:, 0] = axes["d"][:, 2] = told[:, 0]
-        axes["d"][:, 1] = axes["d"][:, 3] = told[:, 1]
+        commanded = CyclicPacket.decode(reply, N).axes["d"]
+        axes["d"][:, 0] = axes["d"][:, 2] = commanded[:, 0]
+        axes["d"][:, 1] = axes["d"][:, 3] = commanded[:, 1]
     assert session.state is State.OPEN, session.events()[-1]
     return packets
 

@@ -65,19 +65,19 @@ def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings
 
 
 def free_port() -> int:
-    """A UDP port nobody has."""
+    """Return a free UDP port."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
 
 
 def steal_ticks() -> int:
-    """Ticks that the host of a virtual machine kept its processors for others."""
+    """Return the ticks that the host of a virtual machine used its processors for others."""
     return int(Path("/proc/stat").read_text().split("\n", 1)[0].split()[8])
 
 
 def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
-    """One run; the times in it and what the processes said."""
+    """Run once; return its times and the reports of its processes."""
     last = max(os.sched_getaffinity(0))
     answering = RealTimeSettings(priority=50, cpu=last)
     asking = replace(answering, priority=60, cpu=min(os.sched_getaffinity(0)))
@@ -119,42 +119,42 @@ def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
     with np.load(arrivals) as file:
         times |= {f"exchange_{name}": array for name, array in file.items()}
     log = exchange.log
-    told = [event for event in exchange.events() if isinstance(event, MotionEnded)]
+    ends_of_motion = [event for event in exchange.events() if isinstance(event, MotionEnded)]
     exchange.close()
-    if times["trouble"] or ended != 0:
-        raise SystemExit(f"the run failed: {times['trouble']} {ended} {log} {told}")
+    if times["fault"] or ended != 0:
+        raise SystemExit(f"the run failed: {times['fault']} {ended} {log} {ends_of_motion}")
     times |= {"status": status, "realtime": exchange.realtime, "steal": steal_ticks() - stolen}
     return times
 
 
 def trip(times: dict[str, Any], end: str) -> Array:
-    """From request to answer, s, of every measured cycle; NaN where no answer ever came."""
+    """Return the time from request to reply, s, of each measured cycle; NaN without a reply."""
     skipped = WARM_UP + (CLOSED_CYCLES if end == "ours" else 0)
-    taken: Array = (times[f"{end}_received"] - times[f"{end}_sent"])[skipped:]
-    return taken
+    durations: Array = (times[f"{end}_received"] - times[f"{end}_sent"])[skipped:]
+    return durations
 
 
 def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
-    """Each missed answer of the exchange, and where the time went."""
+    """Return each late or missing reply of the exchange with its probable cause."""
     first = WARM_UP + CLOSED_CYCLES
-    taken = trip(times, "ours")
-    arrival = np.full(len(taken) + first + 1, np.nan)
+    durations = trip(times, "ours")
+    arrival = np.full(len(durations) + first + 1, np.nan)
     cycle = times["exchange_cycle"]
     inside = (cycle >= 1) & (cycle <= len(arrival))
     arrival[cycle[inside] - 1] = times["exchange_arrival"][inside]
     rows = []
-    for index in np.flatnonzero(~(taken <= PERIOD)):
+    for index in np.flatnonzero(~(durations <= PERIOD)):
         at = int(index) + first
         to_exchange = float(arrival[at] - times["ours_sent"][at])
         answered = float(times["ours_received"][at] - arrival[at])
         if np.isnan(to_exchange):
-            what = "the exchange was held up and left it unanswered for a later one"
+            what = "the exchange was delayed and replied to a later packet"
         elif to_exchange > 0.5 * PERIOD:
-            what = "the network or the controller was held up before the packet was here"
+            what = "the network or the controller was delayed before the packet arrived"
         elif np.isnan(answered):
-            what = "the answer was lost"
+            what = "the reply was lost"
         else:
-            what = "the exchange, or the controller waiting for it, was held up"
+            what = "the exchange, or the controller waiting for it, was delayed"
         rows.append(
             {
                 "cycle": int(index),
@@ -167,19 +167,18 @@ def accounts(times: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def figures(taken: Array) -> dict[str, Any]:
-    """Percentiles of the times taken, s, of the cycles that were answered.
+def figures(durations: Array) -> dict[str, Any]:
+    """Return percentiles of the durations, s, of the cycles that were answered.
 
-    Beside them is what they do not cover: `never_answered`, part of `missed`, which is every cycle
-    that had no answer within its period.
+    `missed` counts cycles without a reply within their period, `never_answered` those without any.
     """
-    came = taken[np.isfinite(taken)]
+    came = durations[np.isfinite(durations)]
     result: dict[str, Any] = {}
     for name, share in (("p50_us", 50.0), ("p99_us", 99.0), ("p999_us", 99.9), ("max_us", 100)):
         result[name] = _us(float(np.percentile(came, share))) if len(came) else None
     result["answered"] = len(came)
-    result["never_answered"] = len(taken) - len(came)
-    result["missed"] = int((~(taken <= PERIOD)).sum())
+    result["never_answered"] = len(durations) - len(came)
+    result["missed"] = int((~(durations <= PERIOD)).sum())
     return result
 
 

@@ -130,7 +130,7 @@ class Asking:
 
 
 class Controller:
-    """Packets of an arm that is where it was told to be, in open mode."""
+    """Packets of an ideal arm in open mode."""
 
     def __init__(self, settings: Settings) -> None:
         self._blocks = settings.blocks
@@ -164,11 +164,11 @@ class Controller:
         reply = self.ours.ask(header + self._view.tobytes(), self._number, 1, late)
         if reply is None or mode == Mode.CLOSED:
             return
-        told = np.frombuffer(reply, self._view.dtype, offset=12)
-        if (told["mode"] != mode).any():
-            raise RuntimeError(f"the exchange asks for mode {told['mode'].tolist()}")
-        self._view["d"][:, 0] = self._view["d"][:, 2] = told["d"][:, 0]
-        self._view["d"][:, 1] = self._view["d"][:, 3] = told["d"][:, 1]
+        answer = np.frombuffer(reply, self._view.dtype, offset=12)
+        if (answer["mode"] != mode).any():
+            raise RuntimeError(f"the exchange asks for mode {answer['mode'].tolist()}")
+        self._view["d"][:, 0] = self._view["d"][:, 2] = answer["d"][:, 0]
+        self._view["d"][:, 1] = self._view["d"][:, 3] = answer["d"][:, 1]
 
     def run(self) -> None:
         """All blocks."""
@@ -200,11 +200,11 @@ def control(settings: Settings) -> None:
     """The controller's process."""
     controller = Controller(settings)
     report = enter(settings.realtime)
-    trouble = ""
+    fault = ""
     try:
         controller.run()
     except RuntimeError as error:
-        trouble = str(error)
+        fault = str(error)
         controller.end()
     ours, floor = controller.ours, controller.floor
     np.savez(
@@ -215,15 +215,15 @@ def control(settings: Settings) -> None:
             for field in ("sent", "received", "woke_late")
         },
         scheduling=np.array(report.scheduling),
-        trouble=np.array(trouble),
+        fault=np.array(fault),
     )
 
 
-def echo(told: Connection, realtime: RealTimeSettings) -> None:
-    """The floor: a process that does nothing but send back what it gets."""
+def echo(parent: Connection, realtime: RealTimeSettings) -> None:
+    """Send packets back at once: the lower bound of the turnaround."""
     server = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     server.bind((HOST, 0))
-    told.send(server.getsockname()[1])
+    parent.send(server.getsockname()[1])
     enter(realtime)
     receive, send = server.recvfrom, server.sendto
     while True:
@@ -232,15 +232,15 @@ def echo(told: Connection, realtime: RealTimeSettings) -> None:
 
 
 def drain(supervisor: int, ring_fd: int, result: str) -> None:
-    """An ordinary process that reads every record, and keeps the times of arrival."""
+    """Read every record in an ordinary process, and store the times of arrival."""
     reader = RingReader(os.open(f"/proc/{supervisor}/fd/{ring_fd}", os.O_RDWR), N)
-    kept: list[NDArray[np.void]] = []
+    drained: list[NDArray[np.void]] = []
     done = Path(result).with_suffix(".end")
     while not done.exists() and os.getppid() == supervisor:
         time.sleep(0.02)
-        kept.append(reader.drain()[["cycle", "arrival"]])
-    kept.append(reader.drain()[["cycle", "arrival"]])
-    records = np.concatenate(kept)
+        drained.append(reader.drain()[["cycle", "arrival"]])
+    drained.append(reader.drain()[["cycle", "arrival"]])
+    records = np.concatenate(drained)
     np.savez(
         result,
         cycle=records["cycle"],
