@@ -330,7 +330,7 @@ def _due(queue: list[Delayed]) -> float:
 
 
 KNOCK_INTERVAL: Final = 1.0
-"""Seconds between two first packets while nobody answers."""
+"""Seconds between two first packets while no PC answers."""
 PATIENCE: Final = 3.0
 """Time for the arm to stop when the session is to end [s]."""
 _NO_CYCLE: Final = -1

@@ -343,7 +343,7 @@ class TestPassing:
         # Two dips of like depth between the looks at a path may be mistaken for one another.
         between = 0.5 / 64 * np.linalg.norm(motion.extrema().velocity)
         assert sampled - 0.0005 * between * 64 <= passed.distance <= sampled + between
-        # What is said is true of the path: the point is that near at that time.
+        # The path has this distance at this time.
         reached = motion.sample_one(passed.time)[0]
         assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
 

@@ -39,14 +39,14 @@ with-dry-run@0                   the campaign is rehearsed and does its dry run
 declines@0x1                     the operator does not accept the first dry run
 hurry@0                          runs are repeated at once, without a restart of the controller"""
 
-_COUNTED: Final = {
+_KINDS_BY_UNIT: Final = {
     "cycle": "stall clock kill interrupt power-cut lurch stop override hold",
     "write": "kill-at-write disk-full disk-error short-write",
     "save": "kill-at-save save-full",
     "create": "create-full",
     "always": "with-dry-run declines hurry",
 }
-KINDS: Final = {kind: what for what, kinds in _COUNTED.items() for kind in kinds.split()}
+KINDS: Final = {kind: what for what, kinds in _KINDS_BY_UNIT.items() for kind in kinds.split()}
 """Quantity counted by `AT` of each kind."""
 _LINE: Final = re.compile(
     r"(?P<kind>[a-z-]+)@(?P<at>\d{1,9})(?:x(?P<count>\d{1,6}))?(?P<options>(?::[^:\s]+)*)"

@@ -1,4 +1,4 @@
-"""What seeds have found in the product, each as small as it could be made."""
+"""Defects of the product found by seeds, each reduced."""
 
 from __future__ import annotations
 
@@ -37,42 +37,42 @@ def controller(cell: Cell) -> SimulatedController:
     return simulated_controller(cell)
 
 
-class TestAControllerThatDoesNotBeginASession:
-    """Seed 72 with `hurry@0`: a run begun anew met a controller whose session went on.
+class TestControllerWithoutInitPacket:
+    """Seed 72 with `hurry@0`: a repeated run met a controller whose session continued.
 
-    Its drive was off, so that its packets were echoed as those before an init packet are, for all
-    of the 60 s; then the person was told to switch the drive on, which does not help.
+    Its drive was off, so that its packets were echoed like those before an init packet, for all
+    of the 60 s; then the operator was asked to switch the drive on, which does not help.
     """
 
-    def test_the_person_is_asked_to_start_its_program_anew(
+    def test_the_operator_is_asked_to_restart_its_program(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
         first = Link.over(SimulatedTransport(controller), cell)
         first.connect(Stop())
         controller.emergency_stop()
         second = Link.over(SimulatedTransport(controller), cell)
-        with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as told:
+        with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as raised:
             second.connect(Stop(), timeout=0.5)
-        assert "switch the drive on" not in str(told.value)
+        assert "switch the drive on" not in str(raised.value)
 
-    def test_a_session_that_ended_at_once_is_not_said_to_have_been_waited_for(
+    def test_the_error_of_a_session_that_ended_at_once_has_no_timeout(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
         controller.finish()
         link = Link.over(SimulatedTransport(controller), cell)
-        with pytest.raises(ControllerFault, match="ended the session within 0") as told:
+        with pytest.raises(ControllerFault, match="ended the session within 0") as raised:
             link.connect(Stop())
-        assert "60 s" not in str(told.value)
+        assert "60 s" not in str(raised.value)
 
-    def test_one_whose_drive_is_off_is_still_told_so(self) -> None:
+    def test_the_error_of_a_drive_that_is_off_names_it(self) -> None:
         assert "switch the drive on" in str(not_ready(State.DRIVE_OFF, 60.0))
         assert "within 60 s" in str(not_ready(State.DRIVE_OFF, 60.0))
 
 
-def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_without_end(
+def test_a_motion_does_not_wait_forever_for_a_drive_that_went_off(
     cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
-    """Seed 455: the drive was lost between two motions, and virtual time went on for ever."""
+    """Seed 455: the drive was lost between two motions, and virtual time did not end."""
     link = Link.over(SimulatedTransport(controller), cell)
     where = link.connect(Stop())
     controller.emergency_stop()
@@ -84,7 +84,7 @@ def test_a_motion_whose_drive_goes_off_before_it_begins_is_not_waited_for_withou
     assert (open_archive(spec.path).outcome or ArchiveOutcome()).outcome == "void"
 
 
-def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(
+def test_a_motion_stopped_while_axes_open_leaves_them_closed(
     cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
     """Seed 2088 with `stop@30`: the link was left with some of the axes in open mode."""
@@ -92,8 +92,8 @@ def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(
     motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
     stop, phases = Stop(), []
 
-    class Looking:
-        """Presses stop when the first axis has opened."""
+    class Stopping:
+        """Requests a stop when the first axis has opened."""
 
         def __getattr__(self, name: str) -> Any:
             return getattr(controller, name)
@@ -103,15 +103,15 @@ def test_a_motion_that_is_stopped_while_its_axes_open_leaves_them_closed(
             stop.requested |= controller.phase is Phase.OPENING
             return controller.next_packet()
 
-    link.transport = SimulatedTransport(Looking())
+    link.transport = SimulatedTransport(Stopping())
     assert link.run(motion, spec, stop).outcome == "stopped"
     assert Phase.OPENING in phases
     assert Phase.OPEN not in phases
     assert link.session.state is State.CLOSED
 
 
-def test_a_repetition_in_which_a_joint_was_stuck_is_run_again(tmp_path: Path) -> None:
-    """Seed 4982: it counted, the campaign was complete, and no estimate could be made of it."""
+def test_a_repetition_with_a_stuck_joint_is_run_again(tmp_path: Path) -> None:
+    """Seed 4982: it was valid, the campaign complete, and no estimate could be made of it."""
     seen = Stage(tmp_path).observed(4982, ["following-error@349x26:axis=1"])
     assert seen.complete
     assert seen.found is not None, seen.unidentified
@@ -122,15 +122,15 @@ def test_a_repetition_in_which_a_joint_was_stuck_is_run_again(tmp_path: Path) ->
     assert "excitation_000_a2.mcap" in seen.found.pooled
 
 
-class TestALinkThatIsClosed:
-    """Seed 6625 with `restart@1102:warm`: started anew as it was told to end, it was never told so
-    again, and virtual time went on until the machine had no memory left."""
+class TestClosedLink:
+    """Seed 6625 with `restart@1102:warm`: restarted during the request to end its session, the
+    controller got no other request, and virtual time did not end."""
 
     @pytest.fixture(autouse=True)
     def patience(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(link_module, "END_TIMEOUT", 0.5)
 
-    def test_does_not_wait_without_end_for_a_controller_started_anew(
+    def test_it_does_not_wait_forever_for_a_restarted_controller(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
         link = Link.over(
@@ -142,7 +142,7 @@ class TestALinkThatIsClosed:
         assert link.transport.now - began == pytest.approx(0.5, abs=0.01)
         assert link.session.state is State.DRIVE_OFF
 
-    def test_says_that_axes_stay_open(self, cell: Cell, controller: SimulatedController) -> None:
+    def test_it_reports_open_axes(self, cell: Cell, controller: SimulatedController) -> None:
         link = Link.over(SimulatedTransport(controller), cell)
         link.connect(Stop())
         exchange(link.transport, link.session, until=lambda: link.session.state is State.OPEN)

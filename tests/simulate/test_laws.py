@@ -1,8 +1,4 @@
-"""A law that nothing breaks proves nothing: each finds the one thing that was altered.
-
-One campaign with some faults is played; untouched it keeps every law. Then one thing at a time is
-put out of order in what was observed, and the law whose business that is has to say so.
-"""
+"""Each law finds an alteration of the observation of a campaign that satisfies all of them."""
 
 from __future__ import annotations
 
@@ -51,10 +47,10 @@ ALL = {**LAWS, "judge": judge_whole}
 
 
 def found(observed: Observed, law: str) -> str:
-    """What one family of laws has to say, in one text."""
-    said: list[Broken] = list(ALL[law](observed))
-    assert all(one.law == law for one in said)
-    return "; ".join(one.text for one in said)
+    """Violations of one family of laws, in one text."""
+    broken: list[Broken] = list(ALL[law](observed))
+    assert all(one.law == law for one in broken)
+    return "; ".join(one.text for one in broken)
 
 
 def with_life(observed: Observed, number: int, **changes: Any) -> Observed:
@@ -75,13 +71,13 @@ def observed(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Observed:
     return play(SEED, twin, tmp_path_factory.mktemp("faulty"), parse_script(FAULTS))
 
 
-def test_an_untouched_campaign_keeps_every_law(observed: Observed) -> None:
+def test_an_unaltered_campaign_satisfies_every_law(observed: Observed) -> None:
     assert observed.complete, observed.ended
     assert len(observed.runs) >= 2
     assert {name: found(observed, name) for name in ALL} == dict.fromkeys(ALL, "")
 
 
-def test_the_faults_have_left_something_of_every_kind_to_judge(observed: Observed) -> None:
+def test_the_faults_have_effects_of_every_kind(observed: Observed) -> None:
     fates = heard(observed)[0].fates
     for kind in ("init", "cyclic", "again", "nothing"):
         assert fates[kind] > 0, kind
@@ -93,7 +89,7 @@ def test_the_faults_have_left_something_of_every_kind_to_judge(observed: Observe
 
 
 def with_exchanged(observed: Observed, index: int, **changes: Any) -> Observed:
-    """One packet of the first life exchanged otherwise."""
+    """One exchanged packet of the first life changed."""
     life = observed.runs[0]
     exchanged = list(life.exchanged)
     exchanged[index] = exchanged[index]._replace(**changes)
@@ -108,7 +104,7 @@ def with_answer(observed: Observed, index: int, offset: int, mask: int = 1) -> O
 
 
 def of_kind(observed: Observed, kind: str, number: int = 0) -> int:
-    """Index of the first packet of the first life that had to get such an answer."""
+    """Index of a packet of the first life with this kind of required answer."""
     kinds = heard(observed)[0].kinds
     return [index for index, one in enumerate(kinds) if one == kind][number]
 
@@ -119,7 +115,7 @@ def longest(observed: Observed) -> Stretch:
 
 
 def in_motion(observed: Observed, further: int = 0) -> tuple[int, int]:
-    """Index of a packet amid a motion of the first life, and byte offset in its first joint."""
+    """Index of a packet within a motion of the first life, and byte offset in its first joint."""
     talk, stretch = heard(observed)[0].talks[0], longest(observed)
     moving = np.flatnonzero((stretch.step[: stretch.leading] != 0.0).any(axis=1))
     offset = 12 + 36 * (talk.init.slots or (0,))[0] + further
@@ -137,7 +133,7 @@ def arm_of(observed: Observed) -> int:
 
 
 def reply_at(observed: Observed) -> tuple[bytes, ...]:
-    """What was sent at rest."""
+    """Reply at rest."""
     return observed.runs[0].exchanged[at_rest(observed)].replies
 
 
@@ -162,7 +158,7 @@ def with_received(observed: Observed, place: tuple[int, int], data: bytes) -> Ob
 
 
 def received_in_motion(observed: Observed, field: int, value: float) -> Observed:
-    """One of D1..D5 of the first joint amid a motion."""
+    """One of D1..D5 of the first joint within a motion."""
     index, at = in_motion(observed)
     return with_received(observed, (index, at + 4 + 4 * field), np.float32(value).tobytes())
 
@@ -204,7 +200,7 @@ def with_set_points(
 
 
 def leapt(observed: Observed, height: float = 0.2, *, records: bool = True) -> Observed:
-    """One set-point in the middle of a motion is that much further [motor revolutions]."""
+    """One set-point in the middle of a motion shifted [motor revolutions]."""
     at = longest(observed).leading // 2
     bump = lambda rows: np.where(rows == at, height, 0.0)[:, np.newaxis]  # noqa: E731
     return with_set_points(observed, bump, records=records)
@@ -223,7 +219,7 @@ def beyond_the_range(observed: Observed) -> Observed:
     return with_set_points(observed, lambda rows: np.full((len(rows), 1), far))
 
 
-def unasked(observed: Observed) -> Observed:
+def unrequested(observed: Observed) -> Observed:
     acts = tuple(act for act in observed.runs[0].acts if act.name != "request")
     return with_life(observed, 0, acts=acts)
 
@@ -246,12 +242,12 @@ def other_excitation(observed: Observed) -> Observed:
     return replace(observed, plan=replace(plan, excitation=other))
 
 
-def stuck(observed: Observed, why: str) -> Observed:
-    return with_life(observed, len(observed.runs) - 1, result=None, error=ControllerFault(why))
+def ended(observed: Observed, reason: str) -> Observed:
+    return with_life(observed, len(observed.runs) - 1, result=None, error=ControllerFault(reason))
 
 
 def unarchived(observed: Observed) -> Observed:
-    """One cycle more was exchanged than there are records in the file."""
+    """One exchanged cycle without a record."""
     life = observed.runs[0]
     rows = life.records.copy()
     index = len(life.exchanged) // 2
@@ -262,7 +258,7 @@ def unarchived(observed: Observed) -> Observed:
 
 
 def too_many_missed(observed: Observed) -> Observed:
-    """Packets left out amid a motion that completed."""
+    """Packets removed within a motion that completed."""
     for number, life in enumerate(observed.runs):
         ends = [event for _, event in life.events if isinstance(event, MotionEnded)]
         done = [event.interval for event in ends if event.outcome == "completed"]
@@ -330,7 +326,7 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("guard", lambda o: received_in_motion(o, 0, 1e3), ("target is elsewhere",)),
     ("guard", lambda o: received_in_motion(o, 2, 1e3), ("does not follow",)),
     ("guard", lambda o: received_in_motion(o, 4, 1e4), ("current limit",)),
-    ("guard", unasked, ("before any motion was requested",)),
+    ("guard", unrequested, ("before any motion was requested",)),
     ("guard", ended_early, ("after the motion had ended",)),
     ("judge", leapt, ("velocity",)),
     ("judge", lambda o: with_answer(o, REST(o), 17), ("safe answer",)),
@@ -342,9 +338,7 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
     ("resume", lambda o: with_life(o, 0, error=ValueError("what?")),
      ("life 1 ended with ValueError",)),
     ("resume", other_excitation, ("it is not the motion as it was planned",)),
-    ("completion", lambda o: stuck(o, "the path was not sent: jog the arm"),
-     ("the path was not sent: jog the arm",)),
-    ("completion", lambda o: stuck(o, "the drive is off"), ("the drive is off",)),
+    ("completion", lambda o: ended(o, "the drive is off"), ("the drive is off",)),
     ("completion", lambda o: replace(o, found=None), ("not identified",)),
     ("gaps", too_many_missed, ("are allowed, and the motion completed",)),
     ("piles", piled_up, ("both were answered",)),
@@ -354,31 +348,31 @@ ALTERED: list[tuple[str, Alter, tuple[str, ...]]] = [
 @pytest.mark.parametrize(
     ("law", "alter", "texts"), ALTERED, ids=[f"{law}: {texts[0]}" for law, _, texts in ALTERED]
 )
-def test_what_was_altered_is_found(
+def test_an_alteration_is_found(
     observed: Observed, law: str, alter: Alter, texts: tuple[str, ...]
 ) -> None:
-    said = found(alter(observed), law)
-    assert said
+    broken = found(alter(observed), law)
+    assert broken
     for text in texts:
-        assert text in said
+        assert text in broken
 
 
 @pytest.fixture(scope="module")
 def led(twin: Twin, tmp_path_factory: pytest.TempPathFactory) -> Observed:
-    """Four packets are lost amid a motion, which the controller of this seed carries on."""
+    """Four packets are lost within a motion, which the controller extrapolates."""
     lost = twin.story.moving[3 * len(twin.story.moving) // 10]
     return play(SEED + 1, twin, tmp_path_factory.mktemp("led"), parse_script([f"lose@{lost}x4"]))
 
 
 def gap_of(observed: Observed) -> tuple[Stretch, int]:
-    """The first motion with a long gap, and its row behind that."""
+    """The first motion with a long gap, and its row after that."""
     talk = heard(observed)[0].talks[0]
-    behind = ((one, np.flatnonzero(talk.records["gap"][one.rows] > 2)) for one in stretches(talk))
-    return next((one, int(rows[0])) for one, rows in behind if rows.size)
+    after = ((one, np.flatnonzero(talk.records["gap"][one.rows] > 2)) for one in stretches(talk))
+    return next((one, int(rows[0])) for one, rows in after if rows.size)
 
 
 def received_there(observed: Observed, field: int, factor: float, more: float = 0.0) -> Observed:
-    """One of D1..D5 of the first joint behind the gap, times a factor and with something added."""
+    """One of D1..D5 of the first joint after the gap, scaled and shifted."""
     stretch, row = gap_of(observed)
     at = 16 + 4 * field + 36 * (stretch.talk.init.slots or (0,))[0]
     value = np.float32(factor * stretch.received[field, row, 0] + more)
@@ -386,7 +380,7 @@ def received_there(observed: Observed, field: int, factor: float, more: float = 
 
 
 def moved_from_there(observed: Observed, way: float, speed: float) -> Observed:
-    """Set-points behind the gap moved by revolutions, and by revolutions per cycle."""
+    """Set-points after the gap moved by revolutions, and by revolutions per cycle."""
     stretch, row = gap_of(observed)
     move = lambda rows: ((way + speed * (rows - row)) * (rows >= row))[:, np.newaxis]  # noqa: E731
     return with_set_points(observed, move, stretch=stretch)
@@ -403,14 +397,14 @@ def moved_from_there(observed: Observed, way: float, speed: float) -> Observed:
         (lambda o: moved_from_there(o, 0.0, 0.02), "acceleration"),
     ],
 )
-def test_a_long_gap_excuses_nothing_behind_it(led: Observed, alter: Alter, text: str) -> None:
-    """Though what follows is judged as begun anew, where the controller led it."""
+def test_set_points_after_a_long_gap_are_checked(led: Observed, alter: Alter, text: str) -> None:
+    """As those of a motion that begins where the controller extrapolated it."""
     assert found(led, "guard") == found(led, "judge") == ""
     assert text in found(alter(led), "guard")
     assert found(alter(led), "judge")
 
 
-def test_the_safe_answers_on_arrays_are_those_of_the_oracle_one_by_one() -> None:
+def test_vectorised_safe_answers_are_those_of_the_oracle() -> None:
     chance = random.Random(4)
     arms = (1, 1, 2, 1)
     modes = [0, 1, 2, 3, 4, 5, 7, 9, 10, 11, 12, 17, 500, 501, 502, 504, 508, -1]
@@ -435,15 +429,15 @@ def test_the_safe_answers_on_arrays_are_those_of_the_oracle_one_by_one() -> None
             )
 
 
-def test_a_jerk_that_only_the_records_can_show_is_found(observed: Observed) -> None:
+def test_a_jerk_visible_only_in_the_records_is_found(observed: Observed) -> None:
     """Four millionths of a revolution: below a step of float32 at 100 revolutions."""
-    said = found(leapt(observed, float(np.max(4.0 * revolutions_of_jerk(observed)))), "guard")
-    assert "jerk" in said
-    assert "velocity" not in said
+    broken = found(leapt(observed, float(np.max(4.0 * revolutions_of_jerk(observed)))), "guard")
+    assert "jerk" in broken
+    assert "velocity" not in broken
 
 
-def test_bounds_of_a_stop_for_losses_that_were_none_are_found(observed: Observed) -> None:
-    """The session says that answers were lost; only the judge counts them itself."""
+def test_bounds_of_a_stop_without_lost_answers_are_found(observed: Observed) -> None:
+    """By the judge, which counts lost answers; `guard` relies on the events of the session."""
     wide = leapt(observed, float(np.min(0.6 * revolutions_of_jerk(observed))))
     assert "jerk" in found(wide, "guard")
     talk = heard(observed)[0].talks[0]
@@ -456,7 +450,7 @@ def test_bounds_of_a_stop_for_losses_that_were_none_are_found(observed: Observed
 
 @pytest.fixture
 def copied(observed: Observed, tmp_path: Path) -> Observed:
-    """The same with a folder of its own, to be put out of order."""
+    """The same with a copy of its folder."""
     shutil.copytree(observed.folder, tmp_path / "folder")
     return replace(observed, folder=tmp_path / "folder")
 
@@ -507,7 +501,7 @@ SPOILT: dict[str, tuple[Callable[[Path], object], dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("what", SPOILT)
-def test_what_was_spoilt_in_the_folder_is_found(copied: Observed, what: str) -> None:
+def test_a_damaged_folder_is_found(copied: Observed, what: str) -> None:
     spoil, texts = SPOILT[what]
     path = whole(copied)
     spoil(path)
@@ -516,83 +510,82 @@ def test_what_was_spoilt_in_the_folder_is_found(copied: Observed, what: str) -> 
 
 
 @pytest.mark.parametrize("name", ["position", "target_current", "commanded_position", "mode"])
-def test_a_record_that_is_not_what_crossed_the_wire_is_found(
+def test_a_record_that_differs_from_its_packet_is_found(
     observed: Observed, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     archived = read(whole(observed))
     cycles = archived.cycles.copy()
     cycles[name][len(cycles) // 2] += 1
     monkeypatch.setattr(archived, "cycles", cycles)
-    said = found(replace(observed), "archives")
+    broken = found(replace(observed), "archives")
     assert {
         "position": "position is not that of the packets",
         "target_current": "target_current is not that of the packets",
         "commanded_position": "not the one that was sent",
         "mode": "mode is not that of the cycle exchanged",
-    }[name] in said
-    assert name == "mode" or "JointState" in said or name == "target_current"
+    }[name] in broken
+    assert name == "mode" or "JointState" in broken or name == "target_current"
 
 
 @pytest.mark.parametrize("rows", [slice(100, 101), slice(100, 110)])
-def test_a_hole_in_an_archive_is_found_unless_it_is_stated(
+def test_missing_records_are_found_unless_stated(
     observed: Observed, monkeypatch: pytest.MonkeyPatch, rows: slice
 ) -> None:
     archived = read(whole(observed))
-    kept = np.ones(len(archived.cycles), bool)
-    kept[rows] = False
+    present = np.ones(len(archived.cycles), bool)
+    present[rows] = False
     for name in ("cycles", "stamps", "sequences", "states", "commanded"):
-        monkeypatch.setattr(archived, name, getattr(archived, name)[kept])
-    count = int((~kept).sum())
-    said = found(replace(observed), "archives")
-    assert f"{count} cycles in between were exchanged and not archived, 0 are stated" in said
-    assert f"samples is stated as {len(kept)}, and is {len(kept) - count}" in said
-    assert "not numbered consecutively" in said
+        monkeypatch.setattr(archived, name, getattr(archived, name)[present])
+    count = int((~present).sum())
+    broken = found(replace(observed), "archives")
+    assert f"{count} cycles in between were exchanged and not archived, 0 are stated" in broken
+    assert f"samples is stated as {len(present)}, and is {len(present) - count}" in broken
+    assert "not numbered consecutively" in broken
     outcome = {**(archived.outcome or {}), "records_lost": str(count)}
     monkeypatch.setattr(archived, "outcome", outcome)
     assert "not archived" not in found(replace(observed), "archives")
 
 
-def test_an_outcome_that_is_not_the_motions_own_is_found(
+def test_another_outcome_than_the_motions_is_found(
     observed: Observed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archived = read(whole(observed))
     monkeypatch.setattr(archived, "outcome", {**(archived.outcome or {}), "outcome": "stopped"})
-    said = found(replace(observed), "archives")
-    assert "it ended completed, and" in said
+    assert "it ended completed, and" in found(replace(observed), "archives")
     assert "says 'stopped', and is entered as 'completed'" in found(replace(observed), "folder")
 
 
-def test_what_was_whole_is_neither_changed_nor_removed_nor_done_again(observed: Observed) -> None:
+def test_changed_removed_and_repeated_archives_are_found(observed: Observed) -> None:
     life = observed.runs[1]
-    kept = next(name for name in life.before if name.startswith("standstill"))
-    changed = with_life(observed, 1, after={**life.after, kept: "0" * 64})
-    assert f"{kept} was changed" in found(changed, "folder")
-    gone = {name: digest for name, digest in life.after.items() if name != kept}
-    assert f"{kept} is gone" in found(with_life(observed, 1, after=gone), "folder")
+    name = next(name for name in life.before if name.startswith("standstill"))
+    changed = with_life(observed, 1, after={**life.after, name: "0" * 64})
+    assert f"{name} was changed" in found(changed, "folder")
+    gone = {other: digest for other, digest in life.after.items() if other != name}
+    assert f"{name} is gone" in found(with_life(observed, 1, after=gone), "folder")
     again = with_life(observed, 1, archives=(*life.archives, "standstill_000_a2.mcap"))
-    assert f"was run although {kept} was complete by then" in found(again, "folder")
+    assert f"was run although {name} was complete by then" in found(again, "folder")
 
 
-def test_what_does_not_count_is_named_to_whoever_asks(
+def test_an_invalid_archive_without_a_note_is_found(
     copied: Observed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert "hil status" not in found(copied, "folder")  # one file is torn by the death of its run
-    told = Campaign.status
+    assert "hil status" not in found(copied, "folder")  # one file was truncated by a kill
+    status = Campaign.status
 
     def silent(campaign: Campaign) -> CampaignStatus:
-        return replace(told(campaign), notes=())
+        return replace(status(campaign), notes=())
 
     monkeypatch.setattr(Campaign, "status", silent)
     assert "hil status does not name" in found(copied, "folder")
 
 
-def test_a_motion_that_failed_is_no_strange_end(observed: Observed) -> None:
+def test_a_failed_motion_may_end_a_run(observed: Observed) -> None:
     failed = MotionFailedError("repetition 1", "lost", "silence")
     assert found(with_life(observed, 0, error=failed), "resume") == ""
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, 10.0])
-def test_an_estimate_elsewhere_than_the_undisturbed_one_is_found(
+def test_an_estimate_that_differs_from_the_undisturbed_is_found(
     observed: Observed, wrong: float
 ) -> None:
     assert observed.found is not None
@@ -605,10 +598,8 @@ def test_an_estimate_elsewhere_than_the_undisturbed_one_is_found(
     assert f"{pooled.names[name]} is" in found(moved, "estimate")
 
 
-def test_a_model_that_predicts_other_torques_of_the_same_motion_is_found(
-    observed: Observed,
-) -> None:
-    """By far less than what the few degrees of freedom of each standard deviation allow."""
+def test_a_model_that_predicts_other_torques_is_found(observed: Observed) -> None:
+    """By far less than the few degrees of freedom of each standard deviation allow."""
     assert observed.found is not None
     assert observed.twin_found is not None
     found_one, pooled = observed.found, observed.found.result.pooled
@@ -622,13 +613,13 @@ def test_a_model_that_predicts_other_torques_of_the_same_motion_is_found(
         assert ("predicted torques differ" in found(calm, "estimate")) is seen
 
 
-def test_what_counts_must_be_pooled(observed: Observed) -> None:
+def test_valid_archives_must_be_pooled(observed: Observed) -> None:
     assert observed.found is not None
     less = replace(observed, found=observed.found._replace(pooled=observed.pooled[1:]))
     assert "are valid and were not pooled" in found(less, "estimate")
 
 
-def test_the_bound_on_estimates_is_the_quantile_that_it_says() -> None:
+def test_the_bound_on_estimates_is_its_quantile() -> None:
     assert degrees_of_freedom(1.9599639845400545) == math.inf
     assert degrees_of_freedom(2.3646242510102993) == pytest.approx(7.0, rel=1e-6)
     # Normal deviates: 2 (1 - Phi(z)) for one of 10 parameters in all seeds together.

@@ -1,8 +1,4 @@
-"""A simulation that finds nothing proves nothing: defects planted in the product are found.
-
-Each is one that a person could make in good faith. The same seed, without the defect, keeps all
-laws.
-"""
+"""Laws find plausible defects injected into the product; without them the same seed is valid."""
 
 from __future__ import annotations
 
@@ -28,7 +24,7 @@ from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.verdicts import Stage, judged
 
 SEED = 6
-"""Its controller goes on at the last velocity where answers are missing, up to eight of them."""
+"""Its controller extrapolates the motion over up to eight missing answers."""
 Plant = Callable[[pytest.MonkeyPatch], None]
 
 
@@ -38,19 +34,19 @@ def stage() -> Iterator[Stage]:
         yield Stage(Path(root))
 
 
-def answers_duplicates_anew(patch: pytest.MonkeyPatch) -> None:
+def answers_duplicates_again(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(PacketSequence, "is_duplicate", lambda self, number: False)
     patch.setattr(PacketSequence, "is_stale", lambda self, number: False)
 
 
 def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
-    """After a gap the motion makes up for it, and the guard does not look at speeds."""
+    """After a gap the motion catches up, and the guard does not check speeds."""
     advance, gap = TrajectoryPlayer.advance, [0]
-    note_gap = StateMachine.record_gap
+    record_gap = StateMachine.record_gap
 
-    def noted(self: StateMachine, missed: int, unanswered: int, max_gap: int) -> None:
+    def recorded(self: StateMachine, missed: int, unanswered: int, max_gap: int) -> None:
         gap[0] = missed
-        note_gap(self, missed, unanswered, max_gap)
+        record_gap(self, missed, unanswered, max_gap)
 
     def advanced(self: TrajectoryPlayer) -> Any:
         for _ in range(gap[0]):
@@ -58,40 +54,37 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
         gap[0] = 0
         return advance(self)
 
-    patch.setattr(StateMachine, "record_gap", noted)
+    patch.setattr(StateMachine, "record_gap", recorded)
     patch.setattr(TrajectoryPlayer, "advance", advanced)
     patch.setattr(Guard, "check_set_point", lambda *arguments: None)
 
 
-def goes_on_after_a_gap(patch: pytest.MonkeyPatch) -> None:
-    """The motion is neither stopped nor compared, however many packets were missed."""
-    note_gap, compare = StateMachine.record_gap, ReplyPolicy.check_gap
+def continues_after_a_gap(patch: pytest.MonkeyPatch) -> None:
+    """The motion is neither stopped nor compared after any number of missed packets."""
+    record_gap, compare = StateMachine.record_gap, ReplyPolicy.check_gap
     patch.setattr(
         StateMachine,
         "record_gap",
-        lambda self, missed, unanswered, most: note_gap(self, missed, 0, most),
+        lambda self, missed, unanswered, most: record_gap(self, missed, 0, most),
     )
     patch.setattr(
         ReplyPolicy, "check_gap", lambda self, unanswered, *others: compare(self, 0, *others)
     )
 
 
-def answers_what_piled_up(patch: pytest.MonkeyPatch) -> None:
-    """Every packet of a pile is answered, so that the motion runs ahead of the arm."""
-    newest = ReceiveQueue._newest
+def answers_all_waiting_packets(patch: pytest.MonkeyPatch) -> None:
+    """The motion runs ahead of the arm."""
 
-    def all_of_them(self: ReceiveQueue, first: Any, period: float) -> Any:
+    def every(self: ReceiveQueue, first: Any, period: float) -> Any:
         arrivals = [first]
         while (packet := self._transport.receive(0.0)) is not None:
             arrivals.append(first._replace(packet=packet))
         return tuple(arrivals)
 
-    assert newest is not all_of_them
-    patch.setattr(ReceiveQueue, "_newest", all_of_them)
+    patch.setattr(ReceiveQueue, "_newest", every)
 
 
-def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
-    """What a manifest says of a stopped motion is that it completed."""
+def enters_stopped_motions_as_completed(patch: pytest.MonkeyPatch) -> None:
     add = CampaignFolder.add
 
     def added(self: CampaignFolder, name: str, outcome: str, reason: str = "") -> None:
@@ -100,12 +93,12 @@ def takes_stopped_motions_for_whole(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(CampaignFolder, "add", added)
 
 
-def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
-    """A run does not believe what the one before it has entered."""
+def repeats_complete_motions(patch: pytest.MonkeyPatch) -> None:
+    """A run ignores the entries of the run before."""
     whole, play = CampaignFolder.whole, Runner.run_motion
     begun: list[bool] = []
 
-    def believed(self: CampaignFolder, kind: str, index: int) -> str | None:
+    def own_entries(self: CampaignFolder, kind: str, index: int) -> str | None:
         return whole(self, kind, index) if begun else None
 
     def played(self: Runner, *arguments: Any) -> str:
@@ -118,7 +111,7 @@ def does_whole_motions_again(patch: pytest.MonkeyPatch) -> None:
         begun.clear()
         unchanged(self)
 
-    patch.setattr(CampaignFolder, "whole", believed)
+    patch.setattr(CampaignFolder, "whole", own_entries)
     patch.setattr(CampaignFolder, "require_unchanged", begins)
     patch.setattr(Runner, "run_motion", played)
 
@@ -142,31 +135,33 @@ def replaced(owner: type, name: str, value: Any) -> Plant:
 
 write = Recorder._write
 loses_a_record = replaced(Recorder, "_write", lambda self, records: write(self, records[:-1]))
-believes_the_manifest = replaced(
+ignores_checksums = replaced(
     CampaignFolder, "_unchanged", lambda self, entry: (self.archives / entry.name).is_file()
 )
-lets_set_points_pass = replaced(Guard, "check_set_point", lambda *_: None)
-lets_feedback_pass = replaced(Guard, "check_feedback", lambda *_: None)
+accepts_set_points = replaced(Guard, "check_set_point", lambda *_: None)
+accepts_feedback = replaced(Guard, "check_feedback", lambda *_: None)
 leaves_at_once = replaced(Execution, "settled", property(lambda self: self.finished))
 
 DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
-    "a duplicate is answered anew": (answers_duplicates_anew, ("duplicate@300x40",), "replies"),
+    "a duplicate is answered again": (answers_duplicates_again, ("duplicate@300x40",), "replies"),
     "a motion catches up, unguarded": (
         catches_up_unguarded, ("lose@{moving}x2", "kill@9999"), "guard"),
-    "the guard lets set-points pass": (
-        lets_set_points_pass, ("lurch@{moving}x3:0.0001",), "guard"),
-    "an arm that does not follow is moved": (
-        lets_feedback_pass, ("following-error@{moving}x60:axis=1:slip",), "guard"),
-    "a motion goes on after a gap": (goes_on_after_a_gap, ("lose@{moving}x4",), "gaps"),
+    "set-points are not checked": (accepts_set_points, ("lurch@{moving}x3:0.0001",), "guard"),
+    "feedback is not checked": (
+        accepts_feedback, ("following-error@{moving}x60:axis=1:slip",), "guard"),
+    "a motion continues after a gap": (continues_after_a_gap, ("lose@{moving}x4",), "gaps"),
     "open mode is left before the arm settles": (leaves_at_once, ("lose@{moving}x4",), "rest"),
-    "what piled up is answered": (answers_what_piled_up, ("stall@{moving}:7ms",), "piles"),
-    "records are lost unsaid": (loses_a_record, (), "archives"),
-    "a stopped motion counts": (takes_stopped_motions_for_whole, ("stop@{moving}",), "folder"),
-    "whole motions are done again": (does_whole_motions_again, ("stop@{late}",), "folder"),
-    "a torn archive counts": (believes_the_manifest, ("power-cut@{late}x2:keep=0.6",), "folder"),
+    "waiting packets are answered": (
+        answers_all_waiting_packets, ("stall@{moving}:7ms",), "piles"),
+    "a lost record is not stated": (loses_a_record, (), "archives"),
+    "a stopped motion is valid": (
+        enters_stopped_motions_as_completed, ("stop@{moving}",), "folder"),
+    "complete motions are repeated": (repeats_complete_motions, ("stop@{late}",), "folder"),
+    "a truncated archive is valid": (
+        ignores_checksums, ("power-cut@{late}x2:keep=0.6",), "folder"),
     "archives are smoothed": (smooths_what_it_archives, (), "archives"),
 }  # fmt: skip
-"""What is planted, the script that brings it out, and the law that finds it."""
+"""Defect, script with which it has an effect, and the law that finds it."""
 
 
 def script(stage: Stage, lines: tuple[str, ...]) -> list[str]:
@@ -190,7 +185,7 @@ def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     assert law in {one.law for one in judged(stage.observed(SEED, wanted))}
 
 
-def test_a_defect_that_needs_no_fault_is_no_reason_to_draw_another_arm(
+def test_a_defect_without_faults_is_reported_and_not_a_reason_for_another_arm(
     stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(self: Runner, *arguments: Any) -> str:

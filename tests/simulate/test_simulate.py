@@ -1,4 +1,4 @@
-"""The simulation itself: seeds are replayable, scripts are read and made small, journals resume."""
+"""The simulation itself: reproducible seeds, scripts and their reduction, journals."""
 
 from __future__ import annotations
 
@@ -21,20 +21,15 @@ STORY = Story(900, tuple(range(100, 800)), 3, 120, 40, 6, 6)
 
 
 class TestScript:
-    def test_whatever_is_drawn_can_be_read_and_every_kind_is_drawn(self) -> None:
-        drawn = {
+    def test_random_scripts_are_valid_and_of_all_kinds(self) -> None:
+        kinds = {
             kind_of(line)
             for seed in range(600)
             for line in parse_script(draw_script(random.Random(seed), STORY)).lines
         }
-        assert drawn >= set(DRAWS) - {"stalls"}
+        assert kinds >= set(DRAWS) - {"stalls"}
 
-    @pytest.mark.parametrize("kind", sorted(DRAWS))
-    def test_each_kind_alone_can_be_read(self, kind: str) -> None:
-        for seed in range(20):
-            parse_script(DRAWS[kind][1](random.Random(seed), STORY).splitlines())
-
-    def test_what_a_line_says_is_kept(self) -> None:
+    def test_a_line_is_read_with_its_options(self) -> None:
         script = parse_script(["# a note", "", "stall@1200:12ms:answering", "lose@3x2"])
         (stall,) = script.events
         assert (stall.at, stall.word) == (1200, "answering")
@@ -42,13 +37,13 @@ class TestScript:
         assert [line for line, _ in script.faults] == ["lose@3x2"]
 
     @pytest.mark.parametrize("line", ["stall@x", "kill@3:softly", "lose@", "nothing", "kill 3"])
-    def test_what_cannot_be_read_is_refused_with_the_grammar(self, line: str) -> None:
+    def test_an_invalid_line_is_refused_with_the_grammar(self, line: str) -> None:
         with pytest.raises(ValueError, match="lines are"):
             parse_script([line])
 
 
 class TestShrinking:
-    def test_only_the_line_that_matters_is_left_and_its_numbers_are_small(self) -> None:
+    def test_the_failing_line_remains_with_small_numbers(self) -> None:
         lines = ("kill@3", "lose@1234x9", "stop@70", "e-stop@5", "hold@8x2")
 
         def fails(candidate: tuple[str, ...]) -> bool:
@@ -56,12 +51,12 @@ class TestShrinking:
 
         assert shrunk(lines, fails) == ("lose@1200x2",)
 
-    def test_two_lines_that_fail_only_together_are_kept(self) -> None:
+    def test_two_lines_that_fail_only_together_remain(self) -> None:
         lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
         both = {"kill@200", "kill@700"}
         assert set(shrunk(lines, lambda candidate: both <= set(candidate))) == both
 
-    def test_it_gives_up_after_so_many_tries(self) -> None:
+    def test_it_ends_after_some_tries(self) -> None:
         tried: list[tuple[str, ...]] = []
         lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
 
@@ -72,7 +67,7 @@ class TestShrinking:
         shrunk(lines, fails, tries=5)
         assert len(tried) == 5
 
-    def test_a_plainer_line_can_be_read(self) -> None:
+    def test_a_simpler_line_is_valid(self) -> None:
         for line in ("lose@1234x9:to_controller", "stall@987:37ms", "delay@55x4:30ms"):
             assert simpler(line)
             parse_script(simpler(line))
@@ -84,19 +79,16 @@ def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
 
 
 class TestJournal:
-    def test_it_knows_what_it_was_told_after_a_half_line(self, tmp_path: Path) -> None:
+    def test_verdicts_are_restored_before_an_incomplete_line(self, tmp_path: Path) -> None:
         path = tmp_path / "seeds.jsonl"
         known = Known(path)
         for seed in (3, 4):
             known.add(verdict(seed, ("guard", "too fast")))
-        whole = path.read_bytes()
-        path.write_bytes(whole + b'{"seed": 5, "scr')
-        again = Known(path)
-        assert again.verdicts == {
-            3: verdict(3, ("guard", "too fast")),
-            4: verdict(4, ("guard", "too fast")),
-        }
-        again.add(verdict(5))
+        with path.open("ab") as file:
+            file.write(b'{"seed": 5, "scr')
+        restored = Known(path)
+        assert restored.verdicts == {k: verdict(k, ("guard", "too fast")) for k in (3, 4)}
+        restored.add(verdict(5))
         assert set(Known(path).verdicts) == {3, 4, 5}
 
     def test_a_summary_counts_kinds_ends_and_failures(self) -> None:
@@ -111,8 +103,8 @@ class TestJournal:
         assert found["campaigns_ended"] == {"complete": 2}
 
 
-def test_a_seed_is_the_same_campaign_again_to_the_last_byte() -> None:
-    """On the wire and in the folder, whatever the host's clock says."""
+def test_a_seed_is_reproducible_to_the_last_byte() -> None:
+    """On the wire and in the folder, independent of the clock of the host."""
     played = []
     for _ in range(2):
         with stage_folder() as root:
@@ -127,15 +119,15 @@ def test_a_seed_is_the_same_campaign_again_to_the_last_byte() -> None:
 
 
 class TestCommand:
-    def test_a_seed_tells_what_was_drawn_and_that_all_laws_hold(
+    def test_one_seed_prints_its_script_and_result(
         self, capsys: pytest.CaptureFixture[str]
     ) -> None:
         assert main(["--seed", "4", "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)
-        assert (told["ran"], told["failed"], told["seeds_failed"]) == (1, 0, [])
-        assert set(told["struck"]) <= set(told["script"])
+        printed = json.loads(capsys.readouterr().out)
+        assert (printed["ran"], printed["failed"], printed["seeds_failed"]) == (1, 0, [])
+        assert set(printed["struck"]) <= set(printed["script"])
 
-    def test_another_script_takes_the_place_of_the_drawn_one(
+    def test_another_script_replaces_the_random_one(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         path = tmp_path / "script"
@@ -147,17 +139,17 @@ class TestCommand:
         assert "run 2" in out
         assert "complete" in out
 
-    def test_many_are_played_once_and_then_read_from_the_journal(
+    def test_many_are_run_once_and_then_read_from_the_journal(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         journal = str(tmp_path / "seeds.jsonl")
         for _ in range(2):
             assert main(["--seeds", "2", "--start", "6", "--journal", journal, "--json"]) == 0
-            told = json.loads(capsys.readouterr().out.splitlines()[-1])
-            assert (told["ran"], told["failed"], told["seeds_failed"]) == (2, 0, [])
+            printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+            assert (printed["ran"], printed["failed"], printed["seeds_failed"]) == (2, 0, [])
         assert len(Path(journal).read_text().splitlines()) == 2
 
-    def test_a_script_that_is_not_there_is_named(self, capsys: pytest.CaptureFixture[str]) -> None:
+    def test_a_missing_script_is_named(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["--seed", "1", "--script", "/nowhere/script"]) == 2
         assert "/nowhere/script" in capsys.readouterr().err
 
@@ -165,26 +157,26 @@ class TestCommand:
 @pytest.mark.parametrize(
     ("seed", "script"),
     [
-        # What is left unexplained is correlated over much of a short motion.
+        # The residual is correlated over much of a short motion.
         (1227, ["restart@580:cold", "clock@900:+3600s"]),
         (1791, ["drive-drop@400"]),
-        # The arm itself trembles where it stands, so that two motions in a row may not begin.
+        # The resting arm trembles, so that two motions in a row are not started.
         (3121, ["hurry@0", "lurch@700x1:-0.3", "axis-leaves@372:axis=1"]),
         # Standard deviations from few blocks of residuals: 6.5 of them are no finding.
         (3886, ["e-stop@460"]),
         # Joint angles of an arm whose calibration is fifteen revolutions of its motor.
         (4536, ["lose@500"]),
-        # A target velocity garbled to 1e37, converted to within as many digits as any.
+        # A target velocity corrupted to 1e37, converted within rounding.
         (7339, ["corrupt@900x2:offset=23:mask=0x40:to_controller"]),
-        # Records that the disk refused are not lost by the death that follows.
+        # Records refused by the disk are not lost by a later kill.
         (4789, ["kill-at-save@1:left", "save-full@2", "kill@1100", "disk-error@10x1:keep=0.481"]),
     ],
 )
-def test_laws_that_were_too_narrow_hold(seed: int, script: list[str], tmp_path: Path) -> None:
+def test_laws_allow_what_they_once_did_not(seed: int, script: list[str], tmp_path: Path) -> None:
     assert judged(Stage(tmp_path).observed(seed, script)) == []
 
 
-def test_a_campaign_that_never_ends_is_a_finding(
+def test_a_campaign_that_does_not_end_is_a_finding(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage = Stage(tmp_path)
@@ -194,8 +186,8 @@ def test_a_campaign_that_never_ends_is_a_finding(
     assert any("EndlessError" in one.text for one in broken)
 
 
-def test_a_scene_whose_arm_trembles_where_it_stands_is_drawn_anew(tmp_path: Path) -> None:
-    """Seed 744: whether a motion could begin was a matter of chance, five runs in a row."""
+def test_a_scene_with_a_trembling_arm_is_replaced(tmp_path: Path) -> None:
+    """Seed 744: whether a motion could start depended on chance, five runs in a row."""
     group = 744 // NEIGHBOURS
     with pytest.raises(SceneError, match="at rest it moves at"):
         _twin(scene_of(group), tmp_path / "trembling")

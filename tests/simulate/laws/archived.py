@@ -1,8 +1,7 @@
-"""Archives read a second time: container, chunks and messages by the published formats alone.
+"""Second reader of archives, from the published formats of container, chunks and messages.
 
-The container is MCAP, walked record by record; messages are CDR laid out by hand from
-`docs/archive-format.md`. What the `mcap` library says of the same files is asked for in
-`archives`, of one file of each campaign, for it takes a hundred times as long.
+The container is MCAP, messages are CDR, laid out as in `docs/archive-format.md`. The `mcap` library
+reads one file of each campaign in `archives`; it takes a hundred times as long.
 """
 
 from __future__ import annotations
@@ -42,20 +41,15 @@ class LoggedEvent:
 
 @dataclass(eq=False)
 class Archived:
-    """What an archive holds up to its last whole chunk.
+    """Content of an archive up to its last complete chunk.
 
     Attributes:
-        path: the file.
         whole: it has a footer, and nothing before it is damaged.
-        problem: what ended the reading; "" where nothing did.
-        metadata, outcome: of the records `hil` and `hil.outcome`; None where there is none.
-        attachments: by name.
-        cycles: (k,) rows of `/hil/cycle`.
-        stamps: (k,) log times of these [ns].
-        sequences: (k,) their numbers.
+        problem: error that ended the reading; "" for none.
+        metadata, outcome: of the records `hil` and `hil.outcome`.
+        cycles: (k,) rows of `/hil/cycle`, with log times `stamps` [ns] and numbers `sequences`.
         states, commanded: (k, 3 n) and (k, 2 n) of the two JointState channels, in their order.
-        events: of `/hil/events`.
-        chunks: whole chunks found.
+        chunks: number of complete chunks.
     """
 
     path: Path
@@ -74,12 +68,12 @@ class Archived:
 
     @property
     def ended(self) -> str:
-        """The outcome it states, "" for none."""
+        """Stated outcome; "" for none."""
         return (self.outcome or {}).get("outcome", "")
 
 
 def cycle_layout(n: int) -> np.dtype[np.void]:
-    """A message of `/hil/cycle` of n joints, encapsulation included."""
+    """Return the layout of a message of `/hil/cycle` of n joints, encapsulation included."""
     names: list[str] = ["sec", "nanosec", "cycle", "arrival"]
     formats: list[Any] = ["<i4", "<u4", "<i8", "<f8"]
     offsets = [4, 8, 20, 28]  # an empty frame_id and padding lie between
@@ -106,7 +100,7 @@ def cycle_layout(n: int) -> np.dtype[np.void]:
 
 
 def read(path: Path) -> Archived:
-    """Read a file as far as it is whole; what is in memory of it is kept, so once is enough."""
+    """Read a file as far as it is complete; cached until the file changes."""
     stat = path.stat()
     return _read(path, stat.st_mtime_ns, stat.st_size)
 
@@ -118,11 +112,17 @@ def _read(path: Path, _changed: int, _size: int) -> Archived:
     data = path.read_bytes()
     try:
         for opcode, body in _records(data):
-            reading.take(opcode, body)
+            reading.read(opcode, body)
             if opcode == _FOOTER:
                 found.whole = True
                 break
-    except (_Torn, struct.error, ValueError, UnicodeDecodeError, zstandard.ZstdError) as error:
+    except (
+        _DamagedError,
+        struct.error,
+        ValueError,
+        UnicodeDecodeError,
+        zstandard.ZstdError,
+    ) as error:
         found.problem = f"{type(error).__name__}: {error}"
     if found.whole and not data.endswith(MAGIC):
         found.whole, found.problem = False, "no magic at the end"
@@ -130,23 +130,23 @@ def _read(path: Path, _changed: int, _size: int) -> Archived:
     return found
 
 
-class _Torn(ValueError):
+class _DamagedError(ValueError):
     """The file ends, or is damaged, here."""
 
 
 def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
     if data[:8] != MAGIC:
-        raise _Torn("no magic at the beginning")
+        raise _DamagedError("no magic at the beginning")
     view, at = memoryview(data), 8
     while at < len(data):
         if at + 9 > len(data):
-            raise _Torn("a record begins and its length is missing")
+            raise _DamagedError("a record begins and its length is missing")
         opcode, length = _RECORD.unpack_from(data, at)
         if at + 9 + length > len(data):
-            raise _Torn(f"{at + 9 + length - len(data)} bytes of a record are missing")
+            raise _DamagedError(f"{at + 9 + length - len(data)} bytes of a record are missing")
         yield opcode, view[at + 9 : at + 9 + length]
         at += 9 + length
-    raise _Torn("no footer")
+    raise _DamagedError("no footer")
 
 
 def _string(body: memoryview, at: int) -> tuple[str, int]:
@@ -162,8 +162,8 @@ class _Reading:
         self._stamps: list[int] = []
         self._sequences: list[int] = []
 
-    def take(self, opcode: int, body: memoryview) -> None:
-        """One record of the data section (or of the summary, which repeats what stood there)."""
+    def read(self, opcode: int, body: memoryview) -> None:
+        """Read one record of the data section, or of the summary, which repeats some."""
         if opcode == _CHUNK_OP:
             self._chunk(body)
         elif opcode == _METADATA:
@@ -183,7 +183,7 @@ class _Reading:
         rest = {key: value for key, value in entries.items() if key != "checksum"}
         text = json.dumps(rest, sort_keys=True, separators=(",", ":"))
         if entries.get("checksum") != f"{zlib.crc32(text.encode()):08x}":
-            raise _Torn(f"metadata {name} fail their checksum")
+            raise _DamagedError(f"metadata {name} fail their checksum")
         if name == "hil":
             self._found.metadata = entries
         elif name == "hil.outcome":
@@ -196,7 +196,7 @@ class _Reading:
         content = bytes(body[at + 8 : at + 8 + size])
         (crc,) = struct.unpack_from("<I", body, at + 8 + size)
         if crc and crc != zlib.crc32(body[:-4]):
-            raise _Torn(f"attachment {name} fails its checksum")
+            raise _DamagedError(f"attachment {name} fails its checksum")
         self._found.attachments[name] = content
 
     def _channel(self, body: memoryview) -> None:
@@ -211,9 +211,9 @@ class _Reading:
         if compression == "zstd":
             content = zstandard.decompress(content, size)
         elif compression:
-            raise _Torn(f"a chunk compressed by {compression}")
+            raise _DamagedError(f"a chunk compressed by {compression}")
         if not crc or crc != zlib.crc32(content) or len(content) != size:
-            raise _Torn("a chunk fails its checksum")
+            raise _DamagedError("a chunk fails its checksum")
         self._messages(content)
         self._found.chunks += 1
 
@@ -234,7 +234,7 @@ class _Reading:
             at += 9 + length
 
     def finish(self) -> None:
-        """Make columns of the messages collected."""
+        """Convert the collected messages to columns."""
         found, parts = self._found, self._parts
         found.events = [_event(one) for one in parts.get("/hil/events", ())]
         names = json.loads((found.metadata or {}).get("joint_names", "[]"))

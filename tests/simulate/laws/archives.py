@@ -43,14 +43,7 @@ _SI: Final = (
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """An archive with its session.
-
-    Attributes:
-        archived: content of the file.
-        life: life that wrote it.
-        talk: the session; None without records, or if none matches.
-        rows: (k,) rows of the session for its records.
-    """
+    """An archive with the session (None without records, or if none matches) and its rows (k,)."""
 
     archived: Archived
     life: Life
@@ -91,16 +84,13 @@ def archives(observed: Observed) -> Iterator[Broken]:
     """Check the law of this module."""
     gears = Gears.of(observed.cell.drive_table)
     constants = np.array(observed.cell.drive_table.torque_constant, float)
-    one_asked = observed.seed
     all_placed = placed(observed)
     for number, one in enumerate(all_placed):
         name = one.archived.path.name
+        by_library = number == observed.seed % len(all_placed)
+        newest = any(one is p for p in _newest(all_placed, one.life))
         texts = [
-            *_readable(
-                one,
-                by_library=number == one_asked % len(all_placed),
-                newest=any(one is p for p in _newest(all_placed, one.life)),
-            ),
+            *_readable(one, by_library=by_library, newest=newest),
             *_columns(one.archived, observed.cell.period),
             *_stated(one),
             *_made_of(one, gears, constants),
@@ -354,8 +344,8 @@ def _interval(
     stated = int((archived.outcome or {}).get("records_lost", 0))
     if archived.whole and archived.ended != "interrupted" and len(missing) > stated:
         yield f"{len(missing)} of its cycles are not in {archived.path.name}, which states {stated}"
-    torn = archived.path.name in life.torn or archived.path.name in life.refused
-    if not archived.whole and life.died and not torn and len(rows):
+    excused = archived.path.name in life.torn or archived.path.name in life.refused
+    if not archived.whole and life.died and not excused and len(rows):
         # An incomplete chunk, and records still in memory.
         most = round(_FLUSHED / period) + _DRAINED
         if cycles[missing[-1]] - cycles[missing[0]] >= most if len(missing) else False:

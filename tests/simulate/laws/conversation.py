@@ -28,30 +28,18 @@ _KNOWN = {*oracle.OPEN, *CLOSED, *PAUSES}
 
 @dataclass(frozen=True, eq=False)
 class Talk:
-    """The cyclic packets of one session with the controller, up to the next init packet.
-
-    Attributes:
-        life: its process life.
-        init: the decoded init packet.
-        usable: whether the arm may be moved.
-        events: of this session, in order.
-        at: index of the init packet in `life.exchanged`.
-        index: (m,) index of each packet there.
-        silent: (m,) whether a silence preceded the packet.
-        received, answer: packets and answers.
-        safe: the safe answers; None if the axis map is invalid.
-    """
+    """The cyclic packets of one session with the controller, up to the next init packet."""
 
     life: Life
     init: Init
-    usable: bool
-    events: tuple[Event, ...]
-    at: int
-    index: NDArray[np.intp]
-    silent: Flags
+    usable: bool  # whether the arm may be moved
+    events: tuple[Event, ...]  # in order
+    at: int  # index of the init packet in `life.exchanged`
+    index: NDArray[np.intp]  # (m,) index of each packet there
+    silent: Flags  # (m,) whether a silence preceded the packet
     received: Packets
     answer: Packets
-    safe: SafeAnswers | None
+    safe: SafeAnswers | None  # None if the axis map is invalid
 
     @cached_property
     def record(self) -> NDArray[np.intp]:
@@ -71,25 +59,15 @@ class Talk:
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """Classification of one process life.
+    """Classification of one process life."""
 
-    Attributes:
-        talks: its sessions.
-        kinds: kind of the required answer of each packet.
-        wrong: index of a packet and the error of its answer.
-        left_out: indices of packets superseded by a newer one.
-        fates: number of packets of each kind.
-        repeated: superseded packets that are duplicates.
-        missed: packets that did not arrive or were not answered, by their numbers.
-    """
-
-    talks: tuple[Talk, ...]
-    kinds: tuple[Kind, ...]
-    wrong: tuple[tuple[int, str], ...]
-    left_out: tuple[int, ...]
-    fates: Counter[Kind]
-    repeated: int
-    missed: int
+    talks: tuple[Talk, ...]  # sessions
+    kinds: tuple[Kind, ...]  # kind of the required answer of each packet
+    wrong: tuple[tuple[int, str], ...]  # index of a packet and the error of its answer
+    left_out: tuple[int, ...]  # indices of packets superseded by a newer one
+    fates: Counter[Kind]  # number of packets of each kind
+    repeated: int  # superseded packets that are duplicates
+    missed: int  # packets that did not arrive or were not answered, by their numbers
 
 
 @lru_cache(maxsize=2)
@@ -139,13 +117,12 @@ class _Classifier:
             self._talk(part, events[number] if number < len(events) else ())
             for number, part in enumerate(self._parts)
         )
-        fates = Counter(self._kinds)
         return Heard(
             talks,
             tuple(self._kinds),
             tuple(self._wrong),
             tuple(self._left_out),
-            fates,
+            Counter(self._kinds),
             self._repeated,
             self._missed,
         )

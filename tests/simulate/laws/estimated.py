@@ -1,17 +1,14 @@
 """Estimates with faults agree with those without, within the intervals of both.
 
-The difference of two estimates with standard deviations s and s' is held against q hypot(s, s'), q
-the quantile of Student's t at the level that makes one false alarm among all parameters of all
-`SEEDS` seeds as improbable as `FALSE_ALARM` (Bonferroni). Its degrees of freedom are those of both
-intervals that `results.json` states together (Welch, of variances that are alike): half a 95 %
-interval is `interval_factor` s.
+The limit of the difference of two estimates with standard deviations s and s' is q hypot(s, s'),
+q the quantile of Student's t with which a false alarm among all parameters of all `SEEDS` seeds has
+the probability `FALSE_ALARM` (Bonferroni). The degrees of freedom are the sum of those of both
+intervals (Welch, equal variances); half a 95 % interval is `interval_factor` s.
 
-Those are few, for s comes from some blocks of residuals, and allow many s. Where nothing disturbed
-the arm, both runs moved it alike, and what both models predict of that motion is compared as well.
-From m samples with white noise of standard deviation r, p parameters are so found that two
-predictions differ by r sqrt(2 p / m) (rms). What is left unexplained is correlated over some
-samples, of which a short motion has hardly more; that is in what both covariances say of the
-difference, as far as they can be trusted. `ALLOWED` times both together may be.
+They are few, since s comes from some blocks of residuals. If nothing disturbed the arm, the torques
+predicted by both models for the motion are compared as well. From m samples with white noise of
+standard deviation r, the predictions of models with p parameters differ by r sqrt(2 p / m) (rms);
+correlated residuals are in both covariances. `ALLOWED` times both together is the limit.
 """
 
 from __future__ import annotations
@@ -112,14 +109,14 @@ def _predicted_alike(found: Estimated, twin: Estimated) -> Iterator[str]:
 
 
 def _rms(samples: Samples, model: RobotModel, values: Array) -> Array:
-    """Torque that these parameters add to a prediction (n,), rms over its usable samples."""
+    """Return the rms torque of these parameters (n,) over usable samples."""
     torque = np.where(samples.usable, samples.predicted_torque(model, values), np.nan)
     return np.asarray(np.sqrt(np.nanmean(torque**2, axis=0)))
 
 
 @lru_cache(maxsize=64)
 def degrees_of_freedom(interval_factor: float) -> float:
-    """Of the t distribution with this 97.5 % quantile; infinite for the normal one."""
+    """Return those of the t distribution with this 97.5 % quantile; infinite for the normal one."""
     least, most = 0.5, 1e7
     if interval_factor <= student.ppf(0.975, most):
         return math.inf

@@ -120,10 +120,10 @@ class _Limits:
 
     def factors(self, stopping: Flags, overridden: Flags) -> Array:
         """(k, 3) on velocity, acceleration and jerk."""
-        plain = np.ones((len(stopping), 3))
-        plain[overridden, 1:] = self.override
-        plain[stopping, 1:] = self.stop
-        return plain
+        factors = np.ones((len(stopping), 3))
+        factors[overridden, 1:] = self.override
+        factors[stopping, 1:] = self.stop
+        return factors
 
 
 def _in_stretch(stretch: Stretch, limits: _Limits, gears: Gears, period: float) -> Iterator[str]:
@@ -350,13 +350,13 @@ def _sent_as_recorded(stretch: Stretch, q: Array, gears: Gears) -> Iterator[str]
         yield "the set-point on the wire is not the recorded one"
     # A repeated set-point has its previous step.
     fresh = ~stretch.again[: len(q)]
-    motor, rounding, told = motor[fresh], rounding[fresh], stretch.step[: len(q)][fresh]
+    motor, rounding, stated = motor[fresh], rounding[fresh], stretch.step[: len(q)][fresh]
     first = stretch.received[0, :1] if stretch.carried else motor[:1]
     step = np.diff(motor, axis=0, prepend=first)
-    slack = 3.0 * rounding + np.spacing(np.abs(told).astype(np.float32))
+    slack = 3.0 * rounding + np.spacing(np.abs(stated).astype(np.float32))
     if stretch.carried:  # a motion at rest resumes from its own set-point
         slack[0] += np.spacing(np.abs(first[0]).astype(np.float32))
-    if np.any(np.abs(told - step) > slack):
+    if np.any(np.abs(stated - step) > slack):
         yield "D2 is not the step from one set-point to the next"
 
 
@@ -368,8 +368,8 @@ def _only_when_requested(stretch: Stretch, q: Array) -> Iterator[str]:
     at = stretch.at[moves]
     talk, acts = stretch.talk, stretch.talk.life.acts
     requests = np.array([a.before for a in acts if a.name == "request"], np.intp)
-    told = [event.cycle for event in talk.events if isinstance(event, MotionEnded)]
-    ends = np.array([talk.at_cycle(cycle) for cycle in told], np.intp)
+    cycles = [event.cycle for event in talk.events if isinstance(event, MotionEnded)]
+    ends = np.array([talk.at_cycle(cycle) for cycle in cycles], np.intp)
     asked = np.searchsorted(requests, at, side="right") - 1
     if (asked < 0).any():
         yield "set-points move before any motion was requested"
@@ -388,7 +388,7 @@ def _held_at_the_end(stretch: Stretch) -> Iterator[str]:
     slots = list(talk.init.slots or ())
     rows = slice(stretch.rows.start + led, stretch.rows.stop)
     mode = int(talk.life.settings.get("mode", 4))
-    kept = np.logical_and.accumulate(talk.received.mode[rows][:, slots] == mode, axis=0)
+    still_open = np.logical_and.accumulate(talk.received.mode[rows][:, slots] == mode, axis=0)
     moved = (stretch.sent[led:] != stretch.sent[led - 1]) | (stretch.step[led:] != 0.0)
-    if np.any(kept & moved):
+    if np.any(still_open & moved):
         yield "an axis is not held while open mode is being left"

@@ -16,26 +16,16 @@ from .wire import CLOSED, D1, MODE, PAUSES, REFUSALS, Array, Flags
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Modes of the axes of the arm in the packets of a session, (m,) or (m, n).
+    """Modes of the axes of the arm in the packets of a session, (m,) or (m, n)."""
 
-    Attributes:
-        ready: (m, n) joints in the configured mode, with the drive on.
-        all_ready: (m,) all of them.
-        is_open: some axis in any open mode, with the drive on.
-        paused, closed: some axis in a pause; all closed; both with the drive on.
-        no_target: a held axis of any arm has a target that is not finite.
-        refused: answered by 505 or 508 that is not an echo.
-        asked_out: answered with the request for the end of open mode.
-    """
-
-    ready: Flags
+    ready: Flags  # (m, n) joints in the configured mode, with the drive on
     all_ready: Flags
-    is_open: Flags
-    paused: Flags
-    closed: Flags
-    no_target: Flags
-    refused: Flags
-    asked_out: Flags
+    is_open: Flags  # some axis in any open mode, with the drive on
+    paused: Flags  # some axis, with the drive on
+    closed: Flags  # all axes, with the drive on
+    no_target: Flags  # a held axis of any arm has a target that is not finite
+    refused: Flags  # answered by 505 or 508 that is not an echo
+    asked_out: Flags  # answered with the request for the end of open mode
 
 
 @lru_cache(maxsize=64)
@@ -63,29 +53,17 @@ def modes_of(talk: Talk) -> Modes:
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """Consecutive packets from the first set-point on, while any axis is open and none refused.
-
-    Attributes:
-        talk: the session.
-        rows: rows of the session.
-        leading: number of rows with set-points in all axes, before the end of open mode is
-            requested.
-        sent: (k, n) D1 of the answers, motor revolutions.
-        step: (k, n) D2 of the answers.
-        received: (5, k, n) D1..D5 of the packets.
-        carried: packets missed before a motion that resumes where the controller extrapolated it.
-        before, step_before: (n,) D1 and D2 of the previous answer.
-    """
+    """Consecutive packets from the first set-point on, while any axis is open and none refused."""
 
     talk: Talk
-    rows: slice
-    leading: int
-    sent: Array
-    step: Array
-    received: Array
-    before: Array
-    step_before: Array
-    carried: int = 0
+    rows: slice  # of the session
+    leading: int  # rows with set-points in all axes, before the end of open mode is requested
+    sent: Array  # (k, n) D1 of the answers, motor revolutions
+    step: Array  # (k, n) D2 of the answers
+    received: Array  # (5, k, n) D1..D5 of the packets
+    before: Array  # (n,) D1 of the previous answer
+    step_before: Array  # (n,) D2 of it
+    carried: int = 0  # packets missed before a motion resumed where the controller extrapolated it
 
     @property
     def again(self) -> Flags:
@@ -121,15 +99,6 @@ def _stretch(talk: Talk, modes: Modes, rows: slice) -> Stretch:
     led = modes.all_ready[rows].copy()
     led[1:] &= ~np.logical_or.accumulate(modes.asked_out[rows])[:-1]
     leading = len(led) if led.all() else int(np.argmin(led))
-    answers = talk.answer.d[rows][:, slots].astype(np.float64)
-    received = talk.received.d[rows][:, slots].astype(np.float64)
-    return Stretch(
-        talk,
-        rows,
-        leading,
-        answers[:, :, 0],
-        answers[:, :, 1],
-        np.moveaxis(received[:, :, :5], 2, 0),
-        answers[0, :, 0],
-        answers[0, :, 1],
-    )
+    sent, step = np.moveaxis(talk.answer.d[rows][:, slots, :2].astype(np.float64), 2, 0)
+    received = np.moveaxis(talk.received.d[rows][:, slots, :5].astype(np.float64), 2, 0)
+    return Stretch(talk, rows, leading, sent, step, received, sent[0], step[0])

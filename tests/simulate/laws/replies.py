@@ -59,7 +59,7 @@ def _counters(life: Life, one: Heard) -> Iterator[str]:
     pile = [index for index in one.left_out if given and index < given[-1]]
     late, left_out = found.discarded.get("late", 0), len(one.left_out)
     refused = found.stale + found.malformed + found.ended
-    for name, counted, least, most in (
+    for name, number, least, most in (
         ("answered", found.answered, answered, answered + slack),
         ("duplicates", found.duplicates, fates["again"], fates["again"] + slack),
         ("missed", found.missed, one.missed, one.missed + slack * LAST),
@@ -67,8 +67,8 @@ def _counters(life: Life, one: Heard) -> Iterator[str]:
         ("late", late, len(pile) - one.repeated, left_out),
         ("refused", refused, fates["nothing"] - left_out - slack, fates["nothing"] - left_out),
     ):
-        if not least <= counted <= most:
-            yield f"{name} is {counted}, and {least} were observed"
+        if not least <= number <= most:
+            yield f"{name} is {number}, and {least} were observed"
     for index in pile:
         if not _newer_answered(life, one, index):
             yield f"packet {index} was superseded, and no newer one was answered"

@@ -28,28 +28,21 @@ MODE, D1, D2, D3, D4, D5 = range(6)
 """Columns of an axis block."""
 _WORDS: Final = 9
 _ECHOED: Final = {0: (D1, D2), 501: (D1, D2), 10: (D1, D2, D3, D4, D5)}
-_KEPT: Final = _ECHOED | dict.fromkeys(oracle.HOLDS_A_POSITION, (D1,))
+_RETURNED: Final = _ECHOED | dict.fromkeys(oracle.HOLDS_A_POSITION, (D1,))
 
 
 @dataclass(frozen=True, eq=False)
 class Packets:
-    """Cyclic packets of one length, decoded.
+    """Cyclic packets of one length, decoded."""
 
-    Attributes:
-        number: (m,) sequence numbers.
-        status: (m, 4) status bytes.
-        function: (m,) the four function bytes as one number.
-        words: (m, n, 9) axis blocks as 4-byte words: mode, D1..D5, extra1..3.
-    """
-
-    number: NDArray[np.int32]
-    status: NDArray[np.uint8]
-    function: NDArray[np.int32]
-    words: Words
+    number: NDArray[np.int32]  # (m,)
+    status: NDArray[np.uint8]  # (m, 4)
+    function: NDArray[np.int32]  # (m,) the four function bytes as one number
+    words: Words  # (m, n, 9) axis blocks as 4-byte words: mode, D1..D5, extra1..3
 
     @classmethod
     def of(cls, packets: Sequence[bytes], n_axes: int) -> Packets:
-        """The first `n_axes` slots of each, which must be as long as that at least."""
+        """Decode the first `n_axes` slots of each packet."""
         length = oracle.length(n_axes)
         joined = b"".join(packet[:length] for packet in packets)
         rows: Words = np.frombuffer(joined, "<i4").reshape(len(packets), length // 4)
@@ -70,29 +63,22 @@ class Packets:
 
 
 def next_number(number: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The number of the answer to each packet."""
+    """Return the number of the answer to each packet."""
     return np.where(number == 0x7FFF, 1, number + 1).astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)
 class SafeAnswers:
-    """Answers to packets without set-points.
+    """Answers to packets without set-points."""
 
-    Attributes:
-        status: (m, 4) bytes.
-        words: (m, n, 9).
-        on: (m, n) whether the drive of each slot's arm is on.
-        held: (m, n) slots that are open with their drive on and given back their target.
-    """
-
-    status: NDArray[np.uint8]
-    words: Words
-    on: Flags
-    held: Flags
+    status: NDArray[np.uint8]  # (m, 4)
+    words: Words  # (m, n, 9)
+    on: Flags  # (m, n) whether the drive of each slot's arm is on
+    held: Flags  # (m, n) open slots with their drive on, whose target is returned
 
 
 def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
-    """The safe answers; `arms` is the arm of each slot, from 1."""
+    """Return the safe answers; `arms` is the arm of each slot, from 1."""
     arm = np.array(arms, np.intp) - 1
     arm_on = received.status == oracle.DRIVE_ON
     on = arm_on[:, arm]
@@ -105,10 +91,10 @@ def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
         if value in oracle.TAKES_INCREMENTS:
             known |= here
             continue
-        known |= here & (~on | (value in _KEPT))
+        known |= here & (~on | (value in _RETURNED))
         keep[here & ~on, D1:] = True
-        if value in _KEPT:
-            for column in _KEPT[value]:
+        if value in _RETURNED:
+            for column in _RETURNED[value]:
                 keep[:, :, column] |= here & on
             if value in oracle.HOLDS_A_POSITION:
                 held |= here & on
@@ -121,23 +107,14 @@ def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
 
 @dataclass(frozen=True, eq=False)
 class Init:
-    """Decoded init packet, for the joints of one arm.
+    """Decoded init packet, for the joints of one arm."""
 
-    Attributes:
-        n_axes: slots of a cyclic packet.
-        period: s.
-        arms: arm of each slot, from 1; None where the map is impossible.
-        slots: slot of each joint of the arm that is moved; None likewise.
-        threshold: (n,) following error, motor revolutions.
-        current: (n,) limit, A.
-    """
-
-    n_axes: int
-    period: float
-    arms: tuple[int, ...] | None
-    slots: tuple[int, ...] | None
-    threshold: Array
-    current: Array
+    n_axes: int  # slots of a cyclic packet
+    period: float  # s
+    arms: tuple[int, ...] | None  # arm of each slot, from 1; None for an impossible map
+    slots: tuple[int, ...] | None  # slot of each joint of the arm that is moved; None likewise
+    threshold: Array  # (n,) following error, motor revolutions
+    current: Array  # (n,) limit, A
 
     @classmethod
     def of(cls, packet: bytes, arm: int, n_joints: int) -> Init:
@@ -167,19 +144,14 @@ class Init:
 
 @dataclass(frozen=True, eq=False)
 class Gears:
-    """Motor revolutions from joint angles, by the formulas of docs/cell-file.md.
+    """Motor revolutions from joint angles, by the formulas of docs/cell-file.md."""
 
-    Attributes:
-        matrix: (n, n) motor revolutions per rad.
-        offset: (n,) motor revolutions where every joint angle is zero.
-    """
-
-    matrix: Array
-    offset: Array
+    matrix: Array  # (n, n) motor revolutions per rad
+    offset: Array  # (n,) motor revolutions at joint angles of zero
 
     @classmethod
     def of(cls, table: Any) -> Gears:
-        """From the cell's `[drive_train]`, as written in the file."""
+        """Return the gears of a cell's `[drive_train]`."""
         kr, sign = np.array(table.gear_ratio, float), np.array(table.joint_sign, float)
         shift = np.radians(np.array(table.joint_offset_deg, float))
         k54, k64, k65 = table.k54 or 0.0, table.k64 or 0.0, table.k65 or 0.0
@@ -191,13 +163,13 @@ class Gears:
         return cls(turned * sign, np.array(table.calibration, float) + turned @ shift)
 
     def motor(self, q: Array) -> Array:
-        """Joint angles (m, n) [rad] to motor revolutions."""
+        """Return motor revolutions of joint angles (m, n) [rad]."""
         return np.asarray(q @ self.matrix.T + self.offset)
 
     def joint(self, motor: Array) -> Array:
-        """Motor revolutions (m, n) to joint angles [rad]."""
+        """Return joint angles [rad] of motor revolutions (m, n)."""
         return np.asarray(np.linalg.solve(self.matrix, (motor - self.offset).T).T, np.float64)
 
     def joint_step(self, motor: Array) -> Array:
-        """Differences of motor revolutions (m, n) to those of joint angles [rad]."""
+        """Return differences of joint angles [rad] of those of motor revolutions (m, n)."""
         return np.asarray(np.linalg.solve(self.matrix, motor.T).T, np.float64)
