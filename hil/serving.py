@@ -94,7 +94,7 @@ class Buttons:
             controller.drive_on()
         if signal.SIGUSR2 in self._pressed:
             self._pressed.discard(signal.SIGUSR2)
-            controller.emergency_stop()
+            controller.lose_drive("emergency stop")
 
 
 @contextmanager

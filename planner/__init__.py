@@ -12,8 +12,6 @@ from planner.errors import (
     InvalidTrajectory,
     InvalidViaPoints,
     LimitExceeded,
-    NoCallPending,
-    NotBegun,
     NotSmooth,
     PlannerCrashed,
     PlannerError,
@@ -83,7 +81,5 @@ __all__ = [
     "PlannerCrashed",
     "PlannerNotStarted",
     "PlanningTimedOut",
-    "NoCallPending",
     "StartMismatch",
-    "NotBegun",
 ]

@@ -77,10 +77,6 @@ class StartMismatch(PlannerError):
         )
 
 
-class NotBegun(PlannerError, RuntimeError):
-    """`TrajectoryPlayer.advance` was called before `begin`."""
-
-
 class PlannerCrashed(PlannerError, RuntimeError):
     """The planning process died during the call."""
 
@@ -104,7 +100,3 @@ class PlanningTimedOut(PlannerError, TimeoutError):
 
     def __init__(self, timeout: float) -> None:
         super().__init__(f"no plan within {timeout:g} s; the planning process was ended")
-
-
-class NoCallPending(PlannerError, RuntimeError):
-    """`WorkerProcess.receive` was called in a process that sent no call."""

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from planner.arrays import Array
-from planner.errors import InvalidSetting, LimitExceeded, NotBegun, StartMismatch
+from planner.errors import InvalidSetting, LimitExceeded, StartMismatch
 from planner.fourier import FourierSeries
 from planner.limits import JointLimits, position_rounding
 from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
@@ -314,7 +314,7 @@ class TrajectoryPlayer:
     def advance(self) -> tuple[Array, Array]:
         """Return the next set-point: position (n,) [rad] and velocity (n,) [rad/s]."""
         if not self._begun:
-            raise NotBegun
+            raise RuntimeError("the motion was not begun")
         if self.finished:
             return self._last, self._rest
         if not self._tabled:

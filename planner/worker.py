@@ -33,13 +33,7 @@ from typing import Any, Final, ParamSpec, Self, TypeAlias, TypeVar
 
 from numpy.typing import ArrayLike
 
-from planner.errors import (
-    NoCallPending,
-    PlannerCrashed,
-    PlannerError,
-    PlannerNotStarted,
-    PlanningTimedOut,
-)
+from planner.errors import PlannerCrashed, PlannerError, PlannerNotStarted, PlanningTimedOut
 from planner.limits import JointLimits
 from planner.moves import plan
 from planner.piecewise_cubic import PiecewiseCubic
@@ -150,7 +144,7 @@ class WorkerProcess:
         PlannerCrashed: the child died and is restarted.
         PlannerNotStarted: the child died before its first call; the reason is on stderr.
         PlanningTimedOut: the call took too long; the child is restarted.
-        NoCallPending: this process sent no call.
+        RuntimeError: this process sent no call.
         Exception: raised by the function.
     """
 
@@ -206,7 +200,7 @@ class WorkerProcess:
         """Return the result of the call that `send` began, or raise its exception."""
         self._detach_in_fork()
         if self._process is None:
-            raise NoCallPending("no call was sent from this process")
+            raise RuntimeError("no call was sent from this process")
         try:
             if not self._ready:
                 self._read()

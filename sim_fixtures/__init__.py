@@ -9,7 +9,7 @@ from __future__ import annotations
 from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.controller import SimulatedController
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.errors import FixtureError, PlantDiverged, SettingError, SimulationError
+from sim_fixtures.errors import PlantDiverged, SettingError, SimulationError
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth, standard_parameters
 from sim_fixtures.program import Phase
 from sim_fixtures.settings import ControllerSettings, ServoSettings
@@ -26,7 +26,6 @@ __all__ = [
     "standard_parameters",
     "UnmodelledEffects",
     "SimulationError",
-    "FixtureError",
     "SettingError",
     "PlantDiverged",
 ]

@@ -554,10 +554,6 @@ class SimulatedController:
         """Press the drive-on button after the drive was lost."""
         self.program.drive_on()
 
-    def emergency_stop(self) -> None:
-        """Press the emergency stop: the drive is switched off, the brakes close."""
-        self.program.trip("emergency stop")
-
     def lose_drive(self, reason: str) -> None:
         """Switch the drive off for a reason and close the brakes."""
         self.program.trip(reason)

@@ -7,10 +7,6 @@ class SimulationError(Exception):
     """Base of every error of the simulated cell."""
 
 
-class FixtureError(SimulationError):
-    """Parameters of a fixture are impossible."""
-
-
 class SettingError(SimulationError, ValueError):
     """A setting is out of range or of the wrong size; `valid` states what is valid."""
 

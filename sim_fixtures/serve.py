@@ -187,36 +187,24 @@ class Histogram:
 class ServeCounts:
     """Counts and times of a served session.
 
-    Attributes:
-        cycles: packets of the controller, the repeated first one counted once.
-        knocks: transmissions of the first packet.
-        replies: accepted answers, at most one per cycle.
-        missed: cycles without a valid answer.
-        late: answers after their cycle, not accepted.
-        surplus: further answers in an answered cycle.
-        rejected: answers of wrong length, number or content.
-        stretched: cycles extended to wait for their answer, by up to `stretch_max` s.
-        own_late: cycles that began late by a tenth of the period or more although the answer before
-            was in time; `slips` of them by a period or more.
-        ended: whether the controller has ended its session (504).
-        answer: times from the packet to its answer.
-        cost: computing times of a cycle of controller and arm.
+    `own_late` are cycles that began late by a tenth of the period or more although the answer
+    before was in time, `slips` those of them that were late by a period or more.
     """
 
-    cycles: int = 0
-    knocks: int = 0
-    replies: int = 0
-    missed: int = 0
-    late: int = 0
-    surplus: int = 0
-    rejected: int = 0
-    stretched: int = 0
+    cycles: int = 0  # packets of the controller, the repeated first one counted once
+    knocks: int = 0  # transmissions of the first packet
+    replies: int = 0  # accepted answers, at most one per cycle
+    missed: int = 0  # cycles without a valid answer
+    late: int = 0  # answers after their cycle, not accepted
+    surplus: int = 0  # further answers in an answered cycle
+    rejected: int = 0  # answers of wrong length, number or content
+    stretched: int = 0  # cycles extended to wait for their answer
     own_late: int = 0
     slips: int = 0
-    ended: bool = False
-    stretch_max: float = 0.0
-    answer: Histogram = field(default_factory=Histogram)
-    cost: Histogram = field(default_factory=Histogram)
+    ended: bool = False  # whether the controller has ended its session (504)
+    stretch_max: float = 0.0  # longest extension of a cycle, s
+    answer: Histogram = field(default_factory=Histogram)  # times from the packet to its answer
+    cost: Histogram = field(default_factory=Histogram)  # computing times of a cycle
     _unanswered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _answered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 

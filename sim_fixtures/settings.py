@@ -32,27 +32,15 @@ def _require(
 
 @dataclass(frozen=True)
 class ServoSettings:
-    """Gains of the position-velocity-current cascade.
+    """Gains of the position-velocity-current cascade."""
 
-    Attributes:
-        position_gain: demanded speed per position error, 1/s.
-        velocity_bandwidth: of the velocity loop with the inertia of the joint, rad/s.
-        rotor_bandwidth: upper bound of the bandwidth with the inertia of the rotor alone, rad/s, as
-            above the resonance of the gear.
-        integral_rate: of the integral part of the velocity loop, 1/s.
-        current_lag: time constant of the current loop, s.
-        model_error: smallest and largest relative error of the built-in dynamic model.
-        deadband_counts: position error in encoder counts below which a resting axis does not
-            integrate.
-    """
-
-    position_gain: float = 20.0
-    velocity_bandwidth: float = 120.0
-    rotor_bandwidth: float = 400.0
-    integral_rate: float = 15.0
-    current_lag: float = 0.0003
-    model_error: tuple[float, float] = (0.05, 0.10)
-    deadband_counts: float = 3.0
+    position_gain: float = 20.0  # demanded speed per position error, 1/s
+    velocity_bandwidth: float = 120.0  # of the velocity loop with the inertia of the joint, rad/s
+    rotor_bandwidth: float = 400.0  # its upper bound with the inertia of the rotor alone, rad/s
+    integral_rate: float = 15.0  # of the integral part of the velocity loop, 1/s
+    current_lag: float = 0.0003  # time constant of the current loop, s
+    model_error: tuple[float, float] = (0.05, 0.10)  # relative, of the built-in dynamic model
+    deadband_counts: float = 3.0  # error in encoder counts that a resting axis does not integrate
 
     def __post_init__(self) -> None:
         for name in ("position_gain", "velocity_bandwidth", "rotor_bandwidth"):
@@ -68,77 +56,47 @@ class ServoSettings:
 class ControllerSettings:
     """Cycle, noise and timing of the controller, in cycles unless a unit is given.
 
-    Attributes:
-        period: cycle, s; an integer number of ms.
-        open_mode: open mode of the program: 1, 2, 4, 5, 7, 8 or 9.
-        substeps: integration steps of the plant per cycle.
-        current_noise: standard deviation of the actual current about its target, A; white from
-            cycle to cycle.
-        current_resolution: step of the target current, A; 0 for none.
-        encoder_noise: standard deviation of a reading before rounding, encoder counts.
-        servo: gains.
-        cold_start: start with nine sync packets, init, two more sync packets; else with init.
-        boot_time: silence of a controller that was restarted cold, s.
-        drive_off_cycles, driving_on_cycles, closed_cycles, closing_cycles: duration of each phase;
-            `closed_cycles` before every opening.
-        opening_stagger: cycles between one axis entering open mode and the next.
-        only_axis: the only axis (from 1) that the program opens; None for all.
-        closing_stagger: cycles between one axis leaving open mode and the next.
-        missed_replies: consecutive missing replies that end open mode.
-        lost_openings: consecutive openings ended by missing replies that end the session; None for
-            no limit. An opening that ends otherwise resets the count.
-        reopening_time: least time before the axes open again after such an opening, s.
-        while_silent: motion in open mode without a valid target. "hold": the last target is held;
-            at speed this can trip the drive. "continue": the last velocity continues, and after
-            the end of open mode decreases to zero within `ramp_time`. "drive_off": the last target
-            is held, and the drive is switched off when missing replies end open mode.
-        ramp_time: time in which a moving axis without a target stops, s.
-        silence_limit: consecutive missing replies, in any state, that end the session.
-        open_intervals: number of openings before the program ends; None for no limit.
-        arm: number of this arm, 1..4.
-        slots: slot of each axis in the packets; None for 0, 1, 2, ...
-        foreign_axes: axes of other arms in the packets, in the other slots; at rest.
-        foreign_open: whether those open with this arm; they move to the targets sent.
-        long_packets: send 732 bytes for any number of axes; random bytes follow the axes.
-        own_motion: postures [rad] to which the controller's program moves with closed axes, one
-            after the other, before it ends the session; in corrected modes, with open axes.
-        own_motion_repeats: move back and forth through these postures until `finish`.
-        own_speed: speed of those moves, as a fraction of the URDF's velocity limits.
-        version: major, minor, build in the init packet.
+    `while_silent` is the motion in open mode without a valid target. "hold": the last target is
+    held; at speed this can trip the drive. "continue": the last velocity continues, and after the
+    end of open mode decreases to zero within `ramp_time`. "drive_off": the last target is held, and
+    the drive is switched off when missing replies end open mode.
+
+    The controller's program moves through the postures `own_motion` [rad] with closed axes before
+    it ends the session; in corrected modes, with open axes.
     """
 
-    period: float = 0.001
-    open_mode: int = 4
-    substeps: int = 2
-    current_noise: float = 0.0
-    current_resolution: float = 0.0
-    encoder_noise: float = 0.5
+    period: float = 0.001  # s; an integer number of ms
+    open_mode: int = 4  # 1, 2, 4, 5, 7, 8 or 9
+    substeps: int = 2  # integration steps of the plant per cycle
+    current_noise: float = 0.0  # standard deviation of the actual current, A; white
+    current_resolution: float = 0.0  # step of the target current, A; 0 for none
+    encoder_noise: float = 0.5  # standard deviation before rounding, encoder counts
     servo: ServoSettings = ServoSettings()
-    cold_start: bool = True
+    cold_start: bool = True  # nine sync packets, init, two more sync packets; else init only
     drive_off_cycles: int = 20
     driving_on_cycles: int = 50
-    closed_cycles: int = 20
+    closed_cycles: int = 20  # before every opening
     closing_cycles: int = 5
-    opening_stagger: int = 3
-    only_axis: int | None = None
-    closing_stagger: int = 0
-    missed_replies: int = 1
-    lost_openings: int | None = None
-    reopening_time: float = 0.0
+    opening_stagger: int = 3  # between one axis entering open mode and the next
+    only_axis: int | None = None  # the only axis (from 1) that the program opens; None for all
+    closing_stagger: int = 0  # between one axis leaving open mode and the next
+    missed_replies: int = 1  # consecutive missing replies that end open mode
+    lost_openings: int | None = None  # consecutive ones, by missing replies, that end the session
+    reopening_time: float = 0.0  # least time before the next opening after a lost one, s
     while_silent: WhileSilent = "hold"
-    ramp_time: float = 0.2
-    silence_limit: int = 1000
-    open_intervals: int | None = None
-    boot_time: float = 2.0
-    arm: int = 1
-    slots: tuple[int, ...] | None = None
-    foreign_axes: int = 0
-    foreign_open: bool = False
-    long_packets: bool = False
+    ramp_time: float = 0.2  # time in which a moving axis without a target stops, s
+    silence_limit: int = 1000  # consecutive missing replies, in any state, that end the session
+    open_intervals: int | None = None  # openings before the program ends; None for no limit
+    boot_time: float = 2.0  # silence of a controller that was restarted cold, s
+    arm: int = 1  # 1..4
+    slots: tuple[int, ...] | None = None  # of each axis in the packets; None for 0, 1, 2, ...
+    foreign_axes: int = 0  # axes of other arms in the other slots, at rest
+    foreign_open: bool = False  # whether those open with this arm and move to the targets sent
+    long_packets: bool = False  # 732 bytes for any number of axes; random bytes follow the axes
     own_motion: tuple[tuple[float, ...], ...] = ()
-    own_motion_repeats: bool = False
-    own_speed: float = 0.3
-    version: tuple[int, int, int] = (3, 20, 305)
+    own_motion_repeats: bool = False  # move back and forth through the postures until `finish`
+    own_speed: float = 0.3  # of those moves, as a fraction of the URDF's velocity limits
+    version: tuple[int, int, int] = (3, 20, 305)  # major, minor, build in the init packet
 
     def __post_init__(self) -> None:
         milliseconds = self.period * 1000.0

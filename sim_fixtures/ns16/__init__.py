@@ -14,7 +14,6 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_fixtures.errors import FixtureError
 from sim_fixtures.ns16 import geometry
 
 TRUTH_PATH = Path(__file__).with_name("truth.json")
@@ -116,28 +115,17 @@ _D4 = -geometry.D[3]
 
 @dataclass(frozen=True)
 class Table2Row:
-    """One row of Table 2, SI units.
+    """One row of Table 2, SI units; the unit of rows f1 is not stated in print."""
 
-    Attributes:
-        id: 1 ... 58 as printed.
-        printed_symbol: the symbol as printed.
-        parameter: its interpretation; rows 41 ... 52 are interleaved in print.
-        pivot: standard parameter whose regressor column is that of this row ("" for friction).
-        sign: +1 or -1, the factor of that column.
-        terms: standard parameters grouped in this row with their factors, pivot included.
-        pi_a, pi_b, pi_c: estimates of methods A and B, and the manufacturer's value or None. The
-            unit of rows f1 is not stated in print.
-    """
-
-    id: int
+    id: int  # 1 ... 58 as printed
     printed_symbol: str
-    parameter: str
-    pivot: str
-    sign: int
-    terms: Mapping[str, float]
-    pi_a: float
-    pi_b: float
-    pi_c: float | None
+    parameter: str  # its interpretation; rows 41 ... 52 are interleaved in print
+    pivot: str  # standard parameter whose regressor column is that of this row ("" for friction)
+    sign: int  # +1 or -1, the factor of that column
+    terms: Mapping[str, float]  # grouped standard parameters with their factors, pivot included
+    pi_a: float  # estimate of method A
+    pi_b: float  # estimate of method B
+    pi_c: float | None  # the manufacturer's value
 
 
 def _masses(first: int, factor: float) -> Terms:
@@ -219,17 +207,9 @@ def _numbers(values: Sequence[float]) -> str:
     return " ".join(repr(float(value) + 0.0).removesuffix(".0") for value in values)
 
 
-def inertial(link: LinkInertia, name: str, scale: float = 1.0) -> str:
-    """Return the line of a URDF with the inertia of a link divided by `scale`.
-
-    Raises:
-        FixtureError: no rigid body has this inertia.
-    """
-    xx, xy, xz, yy, yz, zz = tensor = link.tensor_at_centre
-    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    if link.mass <= 0.0 or moments[0] <= 0.0 or moments[2] >= moments[0] + moments[1]:
-        raise FixtureError(f"{name}: no rigid body has mass {link.mass} and moments {moments}")
-    entries = zip(TENSOR_KEYS, tensor, strict=True)
+def inertial(link: LinkInertia, scale: float = 1.0) -> str:
+    """Return the line of a URDF with the inertia of a link divided by `scale`."""
+    entries = zip(TENSOR_KEYS, link.tensor_at_centre, strict=True)
     text = " ".join(f'i{key}="{_numbers([value / scale])}"' for key, value in entries)
     return (
         f'    <inertial><origin xyz="{_numbers(link.centre_of_mass)}" rpy="0 0 0"/>'
@@ -245,30 +225,9 @@ def urdf_text(inertia_scale: Sequence[float] = (1.0,) * 6) -> str:
     the origin of the frame. Joint i is at p_{i-1} of link i-1, rotated by Rx(alpha_i); its axis is
     Rx(-alpha_i) z, because DH rotates about z before the twist.
     """
-    links = enumerate(zip(load_truth().links, inertia_scale, strict=True), start=1)
+    links = zip(load_truth().links, inertia_scale, strict=True)
     lines = URDF_PATH.read_text(encoding="utf-8").splitlines(keepends=True)
     for at, line in enumerate(lines):
         if line.lstrip().startswith("<inertial>"):
-            number, (link, scale) = next(links)
-            lines[at] = inertial(link, f"link_{number}", scale)
+            lines[at] = inertial(*next(links))
     return "".join(lines)
-
-
-__all__ = [
-    "FOLDER",
-    "URDF_PATH",
-    "CELL_PATH",
-    "TRUTH_PATH",
-    "TABLE2_PATH",
-    "TABLE2",
-    "N_ESSENTIAL",
-    "Table2Row",
-    "table2",
-    "base_from_standard",
-    "LinkInertia",
-    "inertial",
-    "Ns16Truth",
-    "load_truth",
-    "standard_parameters",
-    "urdf_text",
-]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -245,14 +244,6 @@ def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch,
     passed = flown(random_points(1, 3), SIX_AXES)
     assert (passed.how, passed.share) == ("reduced", 0.5 * 0.9999)
     assert passed.join is not None
-
-
-@given(st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=5))
-def test_corners_are_ranked_by_time_saved(savings):
-    order = ranked(np.array(savings)).tolist()
-    assert sorted(order) == list(range(len(savings)))
-    ranks = [savings[i] for i in order]
-    assert all(a + 1e-9 >= b for a, b in pairwise(ranks))
 
 
 @pytest.mark.parametrize(

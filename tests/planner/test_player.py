@@ -19,7 +19,6 @@ from planner import (
     InvalidSetting,
     JointLimits,
     LimitExceeded,
-    NotBegun,
     StartMismatch,
     TrajectoryPlayer,
     plan,
@@ -79,7 +78,7 @@ def test_an_arm_away_from_the_start_is_refused(motions, away):
     assert refusal.value.joint == 3
     assert refusal.value.expected == player.start[3]
     assert refusal.value.tolerance == 1e-3
-    with pytest.raises(NotBegun):
+    with pytest.raises(RuntimeError, match="not begun"):
         player.advance()
 
 

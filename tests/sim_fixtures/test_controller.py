@@ -786,7 +786,7 @@ class TestPauses:
 
     def test_without_a_drive_there_is_nothing_to_pause(self) -> None:
         controller = opened()
-        controller.emergency_stop()
+        controller.lose_drive("emergency stop")
         controller.pause(502, 5)
         assert step(controller).axes["mode"].tolist() == [4, 4]
         assert controller.phase is Phase.TRIPPED

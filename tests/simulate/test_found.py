@@ -49,7 +49,7 @@ class TestControllerWithoutInitPacket:
     ) -> None:
         first = Link.over(SimulatedTransport(controller), cell)
         first.connect(Stop())
-        controller.emergency_stop()
+        controller.lose_drive("emergency stop")
         second = Link.over(SimulatedTransport(controller), cell)
         with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as raised:
             second.connect(Stop(), timeout=0.5)
@@ -75,7 +75,7 @@ def test_a_motion_does_not_wait_forever_for_a_drive_that_went_off(
     """Seed 455: the drive was lost between two motions, and virtual time did not end."""
     link = Link.over(SimulatedTransport(controller), cell)
     where = link.connect(Stop())
-    controller.emergency_stop()
+    controller.lose_drive("emergency stop")
     packets = iter(range(10))
     exchange(link.transport, link.session, until=lambda: next(packets, None) is None)
     motion, spec = short_way(cell, where, tmp_path)
