@@ -40,20 +40,15 @@ KIND_NAMES = {
 """Names of kinds in messages, where they differ from the kind."""
 
 FORMAT_VERSION = 1
-METADATA = "hil"
-"""Name of the metadata record with the header."""
-OUTCOME = "hil.outcome"
-"""Name of the metadata record with the outcome."""
+METADATA = "hil"  # Name of the metadata record with the header
+OUTCOME = "hil.outcome"  # Name of the metadata record with the outcome
 DESCRIPTION = "description"
 """Entry of the outcome: checksum of the header it belongs to. Older files have none."""
-CHUNKS = "chunks"
-"""Entry of the outcome: checksums of all chunks in order. Older files have none."""
-SEALS = (DESCRIPTION, CHUNKS)
-"""Entries of the outcome that only serve to verify the file."""
+CHUNKS = "chunks"  # Entry of the outcome: checksums of all chunks in order. Older files have none
+SEALS = (DESCRIPTION, CHUNKS)  # Entries of the outcome that only serve to verify the file
 CONTROLLER_PROGRAM = "controller"
 """Entry ``motion`` of an archive whose motion was made by a program of the controller."""
-REJECTED = "rejected"
-"""Outcome of a motion that completed and failed its quality check."""
+REJECTED = "rejected"  # Outcome of a motion that completed and failed its quality check
 MOST_JOINTS: Final = 256
 
 _DIGITS = 8  # of a checksum
@@ -79,17 +74,12 @@ class ArchiveName:
     index: int
     attempt: int = 1
 
-    @property
-    def filename(self) -> str:
-        """The name of the file, without folder."""
-        return f"{self.kind}_{self.index:03d}_a{self.attempt}{SUFFIX}"
-
     def __str__(self) -> str:
-        return self.filename
+        return f"{self.kind}_{self.index:03d}_a{self.attempt}{SUFFIX}"
 
     def __fspath__(self) -> str:
         """The file name, so that a folder can be joined with it."""
-        return self.filename
+        return str(self)
 
     @classmethod
     def parse(cls, path: str | PathLike[str]) -> ArchiveName | None:

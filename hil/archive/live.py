@@ -39,16 +39,11 @@ if TYPE_CHECKING:
     from foxglove.websocket import WebSocketServer
 
 LOOPBACK: Final = "127.0.0.1"
-PORT: Final = 8765
-"""Of the Foxglove WebSocket protocol."""
-RATE: Final = 50.0
-"""Messages per second and channel."""
-QUEUE: Final = 50
-"""Batches (of some 20 ms) queued for the thread."""
-BACKLOG: Final = 512
-"""Messages queued for one client."""
-POLL: Final = 0.2
-"""Time between two checks of the end condition, s."""
+PORT: Final = 8765  # Of the Foxglove WebSocket protocol
+RATE: Final = 50.0  # Messages per second and channel
+QUEUE: Final = 50  # Batches (of some 20 ms) queued for the thread
+BACKLOG: Final = 512  # Messages queued for one client
+POLL: Final = 0.2  # Time between two checks of the end condition, s
 MAX_DRIFT: Final = 1.0
 """Difference of the controller's and this computer's time at which they are aligned again, s."""
 _ADDRESS: Final = re.compile(r"((?P<host>\[[0-9a-fA-F:.]+\]|[\w.-]+):)?(?P<port>\d{1,5})")

@@ -43,8 +43,7 @@ from hil.errors import ArchiveError, InputError
 
 Records = NDArray[np.void]
 
-BUFFERED_CYCLES: Final = 5000
-"""Cycles buffered while no archive is open."""
+BUFFERED_CYCLES: Final = 5000  # Cycles buffered while no archive is open
 _PACKETS_PER_CYCLE: Final = 2
 
 
@@ -93,25 +92,19 @@ def _after_restart(parts: list[Records], dtype: np.dtype[np.void], *, least: int
     return rows[int(restarts[-1]) + 1 :] if restarts.size else rows
 
 
-POLL_PERIOD: Final = 0.02
-"""Time between two readings of the ring, s."""
-PACKET_DELAY: Final = 0.005
-MAX_PACKET_DELAY: Final = 0.2
-"""Usual and longest delay of raw packets behind their record, s."""
-CHUNK_DELAY: Final = 0.0005
-"""Time after the last cycle of a chunk is due at which it is read, s."""
-HEARTBEAT_PERIOD: Final = 0.05
-"""s."""
+POLL_PERIOD: Final = 0.02  # Time between two readings of the ring, s
+PACKET_DELAY: Final = 0.005  # Usual delay of raw packets behind their record, s
+MAX_PACKET_DELAY: Final = 0.2  # Longest delay of raw packets, s
+CHUNK_DELAY: Final = 0.0005  # Time after the last cycle of a chunk is due at which it is read, s
+HEARTBEAT_PERIOD: Final = 0.05  # Time between two heartbeats, s
 STALL_LIMIT: Final = 5.0
 """Time for which a disk may block before the heartbeat stops, s; the ring stores more."""
-FLUSH_DELAY: Final = 0.2
-"""Time without a record after which an unfinished chunk is written, s."""
+FLUSH_DELAY: Final = 0.2  # Time without a record after which an unfinished chunk is written, s
 AFTERMATH_TIMEOUT: Final = 2.0
 """Time after the end of a motion until its archive is closed on a silent link, s."""
 EXCHANGE_SILENCE: Final = 1.0
 """Time without a heartbeat of the exchange that is recorded in the archive, s."""
-DETACHED_SILENCE: Final = 60.0
-"""The same without a supervisor after which the archive is closed, s."""
+DETACHED_SILENCE: Final = 60.0  # Without a supervisor, until the archive is closed, s
 
 
 @dataclass

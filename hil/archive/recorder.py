@@ -104,8 +104,7 @@ Records = NDArray[np.void]
 
 LATE_KINDS = frozenset({"late", "answered late"})
 """Kinds of `PacketRejected`: dropped for a newer packet, or answered after its cycle."""
-AFTERMATH = 0.5
-"""Time recorded after a motion was refused or lost, s."""
+AFTERMATH = 0.5  # Time recorded after a motion was refused or lost, s
 
 
 @dataclass(frozen=True, eq=False)

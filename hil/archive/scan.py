@@ -32,8 +32,7 @@ from hil.archive.header import (
 
 NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
 """Channels with one message per sample."""
-ALWAYS: Final = -(1 << 63), 1 << 63
-"""ns, before and after every stamp."""
+ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this

@@ -338,8 +338,7 @@ def message_layout(
     return layout
 
 
-WORLD: Final = "world"
-"""Parent frame of the base, where the description has no link of that name."""
+WORLD: Final = "world"  # Parent frame of the base, where the description has no link of that name
 
 
 def description_messages(urdf: bytes) -> dict[Channel, bytes]:

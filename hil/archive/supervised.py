@@ -135,14 +135,11 @@ class Channel:
         self._socket.close()
 
 
-END_TIMEOUT = 30.0
-"""Time for the last flush of a slow disk, s."""
+END_TIMEOUT = 30.0  # Time for the last flush of a slow disk, s
 HUNG = 5.0
 """Time without a heartbeat after which the process is killed, s; a slow disk does not stop it."""
-EXIT_TIMEOUT = 2.0
-"""Time to exit for a process that was killed or has closed its socket, s."""
-POLL = 0.05
-"""Time between two checks whether the process has ended, s."""
+EXIT_TIMEOUT = 2.0  # Time to exit for a process that was killed or has closed its socket, s
+POLL = 0.05  # Time between two checks whether the process has ended, s
 
 
 class SharedMemory(Protocol):

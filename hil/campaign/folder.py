@@ -301,7 +301,7 @@ class CampaignFolder:
     def next_name(self, kind: str, index: int) -> ArchiveName:
         """Return the name of the next attempt at an interval; no name is used twice."""
         used, attempt = {entry.name for entry in self.manifest()}, 1
-        while (name := ArchiveName(kind, index, attempt).filename) in used or (
+        while (name := str(ArchiveName(kind, index, attempt))) in used or (
             self.archives / name
         ).exists():
             attempt += 1

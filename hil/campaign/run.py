@@ -250,7 +250,7 @@ class Run:
         durable = not self.virtual if self.durable is None else self.durable
         return archive_spec(
             self.cell,
-            self.folder.archives / name.filename,
+            self.folder.archives / name,
             metadata,
             plan | moves_to_dict(interval.moves),
             durable=durable,

@@ -114,7 +114,7 @@ def move(
             path = archive_path(output or Path("runs/move"), "move")
         else:
             make_folder(folder.archives)
-            path = folder.archives / folder.next_name("move", 0).filename
+            path = folder.archives / folder.next_name("move", 0)
         bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
         with stop_on_interrupt() as stop, bar.task("moving (s)", move.duration) as task:
             ended = send(move, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)

@@ -90,7 +90,7 @@ class TestNames:
     def test_a_name_is_parsed_to_what_it_was_made_of(self, kind, index, attempt):
         name = ArchiveName(kind, index, attempt)
         assert ArchiveName.parse(Path("somewhere") / name) == name
-        assert ArchiveName("excitation", 7).filename == "excitation_007_a1.mcap"
+        assert str(ArchiveName("excitation", 7)) == "excitation_007_a1.mcap"
 
     @pytest.mark.parametrize(
         "name", ["excitation.mcap", "dance_001_a1.mcap", "move_1_a1.mcap", "move_001_a0.mcap", "x"]

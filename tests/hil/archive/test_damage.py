@@ -523,14 +523,6 @@ class TestFiles:
         repair(path)
         assert steps == ["file", "name", "folder"]
 
-    def test_link_in_place_of_a_temporary_file_is_not_followed(self, path):
-        victim = path.parent / "victim"
-        victim.write_bytes(b"precious")
-        for name in (path.name, f"{path.stem}_repaired.mcap"):
-            (path.parent / f".{name}.part").symlink_to(victim)
-        repair(path)
-        assert victim.read_bytes() == b"precious"
-
     def test_concurrent_repairs_do_not_interfere(self, path, written, monkeypatch):
         """The second runs from beginning to end while the first reads back what it wrote."""
         second: list[Repair] = []
