@@ -2,8 +2,8 @@
 
 Each round damages an archive or two by its number (`draw`) and runs all readers: `hil archive
 check`, `hil.open_recording`, `hil plot`, `hil identify` of archives or of the folder, every tenth
-round `hil reidentify` and `hil compare`. Each must raise a named error, or return what it returned
-before, or state what was left out (`tests/disk/laws.py`).
+round `hil reidentify`. Each must raise a named error, return what it returned before, or state what
+was left out (`tests/disk/laws.py`).
 
 Rounds in the journal are not run again. A failure is printed with the command that repeats it. The
 exit code is 1 if a law was broken in any round of the journal, 2 if the journal is none of these.
@@ -185,7 +185,7 @@ KINDS: Final[dict[str, Callable[[random.Random, Path, Files], tuple[Files, str]]
 }
 
 
-EVERY = 10  # Rounds of which one is pooled and compared as well
+EVERY = 10  # Rounds of which one is also pooled
 SEED = 20261120
 
 

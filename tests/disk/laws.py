@@ -19,8 +19,7 @@ from hil.archive.check import check_archive
 from hil.batch.cache import CacheLocation
 from hil.batch.run import reidentify
 from hil.batch.workers import Workers
-from hil.compare import gather
-from hil.errors import HilError, InputError
+from hil.errors import HilError
 from hil.identify import Identification, identify_archives, identify_campaign
 from hil.identify.options import FIXED
 from hil.plots.archive_view import view_of
@@ -73,7 +72,7 @@ def broken(
     """Yield a sentence for each violated law, of the archives that were damaged.
 
     Even rounds identify the archives, the others the folder, which has their checksums. With
-    workers there is a batch of the folder and a comparison with itself.
+    workers there is a batch of the folder.
     """
     readers: list[Callable[[], Iterator[str]]] = [
         partial(law, truth, path) for path in harmed for law in (_reads, _checks, _looks)
@@ -82,7 +81,6 @@ def broken(
         readers.append(partial(_identifies, truth, harmed, campaign=bool(number % 2)))
     if workers is not None:
         readers.append(partial(_pools, truth, harmed, workers))
-        readers.append(partial(_compares, truth, workers))
     for reader in readers:
         try:
             yield from reader()
@@ -162,7 +160,6 @@ def _within(
         yield f"{what}: an estimate {np.nanmax(apart):.1f} standard deviations from that before"
 
 
-ALONE = "is the only campaign"
 SAME = 1e-9  # Relative difference of two sums of the same terms in another order
 APART = 5.0
 """Standard deviations of the difference of two estimates that share most of their samples; these
@@ -190,17 +187,6 @@ def _pools(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterat
     if not same and not any(path.name in text for path in harmed for text in messages):
         yield f"batch: another estimate without a message about {harmed[0].name}"
     yield from _within(*truth.batch[""], *found[""], "batch")
-
-
-def _compares(truth: Undamaged, workers: Workers) -> Iterator[str]:
-    """A comparison of one campaign is refused with its name."""
-    try:
-        gather([str(truth.root)], workers, Silent())
-    except InputError as error:
-        if not str(error).startswith(f"{truth.root}: {ALONE}"):
-            yield f"compare: refused one campaign with: {error}"
-    else:
-        yield "compare: one campaign was compared"
 
 
 def _same(one: Archive, other: Archive) -> bool:

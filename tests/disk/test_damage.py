@@ -11,7 +11,7 @@ import pytest
 
 from hil.archive import open_archive
 from hil.batch.workers import LocalWorkers
-from hil.errors import ArchiveError, InputError
+from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
 from tests.disk.damage import KINDS, campaign, main, play
@@ -130,27 +130,3 @@ def test_estimate_of_other_parameters_must_be_reported(
     path = excitations(truth)[0]
     (law,) = broken(truth, [path], 0)
     assert law == f"identify: another estimate without a message about {path.name}"
-
-
-@pytest.mark.parametrize(
-    ("message", "found"),
-    [
-        (None, "one campaign was compared"),
-        ("{root}: is the only campaign given", ""),
-        ("{root}: is of another arm", "refused one campaign with: "),
-        ("nothing was given", "refused one campaign with: "),
-    ],
-)
-def test_comparison_of_one_campaign_must_be_refused(
-    truth: Undamaged, monkeypatch: pytest.MonkeyPatch, message: str | None, found: str
-) -> None:
-    def gathered(*_: object) -> None:
-        if message is not None:
-            raise InputError(None, message.format(root=truth.root))
-
-    monkeypatch.setattr("tests.disk.laws.gather", gathered)
-    monkeypatch.setattr("tests.disk.laws._pools", lambda *_: iter(()))
-    move = next(path for path in sorted(truth.files) if path.name.startswith("move"))
-    with LocalWorkers(1) as workers:
-        laws = list(broken(truth, [move], 0, workers))
-    assert [found in law for law in laws] == ([True] if found else [])
