@@ -319,7 +319,7 @@ def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, wo
     assert not (tmp_path / "out").exists()
 
 
-def test_a_search_is_not_resumed_with_other_settings_or_another_cell(invoke, bare, tmp_path):
+def test_other_settings_or_another_cell_cannot_resume_a_search(invoke, bare, tmp_path):
     with pytest.raises(InputError, match="seed = 2: was 1 when the search began"):
         invoke(CELL_PATH, "--resume", "-o", bare[0], "--seed", 2)
     cell = Cell.load(CELL_PATH)

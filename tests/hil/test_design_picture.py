@@ -403,7 +403,7 @@ def test_shapes_beyond_every_robot_are_left_out(old: str, new: str) -> None:
     assert np.isfinite(arm.tips(np.zeros((1, 1)))).all()
 
 
-def test_the_end_of_an_arm_whose_only_shape_is_a_point_is_that_point() -> None:
+def test_an_arm_that_is_a_point_ends_there() -> None:
     arm = Arm.from_urdf(URDF.replace("0.3 0.1 0.1", "0 0 0"))
     assert arm.tip.tolist() == [0.0, 0.0, 0.0]
 

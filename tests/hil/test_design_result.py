@@ -173,7 +173,7 @@ def test_a_cell_with_other_limits_is_refused_by_name(made, ns16):
         assert word in str(caught.value)
 
 
-def test_a_cell_with_another_campaign_link_or_wall_is_the_same_robot(made, ns16):
+def test_another_campaign_link_or_wall_is_the_same_robot(made, ns16):
     other = ns16.with_campaign(repetitions=3).with_link(transport="udp", host="127.0.0.1")
     respelled = other.text.replace("margin = 0.05", "margin = 5e-2  # m")
     assert respelled != other.text

@@ -144,7 +144,7 @@ def test_motions_through_via_points_are_closed_by_default(cell):
     assert open_path.genome.n_genes == (6 + 1) * 6  # K via points and a speed, for each joint
 
 
-def test_sines_have_the_papers_frequencies_or_those_of_the_limits(cell):
+def test_frequencies_are_the_papers_or_those_of_the_limits(cell):
     """Offsets are in the frame of the limits; sines without a ramp need not rest."""
     settings, limits = preset("a").kinematic(), cell.joint_limits
     slowest, fastest = problem_of(cell, settings).genome.frequency_range
@@ -397,7 +397,7 @@ def test_margins_name_the_motor_and_the_pair(cell):
         assert (not check_motion(motion, cell.joint_limits, currents=limited)) is ok
 
 
-def test_the_nearest_pair_is_no_contact_even_where_the_margin_is_narrow(cell):
+def test_the_nearest_pair_does_not_depend_on_the_margin(cell):
     narrow = cell.with_values({"workspace.margin": 0.01})
     motion = swinging(cell, [0, 1, 2])
     wide, found = (

@@ -60,7 +60,7 @@ def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> No
     assert np.array_equal(rounded.grouping != 0.0, model.base.grouping != 0.0)
 
 
-def test_the_first_independent_parameters_stand_for_groups(model: RobotModel) -> None:
+def test_groups_are_named_by_their_first_parameter(model: RobotModel) -> None:
     base, again = model.base, RobotModel.from_urdf(urdf_text()).base
     assert again.names == base.names
     assert np.array_equal(again.grouping, base.grouping)
@@ -137,7 +137,7 @@ def rank_by_pinocchio(urdf: str) -> int:
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_the_number_of_base_parameters_is_the_rank_of_pinocchios_regressor(arm: str) -> None:
+def test_the_rank_is_that_of_pinocchios_regressor(arm: str) -> None:
     urdf = robot_text(ARMS[arm])
     base = RobotModel.from_urdf(urdf).base
     assert base.rank == rank_by_pinocchio(urdf)

@@ -82,7 +82,7 @@ def test_torque_is_pinocchios_plus_rotors_plus_friction(case: str) -> None:
     assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
 
 
-def test_the_ns16_has_40_base_and_18_friction_parameters_in_this_order() -> None:
+def test_the_ns16_has_40_base_and_18_friction_parameters() -> None:
     model = RobotModel.from_urdf(urdf_text())
     assert model.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
     assert model.n_parameters == len(model.units) == 58
@@ -321,7 +321,7 @@ def test_it_is_the_matrix_of_second_moments_of_the_mass(seed: int) -> None:
 
 
 @given(seeds)
-def test_consistent_is_positive_mass_and_the_triangle_inequalities(seed: int) -> None:
+def test_consistent_bodies_satisfy_the_triangle_inequalities(seed: int) -> None:
     """Of the tensor about the centre of mass."""
     rng = np.random.default_rng(seed)
     moments = rng.uniform(0.05, 1.0, 3)

@@ -105,7 +105,7 @@ def test_all_angles_agree_with_pinocchio(model: RobotModel, angle: float) -> Non
         assert np.allclose(at, near, atol=1e-6)
 
 
-def test_a_model_without_friction_or_rotors_has_inertial_columns_only() -> None:
+def test_without_friction_and_rotors_all_columns_are_inertial() -> None:
     law = FrictionLaw(coulomb=False, viscous=False, third=None)
     model = RobotModel.from_urdf(urdf_text(), rotor_inertia=False, friction=law)
     assert model.n_parameters == model.base.rank == 36

@@ -14,7 +14,6 @@ from identification.excitation import (
     KINDS,
     CurrentModel,
     DesignError,
-    Excitation,
     Front,
     Journal,
     NoFeasibleMotionError,
@@ -31,7 +30,7 @@ from identification.excitation import (
 from identification.excitation.searches.run import Evolution
 from identification.excitation.searches.scores import ROW, unplanned
 from identification.excitation.violation import excess_by_kind
-from planner import FourierSeries, JointLimits, check_limits, plan_moves
+from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, bits, faulty, problem
 
@@ -189,17 +188,6 @@ def _room_under(front: Front) -> float:
     size, coupled = front.measures.T
     assert size[0] > 0.0 and coupled[-1] < 30.0
     return float(size @ np.diff(coupled, append=30.0))
-
-
-def test_the_result_keeps_the_constraints_and_plans_from_its_moves(population):
-    design = search(population, settings("front"))
-    excitation = design.excitation
-    assert not check_motion(excitation.trajectory, LIMITS)
-    assert excitation.moves is not None
-    again = plan_moves(excitation.via_points[0], excitation.moves, LIMITS).trajectory
-    assert again.to_dict() == excitation.trajectory.to_dict()
-    restored = Excitation.from_dict(excitation.to_dict())
-    assert (restored.method, restored.seed, restored.tried) == ("front", 3, 248)
 
 
 def test_sums_of_sines_are_searched_like_via_points():

@@ -417,14 +417,6 @@ def test_only_inertia_and_friction_change(name: str) -> None:
         assert line[0] in " ?" or any(word in line for word in words), line
 
 
-@pytest.mark.parametrize("name", ["two_link", "ns16"])
-def test_writing_nominal_values_changes_rounding_only(name: str) -> None:
-    urdf = ROBOTS[name]()
-    model = RobotModel.from_urdf(urdf)
-    again = RobotModel.from_urdf(write_urdf(urdf, model, model.nominal))
-    np.testing.assert_allclose(again.nominal, model.nominal, rtol=1e-12, atol=1e-12)
-
-
 def test_friction_not_given_and_other_attributes_stay() -> None:
     urdf = ROBOTS["panda"]()
     model = RobotModel.from_urdf(urdf)
