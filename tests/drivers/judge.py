@@ -1,8 +1,6 @@
 """Independent check of a session by its packets, replies and records.
 
-It shares with the code under test only the record's layout and the drive train (tested separately).
-`Conduct` checks the contents of replies and raises AssertionError; `oracle.Reception` predicts
-which packets get a reply.
+`Conduct` checks the contents of replies; `oracle.Reception` predicts which packets get one.
 """
 
 from __future__ import annotations
@@ -156,7 +154,7 @@ class Conduct:
     def _unusable(
         self, received: oracle.Packet, answer: oracle.Packet, safe: oracle.Packet, record: np.void
     ) -> None:
-        """Check that open axes of an unusable arm get drive-off, all else the safe reply."""
+        """Check drive-off of open axes of an unusable arm, and the safe reply of others."""
         axes = [a for a, arm in zip(received.axes, self.arms, strict=True) if arm == self.arm]
         on = received.status[self.arm - 1] == oracle.DRIVE_ON
         if answer != safe:

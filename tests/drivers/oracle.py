@@ -11,8 +11,6 @@ import struct
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from tests.drivers import oracle
-
 DRIVE_ON = 5
 ZERO = bytes(4)
 HOLDS_A_POSITION = (1, 4, 5, 11, 14, 15)
@@ -185,7 +183,7 @@ class Reception:
         number = number_of(packet)
         if len(packet) < 12 or not 1 <= number <= LAST:
             return "nothing"
-        on = oracle.DRIVE_ON in packet[4:8]
+        on = DRIVE_ON in packet[4:8]
         if self.n_axes is None:
             if on or len(packet) >= 1200:
                 return "nothing"
@@ -199,7 +197,7 @@ class Reception:
                 self.n_axes, self.at_init, self.synced = None, False, True
                 return "echo"
             return "nothing"
-        if not oracle.length(self.n_axes) <= len(packet) <= oracle.length(20):
+        if not length(self.n_axes) <= len(packet) <= length(20):
             return "nothing"
         if self.silent:
             return "cyclic"

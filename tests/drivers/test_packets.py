@@ -76,7 +76,7 @@ class TestCyclicPacket:
         packet = struct.pack("<i", 1) + bytes(8) + struct.pack("<i", 4) + payloads
         assert CyclicPacket.decode(packet, 1).encode() == packet
 
-    def test_what_follows_the_axes_is_ignored(self):
+    def test_bytes_behind_the_axes_are_ignored(self):
         packet = CyclicPacket.zeros(5, 6).encode()
         longer = packet + b"\xa5" * (732 - len(packet))
         assert CyclicPacket.decode(longer, 6).encode() == packet

@@ -350,7 +350,7 @@ def test_drive_off_has_zeros_for_values_not_finite():
     ],
 )
 def test_unknown_arms_are_on_if_any_drive_is(arms, status, powered, back):
-    """Then nothing is echoed; four status bytes go back, none of which says drive on."""
+    """Then nothing is echoed; four status bytes go back, none of which is drive on."""
     modes = np.full(2, Mode.CLOSED, np.int32)
     answer = safe_reply(bytes(status), modes, arms)
     assert answer.status == bytes(back)
