@@ -29,13 +29,13 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 78_150,
-    "product files": 324,
-    "test lines": 73_700,
+    "product lines": 74_400,
+    "product files": 322,
+    "test lines": 71_700,
     "test files": 242,
     "import circles": 0,
     "imports inside functions": 32,
-    "files with one importer": 17,
+    "files with one importer": 16,
     "banned names": 0,
     "functions over 60 lines": 27,
 }
