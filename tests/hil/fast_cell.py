@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.archive import Archive
 from hil.campaign import Campaign
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import design
@@ -11,6 +15,7 @@ from hil.campaign.rehearsal import CRITERIA, Criterion, Rehearsal
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.progress import Silent
+from planner import PiecewiseCubic
 
 URDF = """<robot name="fast">
 <link name="base"/>
@@ -130,3 +135,18 @@ def pass_rehearsal(folder: CampaignFolder, *, passed: bool = True) -> None:
         motion_seconds=1.0,
         software={},
     ).save(folder.rehearsal)
+
+
+def set_points(archive: Archive) -> NDArray[np.float64]:
+    """Set-points (k, n) [rad] that were sent in an archive."""
+    commanded = archive.columns["commanded_position"]
+    return np.asarray(commanded[np.isfinite(commanded).all(axis=1)])
+
+
+def on_path(archive: Archive, motion: PiecewiseCubic) -> NDArray[np.float64]:
+    """Set-points (k, n) [rad] of an archive, some 40 of which must be on a path [2e-4 rad]."""
+    points = set_points(archive)
+    planned = motion.sample(np.linspace(0.0, motion.duration, 40_000))[0]
+    for point in points[:: len(points) // 40 + 1]:
+        assert np.abs(planned - point).max(axis=1).min() < 2e-4
+    return points

@@ -149,7 +149,6 @@ def test_currents_are_scaled_by_the_masses_with_a_warning(tmp_path: Path) -> Non
     found = identify(tmp_path, simulated, "log.npz", columns)
     torque = found.prepared.fitted[0].torque
     recorded = found.prepared.sources.training[0].recording
-    assert recorded.motor_current is not None
     made = (torque / recorded.motor_current).mean(axis=0)
     assert made[1:5] == pytest.approx(gains[1:5], rel=0.03)
     assert found.held_out_error < 2.0 * TORQUE_NOISE
@@ -222,9 +221,7 @@ def fitted_by(commands: list[str], output: Path) -> FittedResult:
             arguments, status = [*arguments, "--output", str(output)], NOT_GOOD
         result = CliRunner().invoke(app, arguments)
         assert result.exit_code == status, (command, result.output, result.exception)
-    fitted = Results.load(output / "results.json").fitted
-    assert fitted is not None
-    return fitted
+    return Results.load(output / "results.json").fitted
 
 
 @pytest.fixture
@@ -255,7 +252,6 @@ def test_the_tx40_in_sample_with_its_coupling_and_without(workplace: Path) -> No
     """At most 10.9 % with, 14.3 % without, of the torque through 40 Hz, every row."""
     coupled = fitted_by(COMMANDS[2:4], workplace / "coupled").smoothed_overall_relative_error
     alone = fitted_by(COMMANDS[4:6], workplace / "alone").smoothed_overall_relative_error
-    assert coupled is not None and alone is not None
     assert coupled <= 0.109
     assert coupled < alone <= 0.143
 

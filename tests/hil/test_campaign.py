@@ -45,6 +45,7 @@ from planner import (
     plan_moves,
 )
 from sim_fixtures import SimulatedController
+from tests.hil.fast_cell import set_points
 
 Run = Callable[..., Campaign]
 
@@ -110,8 +111,7 @@ class TestArchives:
 
     def test_commanded_is_what_was_planned_and_the_arm_returns(self, campaign: Campaign) -> None:
         archive = open_archive(campaign.folder.completed("excitation")[0])
-        commanded = archive.columns["commanded_position"]
-        commanded = commanded[~np.isnan(commanded).any(axis=1)]
+        commanded = set_points(archive)
         trajectory, period = campaign.plan.excitation.trajectory, campaign.cell.period
         planned, _, _ = trajectory.sample(np.arange(len(commanded)) * period)
         # The first set-point is the controller's float32 target; its rounding offset remains.

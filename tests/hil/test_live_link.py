@@ -38,7 +38,7 @@ from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
-from tests.hil.fast_cell import fast_cell
+from tests.hil.fast_cell import fast_cell, on_path, set_points
 from tests.hil.test_supervision import spec as spec_of
 
 PATIENT = ("--patience", "2")
@@ -233,12 +233,7 @@ def test_a_motion_is_slowed_held_and_stopped_with_a_viewer(cell: Cell, tmp_path:
     np.testing.assert_allclose(torque, columns["torque"][both], rtol=1e-14)  # a product of matrices
     assert "MotionStarted" in events
 
-    # On the path, whatever was done to the time law.
-    sent = columns["commanded_position"]
-    sent = sent[np.isfinite(sent).all(axis=1)]
-    planned = motion.sample(np.linspace(0.0, motion.duration, 40_000))[0]
-    for point in sent[:: len(sent) // 40]:
-        assert np.abs(planned - point).max(axis=1).min() < 2e-4
+    on_path(archive, motion)
 
 
 def require_shown(seen: list[MotionProgress]) -> None:
@@ -312,9 +307,7 @@ def test_a_request_before_a_motion_begins_is_applied(
             archive = open_archive(path)
             assert archive.complete
             if archive.n_samples:  # none where it was closed at once
-                sent = archive.columns["commanded_position"]
-                sent = sent[np.isfinite(sent).all(axis=1)]
-                assert np.abs(sent - where).max(initial=0.0) < 1e-4, what
+                assert np.abs(set_points(archive) - where).max(initial=0.0) < 1e-4, what
             assert ended.reason == "it had not begun"
             assert "MotionStarted" not in [event.name for event in archive.events]
 

@@ -20,6 +20,7 @@ from hil.move import plan_move, posture, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
 from tests.docs.typed import ROOT, commands
+from tests.hil.fast_cell import set_points
 from tests.hil.screen_rig import on_terminal
 
 
@@ -45,8 +46,7 @@ def test_the_arm_goes_home_and_every_cycle_is_archived(ns16: Cell, tmp_path: Pat
     np.testing.assert_allclose(position[0], ns16.initial, atol=1e-3)
     assert np.all(np.diff(archive.columns["cycle"]) == 1)
     # Straight in joint space: each joint is the same share of its way on.
-    moved = archive.columns["commanded_position"]
-    sent = moved[np.isfinite(moved).all(axis=1)]
+    sent = set_points(archive)
     np.testing.assert_allclose(sent[-1], ns16.home, atol=1e-12)
     share = (sent - ns16.initial) / (ns16.home - ns16.initial)
     assert np.ptp(share, axis=1).max() < 1e-3
@@ -109,8 +109,7 @@ def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_
     (new,) = {entry.name for entry in after.folder.manifest()} - names
     archive = open_archive(after.folder.archives / new)
     start = after.plan.excitation.trajectory.sample(np.array([0.0]))[0][0]
-    sent = archive.columns["commanded_position"]
-    np.testing.assert_allclose(sent[np.isfinite(sent).all(axis=1)][-1], start, atol=1e-12)
+    np.testing.assert_allclose(set_points(archive)[-1], start, atol=1e-12)
     after.folder.require_unchanged()
 
 

@@ -111,7 +111,6 @@ def test_a_negative_torque_constant_is_wrong(
 ) -> None:
     def turned(archive: hil.identify.sources.Archive) -> object:
         recording = recording_of(archive)
-        assert recording.torque is not None
         signs = np.where(np.arange(recording.n_joints) == joint, -1.0, 1.0)
         return replace(recording, torque=recording.torque * signs)
 

@@ -198,7 +198,6 @@ def on_udp(tmp_path: Path, cell: Cell) -> tuple[Path, int]:
 
 def line_on_packets(recorder: subprocess.Popen[str]) -> str:
     """The line on the packets received; notes on what the system refused come before it."""
-    assert recorder.stdout is not None
     return next(line for line in recorder.stdout if "packets from" in line)
 
 
@@ -268,7 +267,6 @@ def test_ctrl_c_ends_the_recording_a_second_one_replies(on_udp: tuple[Path, int]
     with running(*own_motion(path, port)), recorder_of(path) as recorder:
         wait_until_recorded(archive, recorder)
         recorder.send_signal(signal.SIGINT)
-        assert recorder.stdout is not None
         next(line for line in recorder.stdout if "replying until" in line)
         recorder.send_signal(signal.SIGINT)
         output, errors = recorder.communicate(timeout=60)
@@ -345,7 +343,6 @@ def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
     ):
         wait_until_recorded(archive, recorder)
         os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
-        assert recorder.stdout is not None
         result = next(line for line in recorder.stdout if "replying until" in line)
         assert "sent no heartbeat for 5 s and was ended" in result
         controller.send_signal(signal.SIGTERM)

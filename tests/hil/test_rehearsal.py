@@ -153,9 +153,7 @@ def test_a_wrong_cell_or_plan_fails(
             plan, expected = moving(designed, *poor), {"excitation", "unseen motion"}
         case "nearly too weak":
             good = Rehearsal.load(designed.folder)
-            assert good is not None
             (share,) = (c.value for c in good.criteria if c.name == "current (as modelled)")
-            assert share is not None
             text = CELL.replace(right, f"current_limit = {[20.0 * share / 0.85, 12.0]}")
             cell, expected = cell_of(tmp_path, text), {"current (as modelled)"}
         case _:

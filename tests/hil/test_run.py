@@ -73,7 +73,7 @@ from hil.simulation import (
 )
 from sim_fixtures.faults import parse_fault, split_faults
 from tests.hil.batch_work import Here
-from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal
+from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal, set_points
 
 Array = NDArray[np.float64]
 Make = Callable[..., Campaign]
@@ -226,8 +226,7 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
     for name, motion in zip(sorted(found.archives), motions, strict=True):
         archive = open_archive(campaign.folder.archives / name)
         limits, period = campaign.cell.joint_limits, campaign.cell.period
-        commanded = archive.columns["commanded_position"]
-        speed = np.abs(np.diff(commanded[~np.isnan(commanded).any(axis=1)], axis=0)) / period
+        speed = np.abs(np.diff(set_points(archive), axis=0)) / period
         planned = np.abs(motion.sample(np.arange(0, motion.duration, period))[1])
         assert speed.max(axis=0) == pytest.approx(OVERRIDE * planned.max(axis=0), rel=0.01)
         assert np.all(speed <= OVERRIDE * limits.velocity)
@@ -289,7 +288,6 @@ class TestTimeLeft:
                 now = link.cycles * 0.002
                 pace.update(status, now, held=False)
                 left = pace.left(status)
-                assert left is not None
                 estimates.append((now, left))
 
         campaign.run(link, operator=Clock(), durable=False)
@@ -409,11 +407,9 @@ def test_a_repetition_with_lost_replies_is_as_planned(
     link = Link.over(SimulatedTransport(controller, lost), cell, controller.finish)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
     campaign.run(link, unrehearsed=True, durable=False)
-    mine, theirs = (
-        open_archive(one.folder.archives / name).columns["commanded_position"]
-        for one in (campaign, undisturbed)
-    )
-    sent = [int(np.isfinite(one).all(axis=1).sum()) for one in (mine, theirs)]
+    sent = [
+        len(set_points(open_archive(one.folder.archives / name))) for one in (campaign, undisturbed)
+    ]
     assert sent[0] == sent[1] + 2
     both = [played(one.folder.archives / name).commanded for one in (campaign, undisturbed)]
     np.testing.assert_allclose(*both, atol=1e-5)
@@ -668,7 +664,6 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(make: Make) -> None:
         simulated_link(did.cell, instead_of_hardware=True), dry_run_only=True, operator=Operator()
     )
     found = DryRun.load(did.folder)
-    assert found is not None
     for name, edited in (("copied", found), ("edited", replace(found, simulated=False))):
         mine = make(name, real=True)
         edited.accepted_now().save(mine.folder.dry_run)
@@ -715,8 +710,7 @@ def test_a_dry_run_without_archives_or_of_version_1_is_void(tmp_path: Path, dry:
 
 def peak_speed(campaign: Campaign, name: str) -> Array:
     """Of a motion, as a share of the joints' speed limits (n,)."""
-    commanded = open_archive(campaign.folder.archives / name).columns["commanded_position"]
-    commanded = commanded[~np.isnan(commanded).any(axis=1)]
+    commanded = set_points(open_archive(campaign.folder.archives / name))
     speed = np.abs(np.diff(commanded, axis=0)).max(axis=0) / campaign.cell.period
     return np.asarray(speed / campaign.cell.joint_limits.velocity)
 
@@ -913,8 +907,7 @@ def test_an_archive_that_was_not_checked_is_not_pooled(
         campaign.run(operator=Operator(slow_second), unrehearsed=True)
     monkeypatch.undo()
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
-    outcome = open_archive(slowed, fields=()).outcome
-    assert outcome is not None and outcome.outcome == "completed"
+    assert open_archive(slowed, fields=()).outcome.outcome == "completed"
     found = discover([str(campaign.folder.root)], CacheLocation(str(tmp_path / "cache")), Here())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
     (skipped,) = (one for one in found.skipped if one.path == slowed.as_posix())
@@ -940,7 +933,7 @@ def test_a_disturbed_first_repetition_rejects_no_others(make: Make) -> None:
     good = [path.name for path in campaign.folder.completed("excitation")]
     assert good == ["excitation_000_a2.mcap", "excitation_001_a3.mcap", "excitation_002_a1.mcap"]
     touched = open_archive(campaign.folder.archives / "excitation_000_a1.mcap")
-    assert touched.outcome is not None and touched.outcome.outcome == "rejected"
+    assert touched.outcome.outcome == "rejected"
     assert not campaign.folder.damaged()
 
 
@@ -1107,7 +1100,6 @@ def test_a_full_disk_is_named(make: Make, monkeypatch: pytest.MonkeyPatch, name:
 def test_a_stop_while_a_dry_run_is_asked_for(tmp_path: Path, dry: Campaign) -> None:
     campaign = copied(dry, tmp_path / "campaign")
     found = DryRun.load(campaign.folder)
-    assert found is not None
     replace(found, accepted=None).save(campaign.folder.dry_run)
     stop = Stop()
 

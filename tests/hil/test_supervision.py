@@ -31,7 +31,7 @@ from hil.errors import ControllerFault
 from hil.simulation import simulated_link
 from hil.testing import faulty_link
 from planner import Move, PiecewiseCubic, plan_moves
-from tests.hil.fast_cell import fast_campaign, fast_cell
+from tests.hil.fast_cell import fast_campaign, fast_cell, on_path
 
 
 class Watcher:
@@ -78,13 +78,8 @@ class WatchedArm:
         return open_archive(self.path)
 
     def commanded(self) -> np.ndarray:
-        """Set-points (k, n) that were sent; each lies on the path, whatever the time law."""
-        rows = self.archive.columns["commanded_position"]
-        points = rows[np.isfinite(rows).all(axis=1)]
-        planned = self.motion.sample(np.linspace(0.0, self.motion.duration, 40_000))[0]
-        for point in points[:: len(points) // 50 + 1]:
-            assert np.abs(planned - point).max(axis=1).min() < 2e-4
-        return points
+        """Set-points (k, n) [rad]; they are on the path, whatever the time law."""
+        return on_path(self.archive, self.motion)
 
 
 def spec(cell: Cell, path: Path) -> ArchiveSpec:
