@@ -135,7 +135,7 @@ def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
     name = ArchiveName.parse(path)
     for key, value in (name.metadata() if name else {}).items():
         if entries.get(key) != value:
-            faults.append(f"{key} is {entries.get(key)!r}, but the file name says {value!r}")
+            faults.append(f"{key} is {entries.get(key)!r}, but {value!r} in the file name")
     return faults
 
 

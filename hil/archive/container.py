@@ -155,7 +155,7 @@ def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
         opcode, body_length = RECORD.unpack_from(data)
         if body_length == length - RECORD.size:
             return Record(offset, opcode, data[RECORD.size :])
-    raise Damage(offset, "is not of the length that the index says")
+    raise Damage(offset, "is not of the length in the index")
 
 
 def records(

@@ -236,7 +236,7 @@ def _checked_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, str]
     for key, value in named.items():
         if entries[key] != value:
             raise ArchiveWriteError(
-                path, f"{key} is {entries[key]!r}, but the file name says {value!r}", field=key
+                path, f"{key} is {entries[key]!r}, but {value!r} in the file name", field=key
             )
     if entries.get("kind") not in KINDS:
         raise ArchiveWriteError(

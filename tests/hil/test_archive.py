@@ -202,7 +202,7 @@ class TestBadInput:
         ("name", "metadata", "sentence"),
         [
             (f"nowhere/{NAME}", {}, r"nowhere.*cannot be created: No such file"),
-            (NAME, {"kind": "validation"}, "'validation', but the file name says 'excitation'"),
+            (NAME, {"kind": "validation"}, "'validation', but 'excitation' in the file name"),
             ("x.mcap", {}, "None is not a kind of archive; use standstill"),
         ],
     )
