@@ -91,19 +91,14 @@ class UnmodelledEffects:
     the converted current (both low-passed at 30 Hz) by about: ripple 1-2 %, drift 1-4 % (cold arm),
     elasticity 1.5 % on axis 1, delay below 0.3 %.
 
-    Attributes:
-        torque_ripple: amplitude of a torque with two periods per motor turn, as a share of the
-            Coulomb torque of the joint.
-        friction_drift: relative decrease of all friction between cold and hot. The truth is the
-            friction of a half-warm joint; a run starts cold.
-        elasticity: compliance of the spring between gear and link [rad/(N m)], (n,) or empty.
-        delay: additional delay of the target current [s], rounded to sub-steps of the plant.
+    The ripple has two periods per motor turn. The true friction is that of a half-warm joint; a run
+    starts cold.
     """
 
-    torque_ripple: float = 0.0
-    friction_drift: float = 0.0
-    elasticity: tuple[float, ...] = ()
-    delay: float = 0.0
+    torque_ripple: float = 0.0  # amplitude as a share of the Coulomb torque of the joint
+    friction_drift: float = 0.0  # relative decrease of all friction between cold and hot
+    elasticity: tuple[float, ...] = ()  # compliance of each gear [rad/(N m)], (n,) or empty
+    delay: float = 0.0  # additional delay of the target current [s], in sub-steps of the plant
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elasticity", tuple(float(c) for c in self.elasticity))

@@ -37,31 +37,21 @@ _POSITIVE = ("torque_constant", "current_limit", "following_error")
 class SimulatedDrive:
     """Gears, calibration, coupling and motors of one arm; per-axis values are (n,) sequences.
 
-    Attributes:
-        gear_ratio: signed motor revolutions per joint revolution.
-        calibration: motor revolutions at controller angle zero.
-        joint_sign, joint_offset: controller angle = joint_sign * q + joint_offset [rad].
-        torque_constant: N m/A on the motor side.
-        current_limit: A.
-        following_error: threshold in motor revolutions.
-        encoder_counts: counts per motor revolution.
-        k54, k64, k65: wrist coupling, 5 by 4, 6 by 4, 6 by 5; need six axes.
-
     Raises:
         SettingError: wrong sizes, zero or non-finite figures, coupling without a wrist.
     """
 
-    gear_ratio: tuple[float, ...]
-    calibration: tuple[float, ...]
-    joint_sign: tuple[float, ...]
-    joint_offset: tuple[float, ...]
-    torque_constant: tuple[float, ...]
-    current_limit: tuple[float, ...]
-    following_error: tuple[float, ...]
-    encoder_counts: int
-    k54: float = 0.0
-    k64: float = 0.0
-    k65: float = 0.0
+    gear_ratio: tuple[float, ...]  # signed motor revolutions per joint revolution
+    calibration: tuple[float, ...]  # motor revolutions at controller angle zero
+    joint_sign: tuple[float, ...]  # +1 or -1; controller angle = joint_sign * q + joint_offset
+    joint_offset: tuple[float, ...]  # rad
+    torque_constant: tuple[float, ...]  # N m/A on the motor side
+    current_limit: tuple[float, ...]  # A
+    following_error: tuple[float, ...]  # threshold in motor revolutions
+    encoder_counts: int  # per motor revolution
+    k54: float = 0.0  # wrist coupling, 5 by 4; needs six axes
+    k64: float = 0.0  # 6 by 4
+    k65: float = 0.0  # 6 by 5
     _coupled: bool = field(init=False, repr=False)
     _k46: float = field(init=False, repr=False)
     _signed_ratio: tuple[float, ...] = field(init=False, repr=False)

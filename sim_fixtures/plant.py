@@ -31,25 +31,19 @@ _TENSOR_KEYS = ("xx", "xy", "yy", "xz", "yz", "zz")
 class PlantTruth:
     """True rotor inertias, friction and link inertias; arrays (n,), on the joint side.
 
-    Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3).
-
-    Attributes:
-        rotor_inertia: kg m2.
-        coulomb: N m.
-        viscous: N m s/rad.
-        third: N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic").
-        inertia_scale: factor on mass, first moment and tensor of each link of the URDF; (1,) for
-            one factor of all.
+    Friction torque: coulomb sgn(qd) + viscous qd + third sgn(qd) qd^2 (or third qd^3). The factor
+    `inertia_scale` applies to mass, first moment and tensor of each link of the URDF; (1,) for one
+    factor of all.
 
     Raises:
         SettingError: arrays of different sizes, non-finite or (except `third`) negative values, a
             scale that is not positive.
     """
 
-    rotor_inertia: Array
-    coulomb: Array
-    viscous: Array
-    third: Array
+    rotor_inertia: Array  # kg m2
+    coulomb: Array  # N m
+    viscous: Array  # N m s/rad
+    third: Array  # N m s2/rad2 ("quadratic") or N m s3/rad3 ("cubic")
     third_law: Literal["quadratic", "cubic"] = "quadratic"
     inertia_scale: Array = field(default_factory=lambda: np.ones(1))
     _has_third: bool = field(init=False, repr=False, default=False)

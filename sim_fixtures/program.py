@@ -93,15 +93,10 @@ MISSING = Answer()
 class LoopProgram:
     """Phase of the controller, cycle by cycle.
 
-    Attributes:
-        wanted_axes: axes that the program opens, (n,).
-        listening: whether targets of open axes are read from the PC.
-        open_axes: axes in open mode in the packet of this cycle, (n,).
-        reason: reason of the last loss of the drive or of the end of the session; "" if neither.
-        intervals: number of times that all wanted axes were open.
-        openings_lost: consecutive openings that ended by missing replies or 508.
-        gave_up: whether the session ends because of too many of these.
-        pause_mode: mode of each axis in phase PAUSED.
+    The program opens `wanted_axes` (n,); `open_axes` (n,) are in open mode in the packet of this
+    cycle, and their targets are read from the PC while it is `listening`. `reason` is that of the
+    last loss of the drive or of the end of the session. All wanted axes were open `intervals` times;
+    `openings_lost` consecutive openings ended by missing replies or 508, too many if `gave_up`.
     """
 
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:

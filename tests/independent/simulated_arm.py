@@ -25,26 +25,16 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @dataclass(frozen=True, eq=False)
 class SimulatedArm:
-    """A rigid arm of n joints with rotors and dry and viscous friction.
-
-    Attributes:
-        urdf: its description.
-        model: pinocchio's, with rotor inertias as armature.
-        locked: joints of the description that do not belong to the arm, and where they are held.
-        speed: largest joint speeds (n,) [rad/s].
-        centre: posture about which it moves (n,) [rad].
-        room: largest excursion from there (n,) [rad].
-        coulomb, viscous: friction (n,) [N·m, N·m·s/rad].
-    """
+    """A rigid arm of n joints with rotors and dry and viscous friction."""
 
     urdf: str
-    model: pin.Model
-    locked: dict[str, float]
-    speed: Array
-    centre: Array
-    room: Array
-    coulomb: Array
-    viscous: Array
+    model: pin.Model  # with rotor inertias as armature
+    locked: dict[str, float]  # positions of joints of the URDF that do not belong to the arm
+    speed: Array  # largest joint speeds (n,) [rad/s]
+    centre: Array  # posture about which it moves (n,) [rad]
+    room: Array  # largest excursion from there (n,) [rad]
+    coulomb: Array  # (n,) [N·m]
+    viscous: Array  # (n,) [N·m·s/rad]
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -150,18 +140,10 @@ def record(
     rate: float = 250.0,
     moves: Sines | None = None,
 ) -> Log:
-    """A recording whose torque is logged a delay [s] after the position it belongs to.
+    """Return a recording whose torque is logged a delay [s] after its position.
 
-    Args:
-        arm: what moves.
-        seed: of motion and noise.
-        delay: of the torque of every joint [s].
-        pace: of the motion, see :func:`motion`.
-        noise: of the torque, white or a white and an autoregressive part of 50 ms, equally large.
-        level: of the noise, of the rms torque about its mean.
-        duration: [s].
-        rate: samples per second [Hz].
-        moves: the motion, by default the seed's.
+    The noise of the torque has a standard deviation of `level` times that of the torque; it is
+    white, or half of its power autoregressive with 50 ms. `duration` in s, `rate` in Hz.
     """
     moves = motion(arm, seed, pace) if moves is None else moves
     rng = np.random.default_rng([seed, 2])

@@ -342,9 +342,10 @@ def test_the_current_of_a_servo_at_rest_is_that_of_the_model() -> None:
 def test_a_position_error_raises_the_current_and_its_integral() -> None:
     servo = make_servo()
     target = [p + 0.01 for p in servo.measured]
-    first, *_, last = [servo.advance(target, [0.0] * 6) for _ in range(50)]
-    assert np.all(np.array(last) > np.array(first))
-    assert np.all(np.array(last) > servo.model_current)  # positive current turns a motor forward
+    currents = np.array([servo.advance(target, [0.0] * 6) for _ in range(50)])
+    steady = currents[INERTIA_CYCLES + 1 :]  # with the gains of the new posture
+    assert np.all(steady[0] > servo.model_current)  # positive current turns a motor forward
+    assert np.all(np.diff(steady, axis=0) > 0.0)
 
 
 def test_within_the_deadband_nothing_is_integrated() -> None:

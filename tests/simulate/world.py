@@ -127,10 +127,10 @@ class Disk:
         if event.kind == "short-write":
             return os.write(descriptor, data[: max(1, round(event.value * len(data)))])
         part = data[: min(len(data) - 1, round(event.value * len(data)))]
-        kept = os.write(descriptor, part) if len(part) else 0
+        written = os.write(descriptor, part) if len(part) else 0
         if event.kind == "kill-at-write":
             self.dead = True
-            self.torn[self._paths[descriptor].name] = len(data) - kept
+            self.torn[self._paths[descriptor].name] = len(data) - written
             raise Killed(event.line)
         self.refused.add(self._paths[descriptor].name)
         number = errno.EIO if event.kind == "disk-error" else errno.ENOSPC
@@ -550,8 +550,8 @@ def play(seed: int, twin: Twin, root: Path, script: Script | None = None) -> Obs
         while_silent=chance.choice(WHILE_SILENT),
         missed_replies=chance.choice((1, 3, 5, 9)),
     )
-    drawn = draw_script(chance, twin.story)
-    script = parse_script(drawn) if script is None else script
+    own = draw_script(chance, twin.story)  # drawn in any case: `chance` is used further
+    script = parse_script(own) if script is None else script
     world = World(twin.scene, settings, script, chance, root / f"seed_{seed}")
     lives = world.all_lives()
     found, why = None, ""
