@@ -95,8 +95,9 @@ class LoopProgram:
 
     The program opens `wanted_axes` (n,); `open_axes` (n,) are in open mode in the packet of this
     cycle, and their targets are read from the PC while it is `listening`. `reason` is that of the
-    last loss of the drive or of the end of the session. All wanted axes were open `intervals` times;
-    `openings_lost` consecutive openings ended by missing replies or 508, too many if `gave_up`.
+    last loss of the drive or of the end of the session. `intervals` counts the openings of all
+    wanted axes, `openings_lost` consecutive ones that ended by missing replies or 508; the session
+    ends because of too many of these if `gave_up`.
     """
 
     def __init__(self, n_axes: int, settings: ControllerSettings) -> None:
