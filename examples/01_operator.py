@@ -1,8 +1,8 @@
-"""The operator's day in twenty lines: design, rehearse, run, identify, report.
+"""The operator's procedure in twenty lines: design, rehearse, run, identify, report.
 
-One sees each step on the simulated NS 16, then the verdict: the torque error on motions that were
-never fitted. The picture is one repetition as it was archived. Typed again, it goes on where it
-was stopped. For a real arm, name its cell file: `examples/01_operator.py my_cell.toml runs/mine`.
+Prints each step on the simulated NS 16, then the verdict: the torque error on held-out motions. The
+picture is one archived repetition. Started again, it resumes where it was stopped. For a real arm,
+name its cell file: `examples/01_operator.py my_cell.toml runs/mine`.
 """
 
 import sys

@@ -1,8 +1,8 @@
-"""An arm of one's own: a URDF and a cell file of fifty lines, `two_joints/`, are enough.
+"""Your own arm: a URDF and a cell file of fifty lines, `two_joints/`, are enough.
 
-One sees what was planted in the simulated arm, which is not what its maker says, and what was
-found with its 95 % interval. The picture is the torque of a motion that was never fitted, measured
-and predicted. Put your own URDF and cell file there (`hil new` writes one).
+Prints the true parameters of the simulated arm, which differ from the nominal ones, and the
+estimates with their 95 % intervals. The picture is the torque of a held-out motion, measured and
+predicted. Put your own URDF and cell file there (`hil new` writes one).
 """
 
 import sys

@@ -1,9 +1,9 @@
-"""An excitation of one's own: via points that somebody chose, beside those that a search found.
+"""Your own excitation: chosen via points, compared with those of a search.
 
-One sees the paper's criteria of both motions, the determinant (eq. 9, larger is better) and the
-coupling index (eq. 5, smaller is better), and by how much that makes the intervals narrower which
-the simulated NS 16 then gives. The picture is Fig. 2: which parameters each motion mixes up.
-`Campaign.create` takes whatever is an `Excitation`: put your own via points in.
+Prints the paper's criteria of both motions, the determinant (eq. 9, larger is better) and the
+coupling index (eq. 5, smaller is better), and the effect on the intervals of the simulated NS 16.
+The picture is Fig. 2: the correlation of the parameters with each motion. `Campaign.create` accepts
+any `Excitation`: insert your own via points.
 """
 
 import sys

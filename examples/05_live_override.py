@@ -1,7 +1,7 @@
-"""Overriding a motion while it runs: slower, then on at full speed, on the path all the time.
+"""Overriding a motion while it runs: slower, then at full speed again, always on the path.
 
-One sees how far the commanded positions are from the planned straight motion: rounding. The
-picture shows what was wished, the speed along the path that followed within the limits of
+Prints the distance of the commanded positions from the planned straight motion: rounding errors.
+The picture shows the requested override, the resulting speed along the path within the limits of
 `[bounds]`, and that of the joints. On a real arm the keys of `hil run` do this; any object with
 `show` and `request` can.
 """

@@ -1,8 +1,8 @@
-"""A link of one's own: what carries packets is an object of seven methods, here a pipe.
+"""Your own link: an object of seven methods that carries packets, here a pipe.
 
-The controller runs in another process and waits for each answer, so that time is virtual. One sees
-how the motion ended and how many packets went through the pipe; the picture is the archive of it.
-`drivers.Transport` says what a link must do; one in real time runs in the exchange process
+The controller runs in another process and waits for each reply, so that time is virtual. Prints the
+outcome of the motion and the number of packets; the picture is its archive. `drivers.Transport`
+defines the methods; a link in real time runs in the exchange process
 (`drivers.exchange`), opened there from a `TransportSpec`.
 """
 

@@ -40,19 +40,9 @@ class CheckedMove:
     checks: MotionChecks
 
     @property
-    def trajectory(self) -> PiecewiseCubic | FourierSeries:
-        """The motion."""
-        return self.interval.trajectory
-
-    @property
     def duration(self) -> float:
         """Duration at full speed [s]."""
-        return self.trajectory.duration
-
-    @property
-    def not_checked(self) -> str:
-        """Contacts that were not checked, "" for none."""
-        return self.checks.not_checked or ""
+        return self.interval.trajectory.duration
 
 
 def random_via_points(cell: Cell, frame: AngleFrame, count: int, seed: int) -> Array:
@@ -178,15 +168,18 @@ def send(
     """
     checks = active_checks(cell, link.connection, planned.checks)
     if checks is not planned.checks:
-        _require(checks, planned.trajectory)
+        _require(checks, planned.interval.trajectory)
     spec = archive_spec(
         cell,
         path,
         {**kind_entry(path, "move"), **origin_of(cell, only_simulated=link.only_simulated)},
-        {"trajectory": planned.trajectory.to_dict(), **moves_to_dict(planned.interval.moves)},
+        {
+            "trajectory": planned.interval.trajectory.to_dict(),
+            **moves_to_dict(planned.interval.moves),
+        },
         durable=durable,
     )
-    return link.run(player_of(cell, planned.trajectory), spec, stop, watch=watch)
+    return link.run(player_of(cell, planned.interval.trajectory), spec, stop, watch=watch)
 
 
 def _require(checks: MotionChecks, trajectory: PiecewiseCubic | FourierSeries) -> None:

@@ -1,13 +1,14 @@
-"""Options of the long commands: a number that makes no sense is refused before anything runs."""
+"""Options of the long commands, checked before anything runs."""
 
 from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 
 
 def parser_of(package: str, description: str | None, epilog: str = "") -> argparse.ArgumentParser:
-    """The parser of `python -m` this package, whose texts stay as they are."""
+    """Return the parser of `python -m` this package, with texts as they are."""
     return argparse.ArgumentParser(
         prog=f"python -m {package}",
         description=description,
@@ -16,34 +17,18 @@ def parser_of(package: str, description: str | None, epilog: str = "") -> argpar
     )
 
 
-def whole_number(text: str) -> int:
-    """A whole number of 0 or more.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
+def whole_number(text: str, least: int = 0) -> int:
+    """Parse a whole number."""
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of {least} or more")
     return int(text)
 
 
-def at_least_one(text: str) -> int:
-    """A whole number of 1 or more.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
-    return int(text)
+at_least_one = partial(whole_number, least=1)
 
 
 def time_above_0(text: str) -> float:
-    """A time above 0 that ends.
-
-    Raises:
-        argparse.ArgumentTypeError: it is none.
-    """
+    """Parse a finite time above 0."""
     try:
         value = float(text)
     except ValueError:

@@ -26,12 +26,7 @@ class JournalError(ValueError):
 
 
 def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]:
-    """What the whole lines say, in their order; nothing if there is no such file.
-
-    Args:
-        path: of the file; where its name ends in `.xz` it is compressed.
-        entry: converts the object of a line; raises ValueError.
-        what: a line should be, for a person: "result of a round".
+    """Return the complete lines by `entry`, none without a file; `what` describes a line.
 
     Raises:
         JournalError: it cannot be read, or a line is no such entry.
@@ -53,11 +48,7 @@ def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]
 
 
 def rounds(path: Path | None, *needed: str) -> dict[int, dict[str, Any]]:
-    """Results by number, of a journal whose lines have `round` and these facts; {} without one.
-
-    Raises:
-        JournalError: as `entries`.
-    """
+    """Return the lines by `round`; each has the facts `needed`."""
 
     def result(entry: Any) -> tuple[int, dict[str, Any]]:
         if missing := [name for name in needed if name not in entry]:
@@ -68,14 +59,10 @@ def rounds(path: Path | None, *needed: str) -> dict[int, dict[str, Any]]:
 
 
 class Journal:
-    """A journal that is added to; what was added stays, whatever becomes of the process.
+    """A journal to which lines are added; none with path None.
 
-    Args:
-        path: of the file, made where it is missing, with its folder; None keeps nothing.
-        sync_every: s between two waits for the disk; 0 waits for it after each line.
-
-    Raises:
-        JournalError: it cannot be written.
+    `sync_every` is the time between two waits for the disk, s; 0 waits after each line.
+    JournalError: it cannot be written.
     """
 
     def __init__(self, path: Path | None, sync_every: float = 0.0) -> None:
@@ -116,5 +103,5 @@ class Journal:
 
 
 def _whole(content: bytes) -> int:
-    """Bytes of the whole lines."""
+    """Return the number of bytes of complete lines."""
     return content.rfind(b"\n") + 1

@@ -27,14 +27,11 @@ Command = Callable[[list[str]], int]
     ("command", "arguments", "named"),
     [
         (simulate.main, ["--seeds", "-3"], "--seeds: '-3' is not a whole number of 0 or more"),
-        (simulate.main, ["--seeds", "3", "--jobs", "0"], "--jobs: '0' is not"),
         (process_death.main, ["--rounds", "-1"], "--rounds: '-1' is not"),
         (process_death.main, ["--rounds", "1", "--start", "x"], "--start: 'x' is not"),
-        (process_death.main, ["--rounds", "1", "--jobs", "0"], "--jobs: '0' is not"),
         (damage.main, ["--rounds", "1.5"], "--rounds: '1.5' is not"),
         (damage.main, ["--rounds", "1", "--start", "-1"], "--start: '-1' is not"),
         (fuzz.main, ["urdf", "--minutes", "0"], "--minutes: '0' is not a time above 0"),
-        (fuzz.main, ["urdf", "--stop-after", "inf"], "--stop-after: 'inf' is not"),
         (fuzz.main, ["urdf", "--jobs", "-2"], "--jobs: '-2' is not"),
         (endurance.main, ["--minutes", "nan"], "--minutes: 'nan' is not"),
     ],
@@ -87,8 +84,8 @@ OTHERS = {
 }
 
 
-def number(said: dict[str, int]) -> int:
-    return said["n"]
+def number(entry: dict[str, int]) -> int:
+    return entry["n"]
 
 
 def read(path: Path) -> list[int]:
@@ -97,21 +94,13 @@ def read(path: Path) -> list[int]:
 
 @pytest.mark.parametrize("sync_every", [0.0, 60.0])
 def test_what_was_added_is_read_back_in_order(tmp_path: Path, sync_every: float) -> None:
+    """Each line before the journal is closed."""
     path = tmp_path / "new" / "j.jsonl"
     assert read(path) == []
-    for n in (3, 1, 3):
+    for k, n in enumerate((3, 1, 3), 1):
         with Journal(path, sync_every) as journal:
             journal.add(n=n)
-    assert read(path) == [3, 1, 3]
-
-
-def test_a_line_is_there_before_the_journal_is_closed(tmp_path: Path) -> None:
-    with Journal(tmp_path / "j.jsonl", 60.0) as journal:
-        journal.add(n=1)
-        assert read(tmp_path / "j.jsonl") == [1]
-
-
-def test_none_keeps_nothing() -> None:
+            assert read(path) == [3, 1, 3][:k]
     with Journal(None) as journal:
         journal.add(n=1)
     assert rounds(None) == {}
@@ -174,18 +163,7 @@ def test_journals_of_other_commands_are_refused_unchanged(
     path.write_bytes(OTHERS[other])
     command = COMMANDS[name]
     assert command.main([*command.arguments, "--journal", str(path)]) == 2
-    said = capsys.readouterr().err
-    assert f"{path}, line 1 is no " in said
-    assert said.endswith("; name another --journal\n")
-    assert said.count("\n") == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{path}, line 1 is no " in line
+    assert line.endswith("; name another --journal")
     assert path.read_bytes() == OTHERS[other]
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-def test_a_folder_is_no_journal(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = COMMANDS[name]
-    assert command.main([*command.arguments, "--journal", str(tmp_path)]) == 2
-    assert f"{tmp_path} cannot be read: " in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []

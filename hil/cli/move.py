@@ -116,7 +116,10 @@ def move(
             make_folder(folder.archives)
             path = folder.archives / folder.next_name("move", 0)
         bar, durable = make_reporter(quiet=json), cell.controller.transport != "simulated"
-        with stop_on_interrupt() as stop, bar.task("moving (s)", move.duration) as task:
+        with (
+            stop_on_interrupt() as stop,
+            bar.task("moving (s)", move.duration) as task,
+        ):
             ended = send(move, cell, link, path, stop=stop, watch=_Shown(task), durable=durable)
             stopped = stop.requested
         if folder is not None:
@@ -196,7 +199,7 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     """Format the path, one line per joint."""
     frame = AngleFrame.of(cell)
     start, end = frame.shown(move.start), frame.shown(move.target)
-    peaks = np.degrees(move.trajectory.extrema().velocity)
+    peaks = np.degrees(move.interval.trajectory.extrema().velocity)
     width = max(len(name) for name in (*cell.joint_names, "joint"))
     lines = [f"{'joint':{width}}  {'from':>9}  {'to':>9}  {'by':>9}   peak speed"]
     lines += [
@@ -210,7 +213,7 @@ def _described(move: CheckedMove, cell: Cell, link: MotionLink) -> str:
     )
     below = narrower_limits(cell, link.connection, "following_error")
     lines += [f"the smaller following-error threshold applies, {note}" for note in below]
-    return "\n".join([*lines, move.not_checked] if move.not_checked else lines)
+    return "\n".join(filter(None, [*lines, move.checks.not_checked]))
 
 
 def _print(text: str, figures: dict[str, object], *, json: bool) -> None:
