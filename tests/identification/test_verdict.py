@@ -349,17 +349,16 @@ class TestJudgement:
         expected = {finding.next_step for finding in verdict.findings if finding.level == level}
         assert expected == set(verdict.next_steps) and "" not in expected
 
-    def test_a_worse_controller_model_is_good(self) -> None:
-        found = finding_of("against the controller's model", controller=an_error(0.09))
-        assert found.level == "good" and "is 9.0%, of the identified model 5.0%" in found.words
-
     def test_payloads_are_proposed_for_loaded_axes(self) -> None:
         verdict = judged(systematic=np.array([0.025, 0.025]), loaded=np.array([False, True]))
         (step,) = (step for step in verdict.next_steps if "torque constant" in step)
         assert "of two with a known payload" in step
         assert "of one with the drive's data sheet" in step
 
-    def test_small_systematic_errors_are_good(self) -> None:
+    def test_good_findings(self) -> None:
+        """A worse model of the controller, small systematic errors."""
+        found = finding_of("against the controller's model", controller=an_error(0.09))
+        assert found.level == "good" and "is 9.0%, of the identified model 5.0%" in found.words
         verdict = judged(systematic=np.array([0.019, 0.0]))
         assert not any("beyond noise" in one for one in verdict.warnings)
         assert "beyond noise 1.9% at worst" in verdict.line
@@ -422,42 +421,38 @@ def causes(recordings: Sequence[Samples]) -> tuple[Cause, ...]:
 
 def late(samples: Samples) -> Samples:
     time = samples.motion.time
-    return replace(
-        samples,
-        torque=np.column_stack([np.interp(time - DELAY, time, one) for one in samples.torque.T]),
-    )
+    torque = [np.interp(time - DELAY, time, one) for one in samples.torque.T]
+    return replace(samples, torque=np.column_stack(torque))
 
 
 def swapped(values: Array) -> Array:
     return values[:, [0, 2, 1, 3, 4, 5]]
 
 
-def with_other_motion(samples: Samples, change: Callable[[Array], Array]) -> Samples:
-    motion = samples.motion
-    return replace(samples, motion=Motion(motion.time, *(change(one) for one in motion[1:4])))
+def turned(values: Array) -> Array:
+    return values * np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
 
 
-SIGN = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+def moved(samples: Samples, change: Callable[[Array], Array], *, torque: bool = True) -> Samples:
+    """Return samples with another motion, and with another torque by default."""
+    motion = Motion(samples.motion.time, *(change(one) for one in samples.motion[1:4]))
+    if not torque:
+        return replace(samples, motion=motion)
+    usable = np.abs(change(samples.usable.astype(np.float64))) > 0.0
+    return replace(samples, motion=motion, torque=change(samples.torque), usable=usable)
+
+
 GAIN = np.array([1.0, 1.15, 1.0, 1.0, 1.0, 1.0])
 FAULTS: dict[str, tuple[tuple[int, ...], Callable[[Samples], Samples]]] = {
     "delay": ((), late),
     "gain": ((1,), lambda one: replace(one, torque=GAIN * one.torque)),
-    "torque sign": ((2,), lambda one: replace(one, torque=SIGN * one.torque)),
+    "torque sign": ((2,), lambda one: replace(one, torque=turned(one.torque))),
     "torque order": ((1, 2), lambda one: replace(one, torque=swapped(one.torque))),
-    "axis sign": (
-        (2,),
-        lambda one: replace(
-            with_other_motion(one, lambda part: SIGN * part), torque=SIGN * one.torque
-        ),
-    ),
-    "position order": ((1, 2), lambda one: with_other_motion(one, swapped)),
-    "joint order": (
-        (1, 2),
-        lambda one: replace(
-            with_other_motion(one, swapped), torque=swapped(one.torque), usable=swapped(one.usable)
-        ),
-    ),
+    "axis sign": ((2,), lambda one: moved(one, turned)),
+    "position order": ((1, 2), lambda one: moved(one, swapped, torque=False)),
+    "joint order": ((1, 2), lambda one: moved(one, swapped)),
 }
+SIZES = {"delay": DELAY, "gain": 0.15}
 
 
 class TestCausesOfWholeRecordings:
@@ -470,13 +465,11 @@ class TestCausesOfWholeRecordings:
     @pytest.mark.parametrize("kind", FAULTS)
     @pytest.mark.parametrize("seed", [1, 2])
     def test_a_single_fault_is_named(self, kind: str, seed: int) -> None:
+        """With its size within four standard deviations."""
         joints, spoil = FAULTS[kind]
-        found = causes([spoil(recorded(seed))])
-        assert [(one.fault.kind, one.fault.joints) for one in found] == [(kind, joints)]
-
-    def test_sizes_lie_within_four_deviations(self) -> None:
-        for kind, size in (("delay", DELAY), ("gain", 0.15)):
-            (cause,) = causes([FAULTS[kind][1](recorded(1))])
+        (cause,) = causes([spoil(recorded(seed))])
+        assert (cause.fault.kind, cause.fault.joints) == (kind, joints)
+        if size := SIZES.get(kind):
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
     def test_two_faults_are_found_in_sequence(self) -> None:
@@ -488,19 +481,14 @@ class TestCausesOfWholeRecordings:
 class TestCausesOfParts:
     """Faults of some recordings."""
 
-    @pytest.mark.parametrize(
-        ("seeds", "loaded", "words"),
-        [((1,), 0.5, "0.mcap from 5 s on"), (range(4), (1, 3), "1.mcap, 3.mcap")],
-    )
-    def test_a_changed_load_is_measured(
-        self, seeds: Sequence[int], loaded: Any, words: str
-    ) -> None:
+    @pytest.mark.parametrize("count", [1, 4])
+    def test_a_changed_load_is_measured(self, count: int) -> None:
         """In the second half of one recording, or in two of four."""
-        if loaded == 0.5:
-            runs = [recorded(1, LOAD * (np.arange(1250) >= 625))]
-        else:
-            load = np.full(1250, LOAD)
-            runs = [recorded(k, load if k in loaded else None) for k in seeds]
+        words = "0.mcap from 5 s on" if count == 1 else "1.mcap, 3.mcap"
+        half, whole = LOAD * (np.arange(1250) >= 625), np.full(1250, LOAD)
+        runs = [recorded(1, half)]
+        if count == 4:
+            runs = [recorded(k, whole if k in (1, 3) else None) for k in range(4)]
         (cause,) = causes(runs)
         assert cause.fault.kind == "payload"
         assert cause.fault.part is not None and cause.fault.part.name == words
