@@ -22,7 +22,7 @@ NOTHING_OPEN: Final = (
 
 
 class Here(Workers):
-    """This process; `deadly` archives, by name, end it, or would if it were another."""
+    """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
 
     count = 1
 
@@ -44,7 +44,7 @@ class Here(Workers):
 def _refs(argument: Any) -> Iterator[ArchiveRef]:
     if isinstance(argument, ArchiveRef):
         yield argument
-    elif not isinstance(argument, Location):  # looking into an archive is harmless
+    elif not isinstance(argument, Location):
         for one in argument:
             yield from _refs(one)
 
@@ -59,7 +59,7 @@ def slow_number(k: int) -> int:
 
 
 def marked(path: str) -> None:
-    """Leaves a file behind that says it was begun."""
+    """Create a file when it begins."""
     Path(path).touch()
     time.sleep(0.1)
 

@@ -1,4 +1,4 @@
-"""Parts of a batch by themselves: cache, keys, workers, tables, and remote files."""
+"""Parts of a batch: cache, keys, workers, tables, and remote files."""
 
 from __future__ import annotations
 
@@ -77,19 +77,19 @@ def test_bundles_do_not_depend_on_the_order_of_archives(order: list[int]) -> Non
 
 class TestCache:
     @given(st.data())
-    def test_an_entry_with_one_wrong_bit_is_none(self, data: st.DataObject) -> None:
+    def test_entries_with_one_wrong_bit_are_ignored(self, data: st.DataObject) -> None:
         content = {"a": [1.5, "x"], "values": np.arange(7.0), "none": [np.zeros((0, 3))]}
-        whole = encoded(KEY, content)
-        found = decoded(whole, KEY)
+        intact = encoded(KEY, content)
+        found = decoded(intact, KEY)
         assert found["a"] == [1.5, "x"]
         assert found["values"].tobytes() == np.arange(7.0).tobytes()
         assert found["none"][0].shape == (0, 3)
-        bit = data.draw(st.integers(0, 8 * len(whole) - 1))
-        damaged = bytearray(whole)
+        bit = data.draw(st.integers(0, 8 * len(intact) - 1))
+        damaged = bytearray(intact)
         damaged[bit // 8] ^= 1 << bit % 8
         assert decoded(bytes(damaged), KEY) is None
-        assert decoded(whole[: data.draw(st.integers(0, len(whole) - 1))], KEY) is None
-        assert decoded(whole, KEY[::-1]) is None
+        assert decoded(intact[: data.draw(st.integers(0, len(intact) - 1))], KEY) is None
+        assert decoded(intact, KEY[::-1]) is None
 
     @pytest.mark.parametrize(
         "array",
@@ -99,13 +99,12 @@ class TestCache:
             *({"array": "f", "shape": [1], "at": -1}, {"array": ["a", "<f8"]}, {"array": "f"}),
         ],
     )
-    def test_a_forged_array_is_none(self, array: dict[str, object]) -> None:
-        """An untrusted file may carry a checksum that is right; numpy is given no type of it."""
+    def test_forged_arrays_with_valid_checksum_are_ignored(self, array: dict[str, object]) -> None:
         text = json.dumps({"key": KEY, "content": array}).encode()
         body = text + bytes(-len(text) % 8)
         assert decoded(_HEAD.pack(_MAGIC, len(text), crc32(body)) + body, KEY) is None
 
-    def test_two_writers_never_leave_half_an_entry(self, tmp_path: Path) -> None:
+    def test_entries_of_two_writers_are_intact(self, tmp_path: Path) -> None:
         store, contents = Store(tmp_path), [np.full(20_000, number) for number in (1.0, 2.0)]
         with ThreadPoolExecutor(2) as pool:
             writing = [
@@ -118,21 +117,21 @@ class TestCache:
         assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
 
     @pytest.mark.parametrize("forged", [[{"gram": 3}], [{"type": "PhaseFactor"}], [], {}, None])
-    def test_a_forged_sum_counts_as_absent(self, tmp_path: Path, forged: object) -> None:
+    def test_forged_sums_are_ignored(self, tmp_path: Path, forged: object) -> None:
         settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
         key = sum_key([a_ref(0)], settings_digest(settings))
         cache.store(a_ref(0).location).put(key, forged)
         assert cached_bundle([a_ref(0)], settings, cache) is None
 
     @given(st.integers(1, 6), st.booleans())
-    def test_a_square_matrix_is_restored_to_the_bit(self, size: int, symmetric: bool) -> None:
+    def test_square_matrices_are_restored_exactly(self, size: int, symmetric: bool) -> None:
         square = np.random.default_rng(size).normal(size=(3, size, size))
         square = square + square.swapaxes(1, 2) if symmetric else square
         data = encoded(KEY, [square])
         assert decoded(data, KEY)[0].tobytes() == square.tobytes()
         assert not symmetric or len(data) < 300 + 8 * 3 * size * (size + 1) / 2
 
-    def test_a_store_that_cannot_be_written_names_a_remedy(self, tmp_path: Path) -> None:
+    def test_unwritable_stores_are_refused_with_a_remedy(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
         with pytest.raises(CacheError, match="--cache"):
             Store(tmp_path / "file").put(KEY, {})
@@ -146,13 +145,10 @@ class TestCache:
         assert CacheLocation().store(here).folder == tmp_path / ".hil-cache"
         remote = CacheLocation(str(tmp_path)).store("s3://bucket/one/a.mcap")
         assert remote.folder.parent == tmp_path
-
-    def test_a_file_in_place_of_the_folder_is_left_alone(self, tmp_path: Path) -> None:
         (tmp_path / ".hil-cache").write_text("not a folder")
-        store = CacheLocation().store(str(tmp_path / "excitation_000_a1.mcap"))
-        assert tmp_path not in store.folder.parents
+        assert tmp_path not in CacheLocation().store(here).folder.parents
 
-    def test_settings_are_cached_to_the_last_bit(self, tmp_path: Path) -> None:
+    def test_settings_are_restored_exactly(self, tmp_path: Path) -> None:
         settings = Settings(
             Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
             friction={"presliding": 1e-4, "third": "none"},
@@ -182,36 +178,34 @@ def test_a_change_of_the_programs_changes_their_digest(
     assert code_digest.__wrapped__() != here
 
 
-# What things are known by
+# Digests
 
 
 def with_robot(cell: Cell, robot: RobotTable) -> Cell:
     return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
 
 
-def test_an_arm_is_its_links_friction_and_drives_and_not_its_payload_or_campaign() -> None:
+def test_digest_of_an_arm_ignores_payload_and_campaign() -> None:
     cell = Cell.load(CELL_PATH)
     own = arm_digest(cell, b"drives")
-    longer = cell.with_campaign(repetitions=7)
-    assert arm_digest(longer, b"drives") == own
-    payload = PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])
-    loaded = with_robot(cell, cell.file.robot.model_copy(update={"payload": payload}))
-    assert arm_digest(loaded, b"drives") == own
-    tilted = with_robot(cell, cell.file.robot.model_copy(update={"gravity": [0.0, 1.0, -9.8]}))
-    assert arm_digest(tilted, b"drives") != own
+    assert arm_digest(cell.with_campaign(repetitions=7), b"drives") == own
+
+    def changed(**robot: Any) -> str:
+        table = cell.file.robot.model_copy(update=robot)
+        return arm_digest(with_robot(cell, table), b"drives")
+
+    assert changed(payload=PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])) == own
+    assert changed(gravity=[0.0, 1.0, -9.8]) != own
     spring = TorsionSpringTable(kind="torsion_spring", joint="joint_2", rest_deg=0.0, stiffness=9.0)
-    sprung = with_robot(cell, cell.file.robot.model_copy(update={"elements": [spring]}))
-    assert arm_digest(sprung, b"drives") != own
+    assert changed(elements=[spring]) != own
     assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
     assert arm_digest(cell, b"other drives") != own
 
 
-def test_factors_are_known_by_everything_they_depend_on() -> None:
+def test_digest_of_settings_ignores_those_of_the_estimate() -> None:
     stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
-    for_the_estimate = replace(
-        stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),)
-    )
-    assert settings_digest(stated) == settings_digest(for_the_estimate)
+    estimate = replace(stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),))
+    assert settings_digest(stated) == settings_digest(estimate)
     others = [
         stated.preprocessed(velocity="measured"),
         stated.preprocessed(torque_delay=0.004),
@@ -227,12 +221,12 @@ def test_factors_are_known_by_everything_they_depend_on() -> None:
     assert sum_key([a_ref(0), a_ref(1)], digest) != sum_key([a_ref(1), a_ref(0)], digest)
 
 
-# Who does the work
+# Workers
 
 
 @pytest.mark.slow
-def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
-    """The child knows functions by their module, so these are ready-made ones."""
+def test_tasks_that_kill_or_hang_their_process_do_not_affect_others() -> None:
+    """The functions are importable in the child."""
     fine = ArchiveTask("fine.mcap", abs, (-2.0,))
     dead = ArchiveTask("dead.mcap", os._exit, (3,))
     slow = ArchiveTask("slow.mcap", time.sleep, (60.0,))
@@ -248,10 +242,10 @@ def test_a_task_that_kills_or_hangs_its_process_costs_itself() -> None:
     assert "ValueError" in broken["wrong.mcap"]
 
 
-# Tables, as other programs read them
+# Tables
 
 DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
-ODD_NAME = 'line "3", spring/\udcff.mcap'
+FILE_NAME = 'line "3", spring/\udcff.mcap'
 
 
 @cache
@@ -262,7 +256,7 @@ def result() -> BatchResult:
     repetition = replace(
         one,
         level="repetition",
-        archive=ODD_NAME,
+        archive=FILE_NAME,
         sha256="ab" * 32,
         covariance=None,
         std=undetermined,
@@ -277,7 +271,7 @@ def result() -> BatchResult:
         repetitions=(repetition,),
         campaigns=(one, other),
         pooled=(replace(pooled, unseen_torque_rms=one.torque_rms),),
-        broken=(Unused("a/torn.mcap", "its footer is missing"),),
+        broken=(Unused("a/truncated.mcap", "its footer is missing"),),
         skipped=(Unused("a/slow.mcap", "holds a validation run"),),
         read=1,
         cached=0,
@@ -304,7 +298,6 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 class TestCsv:
     def test_has_a_row_per_estimate_and_parameter(self, folder: Path) -> None:
-        """Numbers to the bit, with their intervals and where they come from."""
         rows = rows_of(folder / "parameters.csv")
         columns = [
             (level.level, level.campaign, name, value, std)
@@ -346,13 +339,13 @@ class TestCsv:
         assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
         assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
         assert [tuple(row.values()) for row in rows_of(folder / "not_used.csv")] == [
-            ("a/torn.mcap", "broken", "its footer is missing"),
+            ("a/truncated.mcap", "broken", "its footer is missing"),
             ("a/slow.mcap", "skipped", "holds a validation run"),
         ]
 
 
 def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
-    """And covariances and times, which CSV has not or as text."""
+    """Also covariances, and times as such."""
     parquet = pytest.importorskip("pyarrow.parquet")
     for one in TABLES:
         read: Any = parquet.read_table(folder / f"{one.name}.parquet")
@@ -373,17 +366,12 @@ def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
 
 
 def same(text: str, value: object) -> bool:
-    match value:
-        case None:
-            return text == ""
-        case bool():
-            return text == str(value).lower()
-        case float():
-            return float(text) == value or (math.isnan(float(text)) and math.isnan(value))
-        case datetime():
-            return datetime.fromisoformat(text) == value
-        case _:
-            return text == str(value)
+    if isinstance(value, float):
+        return float(text) == value or (math.isnan(float(text)) and math.isnan(value))
+    if isinstance(value, datetime):
+        return datetime.fromisoformat(text) == value
+    expected = "" if value is None else str(value)
+    return text == (expected.lower() if isinstance(value, bool) else expected)
 
 
 def test_rows_are_written_in_portions(
@@ -394,8 +382,8 @@ def test_rows_are_written_in_portions(
     write_tables(tmp_path, result())
     path = "parameters.parquet"
     assert parquet.ParquetFile(tmp_path / path).num_row_groups > 1
-    portions, whole = (parquet.read_table(at / path).to_pylist() for at in (tmp_path, folder))
-    assert repr(portions) == repr(whole)
+    portions, expected = (parquet.read_table(at / path).to_pylist() for at in (tmp_path, folder))
+    assert repr(portions) == repr(expected)
 
 
 def test_without_pyarrow_there_is_csv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -404,14 +392,11 @@ def test_without_pyarrow_there_is_csv(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [path.name for path in written] == [f"{one.name}.csv" for one in TABLES]
 
 
-def test_a_table_that_cannot_be_finished_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tables_are_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_tables(tmp_path, result())
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    bad = replace(result(), arms={})
     with pytest.raises(KeyError):
-        write_tables(tmp_path, bad)
+        write_tables(tmp_path, replace(result(), arms={}))
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
@@ -423,7 +408,7 @@ def test_every_column_is_documented_and_no_other() -> None:
         assert re.findall(r"`(\w+)`", " ".join(rows)) == list(one.kinds)
 
 
-# Archives behind an address
+# Remote archives
 
 CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
 ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
@@ -440,7 +425,7 @@ def root(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     return address
 
 
-def test_archives_below_an_address_are_found_in_order_and_fetched(root: str) -> None:
+def test_remote_archives_are_found_in_order_and_fetched(root: str) -> None:
     found = archives_below(root)
     assert archives_below(f"{root}/{ARCHIVES[0]}") == found[:1]
     for (url, _), name in zip(found, ARCHIVES, strict=True):
@@ -451,7 +436,7 @@ def test_archives_below_an_address_are_found_in_order_and_fetched(root: str) -> 
         assert not path.parent.exists()
 
 
-def test_a_version_is_that_of_the_content_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_version_of_remote_archives(monkeypatch: pytest.MonkeyPatch) -> None:
     store, address = fsspec.filesystem("memory"), "memory://store/a.mcap"
     store.pipe(address, b"one")
     assert archives_below(address)[0][1] == ""
@@ -467,14 +452,14 @@ def test_a_version_is_that_of_the_content_or_none(monkeypatch: pytest.MonkeyPatc
         ("nosuch://store/x.mcap", "Protocol not known: nosuch"),
     ],
 )
-def test_what_cannot_be_read_is_one_sentence_with_the_address(address: str, message: str) -> None:
+def test_unreadable_addresses_are_named(address: str, message: str) -> None:
     with pytest.raises(InputError, match=f"{address}.*{message}"):
         archives_below(address)
     with pytest.raises(InputError, match=f"{address}.*{message}"), local_file(address):
         pass
 
 
-def test_without_fsspec_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_fsspec_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         archives_below("memory://store")

@@ -29,14 +29,14 @@ def records(count: int = 400, first: int = 777_000_000) -> NDArray[np.void]:
 
 
 def archive(path: Path, rows: NDArray[np.void], *, torque: bool = True, lost: int = 0) -> Path:
-    """An archive of these cycles; the answer to cycle `lost` was not taken."""
+    """Write an archive of these cycles; the reply to cycle `lost` was not accepted."""
     metadata = {"campaign": "c9", "simulated": "yes", "seed": "4"}
     with ArchiveWriter(
         path, joint_names=JOINTS, period=0.002, metadata=metadata, durable=False
     ) as writer:
         writer.write(rows, 50.0 * rows["target_current"] if torque else None)
         if lost:
-            writer.event(lost, "AnswersLost", "1 answer was not taken", data={"count": 1})
+            writer.event(lost, "AnswersLost", "1 reply was not accepted", data={"count": 1})
         writer.close("completed", reason="")
     return path
 
@@ -81,16 +81,16 @@ def test_truncated_archive_gives_its_intact_part(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records())
     path.write_bytes(path.read_bytes()[:-9000])
     recording = open_recording(path)
-    kept = recording.n_samples
-    assert 0 < kept < 400
-    assert kept % 50 == 0  # 100 ms of 2 ms cycles
-    assert np.array_equal(recording.position, records()["position"][:kept])
-    assert f"{kept} samples" in recording.provenance["missing"]
+    count = recording.n_samples
+    assert 0 < count < 400
+    assert count % 50 == 0  # 100 ms of 2 ms cycles
+    assert np.array_equal(recording.position, records()["position"][:count])
+    assert f"{count} samples" in recording.provenance["missing"]
     assert "outcome" not in recording.provenance
 
 
 def test_restarted_cycles_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody knows how two sessions lie in time: the first counts, and the rest is missing."""
+    """The time between two sessions is unknown: only the first is read."""
     monkeypatch.setattr(ArchiveWriter, "_check_growth", lambda *_: None)  # as earlier versions
     rows = np.concatenate([records(100), records(100, first=0)])
     recording = open_recording(archive(tmp_path / NAME, rows))
@@ -109,14 +109,14 @@ def test_imported_stamps_are_converted_to_seconds(tmp_path: Path) -> None:
 
 def test_part_of_the_time_equals_that_part_of_the_recording(tmp_path: Path) -> None:
     path = archive(tmp_path / NAME, records(first=1000))
-    whole = open_recording(path)
+    full = open_recording(path)
     part = open_recording(path, start=2.1, stop=2.3)  # s; the first cycle is at 2 s
-    assert np.array_equal(part.position, whole.position[50:150])
-    assert np.array_equal(part.torque, whole.torque[50:150])
+    assert np.array_equal(part.position, full.position[50:150])
+    assert np.array_equal(part.torque, full.torque[50:150])
     assert part.time == pytest.approx(0.002 * np.arange(100))
     assert part.provenance["part"] == "2.1 s to 2.3 s"
-    assert np.array_equal(open_recording(path, start=2.7).position, whole.position[350:])
-    assert np.array_equal(open_recording(path, stop=2.01).position, whole.position[:5])
+    assert np.array_equal(open_recording(path, start=2.7).position, full.position[350:])
+    assert np.array_equal(open_recording(path, stop=2.01).position, full.position[:5])
     with pytest.raises(ArchiveError, match="has no sample from 90 s to its end"):
         open_recording(path, start=90.0)
     with pytest.raises(ArchiveError, match="has no sample; record it again"):
