@@ -24,8 +24,8 @@ from .wire import Array, Gears
 
 LAW: Final = "rest"
 _STANDSTILL: Final = 5e-4  # motor revolutions per cycle (`drivers.guard`)
-_SWING: Final = 3.0
-"""Largest speed relative to standstill after the controller stopped the arm abruptly."""
+_SWING: Final = 0.1
+"""Largest speed left of the last motion's after the controller stopped the arm abruptly."""
 
 
 def rest(observed: Observed) -> Iterator[Broken]:
@@ -43,7 +43,11 @@ def rest(observed: Observed) -> Iterator[Broken]:
         if _ends_at_rest(life) and life.exchanged:
             at = min(life.last_cycle, len(arm.open_axes) - 1)
             speed = np.abs(arm.velocity[at])
-            rests = observed.cell.model.friction.standstill * (_SWING if _held_up(life) else 1.0)
+            rests = observed.cell.model.friction.standstill
+            if _held_up(life):
+                last = life.records[life.records["interval"] == life.records["interval"].max()]
+                moved = np.abs(arm.velocity[last["cycle"]]).max()
+                rests = np.maximum(rests, _SWING * moved)
             if not disturbed and (speed > rests).any():
                 yield Broken(LAW, f"life {number} ends on a moving arm: {speed.max():.2g} rad/s")
             # A controller that lost its drive closes the axes some cycles later, by itself. Axes
