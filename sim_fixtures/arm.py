@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, pi
+from math import pi
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.errors import SettingError
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
 from sim_fixtures.servo import CurrentLoop
 from sim_fixtures.settings import ControllerSettings
@@ -102,11 +101,6 @@ class UnmodelledEffects:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elasticity", tuple(float(c) for c in self.elasticity))
-        sizes = (self.torque_ripple, self.friction_drift, self.delay, *self.elasticity)
-        if not all(isfinite(size) and size >= 0.0 for size in sizes):
-            raise SettingError("effects", sizes, "finite and not negative")
-        if self.friction_drift >= 1.0:
-            raise SettingError("friction_drift", self.friction_drift, "below 1")
 
     @classmethod
     def default_sizes(cls, n_joints: int) -> UnmodelledEffects:

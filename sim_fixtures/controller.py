@@ -49,7 +49,7 @@ from sim_fixtures.faults import ControllerFault
 from sim_fixtures.plant import PlantTruth, standard_parameters
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import NominalModel, Servo
-from sim_fixtures.settings import AXES_PER_ARM, MAX_SLOTS, ControllerSettings
+from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
 
 _PC_TARGETS = (1, 4, 5)
 _FOREIGN = {
@@ -66,21 +66,13 @@ class Layout:
 
     `tail` are random bytes that fill long packets; `axes` (n_slots,) the axis blocks of the next
     packet; `slots` (and `own`, as an array) the slot of each axis of this arm.
-
-    Raises:
-        SettingError: more axes than slots in a packet, or slots that are not distinct or out of
-            range.
     """
 
     def __init__(
         self, n_axes: int, settings: ControllerSettings, tail: np.random.Generator
     ) -> None:
         self.n_slots = n = n_axes + settings.foreign_axes
-        if n > MAX_SLOTS:
-            raise SettingError("foreign_axes", settings.foreign_axes, f"{MAX_SLOTS} axes in all")
         slots = settings.slots if settings.slots is not None else tuple(range(n_axes))
-        if len(slots) != n_axes or len(set(slots)) != n_axes or not set(slots) <= set(range(n)):
-            raise SettingError("slots", slots, f"{n_axes} different slots of 0..{n - 1}")
         self.slots = tuple(slots)
         self.own = np.array(slots, np.intp)
         self._foreign = np.array([s for s in range(n) if s not in slots], np.intp)
@@ -97,12 +89,6 @@ class Layout:
         self.axes["d"][self._foreign, 0] = self.axes["d"][self._foreign, 2] = places
         arms = {settings.arm - 1, *self._foreign_arm}
         self._on = bytes(DRIVE_ON if arm in arms else 0 for arm in range(N_ARMS))
-
-    @property
-    def foreign_targets(self) -> list[float]:
-        """Targets of the axes of other arms [motor rev]."""
-        targets: list[float] = self.axes["d"][self._foreign, 0].tolist()
-        return targets
 
     def fill(self, values: NDArray[np.float64]) -> None:
         """Set D1..D5, extra1..3 of this arm's axes, (8, n_axes); infinite beyond float32."""
@@ -201,7 +187,7 @@ class OwnMotion:
         repeats: move back through the list and forth again until `end`.
 
     Raises:
-        SettingError: a posture of another size, or a speed that is not finite and positive.
+        SettingError: a speed that is not finite and positive.
     """
 
     def __init__(
@@ -216,16 +202,12 @@ class OwnMotion:
         self._speed: Array = np.array(speed, dtype=np.float64)
         if not (np.isfinite(self._speed).all() and (self._speed > 0.0).all()):
             raise SettingError("own_motion", self._speed.tolist(), "velocity limits in the URDF")
-        n = self._speed.size
-        for posture in postures:
-            if len(posture) != n:
-                raise SettingError("own_motion", tuple(posture), f"{n} joint angles")
         self._postures = [np.array(posture, dtype=np.float64) for posture in postures]
         self._period = period
         self._repeats = repeats
         self._dwell_cycles = max(1, round(dwell / period))
         self._ending = False
-        self.begin(np.zeros(n))
+        self.begin(np.zeros_like(self._speed))
 
     def begin(self, position: ArrayLike) -> None:
         """Start from a position, (n,) [rad]."""
@@ -577,11 +559,6 @@ class SimulatedController:
         if kind == "slip":
             size *= self._drive.following_error[axis - 1]
         self._arm.disturbances.begin(kind, axis - 1, size, cycles)
-
-    @property
-    def foreign_targets(self) -> list[float]:
-        """Targets of the axes of other arms [motor rev]."""
-        return self._layout.foreign_targets
 
     def next_packet(self) -> bytes | None:
         """Return the packet of the cycle that begins; None after the end of the session.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from math import inf, isfinite
+from dataclasses import dataclass
 from typing import Final, Literal
 
 from sim_fixtures.errors import SettingError
@@ -15,19 +14,6 @@ OPEN_MODES: Final = (1, 2, 4, 5, 7, 8, 9)
 CORRECTED_MODES: Final = (2, 7, 8, 9)
 """Open modes in which the controller generates the targets and the PC corrects them."""
 AXES_PER_ARM: Final = 10
-ARMS: Final = 4
-MAX_SLOTS: Final = 20
-
-
-def _require(
-    owner: object, name: str, lower: float, upper: float = inf, *, exclusive: bool = False
-) -> None:
-    """Check that a number is finite and within bounds; SettingError if not."""
-    value = getattr(owner, name)
-    above = value > lower if exclusive else value >= lower
-    if not (isfinite(value) and above and value <= upper):
-        relation = "greater than" if exclusive else "at least"
-        raise SettingError(name, value, f"a finite number {relation} {lower:g}")
 
 
 @dataclass(frozen=True)
@@ -41,15 +27,6 @@ class ServoSettings:
     current_lag: float = 0.0003  # time constant of the current loop, s
     model_error: tuple[float, float] = (0.05, 0.10)  # relative, of the built-in dynamic model
     deadband_counts: float = 3.0  # error in encoder counts that a resting axis does not integrate
-
-    def __post_init__(self) -> None:
-        for name in ("position_gain", "velocity_bandwidth", "rotor_bandwidth"):
-            _require(self, name, 0.0, exclusive=True)
-        for name in ("integral_rate", "current_lag", "deadband_counts"):
-            _require(self, name, 0.0)
-        low, high = self.model_error
-        if not 0.0 <= low <= high < 1.0:
-            raise SettingError("model_error", self.model_error, "0 <= low <= high < 1")
 
 
 @dataclass(frozen=True)
@@ -99,45 +76,9 @@ class ControllerSettings:
     version: tuple[int, int, int] = (3, 20, 305)  # major, minor, build in the init packet
 
     def __post_init__(self) -> None:
-        milliseconds = self.period * 1000.0
-        if not (milliseconds >= 0.999 and abs(milliseconds - round(milliseconds)) < 1e-9):
-            raise SettingError("period", self.period, "a whole number of milliseconds, in seconds")
-        for name in (
-            "current_noise",
-            "current_resolution",
-            "encoder_noise",
-            "opening_stagger",
-            "closing_stagger",
-            "boot_time",
-            "reopening_time",
-            "foreign_axes",
-        ):
-            _require(self, name, 0.0)
-        for field in fields(self):
-            if field.name.endswith("_cycles") or field.name in (
-                "substeps",
-                "missed_replies",
-                "silence_limit",
-            ):
-                _require(self, field.name, 1.0)
-        if self.lost_openings is not None:
-            _require(self, "lost_openings", 1.0)
-        if self.only_axis is not None:
-            _require(self, "only_axis", 1.0)
-        _require(self, "ramp_time", 0.0, exclusive=True)
-        _require(self, "own_speed", 0.0, 1.0, exclusive=True)
-        self._check_choices()
-
-    def _check_choices(self) -> None:
         if self.open_mode not in OPEN_MODES:
             modes = ", ".join(map(str, OPEN_MODES))
             raise SettingError("open_mode", self.open_mode, f"one of {modes}")
-        if self.while_silent not in WHILE_SILENT:
-            raise SettingError("while_silent", self.while_silent, f"one of {WHILE_SILENT}")
-        if not 1 <= self.arm <= ARMS:
-            raise SettingError("arm", self.arm, f"1..{ARMS}")
-        if not all(isfinite(angle) for posture in self.own_motion for angle in posture):
-            raise SettingError("own_motion", self.own_motion, "finite joint angles")
 
     @property
     def corrected(self) -> bool:

@@ -118,8 +118,7 @@ class Table2Row:
     """One row of Table 2, SI units; the unit of rows f1 is not stated in print."""
 
     id: int  # 1 ... 58 as printed
-    printed_symbol: str
-    parameter: str  # its interpretation; rows 41 ... 52 are interleaved in print
+    parameter: str  # interpretation of the printed symbol; rows 41 ... 52 are interleaved in print
     pivot: str  # standard parameter whose regressor column is that of this row ("" for friction)
     sign: int  # +1 or -1, the factor of that column
     terms: Mapping[str, float]  # grouped standard parameters with their factors, pivot included
@@ -176,7 +175,6 @@ def table2() -> tuple[Table2Row, ...]:
             rows.append(
                 Table2Row(
                     id=row_id,
-                    printed_symbol=record["printed_symbol"],
                     parameter=record["parameter"],
                     pivot=pivot,
                     sign=int(terms.get(pivot, 1.0)),

@@ -143,7 +143,6 @@ def test_a_folded_arm_collides(collisions: Collisions) -> None:
     assert collisions.smallest_distance(dh([0.0, 0.0, -165.0, 0.0, 0.0, 0.0])) <= 0.0
 
 
-FACTOR_PRECISION = 0.001  # and cuts factors off after three
 TENSOR_ORDER = ("xx", "xy", "yy", "xz", "yz", "zz")  # of pinocchio's parameter vector
 
 
@@ -191,22 +190,6 @@ def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> Non
     np.testing.assert_allclose(np.radians(truth.viscous), per_degree, rtol=1e-14)
     # Coulomb friction falls with the size of the axis, which is how the interleaving shows
     assert truth.coulomb[0] > truth.coulomb[2] > truth.coulomb[3] > truth.coulomb[5]
-
-
-@pytest.mark.parametrize("row_id", range(23, 41))
-def test_the_print_names_the_same_terms_rounded(row_id: int) -> None:
-    row = ns16.TABLE2[row_id - 1]
-    printed: dict[str, float] = {}
-    factor, sign = 1.0, 1.0
-    for word in row.printed_symbol.split():
-        if word in "+-":
-            sign, factor = (1.0 if word == "+" else -1.0), 1.0
-        elif word[0].isdigit():
-            factor = float(word)
-        else:
-            printed[word] = sign * factor
-            sign, factor = 1.0, 1.0
-    assert printed == pytest.approx(dict(row.terms), abs=FACTOR_PRECISION)
 
 
 def test_forty_columns_are_independent_and_no_more(model: pin.Model) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from hil.progress import reporter
 from tests.arguments import at_least_one, parser_of, whole_number
-from tests.simulate.many import Known, played, stage_folder
+from tests.simulate.many import played, stage_folder
 from tests.simulate.script import GRAMMAR
 from tests.simulate.verdicts import Stage, Verdict, judged, runs_of, summary
 from tests.simulate.world import UndisturbedError
@@ -102,14 +102,13 @@ def _one(options: argparse.Namespace) -> int:
 
 
 def _many(options: argparse.Namespace) -> int:
-    known = Known(options.journal)
     seeds = range(options.start, options.start + options.seeds)
     verdicts: list[Verdict] = []
-    failed = 0
+    failed, shrink = 0, not options.no_shrink
     with redirect_stdout(sys.stderr if options.json else sys.stdout):
         progress = reporter()
         with progress.task("simulating seeds", len(seeds)) as task:
-            for verdict in played(seeds, known, options.jobs, shrink=not options.no_shrink):
+            for verdict in played(seeds, options.journal, options.jobs, shrink=shrink):
                 verdicts.append(verdict)
                 failed += bool(verdict.broken)
                 task.advance(1, f"{failed} failed")

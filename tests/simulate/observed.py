@@ -147,4 +147,5 @@ class Broken(NamedTuple):
     text: str  # with the values
 
 
-Law = Callable[[Observed], Iterable[Broken]]
+Law = Callable[[Observed], Iterable[str]]
+"""Yields a text for each violation."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from tests.simulate import world
 from tests.simulate.__main__ import main
-from tests.simulate.many import Known, stage_folder
+from tests.simulate.many import recorded, stage_folder
 from tests.simulate.scenes import NEIGHBOURS, scene_of
 from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script, simpler
 from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
@@ -80,16 +81,9 @@ def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
 
 class TestJournal:
     def test_verdicts_are_restored_before_an_incomplete_line(self, tmp_path: Path) -> None:
-        path = tmp_path / "seeds.jsonl"
-        known = Known(path)
-        for seed in (3, 4):
-            known.add(verdict(seed, ("guard", "too fast")))
-        with path.open("ab") as file:
-            file.write(b'{"seed": 5, "scr')
-        restored = Known(path)
-        assert restored.verdicts == {k: verdict(k, ("guard", "too fast")) for k in (3, 4)}
-        restored.add(verdict(5))
-        assert set(Known(path).verdicts) == {3, 4, 5}
+        path, found = tmp_path / "seeds.jsonl", verdict(3, ("guard", "too fast"))
+        path.write_text(json.dumps(asdict(found)) + '\n{"seed": 5, "scr')
+        assert recorded(path) == {3: found}
 
     def test_a_summary_counts_kinds_ends_and_failures(self) -> None:
         found = summary([verdict(1), verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c"))])

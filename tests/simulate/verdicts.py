@@ -26,7 +26,7 @@ _HEADER, _AXIS, _INIT = 12, 36, 1200  # bytes
 _DRIVE_ON: Final = 5
 
 
-def gaps(seen: Observed) -> Iterator[Broken]:
+def gaps(seen: Observed) -> Iterator[str]:
     """A motion with more consecutive missed packets than allowed does not complete.
 
     `docs/safety.md`: it is stopped on its path, refused or lost.
@@ -38,7 +38,7 @@ def gaps(seen: Observed) -> Iterator[Broken]:
             outcome = _outcome_of_motion(life, first, second)
             if most < missed < _NUMBERS // 2 and outcome == "completed":
                 text = f"run {number}: {missed} packets missed before packet {_number(second)}"
-                yield Broken("gaps", f"{text}, {most} are allowed, and the motion completed")
+                yield f"{text}, {most} are allowed, and the motion completed"
 
 
 def _outcome_of_motion(life: Life, first: Exchanged, second: Exchanged) -> str | None:
@@ -55,7 +55,7 @@ def _outcome_of_motion(life: Life, first: Exchanged, second: Exchanged) -> str |
     return next((end.outcome for end in same if end.cycle >= int(after["cycle"])), None)
 
 
-def piles(seen: Observed) -> Iterator[Broken]:
+def piles(seen: Observed) -> Iterator[str]:
     """Of packets of one kind that waited together in open mode, one is answered.
 
     Answers to the others would run the motion ahead of the arm (ARCHITECTURE.md).
@@ -69,7 +69,7 @@ def piles(seen: Observed) -> Iterator[Broken]:
             opens = len(second.packet) < _INIT and _opens(second.packet[:end], mode)
             if together and opens and _kind(first, end) == _kind(second, end):
                 text = f"run {number}: packets {_number(first)} and {_number(second)}"
-                yield Broken("piles", f"{text} waited together; both were answered in open mode")
+                yield f"{text} waited together; both were answered in open mode"
 
 
 def _number(one: Exchanged) -> int:
@@ -94,18 +94,18 @@ def _opens(packet: bytes, mode: int) -> bool:
 _NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
 
 
-def completion(seen: Observed) -> Iterator[Broken]:
+def completion(seen: Observed) -> Iterator[str]:
     """Without further faults the campaign completes and is identified.
 
     If the arm was disturbed, its repetitions may differ, and the run may request an inspection.
     """
     if seen.complete:
         if seen.found is None:
-            yield Broken("completion", f"complete, and not identified: {seen.unidentified}")
+            yield f"complete, and not identified: {seen.unidentified}"
         return
     disturbed = any(kind_of(line) in {*DISTURBS_THE_ARM, "corrupt"} for line in seen.struck)
     if not (disturbed and type(seen.runs[-1].error).__name__ in _NEEDS_OPERATOR):
-        yield Broken("completion", f"after {len(seen.runs)} runs it ended {seen.ended}")
+        yield f"after {len(seen.runs)} runs it ended {seen.ended}"
 
 
 LAWS: Final[dict[str, Law]] = {"completion": completion, "gaps": gaps, "piles": piles, **OTHERS}
@@ -116,7 +116,7 @@ def judged(seen: Observed) -> list[Broken]:
     found: list[Broken] = []
     for name, law in LAWS.items():
         try:
-            found += law(seen)
+            found.extend(Broken(name, text) for text in law(seen))
         except Exception as error:
             found.append(Broken(f"{name} (exception)", f"{type(error).__name__}: {error}"))
     return found
@@ -203,12 +203,12 @@ class Verdict:
     """Result of one seed."""
 
     seed: int
-    scene: str  # description of arm and plan
-    script: tuple[str, ...]
-    struck: tuple[str, ...]  # kinds of the lines that occurred
-    met: tuple[str, ...]  # situations that occurred
-    runs: tuple[str, ...]  # "complete", "incomplete" or the name of an error
-    cycles: int  # of the controller
+    scene: str = ""  # description of arm and plan
+    script: tuple[str, ...] = ()
+    struck: tuple[str, ...] = ()  # kinds of the lines that occurred
+    met: tuple[str, ...] = ()  # situations that occurred
+    runs: tuple[str, ...] = ()  # "complete", "incomplete" or the name of an error
+    cycles: int = 0  # of the controller
     broken: tuple[tuple[str, str], ...] = ()  # (law, text)
     shrunk: tuple[str, ...] = ()  # reduced script that breaks the first of these laws
     redrawn: int = 0  # rejected scenes of the group
@@ -262,7 +262,7 @@ class Stage:
         try:
             seen = self.observed(seed)
         except UndisturbedError as error:
-            return Verdict(seed, "", (), (), (), (), 0, (("undisturbed", str(error)),))
+            return Verdict(seed, broken=(("undisturbed", str(error)),))
         broken = judged(seen)
 
         def fails(lines: tuple[str, ...]) -> bool:

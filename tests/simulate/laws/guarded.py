@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import AnswersLost, MotionEnded
-from tests.simulate.observed import Broken, Observed
+from tests.simulate.observed import Observed
 
 from .conversation import talks_of
 from .open_mode import Stretch, stretches
 from .wire import Array, Flags, Gears
 
-LAW: Final = "guard"
 _TOLERANCE: Final = 1e-6
 """Relative tolerance of limits (`docs/interpolator.md`, `drivers.guard`)."""
 _EPS: Final = float(np.finfo(np.float64).eps)
@@ -45,7 +44,7 @@ _RETURN: Final = 0.03  # longest return [s]
 _ORDERS: Final = ("velocity", "acceleration", "jerk")
 
 
-def guard(observed: Observed) -> Iterator[Broken]:
+def guard(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
     gears = Gears.of(observed.cell.drive_table)
     limits = _Limits.of(observed.cell)
@@ -54,7 +53,7 @@ def guard(observed: Observed) -> Iterator[Broken]:
         for stretch in (part for whole in stretches(talk) for part in _parts(whole)):
             for text in _in_stretch(stretch, limits, gears, observed.cell.period):
                 at = stretch.at
-                yield Broken(LAW, f"life {life}, packets {at[0]} to {at[-1]}: {text}")
+                yield f"life {life}, packets {at[0]} to {at[-1]}: {text}"
 
 
 def _parts(stretch: Stretch) -> Iterator[Stretch]:

@@ -13,22 +13,21 @@ import numpy as np
 
 from drivers.events import MotionEnded
 from tests.drivers.judge import Conduct
-from tests.simulate.observed import Broken, Observed
+from tests.simulate.observed import Observed
 
 from .conversation import Talk, heard
 
-LAW: Final = "judge"
 EVERY: Final = 64
 """Every so many seeds one is checked."""
 
 
-def judge(observed: Observed) -> Iterator[Broken]:
+def judge(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
     if observed.seed % EVERY == 0:
         yield from judge_whole(observed)
 
 
-def judge_whole(observed: Observed) -> Iterator[Broken]:
+def judge_whole(observed: Observed) -> Iterator[str]:
     """Every packet of every life."""
     for number, one in enumerate(heard(observed), 1):
         entitled = False
@@ -41,7 +40,7 @@ def judge_whole(observed: Observed) -> Iterator[Broken]:
                     at = index
             except AssertionError as error:
                 text = str(error).partition("\n")[0]
-                yield Broken(LAW, f"life {number}, after packet {at}: {text}")
+                yield f"life {number}, after packet {at}: {text}"
                 break
             entitled = conduct.entitled
 

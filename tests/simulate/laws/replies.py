@@ -14,24 +14,23 @@ import numpy as np
 
 from tests.drivers import oracle
 from tests.drivers.oracle import LAST, number_of
-from tests.simulate.observed import Broken, Life, Observed
+from tests.simulate.observed import Life, Observed
 
 from .conversation import Heard, Talk, heard
 from .open_mode import Modes, modes_of
 from .wire import D1, D2, MODE, Flags, next_number
 
-LAW: Final = "replies"
 Mistake = tuple[Flags | np.bool_, str]
 """Rows with a mistake, (m,), and its text."""
 _MOST_NAMED: Final = 3
 """Packets named for one kind of mistake; the others are counted."""
 
 
-def replies(observed: Observed) -> Iterator[Broken]:
+def replies(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
     for number, (life, one) in enumerate(zip(observed.runs, heard(observed), strict=True), 1):
         for text in _of_life(life, one):
-            yield Broken(LAW, f"life {number}: {text}")
+            yield f"life {number}: {text}"
 
 
 def _of_life(life: Life, one: Heard) -> Iterator[str]:

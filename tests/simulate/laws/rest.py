@@ -17,26 +17,25 @@ from drivers.states import State
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerFault, HilError
 from sim_fixtures.program import Phase
-from tests.simulate.observed import Broken, Life, Observed
+from tests.simulate.observed import Life, Observed
 from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
 from .wire import Array, Gears
 
-LAW: Final = "rest"
 _STANDSTILL: Final = 5e-4  # motor revolutions per cycle (`drivers.guard`)
 _SWING: Final = 0.1
 """Largest speed left of the last motion's after the controller stopped the arm abruptly."""
 
 
-def rest(observed: Observed) -> Iterator[Broken]:
+def rest(observed: Observed) -> Iterator[str]:
     """Check the law of this module."""
     arm, period = observed.arm, observed.cell.period
     gears = Gears.of(observed.cell.drive_table)
     if arm.open_axes[-1:].any():
-        yield Broken(LAW, f"axes are open at the end, phase {arm.phase[-1]}")
+        yield f"axes are open at the end, phase {arm.phase[-1]}"
     fastest = _speed(arm.velocity[-1:], gears, period)
     if fastest > _STANDSTILL:
-        yield Broken(LAW, f"the arm moves at the end, by {fastest:.2g} motor revolutions a cycle")
+        yield f"the arm moves at the end, by {fastest:.2g} motor revolutions a cycle"
     # A disturbed arm may still approach its set-points.
     disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
     for number, life in enumerate(observed.runs, 1):
@@ -49,15 +48,15 @@ def rest(observed: Observed) -> Iterator[Broken]:
                 moved = np.abs(arm.velocity[last["cycle"]]).max()
                 rests = np.maximum(rests, _SWING * moved)
             if not disturbed and (speed > rests).any():
-                yield Broken(LAW, f"life {number} ends on a moving arm: {speed.max():.2g} rad/s")
+                yield f"life {number} ends on a moving arm: {speed.max():.2g} rad/s"
             # A controller that lost its drive closes the axes some cycles later, by itself. Axes
             # that open after the run's last packet are closed when the link is closed.
             excused = arm.phase[at] == Phase.TRIPPED.name or not arm.open_axes[at - 1]
             if arm.open_axes[at] and not excused:
-                yield Broken(LAW, f"life {number} ends with open axes, phase {arm.phase[at]}")
+                yield f"life {number} ends with open axes, phase {arm.phase[at]}"
         for interval, held, wanted in _held_too_short(life):
             text = f"interval {interval} is left {held} cycles after it moved, not {wanted}"
-            yield Broken(LAW, f"life {number}: {text}")
+            yield f"life {number}: {text}"
 
 
 def _speed(velocity: Array, gears: Gears, period: float) -> float:
