@@ -74,8 +74,10 @@ def _in_children(
         for seed, found in stream_in_children(
             children, play_all, groups, lambda group: (group, root, shrink)
         ):
-            died = not isinstance(found, Verdict)
-            yield Verdict(seed, broken=((DIED, str(found)),)) if died else found
+            if isinstance(found, Verdict):
+                yield found
+            else:
+                yield Verdict(seed, broken=((DIED, str(found)),))
 
 
 @cache
