@@ -6,9 +6,9 @@ import os
 import re
 import time
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from stat import S_ISREG
 from typing import Any, Final, NamedTuple
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
@@ -19,12 +19,12 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import digest, json_digest
 from hil.identify.settings import stated_delay
-from hil.progress import Reporter, Silent
+from hil.progress import Reporter
 
 from .cache import BESIDE, CacheLocation, arm_digest, code_digest
-from .factors import cell_in, digest_of, require_complete, stamp_of
+from .factors import cell_in, changed_error, digest_of, require_complete, stamp_of
 from .remote import archives_below, is_url, local_file
-from .types import ArchiveRef, ChangedError, Stamp, Unused
+from .types import ArchiveRef, Unused
 from .workers import ArchiveTask, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
@@ -37,6 +37,10 @@ _LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.weighing`
 _FOR_VIEWERS: Final = "/annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
+_NOT_LISTED: Final = (
+    "is not listed in its campaign's manifest.json: its quality was not checked (the run was"
+    " killed; the next run adds it)"
+)
 _UNTOUCHED: Final = 2_000_000_000
 """Age of time stamps [ns] from which on they show the next change; some have steps of 2 s."""
 
@@ -45,16 +49,12 @@ class Discovery(NamedTuple):
     """Result of a search."""
 
     refs: tuple[ArchiveRef, ...]  #: archives to use, in the order of sums
-    #: files that cannot be used and folders that cannot be read, by path
-    broken: tuple[Unused, ...]
-    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting, by path
+    broken: tuple[Unused, ...]  #: files that cannot be used and folders that cannot be read
+    skipped: tuple[Unused, ...]  #: archives that are not intended for fitting
 
 
 def discover(
-    roots: Sequence[str],
-    cache: CacheLocation,
-    workers: Workers,
-    reporter: Reporter = Silent(),  # noqa: B008 - without state
+    roots: Sequence[str], cache: CacheLocation, workers: Workers, reporter: Reporter
 ) -> Discovery:
     """Find every archive at or below some places.
 
@@ -65,37 +65,32 @@ def discover(
         InputError: a place does not exist, an address cannot be read, or there is no archive.
         CacheError: the cache cannot be written.
     """
-    places, refused, left = find_archives(roots)
+    places, refused = find_archives(roots)
     if not places:
-        problem = "there is no archive (*.mcap) in it"
-        if refused:
-            problem += f", and {refused[0].path} {refused[0].reason}"
-        raise InputError(roots[0] if roots else None, problem, remedy="name others")
+        reasons = ["there is no archive (*.mcap) in it", *(" ".join(one) for one in refused[:1])]
+        raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
     known: dict[Location, ArchiveRef | Unused] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
-        if workers.local:  # else the cache is on the workers
-            for place in places:
-                try:
-                    if (ref := _known(place, cache)) is not None:
-                        known[place] = ref
-                except ArchiveError as error:
-                    known[place] = Unused(place.location, str(error))
-            task.advance(len(known))
+        for place in places if workers.local else ():  # else the cache is on the workers
+            with suppress(ArchiveError):  # it has disappeared: the worker reports it
+                if (ref := _known(place, cache)) is not None:
+                    known[place] = ref
+        task.advance(len(known))
         unknown = [place for place in places if place not in known]
         tasks = [ArchiveTask(place.location, inspect_archive, (place, cache)) for place in unknown]
         known.update(zip(unknown, workers.results(tasks, task.advance), strict=True))
     found = _select([(place, known[place]) for place in places])
-    return Discovery(found.refs, (*refused, *found.broken), (*left, *found.skipped))
+    return found._replace(broken=(*refused, *found.broken))
 
 
 # Locations
 
 
 class Location(NamedTuple):
-    """Location of an archive, and the version of its file without opening it."""
+    """Location of an archive, and the version of its content without opening it."""
 
     location: str  #: path or URL
-    version: str = ""  #: of a remote object's content, "" where its store states none
+    version: str = ""  #: of a remote object, "" where its store states none
 
     @property
     def name(self) -> str:
@@ -113,43 +108,23 @@ class Location(NamedTuple):
         above, _, name = self.folder.rpartition("/")
         return above if name == _ARCHIVES and above else self.folder
 
-    @property
-    def stamp(self) -> Stamp | None:
-        """Stamp of the file now; None of a remote one."""
-        return None if is_url(self.location) else stamp_of(Path(self.location))
 
-
-def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], list[Unused]]:
+def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused]]:
     """Return the archives at or below some folders, archives, or URLs of either, by location.
 
-    Further, folders and files that cannot be read, and broken links. Links are followed; a folder
-    reached by several links is searched once, under its own name.
+    Further, folders and files that cannot be read. Links are followed; a folder reached by several
+    links is searched once, under its own name.
 
     Raises:
         InputError: a place does not exist, or an address cannot be read.
     """
     found: set[Location] = set()
     refused: list[Unused] = []
-    left: list[Unused] = []
     visited: set[Path] = set()
 
     def refuse(error: OSError) -> None:
-        cache = Path(os.fsdecode(error.filename)).as_posix()
-        refused.append(Unused(cache, f"cannot be read: {error.strerror}"))
-
-    def add_file(path: Path) -> None:
-        try:
-            regular = S_ISREG(path.stat().st_mode)
-        except OSError as error:
-            if path.suffix == _SUFFIX:
-                refuse(error)
-            elif path.is_symlink():
-                left.append(Unused(path.as_posix(), "is a broken link"))
-            return
-        if path.suffix == _SUFFIX and regular:
-            found.add(Location(path.as_posix()))
-        elif path.suffix == _SUFFIX:
-            refused.append(Unused(path.as_posix(), "is not a regular file"))
+        folder = Path(os.fsdecode(error.filename)).as_posix()
+        refused.append(Unused(folder, f"cannot be read: {error.strerror}"))
 
     def walk(root: Path) -> None:
         for name, folders, files in os.walk(root, followlinks=True, onerror=refuse):
@@ -159,8 +134,13 @@ def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], l
                 continue
             visited.add(folder)
             folders[:] = [one for one in folders if one != BESIDE]
-            for file in files:
-                add_file(folder / file)
+            for path in (folder / file for file in files):
+                if path.suffix != _SUFFIX:
+                    continue
+                if os.path.isfile(path):  # noqa: PTH113 - False where it cannot be reached
+                    found.add(Location(path.as_posix()))
+                else:
+                    refused.append(Unused(path.as_posix(), "is no regular file that can be read"))
 
     for root in roots:
         path = Path(root)
@@ -172,7 +152,7 @@ def find_archives(roots: Sequence[str]) -> tuple[list[Location], list[Unused], l
             walk(path.resolve())
         else:
             raise InputError(root, "does not exist", remedy="name a folder with archives below it")
-    return sorted(found), refused, left
+    return sorted(found), refused
 
 
 # Metadata
@@ -202,11 +182,11 @@ def inspect_archive(place: Location, cache: CacheLocation) -> ArchiveRef:
     """
     if (known := _known(place, cache)) is not None:
         return known
-    begun, stamp = time.time_ns(), place.stamp
+    begun, stamp = time.time_ns(), _stamp(place)
     with local_file(place.location) as path:
         ref = _read_ref(place, path, cache)
         if stamp is not None and stamp_of(path) != stamp:
-            raise ChangedError(place.location)
+            raise changed_error(place.location)
     ref = replace(ref, stamp=stamp)
     untouched = stamp is None or begun - max(stamp[1:3]) > _UNTOUCHED
     if (stamp is not None or place.version) and untouched:
@@ -216,21 +196,26 @@ def inspect_archive(place: Location, cache: CacheLocation) -> ArchiveRef:
 
 def _known(place: Location, cache: CacheLocation) -> ArchiveRef | None:
     """Return the cached reference of an archive whose file has not changed; None if none."""
-    stamp = place.stamp
-    if stamp is None and not place.version:  # only its bytes would show a change
-        return None
     note = cache.store(place.location).get(_key(place), dict)
-    if note is None or note.get("token") != _token(place, stamp):
+    if note is None:
+        return None
+    stamp = _stamp(place)
+    if note.get("token") != _token(place, stamp):
         return None
     ref: ArchiveRef = note["ref"]
     return replace(ref, location=place.location, campaign=place.campaign, stamp=stamp)
+
+
+def _stamp(place: Location) -> tuple[int, ...] | None:
+    """Return the stamp of a local file now; None of a remote one."""
+    return None if is_url(place.location) else stamp_of(Path(place.location))
 
 
 def _key(place: Location) -> str:
     return digest(f"archive {place.name}".encode("utf-8", "surrogateescape"))
 
 
-def _token(place: Location, stamp: Stamp | None) -> list[Any]:
+def _token(place: Location, stamp: tuple[int, ...] | None) -> list[Any]:
     return [code_digest(), place.version, *(stamp or ())]
 
 
@@ -285,39 +270,34 @@ _Attempts = dict[tuple[str, str, int], int]
 def _select(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
     """Separate archives to be fitted from copies, failures and earlier attempts."""
     manifests, broken = _manifests([place for place, _ in found])
-    read: list[ArchiveRef] = []
-    unusable: list[tuple[Location, str]] = []
-    skipped: list[Unused] = []
+    read, unusable, skipped = list[ArchiveRef](), list[Unused](), list[Unused]()
     for place, one in found:
-        entries = None if place.campaign == place.folder else manifests.get(place.campaign)
+        entries = manifests.get(place.folder)
         entry = None if entries is None else entries.get(place.name)
         if isinstance(one, Unused):
-            unusable.append((place, one.reason))
-        elif entry is not None and entry.sha256 != one.sha256:
-            unusable.append((place, "differs from its entry in the campaign's manifest.json"))
-        elif entry is not None and entry.outcome not in ("", _COMPLETED):
+            unusable.append(one)
+        elif entry is None:
+            if entries is not None and one.use in USES and ArchiveName.parse(place.name):
+                skipped.append(Unused(place.location, _NOT_LISTED))
+            else:
+                read.append(one)
+        elif entry.sha256 != one.sha256:
+            reason = "differs from its entry in the campaign's manifest.json"
+            unusable.append(Unused(place.location, reason))
+        elif entry.outcome not in ("", _COMPLETED):
             read.append(replace(one, outcome=entry.outcome))
-        elif (
-            entry is None
-            and entries is not None
-            and one.use in USES
-            and ArchiveName.parse(place.name)
-        ):
-            reason = (
-                "is not listed in its campaign's manifest.json: its quality was not checked (the "
-                "run was killed; the next run adds it)"
-            )
-            skipped.append(Unused(place.location, reason))
         else:
             read.append(one)
     latest: _Attempts = {}
     for ref in read:
         if ref.attempt and ref.outcome == _COMPLETED:
-            key = (Location(ref.location).folder, ref.kind, ref.index)
+            key = (ref.folder, ref.kind, ref.index)
             latest[key] = max(latest.get(key, 0), ref.attempt)
-    for place, reason in unusable:
-        replaced = _replaced(place, latest)
-        (skipped if replaced else broken).append(Unused(place.location, replaced or reason))
+    for one in unusable:
+        if reason := _not_needed(Location(one.path), latest):
+            skipped.append(Unused(one.path, reason))
+        else:
+            broken.append(one)
     seen: dict[str, str] = {}
     refs: list[ArchiveRef] = []
     for ref in read:
@@ -330,21 +310,21 @@ def _select(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
 
 
 def _manifests(places: Iterable[Location]) -> tuple[dict[str, dict[str, Entry]], list[Unused]]:
-    """Return the manifest entries by name of each campaign, and unreadable manifests."""
+    """Return the manifest entries by name of each folder of archives, and damaged manifests."""
     found: dict[str, dict[str, Entry]] = {}
     broken = []
-    for campaign in dict.fromkeys(one.campaign for one in places if one.campaign != one.folder):
-        folder = CampaignFolder(Path(campaign))
+    folders = {one.folder: one.campaign for one in places if not is_url(one.location)}
+    for folder, campaign in folders.items():
         try:
-            if not is_url(campaign) and folder.sealed:
-                found[campaign] = {entry.name: entry for entry in folder.manifest()}
+            if folder != campaign and (records := CampaignFolder(Path(campaign))).sealed:
+                found[folder] = {entry.name: entry for entry in records.manifest()}
         except CampaignFolderError as error:
             reason = f"{error}; the campaign's archives are used without being checked against it"
             broken.append(Unused(f"{campaign}/manifest.json", reason))
     return found, broken
 
 
-def _replaced(place: Location, latest: _Attempts) -> str:
+def _not_needed(place: Location, latest: _Attempts) -> str:
     """Return why an unusable archive, such as one of a killed run, is not needed; "" if it is."""
     name = ArchiveName.parse(place.name)
     if place.folder.endswith(_FOR_VIEWERS):
@@ -367,14 +347,13 @@ def _exclusion(ref: ArchiveRef, latest: _Attempts, seen: dict[str, str]) -> str:
         return "was recorded with a payload that its cell does not state"
     if ref.outcome != _COMPLETED:
         return f"ended {ref.outcome}"
-    folder = Location(ref.location).folder
-    last = latest.get((folder, ref.kind, ref.index), ref.attempt)
+    last = latest.get((ref.folder, ref.kind, ref.index), ref.attempt)
     if ref.attempt and ref.attempt < last:
         return f"was replaced by attempt {last}"
     if ref.sha256 in seen and ref.use != "standstill":
         return f"is a copy of {seen[ref.sha256]}"
     if ref.attempt:
-        first = seen.setdefault(f"{folder} {ref.record}", ref.name)
+        first = seen.setdefault(f"{ref.folder} {ref.record}", ref.name)
         if first != ref.name:
             return f"is a copy or a repaired version of {first}"
     seen[ref.sha256] = ref.location

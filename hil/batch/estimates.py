@@ -149,17 +149,13 @@ class Estimator:
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
     """Return warnings with the archives they concern, most frequent first."""
-    counts: Counter[str] = Counter()
-    first: dict[str, ArchiveRef] = {}
-    for ref, warnings in warned:
-        for text in warnings:
-            counts[text] += 1
-            first.setdefault(text, ref)
+    counts = Counter(text for _, warnings in warned for text in warnings)
+    first = {text: ref for ref, warnings in reversed(warned) for text in warnings}
     found = []
     for text, count in counts.most_common(_NAMED):
         name = f"{first[text].campaign.rsplit('/', 1)[-1]}/{first[text].name}"
-        some = f"{name}: " if count == 1 else f"{count} of {len(warned)} archives, such as {name}: "
-        found.append(text if count == len(warned) else some + text)
+        some = f"{count} of {len(warned)} archives, such as {name}: {text}"
+        found.append(text if count == len(warned) else some)
     if len(counts) > _NAMED:
         found.append(f"{len(counts) - _NAMED} more warnings are listed with the repetitions")
     return tuple(found)

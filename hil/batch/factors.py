@@ -7,14 +7,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
 from hil.archive import Archive, open_archive
 from hil.cell import Cell
-from hil.cell.errors import CellError
-from hil.errors import ArchiveError, HilError
+from hil.errors import ArchiveError
 from hil.files import file_digest
 from hil.identify.options import Options
 from hil.identify.settings import (
@@ -29,7 +28,6 @@ from hil.identify.settings import (
 )
 from hil.identify.sources import Source, all_fitted, known_warnings, source_of
 from hil.progress import Silent
-from identification import IdentificationError
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import fit_least_squares
@@ -40,7 +38,8 @@ from identification.signals.samples import Samples
 
 from .cache import CacheLocation, decision_digest, settings_digest, sum_key
 from .remote import local_file
-from .types import ArchiveRef, Bundle, ChangedError, Stamp, Summary, Unused
+from .types import ArchiveRef, Bundle, Summary, Unused
+from .workers import reason_of
 
 BUNDLE: Final = 16
 """Archives in one entry of the cache: a summary of each and one sum, fifty times its size."""
@@ -59,8 +58,7 @@ def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
     """Open an archive with the columns that identification reads.
 
     Raises:
-        ChangedError: the file has changed since it was found.
-        ArchiveError: it cannot be read, or is damaged.
+        ArchiveError: it cannot be read, is damaged, or has changed since it was found.
     """
     with local_file(ref.location) as path:
         _require_same(path, ref)
@@ -85,7 +83,12 @@ def require_complete(archive: Archive, location: str) -> None:
 def _require_same(path: Path, ref: ArchiveRef) -> None:
     """Check that a file is unchanged; of a downloaded copy by its bytes."""
     if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
-        raise ChangedError(ref.location)
+        raise changed_error(ref.location)
+
+
+def changed_error(location: str) -> ArchiveError:
+    """Return the error about an archive that was written to while the batch ran."""
+    return ArchiveError(location, "was changed while it was read", remedy="run the batch again")
 
 
 def digest_of(path: Path) -> str:
@@ -96,7 +99,7 @@ def digest_of(path: Path) -> str:
         raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
 
 
-def stamp_of(path: Path) -> Stamp:
+def stamp_of(path: Path) -> tuple[int, ...]:
     """Return size, times and inode of a file, or raise an `ArchiveError`."""
     try:
         found = path.stat()
@@ -143,13 +146,6 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
 # Settings
 
 
-class Decision(NamedTuple):
-    """Settings of a campaign."""
-
-    settings: Settings | None  #: None without any archive to decide them from
-    broken: tuple[Unused, ...] = ()  #: archives that could not be read
-
-
 def archives_for_settings(
     refs: Sequence[ArchiveRef], arms: Settings | None
 ) -> tuple[ArchiveRef, ...]:
@@ -171,10 +167,11 @@ def cached_settings(
 
 def decide_settings(
     refs: Sequence[ArchiveRef], options: Options, arms: Settings | None, cache: CacheLocation
-) -> Decision:
+) -> tuple[Settings | None, list[Unused]]:
     """Decide a campaign's settings from `archives_for_settings` and cache them.
 
-    They are those of the arm, if it has any, with the campaign's own noise.
+    They are those of the arm, if it has any, with the campaign's own noise. Returned with the
+    archives that could not be read; None if no excitation is left.
 
     Raises:
         RecordingError: a recording cannot be prepared.
@@ -189,10 +186,10 @@ def decide_settings(
                 fitted.append(load_source(ref))
             elif rest is None:
                 rest = load_source(ref, to_fit=False)[1]
-        except (HilError, IdentificationError) as error:
-            broken.append(Unused(ref.location, str(error)))
+        except Exception as error:
+            broken.append(Unused(ref.location, reason_of(error)))
     if not fitted:
-        return Decision(None, tuple(broken))
+        return None, broken
     sources, _ = with_noise(
         all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
     )
@@ -202,7 +199,7 @@ def decide_settings(
         settings = carried_over(arms, sources, options)
     if not broken:
         cache.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
-    return Decision(settings, tuple(broken))
+    return settings, broken
 
 
 # Factors
@@ -255,45 +252,33 @@ def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
 
 
 def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> Bundle:
-    """Reduce archives of one campaign that are not in the cache, and cache the result.
+    """Reduce archives of one campaign, and cache the result if all of them are usable.
 
     The sum is added in the order of archives, so that a cached sum of the first ones is continued.
-    Unusable archives are not part of it.
 
     Raises:
         CacheError: the cache cannot be written.
     """
-    store, used = cache.store(refs[0].location), settings_digest(settings)
     counts = range(len(refs), 0, -1)
-    begun = next(
-        filter(None, (cached_bundle(refs[:count], settings, cache) for count in counts)), None
-    )
-    found = begun or Bundle(())
-    if (known := len(found.refs)) == len(refs):
-        return found
-    summaries, broken, phase = list(found.summaries), dict(found.broken), found.phase
-    lasting = True  # whether errors are due to the bytes of the archives
-    for ref in refs[known:]:
+    cached = (cached_bundle(refs[:count], settings, cache) for count in counts)
+    begun = next(filter(None, cached), Bundle(()))
+    left = refs[len(begun.refs) :]
+    summaries, broken, phase = list(begun.summaries), list[Unused](), begun.phase
+    for ref in left:
         try:
             summary, own = archive_factor(ref, settings)
-        except (HilError, IdentificationError) as error:
-            broken[ref.location] = str(error)
-            of_the_bytes = isinstance(error, ArchiveError | CellError | IdentificationError)
-            changed = isinstance(error, ChangedError) or isinstance(error.__cause__, OSError)
-            lasting &= of_the_bytes and not changed
-        except Exception as error:  # an internal error costs this archive, not the batch
-            broken[ref.location] = f"{type(error).__name__}: {error}"
-            lasting = False
+        except Exception as error:
+            broken.append(Unused(ref.location, reason_of(error)))
         else:
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
-    reasons = tuple(Unused(*one) for one in broken.items())
-    bundle = Bundle(tuple(refs), tuple(summaries), phase, reasons, len(refs) - known)
-    if lasting:
+    bundle = Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), len(left))
+    if left and not broken:
+        store, used = cache.store(refs[0].location), settings_digest(settings)
         store.put(sum_key(refs, used), bundle)
-        if known:
-            store.remove(sum_key(refs[:known], used))  # part of a longer one now
+        if begun.refs:
+            store.remove(sum_key(begun.refs, used))  # part of a longer one now
     return bundle
 
 
@@ -305,13 +290,9 @@ def cached_bundle(
     found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
     if found is None:
         return None
-    now = {old.location: ref for old, ref in zip(found.refs, refs, strict=True)}  # moved, perhaps
-    return Bundle(
-        tuple(refs),
-        tuple(replace(one, ref=now[one.ref.location]) for one in found.summaries),
-        found.phase,
-        tuple(Unused(now[path].location, reason) for path, reason in found.broken),
-    )
+    pairs = zip(found.summaries, refs, strict=True)  # the archives may have been moved
+    summaries = tuple(replace(one, ref=ref) for one, ref in pairs)
+    return Bundle(tuple(refs), summaries, found.phase)
 
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:

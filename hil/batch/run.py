@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -11,11 +10,9 @@ from typing import Any, TypeVar, cast, get_args
 
 from hil.cell import Cell
 from hil.errors import InputError
-from hil.files import json_digest
 from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.progress import Reporter
-from hil.terminal_text import plural
 from identification import IdentificationError
 
 from . import factors
@@ -149,7 +146,7 @@ class _Batch:
                 broken = [other for other in results if other is not None]
                 reason = found.reason
             else:
-                one.settings, broken = found.settings, [*found.broken]
+                one.settings, broken = found
                 some = any(ref.use == "excitation" for ref in arguments[0])
                 reason = "" if some else "it holds no excitation"
             self.broken += broken
@@ -235,11 +232,8 @@ class _Batch:
         broken = tuple(dict.fromkeys(reasons))
         if not repetitions:
             problem = "there is no excitation and no imported recording that can be fitted"
-            if broken:
-                path, reason = broken[0]
-                first = f"{len(broken)} could not be used, the first of them {path}: {reason}"
-                alone = f"{path} could not be used: {reason}"
-                problem += f"; {first if len(broken) > 1 else alone}"
+            first = [f"{path} could not be used: {reason}" for path, reason in broken[:1]]
+            problem = "; ".join([problem, *first])
             raise InputError(None, problem)
         return BatchResult(
             estimator=self.options.estimator,
@@ -290,20 +284,16 @@ class _Batch:
     def _cell(self, ref: ArchiveRef) -> Cell:
         """Return the cell of an archive."""
         texts = self.cache.store(ref.location).get(ref.cell, list)
-        if texts is not None and json_digest(texts) == ref.cell:
+        if texts is not None:
             return factors.cell_from(*texts)
         with factors.open_ref(ref) as archive:
             return factors.cell_in(archive)
 
 
 def _setups(keys: Collection[GroupKey]) -> list[str]:
-    """Return warnings about campaigns whose cells state different setups."""
-    counts = Counter(key.setup for key in keys)
-    if len(counts) < 2:
+    """Return a warning if the cells of campaigns state different setups."""
+    setups = sorted({key.setup or "nothing" for key in keys})
+    if len(setups) < 2:
         return []
-    stated = "; ".join(
-        f"{setup or 'nothing'} ({plural(count, 'campaign')})"
-        for setup, count in sorted(counts.items())
-    )
     text = "pooled over campaigns whose cells state different payloads or delays, which are"
-    return [f"{text} compensated: {stated}"]
+    return [f"{text} compensated: {'; '.join(setups)}"]

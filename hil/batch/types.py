@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.errors import ArchiveError, InputError
+from hil.errors import InputError
 from identification.factor.factor import Estimate, Factor
 from identification.factor.phases import PhaseFactor
 from identification.model.payload import Payload
@@ -20,16 +20,6 @@ Array = NDArray[np.float64]
 Level = Literal["repetition", "campaign", "pooled"]
 BatchEstimator = Literal["auto", "wls", "consistent"]
 """Estimators that need factors only, and no samples."""
-
-Stamp = tuple[int, ...]
-"""Values that change when a file is written to: size, times [ns], inode."""
-
-
-class ChangedError(ArchiveError):
-    """An archive was written to while the batch ran."""
-
-    def __init__(self, location: str) -> None:
-        super().__init__(location, "was changed while it was read", remedy="run the batch again")
 
 
 class CacheError(InputError):
@@ -61,7 +51,8 @@ class ArchiveRef:
     motion: str  #: digest of the planned motion, "" where unknown
     when: str = ""  #: time of recording, ISO 8601; "" in simulation
     setup: str = ""
-    stamp: Stamp | None = None  #: of the file when it was hashed; None of a remote one
+    #: size, times [ns] and inode of the file when it was hashed; None of a remote one
+    stamp: tuple[int, ...] | None = None
     kind: str = ""  #: as in its metadata
     attempt: int = 0  #: 0 where the archive does not number them
     outcome: str = "completed"  #: how the recording ended
@@ -72,6 +63,11 @@ class ArchiveRef:
     def name(self) -> str:
         """File name."""
         return self.location.rsplit("/", 1)[-1]
+
+    @property
+    def folder(self) -> str:
+        """Folder of the file."""
+        return self.location.rsplit("/", 1)[0]
 
     @property
     def key(self) -> GroupKey:
@@ -181,7 +177,7 @@ class BatchResult:
     estimator: str
     arms: Mapping[str, Arm]  #: by digest
     repetitions: tuple[LevelEstimate, ...]  #: of all campaigns, in the order of `ArchiveRef.order`
-    campaigns: tuple[LevelEstimate, ...]  #: likewise, by arm and time
+    campaigns: tuple[LevelEstimate, ...]  #: in the same order
     pooled: tuple[LevelEstimate, ...]  #: one per arm
     broken: tuple[Unused, ...]  #: archives and campaigns (by folder) that could not be used
     skipped: tuple[Unused, ...]  #: archives that are not intended for fitting

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Generic, Self, TypeVar
 
 from hil.errors import HilError
+from identification import IdentificationError
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess, stream_in_children
 
@@ -151,7 +152,11 @@ def run_task(task: ArchiveTask[T]) -> T | Unused:
         return task.function(*task.arguments)
     except (CacheError, WorkerSoftwareError):
         raise
-    except HilError as error:
-        return Unused(task.path, str(error))
-    except Exception as error:  # an internal error costs this archive, not the batch
-        return Unused(task.path, f"{type(error).__name__}: {error}")
+    except Exception as error:
+        return Unused(task.path, reason_of(error))
+
+
+def reason_of(error: Exception) -> str:
+    """Return the text of an error; an internal one costs an archive, not the batch."""
+    expected = isinstance(error, HilError | IdentificationError)
+    return str(error) if expected else f"{type(error).__name__}: {error}"

@@ -6,7 +6,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import takewhile
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -20,7 +19,7 @@ from hil.batch.types import BatchEstimator, BatchResult, LevelEstimate, Unused
 from hil.batch.workers import LocalWorkers, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
-from hil.compare.trend import ArmTrend, Trends, findings, summary, trends
+from hil.compare.trend import ArmTrend, Trends, campaign_names, findings, summary, trends
 from hil.files import convert_write_errors, make_folder, write_atomically
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
@@ -29,7 +28,6 @@ SOME_BROKEN: Final = 5
 """Exit status if some archives could not be used."""
 
 _MOST_LINES: Final = 20
-_WIDTH: Final = 42
 
 
 @with_options(Identifying, "how")
@@ -87,7 +85,7 @@ def reidentify(
         if written:
             names = ", ".join(path.name for path in written)
             reporter.say(f"written to {written[0].parent}: {names}")
-        for line in unused_lines(result.broken):
+        for line in _last([f"{path} could not be used: {why}" for path, why in result.broken]):
             typer.echo(printable(line), err=True)
         if result.skipped and not quiet:
             typer.echo(printable(skipped_line(result.skipped)))
@@ -118,21 +116,26 @@ def _workers(address: str | None, count: int | None, places: Sequence[str]) -> W
 def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
     """Format each arm: its campaigns, changes and warnings."""
     by_name = {one.name: one for one in found.arms}
-    above = _above([one.campaign for one in result.campaigns])
-    if above:
-        yield f"below {above}"
     for digest, arm in result.arms.items():
         trend = by_name.get(arm.name)
         yield f"{arm.name}: {'no campaign could be estimated' if trend is None else summary(trend)}"
-        yield from _campaign_lines([one for one in result.campaigns if one.arm == digest], above)
+        campaigns = [one for one in result.campaigns if one.arm == digest]
+        names = campaign_names(campaigns)
+        yield from _last([_line(*one) for one in zip(names, campaigns, strict=True)])
         pooled = [one for one in result.pooled if one.arm == digest]
         for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
             yield f"  note: {warning}"
         for finding in [] if trend is None else findings(trend):
-            if finding.level == "alarm":
-                yield f"  ! {finding.words} {finding.next_step}".rstrip()
-            elif trend is not None and len(trend.campaigns) > 1:
-                yield f"  {'earlier: ' if finding.level == 'past' else ''}{finding.words}"
+            mark = {"alarm": "! ", "past": "earlier: "}.get(finding.level, "")
+            yield f"  {mark}{finding.words} {finding.next_step}".rstrip()
+
+
+def _line(name: str, one: LevelEstimate) -> str:
+    """Format a campaign."""
+    error = relative_error(one.noise_std, one.torque_rms, one.samples)
+    unseen = relative_error(one.unseen_rms, one.unseen_torque_rms)
+    held_out = "" if math.isnan(unseen) else f", held out {unseen:.1%}"
+    return f"  {name}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
 
 
 def alarm_lines(found: Trends) -> Iterator[str]:
@@ -143,60 +146,17 @@ def alarm_lines(found: Trends) -> Iterator[str]:
                 yield f"{arm.name}: {finding.words}"
 
 
-def _campaign_lines(campaigns: Sequence[LevelEstimate], above: str) -> Iterator[str]:
-    """Format a table of the last campaigns, with stated payload and delay if these differ."""
-
-    def row(name: str, when: str, repetitions: object, fitted: str, unseen: str) -> str:
-        short = name if len(name) <= _WIDTH - 2 else "…" + name[3 - _WIDTH :]
-        return f"  {short:<{_WIDTH}}{when:<12}{repetitions:>11}{fitted:>14}{unseen:>18}"
-
-    def share(error: float) -> str:
-        return "-" if math.isnan(error) else f"{error:.1%}"
-
-    if campaigns:
-        yield row("campaign", "recorded", "repetitions", "torque error", "held out")
-    if (more := len(campaigns) - _MOST_LINES) > 0:
-        yield f"  … {more} more: see --output and --json"
-    stated = None
-    for one in campaigns[-_MOST_LINES:]:
-        if one.setup != stated and len({other.setup for other in campaigns}) > 1:
-            yield f"    stated: {one.setup or 'nothing'}"
-        stated = one.setup
-        yield row(
-            one.campaign.removeprefix(above),
-            one.when[:10] or "unknown",
-            one.repetitions,
-            share(relative_error(one.noise_std, one.torque_rms, one.samples)),
-            share(relative_error(one.unseen_rms, one.unseen_torque_rms)),
-        )
-
-
-def _above(folders: Sequence[str]) -> str:
-    """Return the common parent with its slash; "" if there is none or only one folder."""
-    parts = zip(*(folder.split("/")[:-1] for folder in folders), strict=False)
-    shared = [same[0] for same in takewhile(lambda same: len(set(same)) == 1, parts)]
-    return "/".join([*shared, ""]) if shared and len(set(folders)) > 1 else ""
-
-
-def unused_lines(broken: Sequence[Unused]) -> Iterator[str]:
-    """Format the first archives that could not be used."""
-    for one in broken[:_MOST_LINES]:
-        yield f"{one.path} could not be used: {one.reason}"
-    if (more := len(broken) - _MOST_LINES) > 0:
-        yield f"and {more} more: see --output and --json"
+def _last(lines: Sequence[str]) -> Iterator[str]:
+    """Yield the last lines, after the number of the others."""
+    if (more := len(lines) - _MOST_LINES) > 0:
+        yield f"  {more} more: see --output and --json"
+    yield from lines[-_MOST_LINES:]
 
 
 def skipped_line(skipped: Sequence[Unused]) -> str:
-    """Count the skipped archives by reason."""
-    counts: Counter[str] = Counter()
-    for one in skipped:
-        short = re.sub(r"^is an? (?=\w+$)", "", one.reason)
-        short = re.sub(r"\S*(/|\.mcap)\S*", "another", short)
-        counts[re.sub(r"^attempt \d+ ", "a later attempt ", short)] += 1
-    reasons = "; ".join(
-        f"{count}: {reason}" if " " in reason else plural(count, reason)
-        for reason, count in counts.most_common()
-    )
+    """Count the skipped archives by reason, without the name of another archive in it."""
+    counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", one.reason) for one in skipped)
+    reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
     return f"skipped, not for fitting: {reasons}"
 
 

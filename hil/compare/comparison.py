@@ -226,7 +226,7 @@ def _cell(ref: ArchiveRef) -> Cell:
 def compare_campaigns(gathered: CampaignSet) -> Comparison:
     """Compare the campaigns of one arm with the first of them."""
     model, campaigns = gathered.arm.cell.model, gathered.campaigns
-    names = campaign_names(campaigns, days=gathered.dated)
+    names = campaign_names(campaigns)
     axes, payload = axes_of(model, campaigns), payload_trend(model, campaigns, _SHARE)
     weights = friction_weights(model, axes)
     repetitions = [

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, takewhile
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -43,7 +43,6 @@ _QN_NORMAL: Final = 2.2219
 # rad/s or m/s, if the speed of an axis is unknown: any will do, as it has no viscous friction then.
 _ANY_SPEED: Final = 0.5
 _MAX_SHIFTS: Final = 2  # most recent shifts that are reported
-_MAX_NAMES: Final = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +169,7 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
         dated=bool(known),
         axes=_axes(model, ordered, time),
         payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
-        names=tuple(campaign_names(ordered, days=bool(known))),
+        names=tuple(campaign_names(ordered)),
         undated=tuple(one.campaign for one in campaigns if id(one) not in within),
     )
 
@@ -181,28 +180,23 @@ def _natural(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
-def campaign_names(campaigns: Sequence[LevelEstimate], *, days: bool = False) -> list[str]:
-    """Return short names of campaigns, with the day if `days` and the setup if ambiguous."""
+def campaign_names(campaigns: Sequence[LevelEstimate]) -> list[str]:
+    """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
     folders = [one.campaign for one in campaigns]
     names = []
-    for k, name in enumerate(short_names(folders)):
-        name = name or f"campaign {k + 1}"
-        if folders.count(folders[k]) > 1:
-            name += f", {campaigns[k].setup or 'nothing stated'}"
-        names.append(f"{name} ({campaigns[k].when[:10]})" if days else name)
+    for one, name in zip(campaigns, short_names(folders), strict=True):
+        setup = f", {one.setup or 'nothing stated'}" if folders.count(one.campaign) > 1 else ""
+        day = f" ({one.when[:10]})" if one.when else ""
+        names.append(f"{name}{setup}{day}")
     return names
 
 
 def short_names(folders: Sequence[str]) -> list[str]:
-    """Return the shortest unique end of each folder's path."""
-    paths = [folder.rstrip("/") for folder in folders]
-
-    def short(path: str) -> str:
-        others, parts = [f"/{other}" for other in paths if other != path], path.split("/")
-        ends = ("/".join(parts[-count:]) for count in range(1, len(parts)))
-        return next((e for e in ends if not any(o.endswith(f"/{e}") for o in others)), path)
-
-    return [short(path) for path in paths]
+    """Return each folder without the parents that all of them have in common."""
+    parts = [folder.split("/") for folder in folders]
+    parents = zip(*(one[:-1] for one in parts), strict=False)
+    shared = len(list(takewhile(lambda names: len(set(names)) == 1, parents)))
+    return ["/".join(one[shared:]) for one in parts]
 
 
 # Friction and torque error of the axes
@@ -412,16 +406,9 @@ def findings(arm: ArmTrend) -> tuple[Finding, ...]:
 
 def summary(arm: ArmTrend) -> str:
     """Return the state of the arm in one line."""
-    levels, count = [one.level for one in findings(arm)], len(arm.campaigns)
-    alarms, past = levels.count("alarm"), levels.count("past")
-    if alarms:
-        return plural(alarms, "change")
-    if count < 2:
-        return "only one campaign"
-    if past:
-        return f"no new change; {plural(past, 'earlier change')}"
-    few = "no change, but too few campaigns to test the axes"
-    return "no change" if count > MIN_CAMPAIGNS else few
+    levels = [one.level for one in findings(arm)]
+    now, past = plural(levels.count("alarm"), "change"), levels.count("past")
+    return f"{now}, {past} earlier, in {plural(len(arm.campaigns), 'campaign')}"
 
 
 class Shift(NamedTuple):
@@ -487,24 +474,17 @@ def _shift(arm: ArmTrend, axis: AxisTrend, what: str, shift: Shift) -> Finding:
 
 
 def _nothing(arm: ArmTrend) -> str:
-    count, untested = len(arm.campaigns), arm.payload.untested
-    if count < 2:
-        return "There is only one campaign."
+    untested = arm.payload.untested
     payload = f"Payload not tested: {untested}." if untested else "The payload has not changed."
     axes = "Friction and torque error of all axes are within the limits of the earlier campaigns"
-    if count <= MIN_CAMPAIGNS:
+    if len(arm.campaigns) <= MIN_CAMPAIGNS:
         axes = f"Axes are tested in campaigns with at least {MIN_CAMPAIGNS} earlier ones"
-    return f"No change in {count} campaigns. {payload} {axes}."
+    return f"{payload} {axes}."
 
 
 def _order_findings(arm: ArmTrend) -> list[Finding]:
     if arm.undated:
-        names = [one.rstrip("/").rsplit("/", 1)[-1] for one in arm.undated]
-        names[_MAX_NAMES:] = [f"{len(names) - _MAX_NAMES} more"] if len(names) > _MAX_NAMES else []
-        words = (
-            f"{plural(len(arm.undated), 'campaign')} ({', '.join(names)}) without recording time:"
-            " not part of the trend."
-        )
+        words = f"Without recording time, not part of the trend: {', '.join(arm.undated)}."
     elif arm.dated or len(arm.campaigns) < 2:
         return []
     else:

@@ -27,14 +27,12 @@ from hil.batch.discovery import Discovery, discover
 from hil.batch.estimates import warning_lines
 from hil.batch.factors import cached_bundle, open_ref, reduce_bundle
 from hil.batch.run import reidentify
-from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult, ChangedError
+from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign
 from hil.cell import Cell
 from hil.cli import app
-from hil.cli.reidentify import alarm_lines
-from hil.compare.trend import Trends
-from hil.errors import InputError
+from hil.errors import ArchiveError, InputError
 from hil.identify import Options, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
@@ -45,7 +43,6 @@ from hil.progress import Reporter, Silent
 from identification.estimators.consistent import Shrinkage
 from identification.signals.samples import Preprocessing
 
-from .arm_histories import Load, steady, trend_of
 from .batch_work import NOTHING_OPEN, Here
 from .conftest import small
 from .mcap_bytes import with_attachment
@@ -68,7 +65,7 @@ def batch(
 
 
 def found_in(*roots: Path | str, cache: CacheLocation = UNCACHED) -> Discovery:
-    return discover([str(root) for root in roots], cache, Here())
+    return discover([str(root) for root in roots], cache, Here(), Silent())
 
 
 def reasons_of(ones: Any) -> dict[str, str]:
@@ -345,9 +342,7 @@ class TestBroken:
         assert standstill in reasons_of(result.broken)
         assert len(result.repetitions) == 3
 
-    def test_unknown_estimators_are_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="unknown estimator 'lms'; use auto, wls"):
-            Options(estimator="lms")  # type: ignore[arg-type]
+    def test_estimators_that_read_samples_are_refused(self, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="'huber' reads samples; use auto, wls, consistent"):
             batch(tmp_path, estimator="huber")
 
@@ -358,9 +353,6 @@ class TestBroken:
         with pytest.raises(InputError) as caught:
             batch(tmp_path)
         assert str(caught.value).count("bad.mcap") == 1
-        (tmp_path / "worse.mcap").write_bytes(b"x")
-        with pytest.raises(InputError, match=r"2 could not be used, the first of them \S+bad"):
-            batch(tmp_path)
 
     @pytest.mark.parametrize("kinds", [["validation"], ["validation", "standstill"]])
     def test_campaigns_without_excitation(
@@ -399,12 +391,6 @@ class TestCommand:
             ran = CliRunner().invoke(app, ["reidentify", str(place)])
             assert isinstance(ran.exception, InputError)
             assert ran.exception.exit_code == 2
-
-    def test_alarms_are_lines_of_text(self) -> None:
-        arm = trend_of(lambda k, random: replace(steady(k, random), load=Load(2.0 * k)), 2)
-        calm = trend_of(steady, 2)
-        (line,) = alarm_lines(Trends((calm, arm), (), "wls", 4))
-        assert line.startswith("arm: The payload has changed")
 
 
 # Warnings about archives, and payloads that their cells state
@@ -493,7 +479,8 @@ class TestWarnings:
         found += [warned("d", "of all", "of one"), warned("e", "of all", "of two")]
         found += [warned("f", "of all", "of two")]
         two = "2 of 6 archives, such as c1/e: of two"
-        assert warning_lines(found) == ("of all", two, "c1/d: of one")
+        one = "1 of 6 archives, such as c1/d: of one"
+        assert warning_lines(found) == ("of all", two, one)
         many = warning_lines([warned(f"{k}", f"{k} steps of the clock") for k in range(100)])
         assert len(many) < 20
         assert "more warnings are listed with the repetitions" in many[-1]
@@ -566,12 +553,10 @@ class TestPlaces:
     def test_broken_links_and_pipes_are_reported(self, tmp_path: Path, arm: Cell) -> None:
         recording(tmp_path / "a.mcap", arm)
         (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere.mcap")
-        (tmp_path / "line 4").symlink_to(tmp_path / "not mounted")
         os.mkfifo(tmp_path / "pipe.mcap")
         result = found_in(tmp_path)
         assert len(result.refs) == 1
         assert {*reasons_of(result.broken)} == {"gone.mcap", "pipe.mcap"}
-        assert [*reasons_of(result.skipped)] == ["line 4"]
 
 
 class TestGroups:
@@ -600,32 +585,31 @@ class TestGroups:
     def test_simulated_arms_are_others(self, tmp_path: Path, arm: Cell) -> None:
         recording(tmp_path / "real.mcap", arm)
         recording(tmp_path / "model.mcap", arm, {"simulated": "yes"})
-        recording(tmp_path / "rehearsal" / "archives" / "x.mcap", arm, {"simulated": "yes"})
-        result = found_in(tmp_path)
-        assert len({ref.arm for ref in result.refs}) == len(result.refs) == 2
-        assert [one.reason for one in result.skipped] == ["belongs to a rehearsal"]
+        refs = found_in(tmp_path).refs
+        assert len({ref.arm for ref in refs}) == len(refs) == 2
 
-    def test_copies_are_skipped(self, tmp_path: Path, arm: Cell) -> None:
-        (tmp_path / "copy").mkdir()
-        shutil.copy(recording(tmp_path / "a.mcap", arm), tmp_path / "copy" / "b.mcap")
-        result = found_in(tmp_path)
-        assert [Path(ref.location).name for ref in result.refs] == ["a.mcap"]
-        assert "is a copy of" in reasons_of(result.skipped)["b.mcap"]
-
-    def test_weighing_runs_and_annotated_copies_are_skipped(
+    def test_copies_rehearsals_and_weighing_runs_are_skipped(
         self, tmp_path: Path, arm: Cell
     ) -> None:
-        recording(tmp_path / "real.mcap", arm)
+        original = recording(tmp_path / "a.mcap", arm)
+        for folder in ("copy", "annotated"):
+            (tmp_path / folder).mkdir()
+        shutil.copy(original, tmp_path / "copy" / "b.mcap")
+        (tmp_path / "annotated" / "a.mcap").write_bytes(b"for viewers")
         recording(tmp_path / "payload" / "gripper" / "bare" / "archives" / "x.mcap", arm)
         recording(tmp_path / "payload" / "gripper" / "loaded" / "archives" / "y.mcap", arm)
-        (tmp_path / "annotated").mkdir()
-        (tmp_path / "annotated" / "real.mcap").write_bytes(b"for viewers")
+        recording(tmp_path / "rehearsal" / "archives" / "z.mcap", arm, {"simulated": "yes"})
         result = found_in(tmp_path)
-        assert {Path(ref.location).name for ref in result.refs} <= {"real.mcap", "x.mcap"}
+        assert [ref.name for ref in result.refs] == ["a.mcap", "x.mcap"]
         assert not result.broken
-        reasons = {Path(one.path).parent.name: one.reason for one in result.skipped}
-        assert reasons["annotated"] == "is a copy for viewers"
-        assert any("recorded with a payload" in one.reason for one in result.skipped)
+        assert {one.path.removeprefix(f"{tmp_path}/"): one.reason for one in result.skipped} == {
+            "annotated/a.mcap": "is a copy for viewers",
+            "copy/b.mcap": f"is a copy of {original}",
+            "payload/gripper/loaded/archives/y.mcap": (
+                "was recorded with a payload that its cell does not state"
+            ),
+            "rehearsal/archives/z.mcap": "belongs to a rehearsal",
+        }
 
     def test_each_stated_delay_of_a_folder_is_applied(
         self, loose: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -754,10 +738,10 @@ class TestCachedMetadata:
             recording(tmp_path / f"{name}.mcap", arm)
         cache = CacheLocation(str(tmp_path / "cache"))
         with LocalWorkers(2) as workers:
-            found = discover([str(tmp_path)], cache, workers)
+            found = discover([str(tmp_path)], cache, workers, Silent())
         assert [ref.name for ref in found.refs] == ["a.mcap", "b.mcap", "c.mcap"]
         far = Here(local=False)
-        assert discover([str(tmp_path)], cache, far) == found
+        assert discover([str(tmp_path)], cache, far, Silent()) == found
         assert [task.path for task in far.tasks] == [ref.location for ref in found.refs]
 
 
@@ -778,11 +762,11 @@ class TestChanges:
     ) -> None:
         address, other = remote
         cache = CacheLocation(str(tmp_path / "cache"))
-        (ref,) = discover([address], cache, Here()).refs
+        (ref,) = discover([address], cache, Here(), Silent()).refs
         with open_ref(ref):
             pass
         fsspec.filesystem("memory").pipe(address, other)
-        with pytest.raises(ChangedError), open_ref(ref):
+        with pytest.raises(ArchiveError, match="was changed"), open_ref(ref):
             pass
         assert "changed" in reduce_bundle((ref,), SETTINGS, cache).broken[0].reason
         assert cached_bundle((ref,), SETTINGS, cache) is None
@@ -799,7 +783,7 @@ class TestChanges:
             return read(cache, **how)
 
         monkeypatch.setattr(factors, "open_archive", written_to)
-        with pytest.raises(ChangedError), open_ref(ref):
+        with pytest.raises(ArchiveError, match="was changed"), open_ref(ref):
             pass
         cache = CacheLocation(str(tmp_path / "cache"))
         assert reduce_bundle((ref,), SETTINGS, cache).broken
@@ -810,7 +794,7 @@ class TestChanges:
     ) -> None:
         address, _ = remote
         cache = CacheLocation(str(tmp_path / "cache"))
-        (ref,) = discover([address], cache, Here()).refs
+        (ref,) = discover([address], cache, Here(), Silent()).refs
 
         def busy(*_: object) -> None:
             raise RuntimeError("503, Service Unavailable")
@@ -824,16 +808,6 @@ class TestChanges:
         again = reduce_bundle((ref,), SETTINGS, cache)
         assert again.read == 1
         assert "503" not in str(again.broken)
-
-    def test_errors_of_the_bytes_are_cached(self, tmp_path: Path, arm: Cell) -> None:
-        path = recording(tmp_path / "a.mcap", arm)
-        (ref,) = found_in(path).refs
-        damage(path)
-        now = replace(ref, stamp=factors.stamp_of(path))
-        cache = CacheLocation(str(tmp_path / "cache"))
-        found = reduce_bundle((now,), SETTINGS, cache)
-        again = cached_bundle((now,), SETTINGS, cache)
-        assert again is not None and again.broken == found.broken
 
     def test_unchanged_remote_archives_are_cached(self, folder: Path, tmp_path: Path) -> None:
         store = fsspec.filesystem("memory")

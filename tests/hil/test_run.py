@@ -918,7 +918,8 @@ def test_an_archive_that_was_not_checked_is_not_pooled(
     monkeypatch.undo()
     slowed = campaign.folder.archives / "excitation_001_a1.mcap"
     assert open_archive(slowed, fields=()).outcome.outcome == "completed"
-    found = discover([str(campaign.folder.root)], CacheLocation(str(tmp_path / "cache")), Here())
+    cache = CacheLocation(str(tmp_path / "cache"))
+    found = discover([str(campaign.folder.root)], cache, Here(), Silent())
     assert slowed.as_posix() not in {ref.location for ref in found.refs}
     (skipped,) = (one for one in found.skipped if one.path == slowed.as_posix())
     assert "not listed in its campaign's manifest.json" in skipped.reason
