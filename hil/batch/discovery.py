@@ -37,7 +37,7 @@ _LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # see `hil.weighing`
 _FOR_VIEWERS: Final = "/annotated"  # see `hil.annotating`
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
-_NOT_LISTED: Final = (
+_UNCHECKED: Final = (
     "is not listed in its campaign's manifest.json: its quality was not checked (the run was"
     " killed; the next run adds it)"
 )
@@ -278,7 +278,7 @@ def _select(found: Sequence[tuple[Location, ArchiveRef | Unused]]) -> Discovery:
             unusable.append(one)
         elif entry is None:
             if entries is not None and one.use in USES and ArchiveName.parse(place.name):
-                skipped.append(Unused(place.location, _NOT_LISTED))
+                skipped.append(Unused(place.location, _UNCHECKED))
             else:
                 read.append(one)
         elif entry.sha256 != one.sha256:
