@@ -45,7 +45,6 @@ class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
     local = True
-    count = 1
 
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None

@@ -15,6 +15,7 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
+from socket import gethostname
 from time import monotonic
 from typing import Any, Final, TypeVar
 
@@ -39,6 +40,7 @@ _POLL: Final = 2.0  # s, between polls of the cluster while no result arrives
 _RETRIES: Final = 3  # of a task whose worker failed
 _AHEAD: Final = 8  # tasks submitted per thread of the cluster
 
+_INSTALL: Final = "install the same hil and constraints.txt on both, and start it again"
 _LOST: Final = Unused("", "ended every worker that read it")
 
 
@@ -56,7 +58,7 @@ class DaskWorkers(Workers):
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers at the address.
-        ClusterError: no worker joins in time, or one has other software.
+        ClusterError: no worker joins in time.
     """
 
     local = False
@@ -64,31 +66,15 @@ class DaskWorkers(Workers):
     def __init__(self, address: str, *, timeout: float = TIMEOUT, patience: float = 30.0) -> None:
         self._patience = patience
         self._client = _connected(address, patience)
-        expected = software_versions()
-        self._work = partial(perform_task, timeout=timeout, expected=expected)
+        self._work = partial(perform_task, timeout=timeout, expected=software_versions())
         try:
             self._client.wait_for_workers(1, timeout=patience)
-            for worker, found in self._on_all(software_versions).items():
-                if apart := version_differences(expected, found):
-                    raise ClusterError(
-                        f"the worker {worker} has other software than this machine ({apart}); "
-                        "install the same hil and constraints.txt on both, and start it again"
-                    )
         except TimeoutError:
             self._client.close()
             raise ClusterError(
                 f"the Dask scheduler at {address} has no worker after {patience:g} s; start some: "
                 f"dask worker {address} --nthreads 1"
             ) from None
-        except BaseException:
-            self._client.close()
-            raise
-        self.count = self._threads()
-
-    @property
-    def n_workers(self) -> int:
-        """Number of workers now."""
-        return len(self._client.nthreads())
 
     def close(self) -> None:
         """Disconnect from the cluster."""
@@ -117,7 +103,7 @@ class DaskWorkers(Workers):
 
         Raises:
             ClusterError: all workers, or the scheduler, are lost for longer than the patience.
-            WorkerSoftwareError: a worker that joined later has other software.
+            WorkerSoftwareError: a worker has other software.
         """
         waiting, begun = iter(tasks), deque[tuple[ArchiveTask[T], Any]]()
         most = 0
@@ -164,8 +150,12 @@ class DaskWorkers(Workers):
         error = future.exception()
         if isinstance(error, KilledWorker):
             return _LOST
-        if error is not None:
+        if isinstance(error, HilError):
             raise error
+        if error is not None:
+            raise ClusterError(
+                f"a worker cannot run a task ({type(error).__name__}: {error}); {_INSTALL}"
+            ) from error
         return future.result()
 
     def _begin(self, task: ArchiveTask[Any]) -> Any:
@@ -178,7 +168,7 @@ class DaskWorkers(Workers):
             ended = threading.Event()
             future.add_done_callback(lambda _, event=ended: event.set())
             ended.wait(_POLL)
-            if self._connected and self.n_workers:
+            if self._connected and self._client.nthreads():
                 last_seen = monotonic()
             elif monotonic() - last_seen > self._patience:
                 missing = "all workers" if self._connected else "the scheduler"
@@ -213,17 +203,6 @@ def software_versions() -> dict[str, str]:
     return {"hil": code_digest(), "python": python} | {name: version(name) for name in LIBRARIES}
 
 
-def version_differences(here: Mapping[str, str], there: Mapping[str, str] | Exception) -> str:
-    """Return the differences between versions as text; empty if there are none."""
-    if isinstance(there, Exception):
-        return str(there)
-    return ", ".join(
-        f"{name} {there.get(name, 'none'):.12} instead of {here[name]:.12}"
-        for name in here
-        if there.get(name) != here[name]
-    )
-
-
 def perform_task(
     task: ArchiveTask[T], *, timeout: float, expected: Mapping[str, str]
 ) -> T | Unused:
@@ -243,8 +222,12 @@ def perform_task(
 
 def _checked(task: ArchiveTask[T], expected: Mapping[str, str]) -> T | Unused:
     """Run a task in the child, which must have the same software as the client."""
-    if other := version_differences(expected, software_versions()):
-        raise WorkerSoftwareError(f"a worker has other software: {other}")
+    for name, here in software_versions().items():
+        if here != expected[name]:
+            raise WorkerSoftwareError(
+                f"the worker on {gethostname()} has other software than this machine"
+                f" ({name} {here:.12} instead of {expected[name]:.12}); {_INSTALL}"
+            )
     return run_task(task)
 
 

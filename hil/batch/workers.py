@@ -11,6 +11,7 @@ import signal
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Generic, Self, TypeVar
 
 from hil.errors import HilError
@@ -46,7 +47,6 @@ class Workers(ABC):
     """Interface of workers."""
 
     local: bool  #: whether files they write are readable here under the same names
-    count: int  #: number of parallel tasks
 
     def __enter__(self) -> Self:
         return self
@@ -56,6 +56,9 @@ class Workers(ABC):
 
     def close(self) -> None:  # noqa: B027
         """End the workers."""
+
+    def require_folders(self, folders: Sequence[Path]) -> None:  # noqa: B027
+        """Check that workers on other machines have these folders under the same names."""
 
     @abstractmethod
     def results(

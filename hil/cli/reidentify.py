@@ -66,7 +66,8 @@ def reidentify(
         make_folder(output)
     options, keep = how.options(estimator=estimator), cache != "none"
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
-    with _workers(dask, workers, places) as hands:
+    with _workers(dask, workers) as hands:
+        hands.require_folders([Path(place) for place in places if "://" not in place])
         result = run.reidentify(places, options, hands, reporter, cache=location)
     found = trends(result)
     written: list[Path] = []
@@ -99,18 +100,12 @@ def reidentify(
         raise typer.Exit(SOME_BROKEN)
 
 
-def _workers(address: str | None, count: int | None, places: Sequence[str]) -> Workers:
+def _workers(address: str | None, count: int | None) -> Workers:
     if address is None:
         return LocalWorkers(count)
     from hil.batch.cluster import DaskWorkers  # an extra
 
-    hands = DaskWorkers(address)
-    try:
-        hands.require_folders([Path(place) for place in places if "://" not in place])
-    except BaseException:
-        hands.close()
-        raise
-    return hands
+    return DaskWorkers(address)
 
 
 def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:

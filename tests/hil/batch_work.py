@@ -24,8 +24,6 @@ NOTHING_OPEN: Final = (
 class Here(Workers):
     """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
 
-    count = 1
-
     def __init__(self, *deadly: str, local: bool = True) -> None:
         self.deadly, self.local = deadly, local
         self.tasks: list[ArchiveTask[Any]] = []

@@ -23,9 +23,6 @@ from hil.batch.cluster import (
     ClusterError,
     DaskWorkers,
     WorkerSoftwareError,
-    perform_task,
-    release_children,
-    software_versions,
 )
 from hil.batch.types import Unused
 from hil.batch.workers import LocalWorkers, Workers
@@ -188,7 +185,7 @@ class TestWorkers:
 
         with connected(pair) as workers:
             assert list(workers.results(tasks_of(work.number, 1))) == [0]
-            wait_for(lambda: workers.n_workers == 2)
+            workers._client.wait_for_workers(2, timeout=PATIENCE)
 
             def done(count: int) -> None:
                 finished.append(count)
@@ -215,15 +212,11 @@ class TestWorkers:
     def test_with_other_code_are_refused(
         self, cluster: Cluster, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        """Whenever they join: their software is checked with each task."""
         monkeypatch.setattr(dask_cluster, "code_digest", lambda: "other code")
-        with pytest.raises(ClusterError, match=r"worker tcp://.* \(hil \w+ instead of other code"):
-            connected(cluster)
-
-    def test_with_other_code_that_join_later_are_refused(self) -> None:
-        expected = software_versions() | {"hil": "other code"}
-        with pytest.raises(WorkerSoftwareError, match=r"hil \w+ instead of other code"):
-            perform_task(work.task(work.number, 0), timeout=PATIENCE, expected=expected)
-        release_children()
+        message = r"other software .*hil \w+ instead of other code"
+        with connected(cluster) as workers, pytest.raises(WorkerSoftwareError, match=message):
+            list(workers.results(tasks_of(work.number, 1)))
 
     @pytest.mark.slow
     def test_loss_of_all_is_an_error(self, tmp_path: Path) -> None:
@@ -266,17 +259,6 @@ def test_estimates_equal_those_of_local_workers(campaign: Campaign, cluster: Clu
 
 
 # The package
-
-
-def test_dask_and_fsspec_are_imported_on_use() -> None:
-    program = (
-        "import sys, hil.batch.cluster, hil.batch.remote\n"
-        "print([name for name in ('dask', 'distributed', 'fsspec') if name in sys.modules])"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert found.stdout.strip() == "[]"
 
 
 def test_without_dask_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
