@@ -19,7 +19,7 @@ from hil.batch.types import BatchEstimator, BatchResult, LevelEstimate, Unused
 from hil.batch.workers import LocalWorkers, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
-from hil.compare.trend import ArmTrend, Trends, campaign_names, findings, summary, trends
+from hil.compare.trend import ArmTrend, campaign_names, findings, summary, trends
 from hil.files import convert_write_errors, make_folder, write_atomically
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
@@ -77,7 +77,7 @@ def reidentify(
         page = output / "trend.html"
         with convert_write_errors(output):
             written = [*write_tables(output, result), page]
-            write_atomically(page, trend_page(found))
+            write_atomically(page, trend_page(result, found))
     if json:
         print_json(as_dict(result, found, written))
     else:
@@ -108,9 +108,9 @@ def _workers(address: str | None, count: int | None) -> Workers:
     return DaskWorkers(address)
 
 
-def result_lines(result: BatchResult, found: Trends) -> Iterator[str]:
+def result_lines(result: BatchResult, found: Sequence[ArmTrend]) -> Iterator[str]:
     """Format each arm: its campaigns, changes and warnings."""
-    by_name = {one.name: one for one in found.arms}
+    by_name = {one.name: one for one in found}
     for digest, arm in result.arms.items():
         trend = by_name.get(arm.name)
         yield f"{arm.name}: {'no campaign could be estimated' if trend is None else summary(trend)}"
@@ -133,9 +133,9 @@ def _line(name: str, one: LevelEstimate) -> str:
     return f"  {name}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
 
 
-def alarm_lines(found: Trends) -> Iterator[str]:
+def alarm_lines(found: Sequence[ArmTrend]) -> Iterator[str]:
     """Format the alarms only."""
-    for arm in found.arms:
+    for arm in found:
         for finding in findings(arm):
             if finding.level == "alarm":
                 yield f"{arm.name}: {finding.words}"
@@ -155,9 +155,11 @@ def skipped_line(skipped: Sequence[Unused]) -> str:
     return f"skipped, not for fitting: {reasons}"
 
 
-def as_dict(result: BatchResult, found: Trends, written: Sequence[Path]) -> dict[str, Any]:
+def as_dict(
+    result: BatchResult, found: Sequence[ArmTrend], written: Sequence[Path]
+) -> dict[str, Any]:
     """Return the content of `--json`; campaigns by folder, and by setup if one has several."""
-    trends = {one.name: _trend(one) for one in found.arms}
+    trends = {one.name: _trend(one) for one in found}
     folders = Counter((one.arm, one.campaign) for one in result.campaigns)
     return {
         "estimator": result.estimator,

@@ -39,7 +39,6 @@ from .trend import (
     campaign_names,
     friction_in,
     friction_weights,
-    short_names,
 )
 
 Array = NDArray[np.float64]
@@ -95,9 +94,10 @@ class CampaignSet:
     """Campaigns of one arm."""
 
     arm: Arm
-    campaigns: tuple[LevelEstimate, ...]  #: in chronological order if `dated`, else as given
+    campaigns: tuple[
+        LevelEstimate, ...
+    ]  #: in chronological order if the times of all are known, else as given
     repetitions: tuple[tuple[LevelEstimate, ...], ...]  #: of each campaign
-    dated: bool  #: whether the time of all campaigns is known
     broken: tuple[Unused, ...]  #: archives that could not be used
     simulated: bool = False
 
@@ -172,30 +172,28 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Campa
         reason = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
         only = campaigns[0].campaign if campaigns else None
         raise InputError(only, f"is the only campaign that can be estimated{reason}", remedy=_TWO)
-    absolute = [f"{_absolute(root)}/" for root in roots]
+    absolute = [root if "://" in root else Path(root).resolve().as_posix() for root in roots]
 
-    def given_order(one: LevelEstimate) -> tuple[int, str]:
-        own = f"{_absolute(one.campaign)}/"
-        found = [k for k, root in enumerate(absolute) if own.startswith(root)]
-        return found[0] if found else len(absolute), own
+    def given_order(one: LevelEstimate) -> int:
+        inside = [f"{one.campaign}/".startswith(f"{root}/") for root in absolute]
+        return inside.index(True) if any(inside) else len(inside)
 
     dated = all(one.when for one in campaigns)
-    campaigns.sort(key=lambda one: (one.when if dated else "", *given_order(one)))
-    own = {(one.campaign, one.setup): list[LevelEstimate]() for one in campaigns}
-    for rep in result.repetitions:
-        own.get((rep.campaign, rep.setup), []).append(rep)
+    campaigns.sort(key=lambda one: (one.when if dated else "", given_order(one), one.campaign))
     return CampaignSet(
         arm=result.arms[campaigns[0].arm],
         campaigns=tuple(campaigns),
-        repetitions=tuple(tuple(one) for one in own.values()),
-        dated=dated,
+        repetitions=tuple(
+            tuple(
+                each
+                for each in result.repetitions
+                if (each.campaign, each.setup) == (one.campaign, one.setup)
+            )
+            for one in campaigns
+        ),
         broken=result.broken,
         simulated=refs[0].simulated,  # as all of one arm
     )
-
-
-def _absolute(place: str) -> str:
-    return place if "://" in place else Path(place).resolve().as_posix()
 
 
 def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
@@ -206,12 +204,12 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
     for one in campaigns.values():
         if one.arm != first.arm:
             here, there = (Arm(ref.arm, _cell(ref)) for ref in (one, first))
-            reason = "one of them is a simulation, or their controllers state different drives"
-            if differing := arm_differences(here.cell, there.cell):
-                reason = f"they differ in {' and '.join(differing)}"
+            other = ["simulation or the controller's drive train"]
+            differing = arm_differences(here.cell, there.cell) or other
             raise InputError(
                 one.campaign,
-                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): {reason}",
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): they differ"
+                f" in {' and '.join(differing)}",
                 remedy="compare campaigns of one arm",
             )
     if len(campaigns) < 2:
@@ -260,11 +258,11 @@ def compare_campaigns(gathered: CampaignSet) -> Comparison:
     return Comparison(
         arm=gathered.arm.name,
         simulated=gathered.simulated,
-        dated=gathered.dated,
+        dated=all(one.when for one in campaigns),
         changed=bool(parts),
         verdict=verdict,
         findings=tuple(_findings(names, axes, friction, payload, prediction)),
-        warnings=(*_warnings(model, gathered), _CAVEAT),
+        warnings=(*_warnings(model, names, gathered), _CAVEAT),
         campaigns=campaigns,
         names=tuple(names),
         axes=tuple(axes),
@@ -296,29 +294,24 @@ def _known(
     )
 
 
-def _warnings(model: RobotModel, gathered: CampaignSet) -> list[str]:
+def _warnings(model: RobotModel, names: Sequence[str], gathered: CampaignSet) -> list[str]:
     campaigns = gathered.campaigns
-    names = short_names([one.campaign for one in campaigns])
-    lost = zip(short_names([one.path for one in gathered.broken]), gathered.broken, strict=True)
-    found = [f"{name} could not be used: {one.reason}" for name, one in lost]
-    single = [name for name, own in zip(names, gathered.repetitions, strict=True) if len(own) < 2]
-    if single:
-        found.append(
-            f"{', '.join(single)}: with one repetition, uncertainty includes noise only, not the "
-            "scatter of repetitions"
-        )
-    first = campaigns[0].speed_rms
-    for name, one in zip(names[1:], campaigns[1:], strict=True):
-        if first is None or one.speed_rms is None:
-            continue
-        with np.errstate(invalid="ignore", divide="ignore"):
-            far = np.abs(np.log(one.speed_rms / first)) > math.log(_SPEED_RATIO)
-        if far.any():
-            fast = ", ".join(model.joint_names[j] for j in np.flatnonzero(far))
+    found = [f"{path} could not be used: {reason}" for path, reason in gathered.broken]
+    for name, own in zip(names, gathered.repetitions, strict=True):
+        if len(own) < 2:
             found.append(
-                f"{name} has another motion than {names[0]} (rms speed of {fast}): unmodelled"
-                " effects may appear as a change"
+                f"{name}: with one repetition, uncertainty includes noise only, not the scatter of"
+                " repetitions"
             )
+    speeds = np.array([one.speed_rms for one in campaigns], dtype=np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        far = np.abs(np.log(speeds / speeds[0])) > math.log(_SPEED_RATIO)
+    for k in np.flatnonzero(far.any(axis=1)).tolist():
+        fast = ", ".join(model.joint_names[j] for j in np.flatnonzero(far[k]))
+        found.append(
+            f"{names[k]} has another motion than {names[0]} (rms speed of {fast}): unmodelled"
+            " effects may appear as a change"
+        )
     each = zip(names, campaigns, strict=True)
     return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
 

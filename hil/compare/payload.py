@@ -288,8 +288,6 @@ def _projection(model: RobotModel, campaigns: Sequence[LevelEstimate]) -> Projec
     if len(campaigns) < 2:
         return "there is only one campaign"
     information = [one.information for one in campaigns if one.information is not None]
-    if len(information) < len(campaigns) or any(one.covariance is None for one in campaigns):
-        return "the estimator gives no information matrix to compare with"
     known = np.all([np.isfinite(one.std) for one in campaigns], axis=0)
     rows = sum(int(one.samples.sum()) for one in campaigns)
     onto = projection(model, known, np.sum(information, axis=0), rows)
@@ -345,13 +343,8 @@ def _load(payload: Payload | None) -> str:
 
 
 def _describe(change: Change) -> str:
-    if not math.isfinite(change.mass):
-        moment = float(np.linalg.norm(np.nan_to_num(change.moment)))
-        return f"first moment by {moment:.2g} kg·m (this arm does not determine the mass)"
     mass = f"{change.mass:+.2f} ± {change.mass_std:.2g} kg"
-    if abs(change.mass) < _SIGNIFICANT * change.mass_std:
-        return f"its centre or inertia, not significantly its mass ({mass})"
-    if not np.isfinite(change.moment).all():
-        return mass
-    centre = ", ".join(f"{1e3 * c / change.mass:.0f}" for c in change.moment)
+    if not abs(change.mass) > _SIGNIFICANT * change.mass_std:  # or unknown
+        return f"centre or inertia, not significantly the mass ({mass})"
+    centre = ", ".join(f"{one:.0f}" for one in 1e3 * change.moment / change.mass)
     return f"{mass}, centred at ({centre}) mm in the frame of the last joint"

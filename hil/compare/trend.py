@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau, theilslopes
 from scipy.stats import t as student
 
-from hil.batch.types import BatchResult, LevelEstimate, Unused
+from hil.batch.types import BatchResult, LevelEstimate
 from hil.reading import parse_time
 from hil.terminal_text import plural
 from identification import RobotModel
@@ -126,42 +126,33 @@ class ArmTrend:
     warnings: tuple[str, ...] = ()  #: about the archives
 
 
-@dataclass(frozen=True, eq=False)
-class Trends:
-    """Trends of all arms of a batch."""
-
-    arms: tuple[ArmTrend, ...]  #: by name
-    broken: tuple[Unused, ...]
-    estimator: str
-    archives: int  #: number of fitted archives
-    skipped: tuple[Unused, ...] = ()
-
-
-def trends(result: BatchResult) -> Trends:
-    """Compute the trends of every arm of a batch."""
+def trends(result: BatchResult) -> list[ArmTrend]:
+    """Compute the trends of every arm of a batch that has a campaign, by name."""
     found = []
     for digest, arm in sorted(result.arms.items(), key=lambda item: item[1].name):
         campaigns = [one for one in result.campaigns if one.arm == digest]
+        warnings = [text for one in result.pooled if one.arm == digest for text in one.warnings]
         if campaigns:
-            own = [text for one in result.pooled if one.arm == digest for text in one.warnings]
-            trend = arm_trend(arm.name, arm.cell.model, campaigns)
-            found.append(replace(trend, warnings=tuple(dict.fromkeys(own))))
-    return Trends(
-        tuple(found), result.broken, result.estimator, len(result.repetitions), result.skipped
-    )
+            found.append(arm_trend(arm.name, arm.cell.model, campaigns, warnings))
+    return found
 
 
-def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) -> ArmTrend:
+def arm_trend(
+    name: str,
+    model: RobotModel,
+    campaigns: Sequence[LevelEstimate],
+    warnings: Sequence[str] = (),
+) -> ArmTrend:
     """Compute the trends of one arm; campaigns without a recording time only if all lack it."""
     known = [(at.timestamp(), one) for one in campaigns if (at := parse_time(one.when)) is not None]
     if known:
         known.sort(key=lambda pair: (pair[0], pair[1].campaign))
         ordered = [one for _, one in known]
         time = (np.array([at for at, _ in known]) - known[0][0]) / _DAY
+        undated = [one.campaign for one in campaigns if parse_time(one.when) is None]
     else:
-        ordered = sorted(campaigns, key=lambda one: _natural(one.campaign))
+        ordered, undated = sorted(campaigns, key=lambda one: _natural(one.campaign)), []
         time = np.arange(1.0, len(ordered) + 1.0)
-    within = {id(one) for one in ordered}
     return ArmTrend(
         name=name,
         campaigns=tuple(ordered),
@@ -170,7 +161,8 @@ def arm_trend(name: str, model: RobotModel, campaigns: Sequence[LevelEstimate]) 
         axes=_axes(model, ordered, time),
         payload=payload_trend(model, ordered, FALSE_ALARMS / _RULES),
         names=tuple(campaign_names(ordered)),
-        undated=tuple(one.campaign for one in campaigns if id(one) not in within),
+        undated=tuple(undated),
+        warnings=tuple(dict.fromkeys(warnings)),
     )
 
 

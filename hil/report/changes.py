@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
 import matplotlib.dates as mdates
@@ -9,6 +10,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from hil.batch.types import BatchResult
 from hil.compare.comparison import MIN_REPETITIONS, Comparison
 from hil.compare.payload import LEAST_EFFECT
 from hil.compare.trend import (
@@ -19,7 +21,6 @@ from hil.compare.trend import (
     ArmTrend,
     AxisTrend,
     ControlChart,
-    Trends,
     findings,
     summary,
 )
@@ -78,20 +79,19 @@ def comparison_page(found: Comparison) -> bytes:
     return _page(title=found.arm, kind="Comparison of campaigns", comparison=found, parts=[part])
 
 
-def trend_page(trends: Trends) -> bytes:
+def trend_page(batch: BatchResult, arms: Sequence[ArmTrend]) -> bytes:
     """Return the trend report as one HTML file; the same input gives the same bytes."""
-    names = [arm.name for arm in trends.arms]
     return _page(
-        title=names[0] if len(names) == 1 else f"{len(names)} arms",
-        kind=f"Trend report: {trends.archives} archives, estimator {trends.estimator}",
-        trends=trends,
-        parts=[_trend(arm, f"t{k}") for k, arm in enumerate(trends.arms)],
+        title=", ".join(arm.name for arm in arms) or "no campaign",
+        kind=f"Trend report: {len(batch.repetitions)} archives, estimator {batch.estimator}",
+        batch=batch,
+        parts=[_trend(arm, f"t{k}") for k, arm in enumerate(arms)],
     )
 
 
 def _page(**context: Any) -> bytes:
     template = environment().get_template("changes.html.j2")
-    none = {"comparison": None, "trends": None}
+    none = {"comparison": None, "batch": None}
     return page_bytes(template.render(rules=_RULES, software=software(), **(none | context)))
 
 

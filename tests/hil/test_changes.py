@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.stats import kendalltau
 from typer.testing import CliRunner
 
-from hil.batch.types import Arm, LevelEstimate, Unused
+from hil.batch.types import Arm, BatchResult, LevelEstimate, Unused
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.plan import design
@@ -32,7 +32,6 @@ from hil.compare.trend import (
     MIN_CAMPAIGNS,
     ArmTrend,
     Axis,
-    Trends,
     arm_trend,
     chart,
     drift,
@@ -399,17 +398,9 @@ def test_axes_without_information_are_left_out() -> None:
     arm = arm_trend("arm", model(), [*campaigns, *campaigns * 3])
     assert np.isnan(arm.axes[0].friction.values).all()
     assert not any(any(axis.friction.departs) for axis in arm.axes)
-    text = trend_page(Trends((arm,), (), "wls", 16)).decode()
+    text = trend_page(batch_result(), [arm]).decode()
     assert text.count('<span class="title">joint_1</span>') == 0
     assert text.count('<span class="title">joint_2</span>') == 2
-
-
-def test_without_information_the_payload_is_not_tested() -> None:
-    campaigns = [replace(one, information=None) for one in history(steady, 2, seed=2)]
-    arm = arm_trend("arm", model(), campaigns)
-    assert "not tested" in findings(arm)[0].words
-    trends = Trends((arm,), (), "wls", 4)
-    assert trend_page(trends) == trend_page(trends)
 
 
 # --- the page ----------------------------------------------------------------------------------
@@ -417,9 +408,13 @@ def test_without_information_the_payload_is_not_tested() -> None:
 BROKEN = Unused("/data/<b>cut</b>.mcap", "its footer is missing")
 
 
+def batch_result(*broken: Unused) -> BatchResult:
+    return BatchResult("wls", {}, (), (), (), broken, (), read=1, cached=0, code="")
+
+
 @cache
 def page() -> str:
-    return trend_page(Trends((changed(), quiet()), (BROKEN,), "wls", 48)).decode()
+    return trend_page(batch_result(BROKEN), [changed(), quiet()]).decode()
 
 
 def test_the_page_begins_with_the_findings() -> None:
@@ -559,7 +554,7 @@ def in_memory(
         for level in levels
     ]
     arm = Arm("digest", arm_histories.cell())
-    return compare_campaigns(CampaignSet(arm, tuple(levels), tuple(single), not folders, ()))
+    return compare_campaigns(CampaignSet(arm, tuple(levels), tuple(single), ()))
 
 
 def test_an_unstated_payload_is_weighed() -> None:
@@ -643,7 +638,7 @@ def test_undetermined_values_are_not_judged() -> None:
     unknown = replace(second, std=np.full_like(second.std, np.inf), covariance=None)
     arm = Arm("digest", arm_histories.cell())
     levels = (first, unknown)
-    again = compare_campaigns(CampaignSet(arm, levels, ((first,), (unknown,)), True, ()))
+    again = compare_campaigns(CampaignSet(arm, levels, ((first,), (unknown,)), ()))
     assert not again.changed
     assert any("is not determined" in one.words for one in again.findings)
     assert any("one repetition" in warning for warning in again.warnings)
