@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import json as json_format
 import os
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -58,27 +54,14 @@ def study(
     reporter = make_reporter(quiet=quiet or json)
     count = workers or len(os.sched_getaffinity(0))
     try:
-        with _signals_as_ctrl_c():
-            settings = study_settings(
-                quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
-            )
-            arm = None if cell is None else Cell.load(cell)
-            found = run_study(output, settings, reporter, workers=count, cell=arm)
+        settings = study_settings(
+            quick=quick, repetitions=repetitions, motions=motions, seed=seed, effects=effects
+        )
+        arm = None if cell is None else Cell.load(cell)
+        found = run_study(output, settings, reporter, workers=count, cell=arm)
     except KeyboardInterrupt:
         raise OperatorStopError(
             f"stopped; the same command resumes the study in {output}"
         ) from None
     summary = summary_of(found)
     typer.echo(json_format.dumps(summary, indent=1) if json else summary["line"])
-
-
-@contextmanager
-def _signals_as_ctrl_c() -> Iterator[None]:
-    """Handle SIGTERM and SIGHUP like Ctrl-C, so that worker processes end too."""
-    in_main = threading.current_thread() is threading.main_thread()
-    with ExitStack() as undo:
-        for one in (signal.SIGTERM, signal.SIGHUP) if in_main else ():
-            if signal.getsignal(one) is signal.SIG_DFL:  # nohup ignores the second on purpose
-                undo.callback(signal.signal, one, signal.SIG_DFL)
-                signal.signal(one, signal.default_int_handler)
-        yield

@@ -61,15 +61,9 @@ class Search:
 
     @property
     def notes(self) -> str:
-        """Settings, as in the notes of the paper's Table 1."""
-        search, via, sines = self.settings.search, self.settings.via_points, self.settings.sines
-        effort = f"{search.population} individuals, {search.generations} generations"
-        if via is not None:
-            one, two = search.weights
-            fly = f"{100.0 * via.fly:.0f} %"
-            return f"K = {via.n_via}, fly {fly}, λ1 = {one:g}, λ2 = {two:g}; {effort}"
-        harmonics = "" if sines is None else f"W = {sines.harmonics}, "
-        return f"{harmonics}{self.words.removeprefix('method A, ')}; {effort}"
+        """Method and size of the search, for Table 1."""
+        size = self.settings.search
+        return f"{self.words}; {size.population} individuals, {size.generations} generations"
 
 
 def searches(settings: StudySettings, n_joints: int) -> list[Search]:
@@ -205,22 +199,18 @@ class Plans:
 
     def without(self, ended: Mapping[Path, str]) -> Plans:
         """Return the plans without ended campaigns, by folder; StudyError for A, B and B0."""
-        missing = list(self.missing)
+        executions, missing = dict[str, dict[str, Execution]](), list(self.missing)
         for condition, some in self.executions.items():
-            for key, one in some.items():
-                if one.root not in ended:
-                    continue
+            executions[condition] = {key: e for key, e in some.items() if e.root not in ended}
+            for key in some.keys() - executions[condition].keys():
+                root = some[key].root
                 if key == B or (condition != ABLATION and key != AP):
                     raise StudyError(
-                        f"{one.root}: the controller ended the excitation: {ended[one.root]};"
-                        " search another one with --seed, in another folder"
+                        f"{root}: the controller ended the excitation: {ended[root]}; search"
+                        " another one with --seed, in another folder"
                     )
-                missing.append(f"{key} could not be run: {ended[one.root]}")
-        left = {
-            condition: {key: one for key, one in some.items() if one.root not in ended}
-            for condition, some in self.executions.items()
-        }
-        return replace(self, executions=left, missing=missing)
+                missing.append(f"{key} could not be run: {ended[root]}")
+        return replace(self, executions=executions, missing=missing)
 
 
 def noise_key(method: str, factor: float) -> str:

@@ -35,7 +35,6 @@ def study_page(results: StudyResults) -> bytes:
     text = template.render(
         results=results,
         labels=first.labels,
-        paragraphs={one.key: one for one in results.reading},
         legend=[(one.label, _VARIABLES[k % 4]) for k, one in enumerate(first.methods)],
         parameters=sorted(
             enumerate(results.parameters), key=lambda one: one[1].printed_id or math.inf

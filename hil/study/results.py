@@ -277,7 +277,6 @@ _OUTCOMES: Final = {
 def conclusions(results: StudyResults) -> list[Paragraph]:
     """Return all paragraphs, the paper's question first."""
     found = [_prediction(results), _classes(results), _effects(results)]
-    found += [_ablation(one, results.ranges) for one in results.ablations]
     return [one for one in found if one is not None]
 
 
@@ -369,27 +368,6 @@ def _effects(results: StudyResults) -> Paragraph | None:
             f"Effects: {'; '.join(effects.effects)}.",
         ],
     )
-
-
-def _ablation(ablation: AblationResult, ranges: Sequence[ChanceRange]) -> Paragraph | None:
-    """List the settings outside the range over other repetitions of the study's own motion."""
-    known = [one for one in ranges if (one.method, one.motion_class) == (B, "fly-by")]
-    if not known or ablation.key not in ("fly", "n_via", "weight"):
-        return None
-    chance = known[-1]  # that of the estimate itself, where it is known
-    outside = [
-        point.name
-        for point in ablation.points
-        for value in [getattr(point, chance.quantity).get("fly-by", chance.low)]
-        if not (point.base or chance.low <= value <= chance.high)
-    ]
-    low, high = (significant(100.0 * bound, 3) for bound in (chance.low, chance.high))
-    own = "own " if chance.quantity == "own" else ""
-    text = (
-        f"The {own}fly-by error for other repetitions of the study's own B ranges from {low} % to"
-        f" {high} %; outside: {', '.join(outside) or 'no setting'}."
-    )
-    return Paragraph(key=f"ablation-{ablation.key}", heading=ablation.title, sentences=[text])
 
 
 def _main(condition: ConditionResult) -> ComparisonResult:

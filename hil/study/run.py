@@ -16,13 +16,14 @@ from hil.design import preset
 from hil.files import digest
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
+from hil.version import software
 from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
 from . import campaigns, tables
 from .page import write_outcome
 from .records import PLANTED, FitRecord, Reader, ScoreRecord
-from .results import MotionRow, SearchResult, StudyResults
+from .results import MotionRow, SearchResult, StudyResults, conclusions
 from .settings import StudyFolder, StudySettings
 
 _WORDS: Final = {
@@ -104,23 +105,22 @@ def _simulated(
         drifts = name == campaigns.EFFECTS
         effects = tuple(json.loads(simulated_provenance(cell, drifts)["effects"]))
         condition = tables.Condition(name, _WORDS[name], effects, drifts)
-        conditions.append(
-            tables.condition_result(
-                condition, campaigns.LABELS, fits[name], scores[name], parameters
-            )
-        )
+        conditions.append(tables.condition_result(condition, fits[name], scores[name], parameters))
     sines, sizes, main = plans.searched[campaigns.A], preset("b").search, fits[campaigns.NO_EFFECTS]
     evidence = tables.Evidence(
         fits[campaigns.ABLATION], main, scores[campaigns.NO_EFFECTS], truth, sines
     )
     varied, ranges = tables.ablations(settings, evidence)
-    return tables.study_results(
-        root,
-        cell,
-        truth,
+    results = StudyResults(
+        name=root.resolve().name,
+        cell=cell.name,
         simulated=True,
         quick=settings.effort_b.tried < sizes.population * sizes.generations,
         settings=settings,
+        software=software(),
+        joint_names=list(cell.joint_names),
+        n_base=len(cell.model.base.names),
+        parameters=parameters,
         searches=[
             _search_result(one, chosen=key in (sines, campaigns.B, campaigns.B0))
             for key, one in found.items()
@@ -135,8 +135,10 @@ def _simulated(
         ranges=ranges,
         missing=plans.missing
         + ([] if settings.effects else ["The unmodelled effects were not simulated."]),
+        reading=[],
         times={},
     )
+    return results.model_copy(update={"reading": conclusions(results)})
 
 
 def _row(key: str, words: str, excitation: Excitation, record: FitRecord) -> MotionRow:

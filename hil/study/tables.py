@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from math import pi
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hil.cell import Cell
-from hil.version import software
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
-from .campaigns import AP, SINES, A, B, noise_key, variant_key
+from .campaigns import AP, LABELS, SINES, A, B, noise_key, variant_key
 from .records import PLANTED, ClassForms, FitRecord, Fitted, ScoreRecord
 from .results import (
     AblationPoint,
@@ -31,8 +29,6 @@ from .results import (
     MethodResult,
     MotionRow,
     StudyParameter,
-    StudyResults,
-    conclusions,
 )
 from .settings import StudySettings
 from .statistics import compared_on, corrected, parameter_error, ranges_of
@@ -51,21 +47,6 @@ TABLE1: Final = (
     ("b", 15996, 30.9, 101.2, "K = 6, λ1 = 0.7, λ2 = 0.3; 150 individuals"),
 )
 """The paper's Table 1: method, N, log det (units not stated), I_c, notes."""
-
-
-def study_results(root: Path, cell: Cell, truth: Array, **tables: Any) -> StudyResults:
-    """Return the results of a study with its conclusions; `tables` are the other fields."""
-    results = StudyResults(
-        name=root.resolve().name,
-        cell=cell.name,
-        software=software(),
-        joint_names=list(cell.joint_names),
-        n_base=len(cell.model.base.names),
-        parameters=parameters_of(cell, truth),
-        reading=[],
-        **tables,
-    )
-    return results.model_copy(update={"reading": conclusions(results)})
 
 
 def is_printed(cell: Cell) -> bool:
@@ -148,7 +129,6 @@ class Condition:
 
 def condition_result(
     condition: Condition,
-    labels: Mapping[str, str],
     fits: Mapping[str, FitRecord],
     scores: Mapping[str, ScoreRecord],
     parameters: Sequence[StudyParameter],
@@ -179,7 +159,7 @@ def condition_result(
         key=condition.key,
         words=condition.words,
         effects=list(condition.effects),
-        methods=[_method(key, labels[key], fits[key]) for key in keys],
+        methods=[_method(key, LABELS[key], fits[key]) for key in keys],
         classes=[
             _class_result(name, one, forms[name], estimates, truth, own=not condition.effects)
             for name, one in scores.items()
@@ -299,8 +279,6 @@ _TEXTS: Final = {
     ),
 }
 """Title, name of the setting and description, by key of the ablation."""
-_SINES_LABELS: Final = ("middle, printed", "home, printed", "middle, fast", "home, fast")
-_LABELS: Final = dict(zip(SINES, _SINES_LABELS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +344,7 @@ def ablations(
                 reference,
                 method=method,
                 base=base in (value, key),
-                label=_LABELS.get(key, ""),
+                label=SINES[key][0] if key in SINES else "",
             )
             for value, method, key in rows
             if key in fits

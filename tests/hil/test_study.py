@@ -42,9 +42,6 @@ from hil.study.campaigns import (
 from hil.study.page import study_page
 from hil.study.records import PLANTED, ClassForms, ExampleRecord, FitRecord, MotionForm, ScoreRecord
 from hil.study.results import (
-    AblationPoint,
-    AblationResult,
-    ChanceRange,
     ConditionResult,
     EqualDataResult,
     StudyParameter,
@@ -317,23 +314,17 @@ def condition(
     methods = {"a": a, "b": b}
     return condition_result(
         named,
-        {"a": "A", "b": "B"},
         {key: fitted(flagged(k, 2, repetitions, noise)) for k, key in enumerate(methods)},
         {"fly-by": scored(methods)},
         PARAMETERS,
     )
 
 
-def study(
-    *conditions: ConditionResult,
-    ablations: Sequence[AblationResult] = (),
-    ranges: Sequence[ChanceRange] = (),
-) -> StudyResults:
+def study(*conditions: ConditionResult) -> StudyResults:
     results = StudyResults(
         name="made up", cell="arm", simulated=True, quick=False, settings=QUICK, software={},
         joint_names=["hip", "knee"], n_base=2, parameters=PARAMETERS, searches=[], table1=[],
-        conditions=list(conditions), ablations=list(ablations), ranges=list(ranges), reading=[],
-        missing=[], times={},
+        conditions=list(conditions), ablations=[], ranges=[], reading=[], missing=[], times={},
     )  # fmt: skip
     return results.model_copy(update={"reading": conclusions(results)})
 
@@ -402,24 +393,6 @@ class TestConclusion:
         verdict = study(uneven).reading[0].verdict
         assert verdict.startswith("A is better")
         assert ("% smaller, but not with as much motion of each." in verdict) is gone
-
-    def test_settings_outside_the_range_of_chance_are_named(self) -> None:
-        points = [
-            AblationPoint(
-                value=value, method="b", base=value == 0.5, repetitions=3, log10_det=1.0,
-                coupling_index=2.0, duration=1.0, parameter_error=1.0, error={"fly-by": 0.01},
-                own={"fly-by": own},
-            )
-            for value, own in ((0.0, 1.5e-3), (0.5, 5e-3), (1.0, 2.5e-3))
-        ]  # fmt: skip
-        band = ChanceRange(
-            method="b", repetitions=3, quantity="own", motion_class="fly-by", low=1e-3, high=2e-3,
-            subsets=400,
-        )  # fmt: skip
-        fly = AblationResult(key="fly", title="Fly-by", variable="share", words="", points=points)
-        found = study(condition(1.0), ablations=[fly], ranges=[band]).reading[-1]
-        assert found.key == "ablation-fly"
-        assert found.sentences[0].endswith("0.100 % to 0.200 %; outside: 1.")
 
 
 class TestPlans:
