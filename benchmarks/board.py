@@ -1,4 +1,4 @@
-"""Identification by default settings beside an ordinary fit, on real recordings and on spoilt ones.
+"""Identification with default settings and an ordinary fit, on real and on degraded recordings.
 
 Run with ``python -m benchmarks.board [--data FOLDER] [--only NAME] [--short] [--degraded]
 [--json]``, where FOLDER holds the folders of recordings that `benchmarks/recordings` describes.
@@ -6,14 +6,14 @@ With ``--short`` the first and the last 40 % of each log are fitted and its rest
 
 Errors are ||tau - tau_hat|| / ||tau|| over all joints and every row of what is predicted, of the
 torque as it was recorded. *hil* imports a recording and identifies from the archive as `hil
-identify` does, by default settings; *plain* is `benchmarks.plain_fit` on the same rows. A ratio
-below 1 is won. *Inside* is the share of hil's held-out means of torque inside their 95 % intervals.
+identify` does with default settings; `plain` is `benchmarks.plain_fit` on the same rows. A ratio
+below 1 is better than that. *Inside* is the share of hil's held-out means of torque inside their
+95 % intervals.
 
-With ``--degraded``, the first held-out split of each robot and of the simulated cell is done again
-with copies of the logs, each with one fault (`benchmarks.degradations`): the error beside that of
-the copy without a fault, and what the verdict calls wrong or
-suspicious only with the fault. *Right* is a verdict that
-names the fault, or leaves it out where it is harmless, and blames nothing else.
+With ``--degraded``, the first held-out split of each robot and of the simulated cell is repeated
+with copies of the logs, each with one fault (`benchmarks.degradations`): the error, that of the
+copy without a fault, and the causes that the verdict names only with the fault. A verdict is
+*right* if it names the fault, or nothing if the fault is harmless, and no other cause.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def identified_parts(parts: Parts, folder: Path) -> Identified:
         return identified(fitted, [predicted])
 
 
-def plain_errors(parts: Parts) -> tuple[float, list[float]]:
+def fit_errors(parts: Parts) -> tuple[float, list[float]]:
     """Errors of the ordinary fit over all joints, and by joint."""
     fitted = plain_fit.fit(parts.fitted.pinocchio_model(), parts.fitted.measured)
     torque, predicted = parts.predicted.torque, fitted.predicted_torque(parts.predicted.measured)
@@ -126,16 +126,16 @@ def row(name: str, split: Split, archives: Mapping[str, Path], logs: Mapping[str
     start = time.perf_counter()
     ours = identified_split(split, archives, parts)
     middle = time.perf_counter()
-    plain, plain_joints = plain_errors(parts)
+    fit, fit_joints = fit_errors(parts)
     calibration = ours.results.calibration
     return {
         "data": name,
         "split": str(split),
         "hil": ours.error,
-        "plain": plain,
-        "ratio": ours.error / plain,
+        "plain": fit,
+        "ratio": ours.error / fit,
         "hil_joints": ours.joints,
-        "plain_joints": plain_joints,
+        "plain_joints": fit_joints,
         "seconds": {"hil": middle - start, "plain": time.perf_counter() - middle},
         "inside": None if calibration is None else calibration.inside,
         "white_inside": None if calibration is None else calibration.white_inside,

@@ -21,7 +21,7 @@ from unittest.mock import patch
 import numpy as np
 
 from benchmarks import parser_of, show
-from benchmarks.board import DATA, cut, identified_parts, plain_errors, split_logs
+from benchmarks.board import DATA, cut, fit_errors, identified_parts, split_logs
 from benchmarks.published import known
 from identification.selection import inner_prediction
 
@@ -39,19 +39,19 @@ PRESENT: Final = "present values"
 
 
 def ratios(name: str, data: Path) -> dict[tuple[str, str], float]:
-    """Error over that of the plain fit on one robot, by default and its value."""
+    """Return the error relative to the ordinary fit on one robot, by default and its value."""
     split, logs = split_logs(name, data)
     parts = cut(split, logs)
-    plain, _ = plain_errors(parts)
+    fit, _ = fit_errors(parts)
     found = {}
     with tempfile.TemporaryDirectory() as scratch:
-        found[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / plain
+        found[PRESENT, ""] = identified_parts(parts, Path(scratch)).error / fit
         for default, values in ALTERNATIVES.items():
             for value in values:
                 with patch.object(inner_prediction, default, value):
                     error = identified_parts(parts, Path(scratch)).error
-                found[default, str(value)] = error / plain
-                print(f"{name}: {default} = {value}: {error / plain:.3f}", flush=True)
+                found[default, str(value)] = error / fit
+                print(f"{name}: {default} = {value}: {error / fit:.3f}", flush=True)
     return found
 
 

@@ -17,7 +17,7 @@ it, "chosen inside" on the last two sevenths of the part that is fitted, which i
 only that is a prediction.
 
 `torque_bandwidth` is that of the low-pass of the logged torque, found on the fitted part alone;
-"plain" does without. The headline figures are not from these tables: they are those of `hil
+"plain" is without it. The headline figures are not from these tables: they are those of `hil
 identify` with its default settings, in sample and held out.
 """
 

@@ -6,8 +6,8 @@ bare echo process with the same scheduling shows what this machine can do at all
 
     python -m benchmarks.turnaround [--cycles N] [--busy] [--json]
 
-An answer that comes later than one cycle after its request is missed; for each, it is said where
-the time went. With `--busy` all is done once more beside a process that keeps a processor busy.
+A reply later than one cycle after its request is missed; the output says where the time of each
+went. With `--busy` everything is repeated beside a process that keeps a processor busy.
 """
 
 from __future__ import annotations

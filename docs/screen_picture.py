@@ -1,7 +1,7 @@
 """Draw docs/screen.png: the screen of a run on the simulated NS 16, as the program draws it.
 
-`python docs/screen_picture.py` runs a short campaign in virtual time, for a minute or so, and takes
-the screen in the middle of its third repetition.
+`python docs/screen_picture.py` runs a short campaign in virtual time, for about a minute, and draws
+the screen in the middle of the third repetition.
 """
 
 from __future__ import annotations
@@ -29,45 +29,45 @@ HERE: Final = Path(__file__).parent
 COLUMNS, ROWS = 80, 24
 REPETITION: Final = 3
 MIDDLE: Final = 0.4
-"""Of the motion that is done when the picture is taken."""
+"""Share of the motion that is complete in the picture."""
 HEIGHT, MARGIN = 20, 14
-"""Pixels of a letter, and around the screen."""
+"""Height of a letter and margin of the picture, pixels."""
 EIGHTHS: Final = " ▏▎▍▌▋▊▉█"
 THEME: Final[TerminalTheme] = MONOKAI
 
 Colour = tuple[int, int, int]
 
 
-class Photographer(Screen):
-    """A screen that nobody sees, of which one moment is kept."""
+class RecordingScreen(Screen):
+    """A hidden screen whose state at one moment is stored."""
 
-    taken: Shown | None = None
+    stored: Shown | None = None
 
     def show(self, status: RunStatus) -> None:
-        """Keep it, if it is the moment."""
+        """Store the state in the middle of the motion."""
         super().show(status)
         motion = status.motion
-        if self.taken is None and (status.phase, status.number) == ("repetition", REPETITION):
+        if self.stored is None and (status.phase, status.number) == ("repetition", REPETITION):
             done = 0.0 if motion is None else (motion.motion_time or 0.0)
             if motion is not None and done > MIDDLE * (motion.duration or 0.0):
-                self.taken = replace(self.shown(), keys=True)
+                self.stored = replace(self.shown(), keys=True)
 
 
-def photographed() -> Shown:
-    """A moment of a run."""
+def screen_in_run() -> Shown:
+    """Return the state of the screen in the middle of a run."""
     cell = Cell.load(HERE.parent / "sim_fixtures" / "ns16" / "cell.toml")
     cell = cell.with_campaign(repetitions=5, validation_runs=1)
     with TemporaryDirectory() as folder:
         campaign = Campaign.create(Path(folder) / "october", cell, design(cell, reporter()))
-        with Photographer.of(cell, stop := Stop(), title="october", quiet=True) as screen:
+        with RecordingScreen.of(cell, stop := Stop(), title="october", quiet=True) as screen:
             campaign.run(None, stop, Silent(), operator=screen, unrehearsed=True, durable=False)
-    assert isinstance(screen, Photographer)
-    assert screen.taken is not None
-    return screen.taken
+    assert isinstance(screen, RecordingScreen)
+    assert screen.stored is not None
+    return screen.stored
 
 
 def picture(shown: Shown) -> Image.Image:
-    """The screen, letter by letter."""
+    """Draw a screen, letter by letter."""
     console = Console(width=COLUMNS, height=ROWS, force_terminal=True, color_system="truecolor")
     fonts = {bold: _font(bold) for bold in (False, True)}
     wide = fonts[False].getlength("m")
@@ -102,7 +102,7 @@ def _font(bold: bool) -> ImageFont.FreeTypeFont:
 
 
 def _colours(style: Style) -> tuple[Colour, Colour]:
-    """Of a letter and what is behind it."""
+    """Return the colours of a letter and its background."""
     paper: Colour = THEME.background_color
     ink: Colour = THEME.foreground_color
     if style.color is not None and not style.color.is_default:
@@ -113,6 +113,6 @@ def _colours(style: Style) -> tuple[Colour, Colour]:
 
 
 if __name__ == "__main__":
-    picture(photographed()).save(
+    picture(screen_in_run()).save(
         sys.argv[1] if sys.argv[1:] else HERE / "screen.png", optimize=True
     )

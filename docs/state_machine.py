@@ -1,8 +1,8 @@
 """Writes `state-machine.md` and its picture, `state-machine.svg`, from the session's state table.
 
-Where a state stands is said here; which arrows there are, and their words, comes from
-`drivers.states` alone. Every arrow carries a title "from | inputs | to", by which it is read back.
-The picture brings its own paper, so that it can be read on a light page and on a dark one.
+Positions of states are defined here; arrows and their labels come from `drivers.states`. Each arrow
+has a title "from | inputs | to", which a test reads. The picture has its own background, so that it
+is readable on light and dark pages.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ Table = Mapping[State, Mapping[Input, State]]
 
 _TITLE: Final = """# The session's state machine
 
-This page and its picture are made from the table `drivers.states.TRANSITIONS` by
-`python docs/state_machine.py`; a test fails where they differ. What each state is answered with
-stands at the head of `drivers/session.py`.
+This page and its picture are generated from the table `drivers.states.TRANSITIONS` by
+`python docs/state_machine.py`; a test fails if they differ. The replies of each state are in the
+docstring of `drivers/session.py`.
 """
 _PICTURE: Final = "state-machine.svg"
 _ANY: Final = "any state after init"
 
 
 def label(member: State | Input) -> str:
-    """A member's name as it is written on the page."""
+    """Return the name of a member on the page."""
     return member.name.lower().replace("_", " ")
 
 
 def common_inputs(table: Table) -> dict[Input, State]:
-    """Inputs that lead to one and the same state from every started state, with that state.
+    """Return the inputs that lead to the same state from every started state, and that state.
 
-    A state is started if the drive can be reported off in it: the init packet came, the session
+    In started states the drive can be reported off: the init packet was received, and the session
     has not ended.
     """
     started = [row for row in table.values() if Input.OFF in row]
@@ -51,7 +51,7 @@ def common_inputs(table: Table) -> dict[Input, State]:
 
 
 def edges(table: Table) -> list[tuple[State | None, State, tuple[Input, ...]]]:
-    """The arrows of the diagram: from (None for every started state), to, and inputs merged."""
+    """Return the arrows: from (None for every started state), to, and their inputs."""
     common = common_inputs(table)
     merged: dict[tuple[State | None, State], list[Input]] = {}
     for before, row in table.items():
@@ -67,7 +67,7 @@ def edges(table: Table) -> list[tuple[State | None, State, tuple[Input, ...]]]:
 
 
 def meanings() -> dict[Input, str]:
-    """What each input means: the sentences below the members in the source of `Input`."""
+    """Return the meaning of each input: the docstrings of the members of `Input`."""
     (enum,) = ast.parse(inspect.getsource(Input)).body
     assert isinstance(enum, ast.ClassDef)
     found: dict[Input, str] = {}
@@ -81,7 +81,7 @@ def meanings() -> dict[Input, str]:
 
 
 def input_table(table: Table = TRANSITIONS) -> str:
-    """What each input means, and where it leads, as a Markdown table."""
+    """Return the meaning and target of each input as a Markdown table."""
     texts = meanings()
     lines = ["| input | meaning | leads to |", "|---|---|---|"]
     for what in Input:
@@ -97,13 +97,13 @@ def input_table(table: Table = TRANSITIONS) -> str:
 
 
 def page() -> str:
-    """The whole of ``docs/state-machine.md``."""
+    """Return the text of ``docs/state-machine.md``."""
     started = ", ".join(label(state) for state, row in TRANSITIONS.items() if Input.OFF in row)
     return (
-        f"{_TITLE}\n![States of the session, and what leads from one to the next]({_PICTURE})\n\n"
-        f'"{_ANY[0].upper() + _ANY[1:]}" stands for: {started}.\n\n## Inputs\n\n'
-        "A cyclic packet is read as one input, judged by the axes that are to be moved; the "
-        "session adds inputs of its own. What leads nowhere in a state cannot happen in it.\n\n"
+        f"{_TITLE}\n![States of the session, and the inputs between them]({_PICTURE})\n\n"
+        f'"{_ANY[0].upper() + _ANY[1:]}" means: {started}.\n\n## Inputs\n\n'
+        "A cyclic packet is one input, which depends on the axes to be moved; the session adds "
+        "further inputs. An input without a target in a state cannot occur in it.\n\n"
         f"{input_table()}"
     )
 
@@ -123,11 +123,11 @@ AT: Final = {
     State.EXITING: (850, 435),
     State.ENDED: (880, 250),
 }
-"""Middle of each state's box."""
+"""Centre of the box of each state."""
 CORNERS: Final = {(State.FAULTED, State.SYNC): [(110.0, 230.0)]}
-"""Where an arrow turns on its way."""
+"""Corners of an arrow."""
 FROM_BELOW: Final = (State.DRIVING_ON, State.CLOSED, State.FAULTED)
-"""States whose arrow from any state comes from below: the others' comes from above."""
+"""States whose arrow from any state comes from below, not from above."""
 LABEL_AT: Final = {
     (State.DRIVING_ON, State.OPEN): 0.27,
     (State.CLOSED, State.OPENING): 0.27,
@@ -136,7 +136,7 @@ LABEL_AT: Final = {
     (State.DRIVE_OFF, State.FAULTED): 0.62,
     (State.FREEZING, State.FAULTED): 0.3,
 }
-"""Where along an arrow its words stand, if not in the middle."""
+"""Position of the label along an arrow, if not in the middle."""
 STYLE: Final = """
   svg { --ink: #1a2026; --paper: #ffffff; --box: #e8eef4; --end: #fbe0e1; --line: #55606b; }
   @media (prefers-color-scheme: dark) {
@@ -156,11 +156,11 @@ Point = tuple[float, float]
 
 
 def svg(table: Table = TRANSITIONS) -> str:
-    """The picture of a table of these states."""
+    """Draw a table of states."""
     stays = {after: inputs for before, after, inputs in edges(table) if before == after}
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
-        'aria-label="States of the session and what leads from one to the next">',
+        'aria-label="States of the session and the inputs between them">',
         f"<style>{STYLE}</style>",
         '<defs><marker id="head" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" '
         'markerHeight="7" orient="auto-start-reverse"><path class="head" d="M0 0L10 5L0 10z"/>'
@@ -200,7 +200,7 @@ def _box(state: State, stays: tuple[Input, ...]) -> Iterator[str]:
 
 
 def _from_any(after: State, inputs: tuple[Input, ...]) -> Iterator[str]:
-    """A short arrow into a state, for inputs that lead there from every started one."""
+    """Draw the short arrow into a state for inputs from every started one."""
     (x, y), (wide, tall) = AT[after], BOX
     below = after in FROM_BELOW
     begin = y + (tall / 2 + 24) * (1 if below else -1)
@@ -215,8 +215,12 @@ def _from_any(after: State, inputs: tuple[Input, ...]) -> Iterator[str]:
 
 
 def _arrow(before: State, after: State, inputs: tuple[Input, ...]) -> Iterator[str]:
-    way = [AT[before], *CORNERS.get((before, after), ()), AT[after]]
-    points = [_edge_of(way[0], way[1]), *way[1:-1], _edge_of(way[-1], way[-2])]
+    corners = [AT[before], *CORNERS.get((before, after), ()), AT[after]]
+    points = [
+        _edge_of(corners[0], corners[1]),
+        *corners[1:-1],
+        _edge_of(corners[-1], corners[-2]),
+    ]
     path = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
     (ax, ay), (bx, by) = points[0], points[1]
     share = LABEL_AT.get((before, after), 0.5)
@@ -232,7 +236,7 @@ def _arrow(before: State, after: State, inputs: tuple[Input, ...]) -> Iterator[s
 
 
 def _edge_of(middle: Point, towards: Point) -> Point:
-    """Where the straight line from a box's middle leaves it."""
+    """Return the point where the line from the centre of a box leaves it."""
     dx, dy = towards[0] - middle[0], towards[1] - middle[1]
     share = min(
         BOX[0] / 2 / abs(dx) if dx else 1.0,

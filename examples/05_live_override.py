@@ -22,28 +22,28 @@ from hil.move import plan_move, send
 PICTURE = Path("runs/examples/05_live_override.png")
 
 
-class Person:
+class Operator:
     """Slows the motion down from a quarter to half of the motion."""
 
     def __init__(self) -> None:
-        self.wishes, self.seen = OperatorRequest(), []
+        self.requested, self.seen = OperatorRequest(), []
 
     def show(self, progress: MotionProgress) -> None:
-        """Look where the motion is, about ten times a second."""
+        """Choose the override from the progress; called about ten times a second."""
         done = (progress.motion_time or 0.0) / (progress.duration or 1.0)
-        self.wishes = OperatorRequest(override=0.25 if 0.25 < done < 0.5 else 1.0)
-        self.seen.append((progress.cycles, self.wishes.override, progress.rate or 0.0))
+        self.requested = OperatorRequest(override=0.25 if 0.25 < done < 0.5 else 1.0)
+        self.seen.append((progress.cycles, self.requested.override, progress.rate or 0.0))
 
     def request(self) -> OperatorRequest:
-        """What it shall do now."""
-        return self.wishes
+        """Return the present request."""
+        return self.requested
 
 
-cell, person = Cell.load("sim_fixtures/ns16/cell.toml"), Person()
+cell, operator = Cell.load("sim_fixtures/ns16/cell.toml"), Operator()
 with TemporaryDirectory() as folder, cell_link(cell) as link, stop_on_interrupt() as stop:
     move = plan_move(cell, link.connect(stop), cell.home, speed=0.02)
     archive = Path(folder) / "move_000_a1.mcap"
-    print(send(move, cell, link, archive, stop=stop, watch=person).outcome)
+    print(send(move, cell, link, archive, stop=stop, watch=operator).outcome)
     q = open_archive(archive).columns["commanded_position"]
     q = q[np.isfinite(q).all(axis=1)]
 along = (move.target - move.start) / np.linalg.norm(move.target - move.start)
@@ -51,8 +51,10 @@ beside = (q - move.start) - np.outer((q - move.start) @ along, along)
 print(f"{move.duration:.2f} s planned, {len(q) * cell.period:.2f} s executed")
 print(f"largest distance from the planned path: {np.abs(beside).max():.1e} rad")
 figure, rows = plt.subplots(2, sharex=True, figsize=(8, 4.5), layout="constrained")
-cycles, wished, rate = np.array(person.seen).T
-rows[0].step(cycles * cell.period, wished, "--", where="post", color="#666666", label="wished")
+cycles, requested, rate = np.array(operator.seen).T
+rows[0].step(
+    cycles * cell.period, requested, "--", where="post", color="#666666", label="requested"
+)
 rows[0].plot(cycles * cell.period, rate, color="#0072b2", label="speed along the path")
 rows[0].legend(loc="lower right")
 speed = np.degrees(np.diff(q, axis=0)) / cell.period

@@ -1,4 +1,4 @@
-"""Your own link: an object of seven methods that carries packets, here a pipe.
+"""Your own link: an object with seven methods that carries packets, here a pipe.
 
 The controller runs in another process and waits for each reply, so that time is virtual. Prints the
 outcome of the motion and the number of packets; the picture is its archive. `drivers.Transport`
@@ -21,11 +21,11 @@ from hil.simulation import simulated_controller
 
 CELL = "sim_fixtures/ns16/cell.toml"
 PICTURE = Path("runs/examples/07_own_transport.png")
-PATIENCE = 60.0  # s that the controller waits for an answer
+REPLY_TIMEOUT = 60.0  # s that the controller waits for a reply
 
 
 class PipeTransport:
-    """One message is one packet; the far end sends the next one when it has its answer."""
+    """One message is one packet; the controller sends the next one after the reply."""
 
     ages = None  # every packet carries all values
 
@@ -38,50 +38,50 @@ class PipeTransport:
         return self.packets * self.period
 
     def receive(self, timeout: float) -> bytes | None:
-        """The next packet, None if there is none in time."""
+        """Return the next packet, None after `timeout` seconds."""
         try:
             packet = self.end.recv_bytes() if self.end.poll(timeout) else None
         except (EOFError, OSError) as error:
-            raise TransportClosed("the far end has gone") from error
+            raise TransportClosed("the controller closed the pipe") from error
         self.packets += packet is not None
         return packet
 
     def send(self, packet: bytes) -> None:
-        """The answer."""
+        """Send a reply."""
         try:
             self.end.send_bytes(packet)
         except OSError as error:
-            raise TransportClosed("the far end has gone") from error
+            raise TransportClosed("the controller closed the pipe") from error
 
     def rejected(self) -> dict[str, int]:
-        """Nothing is discarded on the way."""
+        """Return counts of discarded packets: none."""
         return {}
 
     def forget_peer(self) -> None:
-        """There is only one."""
+        """Do nothing: a pipe has one peer."""
 
     def close(self) -> None:
-        """Give the link up."""
+        """Close the pipe."""
         self.end.close()
 
 
 def controller(end: Connection) -> None:
-    """The other process: a packet, its answer, the next packet."""
+    """Run the controller: a packet, its reply, the next packet."""
     arm = simulated_controller(Cell.load(CELL))
     while (packet := arm.next_packet()) is not None:
         if packet:
             end.send_bytes(packet)
-        arm.accept(end.recv_bytes() if packet and end.poll(PATIENCE) else None)
+        arm.accept(end.recv_bytes() if packet and end.poll(REPLY_TIMEOUT) else None)
 
 
 def main() -> None:
     """Connect through the pipe and go home."""
-    cell, (near, far) = Cell.load(CELL), Pipe()
-    get_context("fork").Process(target=controller, args=(far,), daemon=True).start()
+    cell, (pc_end, controller_end) = Cell.load(CELL), Pipe()
+    get_context("fork").Process(target=controller, args=(controller_end,), daemon=True).start()
     ring = CycleRing(len(cell.joint_names), capacity=1000)
     guard = Guard(cell.guard_limits, cell.period)
     session = Session(cell.drive_train, guard, ring, **cell.session_settings())
-    link = Link(PipeTransport(near, cell.period), session, ring, guard, cell)
+    link = Link(PipeTransport(pc_end, cell.period), session, ring, guard, cell)
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
         move = plan_move(cell, link.connect(stop), cell.home)

@@ -1,7 +1,6 @@
 """Names of the package in running text become links to the API reference.
 
-Pages and docstrings are plain text, readable as they are; a name such as `identification.estimate`
-or `Session` stands in backticks there, and leads to its documentation here wherever it has one.
+A name in backticks, such as `identification.estimate` or `Session`, is linked to its documentation.
 """
 
 from __future__ import annotations
@@ -18,18 +17,18 @@ _CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 _NAME = re.compile(r"[\w.]+")
 
 Place = tuple[str, str]
-"""Page, and where on it."""
+"""Page and anchor."""
 
 
-def places_of(objects: Mapping[str, Any]) -> dict[str, Place]:
-    """Where each name is documented: full names, and last parts of classes if only one has it."""
-    places = {name: (entry.docname, entry.node_id) for name, entry in objects.items()}
+def places(objects: Mapping[str, Any]) -> dict[str, Place]:
+    """Return the place of each full name, and of the last part of classes where it is unique."""
+    full = {name: (entry.docname, entry.node_id) for name, entry in objects.items()}
     short: dict[str, set[Place]] = {}
     for name, entry in objects.items():
         if entry.objtype in ("class", "exception"):
-            short.setdefault(name.rpartition(".")[2], set()).add(places[name])
-    alone = {name: found.pop() for name, found in short.items() if len(found) == 1}
-    return alone | places
+            short.setdefault(name.rpartition(".")[2], set()).add(full[name])
+    unique = {name: found.pop() for name, found in short.items() if len(found) == 1}
+    return unique | full
 
 
 class LinkedNames(SphinxPostTransform):
@@ -39,39 +38,38 @@ class LinkedNames(SphinxPostTransform):
 
     def run(self, **_: Any) -> None:
         """Link every literal of the page that is a documented name."""
-        places = places_of(self.env.domains.python_domain.objects)
+        found = places(self.env.domains.python_domain.objects)
         page = self.env.current_document.docname
         for literal in list(self.document.findall(nodes.literal)):
-            place = places.get(literal.astext().removesuffix("()"))
+            place = found.get(literal.astext().removesuffix("()"))
             if place is not None and not isinstance(literal.parent, nodes.reference):
                 link = make_refnode(self.app.builder, page, *place, literal.deepcopy())
                 literal.replace_self(link)
 
 
-def plain_docstring(
+def restructured_docstring(
     _app: Any, what: str, _name: str, _of: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Make reStructuredText of a docstring that was written for reading.
+    """Convert a docstring to reStructuredText.
 
-    Any `code` is a literal; |x| is a magnitude; what stands between lines of three backticks is
-    kept as it is.
+    Any `code` is a literal, |x| a magnitude, text between lines of three backticks a code block.
     """
     # An empty comment: else napoleon reads the first line of a property as "type: description".
-    kept = ["..", ""] if what in ("property", "attribute", "data") else []
+    converted = ["..", ""] if what in ("property", "attribute", "data") else []
     fenced = False
     for line in lines:
         if line.strip() == "```":
             fenced = not fenced
-            kept += ["::", ""] if fenced else [""]
+            converted += ["::", ""] if fenced else [""]
         elif fenced:
-            kept.append(f"    {line}")
+            converted.append(f"    {line}")
         else:
-            kept.append(_marked_up(line))
-    lines[:] = kept
+            converted.append(_marked_up(line))
+    lines[:] = converted
 
 
 def _marked_up(line: str) -> str:
-    """A line with its code as literals, and its bars escaped outside of them."""
+    """Return a line with its code as literals, and with bars escaped outside of them."""
     parts = re.split(r"(``.*?``)", _CODE.sub(_literal, line))
     return "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
 
@@ -85,5 +83,7 @@ def _literal(code: re.Match[str]) -> str:
 def setup(app: Any) -> dict[str, bool]:
     """Register both."""
     app.add_post_transform(LinkedNames)
-    app.connect("autodoc-process-docstring", plain_docstring, priority=400)  # before napoleon
+    app.connect(
+        "autodoc-process-docstring", restructured_docstring, priority=400
+    )  # before napoleon
     return {"parallel_read_safe": True, "parallel_write_safe": True}
