@@ -6,7 +6,6 @@ import math
 import os
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,16 +13,16 @@ from typing import Annotated, Any, Literal
 import typer
 
 from hil.campaign.campaign import campaign_of_design, require_replaceable
-from hil.campaign.operator import Stop, stop_on_interrupt
+from hil.campaign.operator import stop_on_interrupt
 from hil.campaign.plan import quick_settings
 from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
-from hil.design.advice import WEAK, NoExcitationError, criteria_text, margins, weakest
+from hil.design.advice import WEAK, criteria_text, margins, weakest
 from hil.design.earlier import estimate_earlier
 from hil.design.result import references
-from hil.design.run import Designed, DesignFolder, require_same, run_design
+from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
 from hil.plots import save
@@ -63,17 +62,14 @@ def _lines(done: Designed) -> Iterator[str]:
         f"{len(design.front)} on the front"
     )
     raw, scaled = criteria.condition, criteria.scaled_condition
-    if raw is not None and scaled is not None:
+    assert raw is not None and scaled is not None
+    yield f"condition number of the regressor {raw:.0f}, {scaled:.1f} with columns of unit length"
+    if scaled > WEAK:
+        names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
         yield (
-            f"condition number of the regressor {raw:.0f}, {scaled:.1f} with columns of unit length"
+            f"this motion hardly separates {names}: use more via points or harmonics, allow a "
+            "longer motion, or choose other parameters ([objective] parameters)"
         )
-        if scaled > WEAK:
-            names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
-            yield (
-                f"this motion hardly separates {names}: use more "
-                f"{'via points' if sines is None else 'harmonics'}, allow a longer motion, search "
-                "longer, or choose other parameters ([objective] parameters)"
-            )
     if design.chosen is None:
         yield f"polished from {criteria_text(design.origin_criteria.measures)}"
     if sines is not None and sines.ramp == 0.0:
@@ -91,20 +87,13 @@ def _draw(
     """Draw the picture; a failure is only reported."""
     from hil.plots.design_picture import draw_design  # loads the arm's shapes
 
-    design, excitation = done.design, done.result.excitation
-    grown = tuple(design.front.measures[design.origin].tolist())
     figure = draw_design(
-        excitation,
+        done.design,
         cell,
-        front=design.front,
-        chosen=design.chosen,
-        knee=None if design.chosen is not None else grown,
         references=beside,
         unchecked=done.result.settings.unchecked,
-        complete=design.complete,
         together=together,
-        margins=margins(cell, done.problem, excitation.trajectory),
-        title=cell.name,
+        margins=margins(cell, done.problem, done.design.excitation.trajectory),
     )
     try:
         save(figure, folder.picture)
@@ -112,18 +101,9 @@ def _draw(
         say(f"warning: {error}; repeat with --resume to draw it", err=True)
 
 
-def _folder(given: str) -> Path:
-    """Refuse an empty name, which would be the working directory."""
-    if not given:
-        raise InputError(None, "is empty", field="--output", remedy="name a folder")
-    return Path(given)
-
-
 def design(
     cell: Annotated[Path | None, typer.Argument()] = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", parser=_folder, metavar="<path>")
-    ] = Path("runs/design"),
+    output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
     method: Method | None = None,
     settings: Path | None = None,
     show_settings: Method | None = None,
@@ -212,8 +192,6 @@ def design(
         asked = asked.kinematic()
     if purpose == "payload":
         asked = asked.for_payload()
-    if there is not None:
-        require_same(asked, there, folder.settings)
     beside = references(compare or [], loaded, asked, together=bool(earlier))
     estimate = estimate_earlier(earlier, loaded, reporter) if earlier else None
 
@@ -249,27 +227,19 @@ def design(
             )
         _draw(folder, done, loaded, beside, together=estimate is not None)
 
-    with _stoppable(folder) as stop:
-        try:
-            done = run_design(
-                folder,
-                loaded,
-                asked,
-                reporter,
-                workers=workers or len(os.sched_getaffinity(0)),
-                earlier=estimate,
-                stop=lambda: stop.requested,
-                resume=resume,
-                force=force,
-                then=finish,
-            )
-        except NoExcitationError as error:
-            if not folder.settings.exists():  # the search had not started
-                raise
-            raise NoExcitationError(
-                f"{error}; then repeat the command with --force, or with --resume if cell and "
-                "settings are unchanged"
-            ) from error
+    with stop_on_interrupt() as stop:
+        done = run_design(
+            folder,
+            loaded,
+            asked,
+            reporter,
+            workers=workers or len(os.sched_getaffinity(0)),
+            earlier=estimate,
+            stop=lambda: stop.requested,
+            resume=resume,
+            force=force,
+            then=finish,
+        )
     if not done.design.complete:
         raise OperatorStopError(
             f"stopped before the end of the search; the best motion so far is in {folder.result}; "
@@ -293,15 +263,3 @@ def _campaign(
     except (HilError, OSError) as error:  # the design is valid without one
         return str(error), ()
     return None, ()
-
-
-@contextmanager
-def _stoppable(folder: DesignFolder) -> Iterator[Stop]:
-    """Turn Ctrl-C and SIGTERM into a request to stop; a second one exits at once."""
-    try:
-        with stop_on_interrupt() as stop:
-            yield stop
-    except KeyboardInterrupt:
-        raise OperatorStopError(
-            f"interrupted; evaluated motions are in {folder.journal}; continue with --resume"
-        ) from None

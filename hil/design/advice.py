@@ -46,17 +46,13 @@ def margins(cell: Cell, problem: excitation.Problem, trajectory: Trajectory) -> 
             f"(motor of {currents.model.joint_names[motor]})"
         )
     if constraints.checker is not None:
-        margin = max(_WIDEST, cell.workspace.margin)
-        workspace = replace(cell.workspace, margin=margin)
-        folders = cell.mesh_folders
+        workspace = replace(cell.workspace, margin=max(_WIDEST, cell.workspace.margin))
         wide = excitation.CollisionChecker(
-            cell.urdf, workspace, limits=cell.joint_limits, mesh_folders=folders
+            cell.urdf, workspace, limits=cell.joint_limits, mesh_folders=cell.mesh_folders
         )
         near = wide.deepest_contact(motion.position)
-        pair = (
-            "" if near is None else f"nearest {near.distance:.2f} m ({near.first}, {near.second})"
-        )
-        parts.append(pair or f"nothing nearer than {margin:g} m")
+        if near is not None:
+            parts.append(f"nearest {near.distance:.2f} m ({near.first}, {near.second})")
     return "; ".join(parts)
 
 
@@ -64,15 +60,13 @@ def weakest(objective: excitation.Objective, trajectory: Trajectory) -> tuple[st
     """Return the parameters that a motion separates least, in falling order.
 
     These are the largest entries of the eigenvector with the smallest eigenvalue of the Gram matrix
-    of unit columns, or the parameters without excitation.
+    of unit columns.
     """
     gram = objective.information(excitation.midpoints(trajectory))
     chosen = objective.parameters
     names = objective.model.parameter_names
     judged = names if chosen is None else tuple(names[k] for k in chosen)
     length = np.sqrt(np.diag(gram))
-    if not np.all(length > 0.0):
-        return tuple(judged[k] for k in np.flatnonzero(~(length > 0.0)))
     _, directions = np.linalg.eigh(gram / length[:, None] / length)
     size: Array = np.abs(directions[:, 0])
     order = np.argsort(-size, kind="stable")[:_MOST_NAMES]
@@ -102,8 +96,6 @@ _SINES: Final = {
     "torque": _SLOWER_SINES,
     "joint limit": "use longer ramps or lower frequencies ([sines] ramp, fastest)",
 }
-_FEW: Final = 500  # motions; with fewer a longer search may succeed
-_FAR: Final = 1.5  # ratio of durations beyond which a longer search does not help
 
 
 class NoExcitationError(UnsafeError):
@@ -132,17 +124,14 @@ def infeasible_text(error: excitation.NoFeasibleMotionError, frame: AngleFrame) 
 def _advice(
     error: excitation.NoFeasibleMotionError, settings: DesignSettings, always: str | None
 ) -> Iterator[str]:
-    """Yield remedies for each kind of constraint that excludes more than half of the motions."""
+    """Yield remedies for the constraints that exclude more than half, or most, of the motions."""
     remedies = _VIA_POINTS if settings.sines is None else _SINES
-    unexciting, chance = 2 * error.unexciting > error.tried, True
     kinds = sorted(error.rejected, key=lambda kind: -error.rejected[kind])
     ruling = [kind for kind in kinds if 2 * error.rejected[kind] > error.tried]
-    for kind in ruling or ([] if unexciting else kinds[:1]):
+    for kind in ruling or kinds[:1]:
         if kind == "duration":  # of via points
             nearest, asked = error.nearest[kind], settings.constraints
             long = nearest.value > nearest.bound
-            least = min(nearest.value, nearest.bound)
-            chance = max(nearest.value, nearest.bound) < _FAR * least
             yield (
                 f"the {'shortest' if long else 'longest'} motion lasts {nearest.value:.3g} s,"
                 f" allowed are {asked.min_duration:g} to {asked.max_duration:g} s: "
@@ -150,11 +139,8 @@ def _advice(
             )
         elif kind == "collision" and always is not None:
             yield always
-            chance = False
         elif kind in remedies:
             yield remedies[kind]
-    if unexciting:
+    if error.unexciting:
         more = "via points" if settings.sines is None else "harmonics, or a longer motion,"
         yield f"use more {more} or fewer parameters ([objective] parameters)"
-    if chance and 0 < error.tried < _FEW:
-        yield (f"evaluate more than {error.tried} motions ([search] population, generations)")

@@ -118,23 +118,6 @@ def _flat(settings: DesignSettings) -> dict[str, Any]:
     }
 
 
-def require_same(asked: DesignSettings, stored: DesignSettings, path: Path) -> None:
-    """Check that a search is resumed with the settings that it was started with.
-
-    Raises:
-        SettingsError: names the first field that differs.
-    """
-    new, old = _flat(asked), _flat(stored)
-    for field in sorted(new.keys() | old.keys()):
-        if new.get(field) != old.get(field):
-            raise SettingsError(
-                path,
-                f"was {old.get(field)!r} when the search began",
-                field=f"{field} = {new.get(field)!r}",
-                remedy="resume it without other settings, or start one in another folder (-o)",
-            )
-
-
 @dataclass(frozen=True, eq=False)
 class Designed:
     """Problem, design and stored result of a search."""
@@ -171,8 +154,13 @@ def run_design(
     problem = problem_of(cell, settings, earlier)  # before anything is replaced
     archives = () if earlier is None else earlier.archives
     with folder.locked():
-        if resume:  # another search may have changed them since they were read
-            require_same(settings, folder.resumed_settings(), folder.settings)
+        if resume:
+            if settings != folder.resumed_settings():
+                raise SettingsError(
+                    folder.settings,
+                    "are not the settings that were asked for",
+                    remedy="resume the search without options, or start one in another folder (-o)",
+                )
         else:
             folder.create(settings, force=force)
         added = {} if earlier is None else dict(archives) | {"repetitions": earlier.repetitions}
@@ -191,8 +179,6 @@ def run_design(
                 )
             finally:
                 journal.close()
-        if journal.recalled:
-            reporter.say(f"{journal.recalled} scores were read from the journal")
         if journal.error is not None:
             reporter.say(
                 f"the last scores are not in the journal ({journal.error.strerror}); a resumed "
@@ -232,7 +218,7 @@ def run_search(
     frame, total = AngleFrame.of(cell), excitation.most_evaluations(settings)
     if checker is not None and checker.exceptions is not None:
         reporter.say(checker.exceptions)
-    done, note, warned = 0, "scoring the first motions", False
+    done, note = 0, "scoring the first motions"
     with (
         reporter.task("designing (motions)", total) as task,
         excitation.Population(problem, workers) as population,
@@ -246,15 +232,9 @@ def run_search(
 
         def update(progress: excitation.Progress) -> None:
             """Report a generation, whose scores may be from the journal."""
-            nonlocal note, warned
+            nonlocal note
             note = _note(progress)
             scored(progress.evaluated - done)
-            if journal is not None and journal.error is not None and not warned:
-                warned = True
-                reporter.say(
-                    f"the journal cannot be written ({journal.error.strerror}); the search "
-                    "continues and tries to write it again"
-                )
 
         try:
             design = excitation.search(

@@ -20,7 +20,7 @@ from hil.archive.check import Overview, read_overview
 from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
-from hil.plots.plan_picture import broken
+from hil.plots.plan_picture import wrapped
 from hil.report import drawing
 from hil.report.rendering import environment, page_bytes
 from hil.terminal_text import plural
@@ -426,7 +426,7 @@ def draw_archive(view: ArchiveView) -> Figure:
                         textcoords="offset points", fontsize=style.TEXT,
                     )  # fmt: skip
                 axes.set_xlabel(_SECONDS if j == rows - 1 else "")
-                axes.set_ylabel("" if k else broken(drawing.label(view.joint_names[j])))
+                axes.set_ylabel("" if k else wrapped(view.joint_names[j]))
         simulated = "SIMULATED" if facts.metadata.get("simulated") == "yes" else ""
         packets = view.missed and f"packets: {view.missed}"
         parts = (simulated, view.frame, packets, facts.lost, facts.damage, "red dashes: limits")

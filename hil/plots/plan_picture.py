@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import re
+import textwrap
 from collections.abc import Sequence
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from hil.cell import AngleFrame
 from hil.errors import InputError
 from hil.files import write_atomically
 from hil.plots import style
-from hil.report.drawing import thinned
+from hil.report.drawing import label, thinned
 from planner import JointLimits, Trajectory
 from planner.moves import MotionPlan
 
@@ -64,9 +63,7 @@ def draw_motion(
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
             style.bare(axes)
             axes.grid(False, axis="x")
-        name = broken(name)
-        size = style.TEXT - (1.0 if "\n" in name else 0.0)
-        row[0].set_ylabel(name, color=style.INK, fontsize=size)
+        row[0].set_ylabel(wrapped(name), color=style.INK)
     for axes, (title, *_) in zip(rows[0], columns, strict=False):
         axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
         for number, at in enumerate(postures, 1):
@@ -75,28 +72,19 @@ def draw_motion(
         axes.set_xlabel("time [s]")
 
 
-def broken(name: str) -> str:
-    """Break a joint's name into at most two lines; abbreviate in the middle."""
-    name = "".join(c if c.isprintable() else " " for c in name).strip()
-    ends = [match.end() for match in re.finditer(r"[_\W]+", name)]
-    fitting = [end for end in ends if end <= _LETTERS and end < len(name)]
-    at = fitting[-1] if fitting and len(name) > _LETTERS else 0
-    rest, half = name[at:], (_LETTERS - 1) // 2
-    if len(rest) > _LETTERS:
-        rest = f"{rest[:half]}…{rest[half + 1 - _LETTERS :]}"
-    return f"{name[:at].rstrip()}\n{rest}" if at else rest
+def wrapped(name: str) -> str:
+    """Return a joint's name in lines that fit the height of a row."""
+    return textwrap.fill(label(name), _LETTERS)
 
 
 def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
-    """Draw limits, set the range of the axis, and ticks at limits and zero (or the middle)."""
+    """Draw limits, set the range of the axis, and ticks at limits and zero."""
     for bound in (low, high):
         axes.axhline(bound, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
     least, most = min(low, float(values.min())), max(high, float(values.max()))
     room = 0.1 * (most - least)
     axes.set_ylim(least - room, most + room)
-    middle = 0.0 if low < 0.0 < high else (low + high) / 2.0
-    inside = min(abs(middle - low), abs(high - middle)) > 2.0 * room
-    axes.set_yticks([low, middle, high] if inside else [low, high])
+    axes.set_yticks([low, *([0.0] if low < 0.0 < high else []), high])
     axes.yaxis.set_major_formatter("{x:.4g}")
 
 
@@ -129,9 +117,6 @@ def draw_plan(
     height = _TOP + n * _ROW + _BOTTOM
     targets = np.array([frame.shown(move.target) for move in plan.moves])
     times = [target.time for target in plan.targets]
-    # Omit numbers that would overlap.
-    apart = 0.03 * plan.trajectory.duration
-    shown = [True, *(b - a >= apart for a, b in pairwise(times))]
     with style.page():
         figure = Figure(figsize=(_WIDTH, height))
         grid = figure.add_gridspec(
@@ -152,9 +137,8 @@ def draw_plan(
                 clip_on=False, zorder=4.0,
             )  # fmt: skip
         for axes in rows[0]:
-            for number, (time, show) in enumerate(zip(times, shown, strict=True), 1):
-                if show:
-                    _number(axes, number, time)
+            for number, time in enumerate(times, 1):
+                _number(axes, number, time)
         figure.align_ylabels([row[0] for row in rows])
         duration, stopping = plan.duration, plan.duration_with_stops
         share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
@@ -24,19 +23,13 @@ Array = NDArray[np.float64]
 
 
 class View(NamedTuple):
-    """An orthographic view: indices of the horizontal and vertical base axes."""
+    """An orthographic view."""
 
     name: str
-    across: int
-    up: int
-
-    @property
-    def axes(self) -> tuple[int, int]:
-        """Indices of both axes."""
-        return self.across, self.up
+    axes: tuple[int, int]  # base axes to the right and upwards
 
 
-SIDE, TOP = View("side", 0, 2), View("top", 0, 1)
+SIDE, TOP = View("side", (0, 2)), View("top", (0, 1))
 VIEWS: Final = (SIDE, TOP)
 _SWEPT, _SWEPT_EDGE = "#dfe8f1", "#8fa9c4"
 _BASE, _ARM, _ARM_EDGE = "#8a8a8a", "#4b5763", "#ffffff"
@@ -48,10 +41,8 @@ _STEP, _LONGEST = 0.03, 1500
 """Sampling period of the swept volume, s, and largest number of samples."""
 _ROOM: Final = 0.06
 _NEAR: Final = 0.2  # Obstacles within this fraction of the swept volume's size are drawn
-_SHORT: Final = 0.08  # Paths shorter than this fraction of the view have no arrow head
 _GRID: Final = 500  # Grid points across a view
-_HIGHEST, _FLATTEST = 1.3, 0.5
-_HEAD: Final = {"arrowstyle": "-|>,head_width=0.22,head_length=0.4", "color": _PATH}
+_FLATTEST: Final = 0.5  # Smallest range of an axis relative to the largest
 
 
 def outlines(points: Array) -> Array:
@@ -96,7 +87,7 @@ class Strip:
     @classmethod
     def of(cls, arm: Arm, trajectory: Trajectory, workspace: Workspace, count: int) -> Strip:
         """Sample a motion, and `count` of its postures at equal intervals."""
-        postures = posture_times(trajectory, count)
+        postures = np.linspace(0.0, trajectory.duration, count, endpoint=False)
         steps = int(np.clip(np.ceil(trajectory.duration / _STEP), 1, _LONGEST))
         time = np.linspace(0.0, trajectory.duration, steps + 1)
         q, shown = trajectory.sample(time)[0], trajectory.sample(postures)[0]
@@ -117,22 +108,14 @@ class Strip:
             if np.all((lower < most) & (upper > least)):
                 low = np.minimum(low, np.maximum(lower, least))
                 high = np.maximum(high, np.minimum(upper, most))
-        size = (1.0 + 2.0 * _ROOM) * np.maximum(high - low, 1e-3)
-        size[0] = max(size[0], size.max() / _HIGHEST)
-        size[1:] = np.maximum(size[1:], _FLATTEST * size[0])
+        longest = max(float(np.max(high - low)), 1e-3)
+        size = (1.0 + 2.0 * _ROOM) * np.maximum(high - low, _FLATTEST * longest)
         return np.stack(((low + high - size) / 2.0, (low + high + size) / 2.0), axis=1)
 
     def shape(self, view: View) -> float:
         """Return height over width of a view."""
-        size = np.ptp(self.extents, axis=1)
-        return float(size[view.up] / size[view.across])
-
-
-def posture_times(trajectory: Trajectory, count: int) -> Array:
-    """Return `count` equidistant times [s], without the end of a closed motion."""
-    ends, _, _ = trajectory.sample(np.array([0.0, trajectory.duration]))
-    closed = bool(np.allclose(ends[0], ends[1], atol=1e-9))
-    return np.linspace(0.0, trajectory.duration, count, endpoint=not closed)
+        across, up = np.ptp(self.extents, axis=1)[list(view.axes)]
+        return float(up / across)
 
 
 def draw_strip(rows: Sequence[Sequence[Axes]], strip: Strip) -> None:
@@ -151,13 +134,13 @@ def draw_strip(rows: Sequence[Sequence[Axes]], strip: Strip) -> None:
                 sweep, levels=[0.5], colors=[_SWEPT_EDGE], linewidths=0.6, extent=extent, zorder=1.1
             )
             _arm(axes, strip, k, view)
-            axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
-            axes.yaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+            axes.locator_params(nbins=4)
             axes.tick_params(labelleft=k == 0, labelbottom=view is TOP, length=2.0, pad=2.0)
             for spine in axes.spines.values():
                 spine.set_color(style.RULE)
-            axes.set_ylabel("" if k else f"{view.name} view: {'xyz'[view.up]} [m]")
-            axes.set_xlabel(f"{'xyz'[view.across]} [m]" if view is TOP else "")
+            across, up = ("xyz"[axis] for axis in view.axes)
+            axes.set_ylabel("" if k else f"{view.name} view: {up} [m]")
+            axes.set_xlabel(f"{across} [m]" if view is TOP else "")
     for k, (axes, time) in enumerate(zip(rows[0], strip.postures, strict=True), 1):
         axes.set_title(f"{k}", loc="left", fontweight="bold", color=style.INK, pad=4.0)
         axes.set_title(f"{time:.2f} s", loc="center", color=style.MUTED, pad=4.0)
@@ -175,19 +158,14 @@ def _arm(axes: Axes, strip: Strip, k: int, view: View) -> None:
     colours = [_BASE if strip.joints[b] < 0 else _ARM for b in order]
     look: dict[str, Any] = {"facecolors": colours, "edgecolors": _ARM_EDGE, "linewidths": 0.45}
     axes.add_collection(PolyCollection(shapes, **look, zorder=2.0))
-    end = strip.postures[k + 1] if k + 1 < len(strip.postures) else strip.time[-1]
-    shown = (strip.time >= strip.postures[k]) & (strip.time <= end)
-    way = strip.path[shown][:, view.axes]
-    if not len(way):  # a motion shorter than the sampling period
-        return
-    axes.plot(*way.T, color=_PATH, linewidth=1.3, zorder=3.0)
-    axes.plot(*way[0], marker="o", markersize=3.2, color=_PATH, zorder=3.0)
-    if np.ptp(way, axis=0).max() > _SHORT * np.ptp(axes.get_xlim()):
-        axes.annotate("", way[-1], way[int(0.97 * len(way)) - 1], arrowprops=_HEAD, zorder=3.1)
+    start, stop = np.searchsorted(strip.time, [*strip.postures, np.inf])[k : k + 2]
+    path = strip.path[start : stop + 1, view.axes]
+    axes.plot(*path.T, color=_PATH, linewidth=1.3, zorder=3.0)
+    axes.plot(*path[:1].T, marker="o", markersize=3.2, color=_PATH, zorder=3.0)
 
 
 def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
-    """Draw obstacles below the swept area, and their outlines above it."""
+    """Draw the obstacles."""
     boxes = [
         [[corner[k] for k in view.axes] for corner in (box.lower, box.upper)]
         for box in workspace.boxes
@@ -198,9 +176,5 @@ def _surroundings(axes: Axes, workspace: Workspace, view: View) -> None:
         axes.axhline(workspace.floor, color=style.INK, linewidth=1.0, zorder=1.6)
     for low, high in boxes:
         size = np.subtract(high, low)
-        looks: tuple[dict[str, Any], ...] = (
-            {"facecolor": _SOLID, "hatch": "////", "linewidth": 0.0, "zorder": 0.5},
-            {"fill": False, "linewidth": 0.9, "zorder": 1.5},
-        )
-        for look in looks:
-            axes.add_patch(Rectangle((low[0], low[1]), *size, edgecolor=_HATCH, **look))
+        look: dict[str, Any] = {"facecolor": _SOLID, "edgecolor": _HATCH, "hatch": "////"}
+        axes.add_patch(Rectangle((low[0], low[1]), *size, zorder=0.5, **look))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -81,9 +81,8 @@ def excess_by_kind(violations: Iterable[Violation]) -> Array:
 class NoFeasibleMotionError(IdentificationError):
     """None of `tried` motions satisfies all constraints and excites all parameters.
 
-    `rejected` has their number and `nearest` the smallest violation by kind of constraint,
-    `closest` the violations of the motion with the smallest sum of excesses; `unexciting` motions
-    satisfy all constraints; `stopped`: the search was stopped before its end.
+    `rejected` has their number and `nearest` the smallest violation by kind of constraint;
+    `unexciting` motions satisfy all constraints; `stopped`: the search was stopped before its end.
     """
 
     def __init__(
@@ -91,14 +90,12 @@ class NoFeasibleMotionError(IdentificationError):
         rejected: Mapping[str, int],
         nearest: Mapping[str, Violation],
         *,
-        closest: Sequence[Violation] = (),
         tried: int | None = None,
         unexciting: int = 0,
         stopped: bool = False,
     ) -> None:
         self.rejected = dict(rejected)
         self.nearest = dict(nearest)
-        self.closest = tuple(closest)
         self.tried = sum(self.rejected.values()) if tried is None else tried
         self.unexciting = unexciting
         self.stopped = stopped
@@ -110,12 +107,6 @@ class NoFeasibleMotionError(IdentificationError):
             f"{kind} excludes {count}, smallest violation: {text_of(self.nearest[kind])}"
             for kind, count in sorted(self.rejected.items(), key=lambda item: -item[1])
         ]
-        worst: dict[str, Violation] = {}
-        for violation in sorted(self.closest, key=lambda violation: -violation.excess):
-            worst.setdefault(violation.kind, violation)
-        if len(self.closest) > 1:
-            broken = " and ".join(map(text_of, worst.values()))
-            reasons.append(f"the motion closest to feasible violates {broken}")
         if self.unexciting:
             reasons.append(
                 f"{self.unexciting} satisfy all constraints but leave a parameter without "

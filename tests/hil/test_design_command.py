@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import re
@@ -10,10 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -23,15 +19,13 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from hil.cell import Cell
-from hil.cli.design import design, design_summary
+from hil.cli.design import design
 from hil.design import DesignResult, load_design, preset, run_search
 from hil.design.advice import NoExcitationError
 from hil.design.run import DesignFolder
-from hil.design.settings import preset_text
 from hil.errors import InputError, OperatorStopError
 from hil.plots import design_picture
 from hil.progress import Silent
-from identification.excitation import CRITERIA
 from sim_fixtures.ns16 import CELL_PATH
 
 SETTINGS = """\
@@ -149,13 +143,6 @@ def test_an_earlier_design_is_only_overwritten_with_force(invoke, settings, copi
     assert (copied / "notes.txt").read_text() == "mine"
 
 
-def test_invalid_settings_do_not_remove_an_earlier_design(invoke, settings, copied):
-    settings.write_text(SETTINGS + "[sines]\nfastest = [1.0, 2.0]\n")
-    with pytest.raises(InputError, match="2 entries"):
-        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", copied, "--force")
-    load_design(copied)
-
-
 def test_other_files_are_never_removed(invoke, settings, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
@@ -166,7 +153,7 @@ def test_other_files_are_never_removed(invoke, settings, tmp_path):
     assert (out / "settings.toml").read_text() == "mine = true\n"
 
 
-@pytest.mark.parametrize("option", [(), ("--force",), ("--resume",)])
+@pytest.mark.parametrize("option", [("--force",), ("--resume",)])
 def test_a_locked_folder_is_refused(invoke, settings, copied, option):
     def content():
         return {path.name: path.read_bytes() for path in copied.iterdir()}
@@ -190,15 +177,6 @@ def test_the_folder_is_locked_until_the_picture_is_saved(invoke, copied):
         return Figure()
 
     invoke(CELL_PATH, "--resume", "-o", copied, draw=meanwhile)
-
-
-def test_a_file_system_without_locks_is_reported(invoke, settings, tmp_path, monkeypatch):
-    def refused(*_):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(fcntl, "flock", refused)
-    with pytest.raises(InputError, match=r"cannot be locked.*No locks available.*disk of this PC"):
-        invoke(CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
 
 
 def test_a_result_that_cannot_be_written_names_file_and_remedy(invoke, copied, monkeypatch):
@@ -231,14 +209,6 @@ def test_an_exhausted_search_is_reported(invoke, settings, tmp_path):
     assert "100 %" in output
 
 
-@pytest.mark.parametrize("method", ["a", "b", "balanced", "front"])
-def test_show_settings_prints_the_preset(invoke, method):
-    result = invoke("--show-settings", method)
-    assert result.exit_code == 0
-    assert result.output == preset_text(method)
-    assert tomllib.loads(result.output)["method"] == method
-
-
 def test_json_agrees_with_the_file(bare):
     printed, found = json.loads(bare[1]), DesignResult.load(bare[0])
     for name in ("log10_det", "coupling_index", "condition"):
@@ -247,14 +217,6 @@ def test_json_agrees_with_the_file(bare):
     assert Path(printed["file"]) == bare[0] / "excitation.toml"
     given = found.settings.constraints
     assert not (given.closed or given.collision or given.current)
-
-
-def test_resuming_a_complete_search_gives_the_same_file(invoke, bare, copied):
-    (copied / "excitation.toml").unlink()
-    output = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet")
-    assert len(output.stdout.splitlines()) == 1
-    whole = (bare[0] / "excitation.toml").read_bytes()
-    assert (copied / "excitation.toml").read_bytes() == whole
 
 
 def test_sines_without_a_ramp_are_reported(invoke, tmp_path):
@@ -274,8 +236,6 @@ def test_no_feasible_motion_names_constraints_and_remedies(invoke, settings, tmp
     assert "duration excludes 16" in text and "0.5" in text
     lasts = r"the shortest motion lasts [\d.]+ s, allowed are 0 to 0.5 s: allow more "
     assert re.search(lasts + r"time \(\[constraints\] max_duration\)", text)
-    assert "evaluate more" not in text
-    assert "repeat the command with --force, or with --resume if cell and settings" in text
     assert caught.value.exit_code == 3
     assert not (tmp_path / "out" / "excitation.toml").exists()
 
@@ -306,7 +266,6 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--earlier", "NOWHERE"], "nowhere"),
         ([CELL_PATH, "-o", "SETTINGS"], "cannot be created"),
-        ([CELL_PATH, "-o", ""], "--output: is empty; name a folder"),
     ],
 )
 def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, words):
@@ -320,7 +279,7 @@ def test_invalid_arguments_are_refused(invoke, settings, tmp_path, arguments, wo
 
 
 def test_other_settings_or_another_cell_cannot_resume_a_search(invoke, bare, tmp_path):
-    with pytest.raises(InputError, match="seed = 2: was 1 when the search began"):
+    with pytest.raises(InputError, match="not the settings that were asked for"):
         invoke(CELL_PATH, "--resume", "-o", bare[0], "--seed", 2)
     cell = Cell.load(CELL_PATH)
     (tmp_path / "cell.toml").write_text(cell.text.replace("[155.0, 155.0,", "[150.0, 155.0,"))
@@ -358,14 +317,10 @@ def test_unchecked_constraints_are_in_picture_json_and_stderr(invoke, bare, copi
     assert f"warning: not checked: {', '.join(unchecked)}" in result.stderr
     assert json.loads(bare[1])["unchecked"] == unchecked
     assert seen.arguments["margins"] == "" and not seen.arguments["together"]
-
-
-def test_the_picture_has_the_margins_of_a_real_cell(invoke, made, tmp_path):
-    seen, copied = Seen(), Path(shutil.copytree(made[0], tmp_path / "copied"))
-    result = invoke(CELL_PATH, "--resume", "-o", copied, "--quiet", draw=seen)
-    assert seen.arguments["unchecked"] == () and seen.arguments["complete"]
-    assert seen.arguments["margins"].startswith("current at most ")
-    assert result.stderr == ""
+    (copied / "excitation.toml").unlink()
+    invoke(CELL_PATH, "--resume", "-o", copied)
+    files = (folder / "excitation.toml" for folder in (bare[0], copied))
+    assert len({file.read_bytes() for file in files}) == 1
 
 
 @pytest.mark.parametrize("name", ["excitation.toml", "settings.toml"])
@@ -376,24 +331,12 @@ def test_settings_are_read_from_a_result_file(invoke, bare, tmp_path, name):
     assert one.read_bytes() == two.read_bytes()
 
 
-def test_numbers_that_are_not_finite_are_null(bare):
-    result = DesignResult.load(bare[0])
-    criteria = replace(
-        result.excitation.criteria, log10_det=-np.inf, coupling_index=np.inf, condition=np.nan
-    )
-    excitation = replace(result.excitation, criteria=criteria)
-    found = SimpleNamespace(complete=True, exhausted=False, front=[])
-    done = SimpleNamespace(result=replace(result, excitation=excitation), design=found)
-    printed = json.loads(json.dumps(design_summary(done, DesignFolder(bare[0])), allow_nan=False))
-    assert [printed[name] for name in CRITERIA] == [None, None] and printed["condition"] is None
-
-
 def test_parameters_that_are_hardly_separated_are_named(invoke, copied, monkeypatch):
     monkeypatch.setattr("hil.cli.design.weakest", lambda *_: pytest.fail("named for a fine motion"))
     invoke(CELL_PATH, "--resume", "-o", copied)
     monkeypatch.setattr("hil.cli.design.WEAK", 1.0)
     monkeypatch.setattr("hil.cli.design.weakest", lambda *_: ("I6zz", "f1_6"))
-    assert "hardly separates I6zz, f1_6: use more via points" in (
+    assert "hardly separates I6zz, f1_6: use more via points or harmonics" in (
         invoke(CELL_PATH, "--resume", "-o", copied).output
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from scipy.spatial import ConvexHull
@@ -20,8 +19,8 @@ from hil.arm import Arm, surface_points
 from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import POSTURES, draw_design
-from hil.plots.posture_strip import Strip, covered, draw_strip, outlines, posture_times
-from identification.excitation import correlation, information
+from hil.plots.posture_strip import Strip, covered, outlines
+from identification.excitation import Design, SearchSettings, information
 from identification.excitation.constraints import sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.excitation import Excitation
@@ -60,12 +59,6 @@ SHAPES = """
 """
 
 
-def front_of(log10_det: list[float], coupling_index: list[float]) -> Front:
-    count = len(log10_det)
-    measures = np.column_stack([log10_det, coupling_index])
-    return Front(np.zeros((count, 1)), measures, np.ones(count))
-
-
 @pytest.fixture(scope="module")
 def ns16() -> Cell:
     return Cell.load(CELL_PATH)
@@ -83,6 +76,25 @@ def excitation(cell: Cell, trajectory: Trajectory) -> Excitation:
     return Excitation(trajectory, criteria, "front", seed=1, tried=1, rejected={})
 
 
+def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Design:
+    """A design with three motions on its front, of which the second is chosen or polished."""
+    found = excitation(cell, trajectory)
+    measures = np.array([[100.0, 70.0], [105.7, 80.0], [108.0, 110.0]])
+    return Design(
+        settings=SearchSettings(),
+        genes=np.zeros(1),
+        excitation=found,
+        front=Front(np.zeros((3, 1)), measures, np.ones(3)),
+        chosen=chosen,
+        origin=1,
+        origin_criteria=found.criteria,
+        history=np.zeros((1, 3)),
+        complete=True,
+        exhausted=False,
+        scale=None,
+    )
+
+
 def wandering(cell: Cell, points: int = 5) -> Trajectory:
     limits = cell.joint_limits
     middle, half = (limits.upper + limits.lower) / 2.0, (limits.upper - limits.lower) / 2.0
@@ -95,14 +107,9 @@ def texts(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.findobj(Text)]
 
 
-def laid_out(figure: Figure) -> RendererAgg:
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return canvas.get_renderer()
-
-
-def front_axes(figure: Figure) -> list[Axes]:
-    return [axes for axes in figure.axes if axes.get_xlabel().startswith("coupling index")]
+def axes_of(figure: Figure, xlabel: str) -> Axes:
+    (axes,) = (axes for axes in figure.axes if axes.get_xlabel().startswith(xlabel))
+    return axes
 
 
 class TestSilhouettes:
@@ -170,17 +177,8 @@ class TestArm:
             np.testing.assert_allclose(corners[0], expected, atol=1e-12)
 
 
-class TestPostures:
-    def test_a_closed_motion_does_not_show_its_beginning_twice(self, ns16):
-        away = ns16.home + 0.3
-        there = plan(np.array([ns16.home, away]), ns16.joint_limits)
-        back = plan(np.array([ns16.home, away, ns16.home]), ns16.joint_limits)
-        assert posture_times(there, 5)[-1] == there.duration
-        times = posture_times(back, 5)
-        assert times[-1] < back.duration
-        np.testing.assert_allclose(np.diff(times), back.duration / 5.0)
-
-    def test_the_strip_shows_all_that_the_arm_does(self, ns16, two_link):
+class TestStrip:
+    def test_it_contains_the_swept_volume_and_near_obstacles(self, ns16, two_link):
         motion = wandering(ns16)
         strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
         fine = Arm.from_urdf(ns16.urdf).corners(
@@ -197,188 +195,62 @@ class TestPostures:
         far = Cell.from_texts(far_away, two_link.urdf, Path("cell.toml"))
         assert Strip.of(arm, motion, far.workspace, 5).extents[0][1] < 3.0
 
-    def test_a_motion_of_an_instant_has_a_picture(self, ns16):
-        points = np.array([ns16.home, ns16.home + 1e-4])
-        motion = plan(points, ns16.joint_limits)
-        strip = Strip.of(Arm.from_urdf(ns16.urdf), motion, ns16.workspace, 7)
-        draw_strip(Figure().subplots(2, 7).tolist(), strip)
 
-
-class TestCorrelations:
-    def test_the_matrix_is_that_of_the_motion_without_friction(self, ns16):
-        designed = excitation(ns16, wandering(ns16))
-        figure = draw_design(designed, ns16)
-        shown = np.asarray(
-            next(a for a in figure.axes if a.get_xlabel().startswith("parameters"))
-            .images[0]
-            .get_array()
-        )
-        motion = sampled(designed.trajectory, 0.001)
+class TestPage:
+    def test_a_design_of_an_industrial_arm(self, ns16):
+        """Correlations of its motion without friction; positions in angles of the cell."""
+        design = design_of(ns16, wandering(ns16))
+        figure = draw_design(design, ns16)
+        (image,) = axes_of(figure, "parameters").images
+        motion = sampled(design.excitation.trajectory, 0.001)
         factor = Factor.from_samples(ns16.model, motion, np.zeros_like(motion.position))
         inverse = np.linalg.inv(information(factor))
         deviation = np.sqrt(np.diag(inverse))
         expected = np.abs(inverse / np.outer(deviation, deviation))[:40, :40]
-        assert shown.shape == (40, 40)
-        np.testing.assert_allclose(shown, expected, atol=1e-5)
-        assert np.all(np.isfinite(correlation(information(factor))))
-
-    def test_parameters_without_excitation_are_reported(self, ns16):
-        still = plan(np.array([ns16.home, ns16.home + 0.4 * np.eye(6)[0]]), ns16.joint_limits)
-        figure = draw_design(excitation(ns16, still), ns16)
-        shown = " ".join(texts(figure))
-        assert "does not excite a parameter" in shown
-        assert "I_c ∞" in shown
-        assert "nan" not in shown
-
-
-class TestFront:
-    def page(self, cell: Cell, front: Front, **options) -> tuple[Figure, Axes]:
-        figure = draw_design(excitation(cell, wandering(cell)), cell, front=front, **options)
-        (axes,) = front_axes(figure)
-        return figure, axes
-
-    @pytest.mark.parametrize("count", [0, 1, 2, 60])
-    def test_any_number_of_motions(self, two_link, count):
-        share = np.linspace(0.0, 1.0, count)
-        front = front_of((100.0 + 8.0 * np.sqrt(share)).tolist(), (70.0 + 40.0 * share**2).tolist())
-        _, axes = self.page(two_link, front, chosen=count // 2 if count else None)
-        points = [line for line in axes.lines if line.get_label().startswith("front")]
-        assert [len(line.get_xdata()) for line in points] == ([count] if count > 1 else [])
-
-    def test_motions_on_the_page_carry_their_figures(self, two_link):
-        front = front_of([100.0, 105.7, 108.0], [70.0, 80.0, 110.0])
-        others = {"A": (104.0, 90.5), "B (kinematic)": (101.2, 80.9), "C": (20.0, 400.0)}
-        figure, axes = self.page(two_link, front, chosen=1, references=others)
-        shown = texts(figure)
-        for label in (
-            "chosen (105.7, 80.0)",
-            "A (104.0, 90.5)",
-            "B (kinematic) (101.2, 80.9)",
-            "C (20.0, 400.0)",
-        ):
-            assert label in shown
-        assert "polished" not in " ".join(shown)
-        assert axes.get_xlim()[1] < 120.0 and axes.get_ylim()[0] > 95.0  # C does not flatten it
-        assert not front_axes(draw_design(excitation(two_link, wandering(two_link)), two_link))
-        criteria = excitation(two_link, wandering(two_link)).criteria
-        determinant, index = criteria.log10_det, criteria.coupling_index
-        front = front_of([determinant - 3.0, determinant - 1.0], [index + 1.0, index + 3.0])
-        knee = (determinant - 1.0, index + 3.0)
-        figure, axes = self.page(two_link, front, knee=knee)
-        shown = " ".join(texts(figure))
-        assert "chosen, polished (" in shown
-        assert f"grew from ({knee[0]:.1f}, {knee[1]:.1f})" in shown
-        star = next(line for line in axes.lines if line.get_marker() == "*")
-        assert (star.get_xdata(), star.get_ydata()) == (index, determinant)
-
-    def test_no_legend_lies_on_the_front(self, two_link, ns16):
-        names = ("A", "B", "C", "balanced", "an older one with a long name", "E")
-        references = {name: (101.0 + k, 90.0) for k, name in enumerate(names)}
-        front = front_of(np.linspace(100.0, 103.0, 60), np.linspace(70.0, 90.0, 60))
-        for cell in (two_link, ns16):
-            figure, axes = self.page(cell, front, chosen=20, references=references)
-            renderer = laid_out(figure)
-            legend = axes.get_legend().get_window_extent(renderer)
-            matrix = next(a for a in figure.axes if a.get_xlabel().startswith("parameters"))
-            assert not legend.overlaps(axes.get_window_extent(renderer))
-            assert not legend.overlaps(matrix.get_tightbbox(renderer))
-            assert legend.x1 < figure.bbox.x1
-
-    def test_earlier_archives_are_labelled_apart_from_the_motion(self, two_link):
-        front = front_of([100.0, 105.0], [70.0, 95.0])
-        figure, axes = self.page(two_link, front, chosen=0, together=True)
-        head = figure.texts[0].get_text()
-        assert "including earlier archives, weighted" in head
-        assert "I_c" not in head
-        assert "not comparable" in figure.texts[1].get_text()
-        assert "including earlier archives, weighted" in axes.get_xlabel()
-        assert "including earlier archives" in axes.get_ylabel()
-        assert "from this motion alone" in " ".join(texts(figure))
-
-
-class TestPage:
-    def test_positions_have_the_limits_and_angles_of_the_cell(self, ns16):
-        figure = draw_design(excitation(ns16, wandering(ns16)), ns16)
+        np.testing.assert_allclose(np.asarray(image.get_array()), expected, atol=1e-5)
         (position,) = (a for a in figure.axes if a.get_ylabel() == "joint_2")
         assert position.get_yticks() == pytest.approx([-50.0, 0.0, 95.0])  # as in the file
         assert "position [deg, controller angles]" in texts(figure)
         equal = [axes for axes in figure.axes if axes.get_aspect() == 1.0 and not axes.images]
         assert len(equal) == 2 * POSTURES  # each from the side and from above
 
-    def test_names_of_joints_do_not_run_into_each_other(self, two_link):
-        long = two_link.urdf.replace('name="shoulder"', 'name="shoulder_pan_and_lift_joint_1"')
-        long = long.replace('name="elbow"', 'name="shoulder_pan_and_lift_joint_2"')
-        assert long != two_link.urdf
-        cell = Cell.from_texts(TWO_LINK_CELL, long, Path("cell.toml"))
-        figure = draw_design(excitation(cell, wandering(cell)), cell)
-        renderer = laid_out(figure)
-        for axes in figure.axes:
-            if axes.get_ylabel().startswith("shoulder"):
-                label, own = axes.yaxis.label.get_window_extent(renderer), axes.bbox
-                assert label.height < own.height * 1.05
-                assert label.x0 > 0.0
+    def test_motions_on_the_front_are_labelled_with_their_criteria(self, two_link):
+        design = design_of(two_link, wandering(two_link))
+        references = {"A": (104.0, 90.5), "B (kinematic)": (20.0, 400.0)}
+        figure = draw_design(design, two_link, references=references)
+        labels = "chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (kinematic) (20.0, 400.0)"
+        assert set(labels) <= set(texts(figure))
+        axes = axes_of(figure, "coupling index")
+        assert axes.get_xlim()[1] < 120.0 and axes.get_ylim()[0] > 95.0  # B does not flatten it
+        figure = draw_design(replace(design, chosen=None), two_link)
+        log10_det, index = design.excitation.criteria.measures
+        assert f"chosen, polished ({log10_det:.1f}, {index:.1f})" in texts(figure)
+        assert "grew from (105.7, 80.0)" in texts(figure)
+        axes = axes_of(figure, "coupling index")
+        star = next(line for line in axes.lines if line.get_marker() == "*")
+        assert (star.get_xdata(), star.get_ydata()) == (index, log10_det)
 
-    def test_what_was_not_checked_stands_in_red(self, two_link):
-        designed = excitation(two_link, wandering(two_link))
-        unchecked = ("floor", "walls", "the arm itself")
-        page = draw_design(designed, two_link, unchecked=unchecked, complete=False)
+    def test_warnings_are_red(self, two_link):
+        design = replace(design_of(two_link, wandering(two_link)), complete=False)
+        page = draw_design(design, two_link, unchecked=("floor", "walls"), together=True)
         red = [text.get_text() for text in page.texts if text.get_color() == style.LIMIT]
         assert red == [
-            "NOT CHECKED: floor, walls, the arm itself; not for a robot",
+            "NOT CHECKED: floor, walls; not for a robot",
             "search interrupted: better motions may exist",
         ]
+        assert "with earlier archives, not comparable" in " ".join(t.get_text() for t in page.texts)
         margins = "current at most 71 % (motor of joint_2)"
-        calm = draw_design(designed, two_link, margins=margins)
-        assert not [text for text in calm.texts if text.get_color() == style.LIMIT]
-        assert margins in texts(calm)
-        assert "bars from joint to joint" in " ".join(texts(calm))  # its shapes are not known
+        page = draw_design(replace(design, complete=True), two_link, margins=margins)
+        assert not [text for text in page.texts if text.get_color() == style.LIMIT]
+        assert margins in texts(page)
 
-    def test_the_same_motion_gives_the_same_bytes(self, two_link, tmp_path):
+    def test_one_motion_gives_the_same_bytes(self, two_link, tmp_path):
         frequency = np.array([[1.0, 2.0], [1.3, 2.9]])
         bare = FourierSeries(np.zeros(2), np.full((2, 2), 0.4), frequency, 6.0, 0.0)
         for motion in (wandering(two_link), bare):
             for name in ("a.png", "b.png"):
-                figure = draw_design(excitation(two_link, motion), two_link, title="twice")
-                save(figure, tmp_path / name)
+                save(draw_design(design_of(two_link, motion), two_link), tmp_path / name)
             assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
-
-    @pytest.mark.parametrize("full", [False, True])
-    @pytest.mark.parametrize("title", ["", "a $\\frac{title}{}$ <of> a person\n" * 3])
-    def test_nothing_is_cut_and_no_text_lies_upon_another(self, ns16, title, full):
-        nearest = "nearest 0.112 m (" + "a_link_with_a_long_name, " * 6 + "floor)"
-        more = {
-            "unchecked": ("floor", "walls", "the arm itself", "currents"),
-            "complete": False,
-            "together": True,
-            "margins": f"current at most 71 % (motor of joint_2); {nearest}",
-            "knee": (102.0, 70.0),
-            "references": {"method B (kinematic)": (99.0, 118.2), "method A": (101.0, 500.0)},
-        }
-        figure = draw_design(
-            excitation(ns16, wandering(ns16)),
-            ns16,
-            front=front_of([100.0, 105.0], [70.0, 95.0]),
-            chosen=None if full else 0,
-            title=title,
-            **(more if full else {}),
-        )
-        with style.page():
-            renderer = laid_out(figure)
-            extent = figure.get_tightbbox(renderer)
-            width, height = figure.get_size_inches()
-            assert extent.x0 >= 0.0
-            assert extent.y0 >= 0.0
-            assert extent.x1 <= width
-            assert extent.y1 <= height
-            heads = [*figure.texts, *(axes.title for axes in figure.axes)]
-            heads += [axes._left_title for axes in figure.axes]
-            boxes = [
-                (text.get_text(), text.get_window_extent(renderer))
-                for text in heads
-                if text.get_text()
-            ]
-        for (first, a), (second, b) in combinations(boxes, 2):
-            assert not a.overlaps(b), f"{first!r} upon {second!r}"
 
 
 # The arm as it is drawn.

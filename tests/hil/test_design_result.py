@@ -87,13 +87,6 @@ def test_criteria_are_sampled_every_millisecond(made, ns16):
     assert excitation.criteria.scaled_condition is not None
 
 
-def test_the_file_has_moves_or_amplitudes(made, text):
-    sines = isinstance(made[1].design.excitation.trajectory, FourierSeries)
-    assert len(text) < 20_000 and "coupling_index_max = 1653.0" in text
-    assert ("amplitude_deg" in text) == sines
-    assert ("[[plan.moves]]" in text) == ("target_deg" in text) == (not sines)
-
-
 def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):
     sines = "amplitude_deg" in text
     for name in ("amplitude_deg" if sines else "target_deg", "coupling_index"):
@@ -126,11 +119,6 @@ def test_invalid_numbers_are_refused(text, tmp_path, line):
         load_design(written(tmp_path, resealed(changed)))
 
 
-def test_comments_and_blank_lines_may_be_changed(text, tmp_path, made):
-    path = written(tmp_path, "# mine\n\n" + re.sub(r"(?m)^#.*\n", "", text))
-    assert load_design(path).to_dict() == made[1].design.excitation.to_dict()
-
-
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -144,11 +132,6 @@ def test_another_file_is_refused(text, tmp_path, old, new, words):
     with pytest.raises(InputError, match=words) as caught:
         load_design(written(tmp_path, text.replace(old, new, 1)))
     assert "design it again" in str(caught.value)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"excitation\.toml: cannot be read"):
-        load_design(tmp_path)
 
 
 def test_a_motion_may_differ_by_rounding_only(made, text, tmp_path):
@@ -376,25 +359,11 @@ def test_a_joint_at_rest_is_weighted_like_the_others(tmp_path, cell, run):
     assert np.all(np.isfinite(problem.score(genes).measures))
 
 
-def test_archives_can_be_named_one_by_one(known, campaign, cell):
-    kinds = ("excitation", "validation", "standstill")
-    paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
-    again = estimate_earlier(paths, cell, Silent())
-    np.testing.assert_array_equal(again.gram, known.gram)
-    assert again.archives == known.archives
-    assert all(re.fullmatch("[0-9a-f]{64}", digest) for _, digest in known.archives)
-
-
 def test_archives_of_another_robot_are_refused(campaign, cell):
     text = cell.text.replace('third = "quadratic"', 'third = "cubic"')
     other = Cell.from_texts(text, cell.urdf, cell.path)
     with pytest.raises(InputError, match="whose robot is not that of"):
         estimate_earlier([campaign.folder.root], other, Silent())
-
-
-def test_a_folder_without_archives_is_refused(tmp_path, cell):
-    with pytest.raises(InputError, match="contains no complete archive"):
-        estimate_earlier([tmp_path], cell, Silent())
 
 
 @pytest.mark.slow

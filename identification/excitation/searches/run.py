@@ -17,7 +17,7 @@ from identification.excitation.excitation import Excitation
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import CHUNK, Population, SearchSettings
 from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
-from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
+from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
 Array = NDArray[np.float64]
 Phase = Literal["sample", "search", "polish"]
@@ -69,7 +69,6 @@ _SCALE: Final = (5, 0)
 # Excess of a motion that leaves a parameter without excitation: it ranks behind all that excite,
 # and before unplannable ones, whose excess is infinite.
 _UNEXCITING: Final = 1e6
-_ALL: Final = "all"
 
 
 # The polish is CMA-ES (Hansen 2016, "The CMA Evolution Strategy: A Tutorial") on ranks; feasible
@@ -348,7 +347,7 @@ class _Search:
         self._front = Front.empty(self._genome.n_genes)
         self._tried = self._feasible = 0
         self._rejected: Counter[str] = Counter()
-        # Smallest positive excess of each kind and of their sum, with the genes.
+        # Smallest positive excess of each kind, with the genes.
         self._nearest: dict[str, tuple[float, Array]] = {}
 
     def run(self) -> Design:
@@ -431,12 +430,10 @@ class _Search:
                 self._journal.record(genes, scores)
         self._tried += len(genes)
         self._feasible += int(np.count_nonzero(scores.feasible))
-        sums = scores.excess.sum(axis=1)
-        for kind, excess in zip((*KINDS, _ALL), (*scores.excess.T, sums), strict=True):
+        for kind, excess in zip(KINDS, scores.excess.T, strict=True):
             broken = np.flatnonzero(excess)
             if len(broken) > 0:
-                if kind != _ALL:
-                    self._rejected[kind] += len(broken)
+                self._rejected[kind] += len(broken)
                 index = int(broken[np.argmin(excess[broken])])
                 if kind not in self._nearest or excess[index] < self._nearest[kind][0]:
                     self._nearest[kind] = float(excess[index]), genes[index].copy()
@@ -468,19 +465,15 @@ class _Search:
 
     def _failure(self) -> NoFeasibleMotionError:
         """Return the error with the smallest violations of each kind."""
-        broken = {
-            kind: self._population.violations(genes) for kind, (_, genes) in self._nearest.items()
-        }
-
-        def worst(kind: str) -> Violation:
+        nearest = {}
+        for kind, (_, genes) in sorted(self._nearest.items()):
+            broken = self._population.violations(genes)
             # empty if a process that was killed from outside was scored as unplannable
-            same = [violation for violation in broken[kind] if violation.kind == kind]
-            return max(same or broken[kind], key=lambda violation: violation.excess)
-
+            same = [violation for violation in broken if violation.kind == kind] or broken
+            nearest[kind] = max(same, key=lambda violation: violation.excess)
         return NoFeasibleMotionError(
             self._rejected,
-            {kind: worst(kind) for kind in sorted(self._rejected)},
-            closest=broken.get(_ALL, ()),
+            nearest,
             tried=self._tried,
             unexciting=self._feasible,
             stopped=self._stopped,
