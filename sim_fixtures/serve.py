@@ -76,9 +76,8 @@ class UdpControllerLink:
     from any other address or port are dropped.
 
     Attributes:
-        foreign: number of datagrams from other addresses; `last_foreign` is "host:port" of one.
-        waited: time of the last packet in the kernel's queue [s]; 0 if unknown.
-        unsent: number of packets that the network refused; `problem` is the last reason.
+        foreign: number of datagrams from other addresses.
+        waited: time of the last packet in the kernel's queue [s].
 
     Raises:
         ControllerLinkError: no such host, or the local port is in use.
@@ -86,17 +85,13 @@ class UdpControllerLink:
 
     def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:
         self.foreign = 0
-        self.last_foreign = ""
         self.waited = 0.0
-        self.unsent = 0
-        self.problem = ""
         try:
             self._pc = (socket.gethostbyname(host), port)
         except (OSError, UnicodeError) as error:
             raise ControllerLinkError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        with suppress(OSError):  # not available on every system
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             self._socket.setblocking(False)
             self._socket.bind(("", source_port or 0))
@@ -114,11 +109,8 @@ class UdpControllerLink:
 
     def send(self, packet: bytes) -> None:
         """Send one datagram; it is lost if the network is down or full."""
-        try:
+        with suppress(OSError):
             self._socket.sendto(packet, self._pc)
-        except OSError as error:
-            self.unsent += 1
-            self.problem = error.strerror or str(error)
 
     def receive(self, timeout: float) -> bytes | None:
         """Return the next datagram of the PC, or None."""
@@ -135,7 +127,6 @@ class UdpControllerLink:
                 self.waited = _waited(control)
                 return packet
             self.foreign += 1
-            self.last_foreign = f"{sender[0]}:{sender[1]}"
             if time.monotonic() > until:
                 return None
 

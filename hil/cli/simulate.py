@@ -41,15 +41,10 @@ WORDS: Final = {
 }
 
 
-_REPEATED: Final = {Phase.CLOSED, Phase.OPENING, Phase.OPEN}
-"""Phases that repeat when open mode is lost repeatedly."""
-
-
 class Status(StatusLine):
     """Progress of a session: a line for each change of phase, and counts.
 
-    Repeated losses of open mode are reported for the 2nd, 4th, 8th ... time. `stretch` is the
-    largest extension of a cycle, s.
+    `stretch` is the largest extension of a cycle, s.
     """
 
     def __init__(
@@ -86,16 +81,12 @@ class Status(StatusLine):
         self.update(lambda: self._line(tally))
 
     def _say_change(self, controller: SimulatedController) -> None:
-        lost, phase, reason = controller.program.openings_lost, controller.phase, controller.reason
-        if lost <= 1 or controller.program.gave_up or phase not in _REPEATED:
-            text = WORDS[phase]
-            text += f" in mode {self._settings.open_mode}" if phase is Phase.OPENING else ""
-            text += f": {reason}" if reason and reason != self._reason else ""
-            self._reason = reason
-        elif phase is Phase.CLOSED and lost.bit_count() == 1:
-            text = f"open mode lost {lost} times in a row: {reason}"
-        else:
-            return
+        text, reason = WORDS[controller.phase], controller.reason
+        if controller.phase is Phase.OPENING:
+            text += f" in mode {self._settings.open_mode}"
+        if reason and reason != self._reason:
+            text += f": {reason}"
+        self._reason = reason
         self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
 
     def _line(self, tally: ServeCounts) -> str:
@@ -103,8 +94,8 @@ class Status(StatusLine):
             return f"waiting for a PC program at {self._place} ({tally.knocks} packets sent)"
         return (
             f"{tally.cycles} cycles, {tally.replies} replies, {tally.missed} missed, "
-            f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} started late"
-            + (f", {tally.stretched} stretched" if self._stretch else "")
+            f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} started late, "
+            f"{tally.stretched} stretched"
         )
 
 
@@ -267,20 +258,18 @@ def _sentences(served: Served) -> list[str]:
     """Format the summary."""
     summary, reason = served.summary, served.controller.reason
     if not summary.cycles:
-        return [f"no reply of a PC program; the first packet was sent {_times(summary.knocks)}"]
+        sent = plural(summary.knocks, "time")
+        return [f"no reply of a PC program; the first packet was sent {sent}"]
     end = "the session has ended (504)" if summary.ended else "the session was aborted"
     counts = (
         f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
         f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from other addresses"
+        f"{served.foreign} from other addresses; {plural(summary.stretched, 'cycle')} extended by "
+        f"up to {1e3 * summary.stretch_max:.1f} ms to wait for a reply"
     )
-    if summary.stretched:
-        counts += (
-            f"; {plural(summary.stretched, 'cycle')} extended by up to "
-            f"{1e3 * summary.stretch_max:.1f} ms to wait for a reply, unlike a real controller"
-        )
+    opened = plural(served.intervals, "time")
     return [
-        f"{end}{': ' if reason else ''}{reason}; open mode was reached {_times(served.intervals)}",
+        f"{end}{': ' if reason else ''}{reason}; open mode was reached {opened}",
         counts,
         f"time to reply: {_spread(summary.answer)}",
         f"time to simulate a cycle: {_spread(summary.cost)}; "
@@ -298,6 +287,3 @@ def _spread(times: Histogram) -> str:
     median, most, longest = (f"{1e6 * seconds:.0f} µs" for seconds in _parts(times))
     return f"{median} median, {most} 99 %, {longest} maximum"
 
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import os
 import shutil
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -167,7 +164,6 @@ class _Piece:
                 restarts=errors,
                 motions=self.link.exchange.status().ended_count - before,
                 descriptors={name: count(f"/proc/{pid}/fd") for name, pid in self.pids.items()},
-                held=held(),
                 **whole,
             )
             if not whole["faulty"]:  # what is faulty is to be looked at
@@ -243,37 +239,3 @@ def own_memory(pid: int) -> int:
     text = Path(f"/proc/{pid}/smaps_rollup").read_text("ascii")
     kilobytes = {name: value for name, _, value in (row.partition(":") for row in text.split("\n"))}
     return 1024 * sum(int(kilobytes[name].split()[0]) for name in ("Anonymous", "Swap"))
-
-
-_INTERNED: Final = 2**17  # more strings than the table takes before it is rebuilt; 32 000 stay
-
-
-class _MallInfo(ctypes.Structure):
-    """`struct mallinfo2` of glibc 2.33."""
-
-    _fields_ = tuple(
-        (name, ctypes.c_size_t)
-        for name in (
-            "arena", "ordblks", "smblks", "hblks", "hblkhd",
-            "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost",
-        )
-    )  # fmt: skip
-
-
-def held() -> dict[str, int]:
-    """Memory in use by this process: bytes of malloc (with glibc), blocks of Python's allocator.
-
-    Freed memory stays with the process until it is used again; the memory in use separates a leak
-    from a campaign that needed more for a moment. Free lists, the attribute cache and the unused
-    part of the table of interned strings are cleared first: they fill for hours.
-    """
-    gc.collect()
-    sys._clear_type_cache()
-    for number in range(_INTERNED):
-        sys.intern(f"number {number}")
-    blocks = {"blocks": sys.getallocatedblocks()}
-    if (mallinfo := getattr(ctypes.CDLL(None), "mallinfo2", None)) is None:
-        return blocks
-    mallinfo.restype = _MallInfo
-    found = mallinfo()
-    return {"bytes": found.uordblks + found.hblkhd, **blocks}

@@ -19,7 +19,7 @@ import pytest
 
 from drivers.exchange.control import BINS, upper_edge
 from tests.endurance.__main__ import main
-from tests.endurance.piece import held, own_memory
+from tests.endurance.piece import own_memory
 from tests.endurance.verdict import PROCESSES, Line, Piece, judge, read_journal
 from tests.journal import Journal
 
@@ -61,7 +61,7 @@ def ran(number: int, **changes: Any) -> Line:
     """A faultless campaign with changes."""
     return {
         "number": number, "t": 30.0 * number, "complete": True, "stopped": False, "restarts": [],
-        "motions": 26, "archives": 26, "faulty": [], "outcomes": {"completed": 26}, "held": {},
+        "motions": 26, "archives": 26, "faulty": [], "outcomes": {"completed": 26},
         "records": 30_000, "records_lost": 0, "descriptors": IDLE, **changes,
     }  # fmt: skip
 
@@ -107,11 +107,6 @@ def all_of(*changes: Change) -> Change:
     return lambda one: reduce(lambda piece, change: change(piece), changes, one)
 
 
-def holding(name: str, grown: float) -> Change:
-    """A supervisor with so much more memory in use each hour."""
-    return each_campaign(lambda ran: {"held": {name: 400_000 + round(grown * ran["t"] / 3600.0)}})
-
-
 LOADED = sampled(lambda _, s: {"load": 6.0})
 MORE_THREADS = sampled(
     lambda _, s: {
@@ -146,8 +141,6 @@ SHARED = sampled(lambda place, s: {"shared": 3 + int(s["t"] // 600.0) + place % 
         (with_one(faulty=["x.mcap is damaged"]), "x.mcap is damaged"),
         (with_one(records_lost=3), "3 records lost"),
         (with_one(descriptors={**IDLE, "exchange": 13}), "the exchange has 13 descriptors"),
-        (holding("bytes", 10_000), "what the supervisor holds (bytes) grows by 10.0% in 4 h"),
-        (holding("blocks", 10_000), "what the supervisor holds (blocks) grows"),
         (lambda _: piece(3, leak=1.0), "the archive's memory grows by"),
         (lambda one: replace(one, campaigns=[], ended=None), "4800 s without one campaign"),
     ],
@@ -243,16 +236,6 @@ def test_a_piece_is_not_appended_to_what_is_no_journal(tmp_path: Path) -> None:
     with pytest.raises(SystemExit):
         main([*run, "--journal", str(path.with_name("small.jsonl.xz"))])
     assert not folder.exists()
-
-
-def test_memory_in_use_is_known_to_the_byte() -> None:
-    before = held()
-    made = np.ones(MIB), [object() for _ in range(1000)]
-    after = held()
-    assert after["bytes"] - before["bytes"] == pytest.approx(8 * MIB, rel=0.01)
-    assert after["blocks"] - before["blocks"] == pytest.approx(1000, abs=50)
-    del made
-    assert held()["bytes"] - before["bytes"] < MIB
 
 
 def test_own_memory_excludes_mapped_files(tmp_path: Path) -> None:

@@ -229,19 +229,11 @@ def _counts(piece: Piece) -> Iterator[Finding]:
 
 
 def _memory(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:
-    """Anonymous memory of each process, and the memory in use by the supervisor.
-
-    Resident memory also grows while the rings are filled for the first time.
-    """
-    used: dict[str, list[tuple[float, int]]] = {f"the {name}'s memory": [] for name in PROCESSES}
-    for one in piece.samples + piece.campaigns:
-        if one["t"] >= WARM_UP:
-            for name, use in one.get("processes", {}).items():
-                used[f"the {name}'s memory"].append((one["t"], use["own"]))
-            for name, value in one.get("held", {}).items():
-                used.setdefault(f"what the supervisor holds ({name})", []).append((one["t"], value))
-    for what, sizes in used.items():
-        yield from _growth(what, sizes, figures)
+    """Anonymous memory of each process; resident memory also grows while rings are filled."""
+    warm = [one for one in piece.samples if one["t"] >= WARM_UP]
+    for name in PROCESSES:
+        sizes = [(s["t"], s["processes"][name]["own"]) for s in warm if name in s["processes"]]
+        yield from _growth(f"the {name}'s memory", sizes, figures)
 
 
 def _growth(

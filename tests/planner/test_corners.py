@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner import FlyDistance, FlyPercent, JointLimits, PiecewiseCubic, Stop, plan
+from planner import FlyDistance, FlyPercent, JointLimits, PiecewiseCubic, plan
 from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, ranked, solve_many
 from planner.errors import UnsupportedSolver
 from planner.interpolator import corner
@@ -50,23 +50,6 @@ def test_the_line_is_straight_for_any_slowest_joint():
     extrema = motion.extrema()
     assert np.all(extrema.acceleration <= limits.acceleration * (1 + 1e-12))
     assert np.all(extrema.jerk <= limits.jerk * (1 + 1e-12))
-
-
-def test_it_equals_ruckig_if_that_synchronises_the_phase():
-    start, end = random_points(3, 2)
-    problem = ruckig.InputParameter(6)
-    problem.synchronization = ruckig.Synchronization.Phase
-    problem.current_position, problem.target_position = start, end
-    problem.max_velocity = SIX_AXES.velocity
-    problem.max_acceleration = SIX_AXES.acceleration
-    problem.max_jerk = SIX_AXES.jerk
-    solution = ruckig.Trajectory(6)
-    ruckig.Ruckig(6).calculate(problem, solution)
-    motion = straight_table(straight(start, end, SIX_AXES))
-    assert motion.duration == pytest.approx(solution.duration)
-    for t in np.linspace(0.0, motion.duration, 50):
-        for ours, theirs in zip(motion.sample_one(t), solution.at_time(t), strict=True):
-            np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
 
 def test_states_and_parts_are_those_of_the_complete_motion():
@@ -203,19 +186,6 @@ def test_the_motion_stops_if_the_solver_raises(monkeypatch, error):
     assert flown(random_points(4, 3), SIX_AXES) is STOP
 
 
-def test_a_join_beyond_a_position_limit_is_reduced():
-    tightened = 0
-    for seed in range(300):
-        points = random_points(seed, 3)
-        # Joint 5 reverses exactly on its limit while joint 0 determines the time.
-        points[1] = SIX_AXES.upper
-        passed = flown(points, SIX_AXES, 1.0)
-        if passed.join is not None:
-            assert np.all(passed.join.extrema().upper <= SIX_AXES.upper + 1e-9)
-        tightened += passed.share < 0.89
-    assert tightened > 0
-
-
 def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
     points, asked = random_points(1, 3), []
 
@@ -283,13 +253,6 @@ def test_no_corner_is_planned_with_an_unknown_solver(monkeypatch, version):
     else:
         with pytest.raises(UnsupportedSolver, match=rf"{version}.*0\.19"):
             flown(points, SIX_AXES)
-
-
-def test_nothing_is_cut_from_a_stop():
-    a, b, c = random_points(6, 3)
-    for fly in (Stop(), FlyPercent(0.0), FlyDistance(0.0)):
-        assert corner(legs_between(np.array([a, b, c]), SIX_AXES), fly) is STOP
-    assert flown(np.array([a, b, b]), SIX_AXES) is STOP
 
 
 numbers = st.floats(-3.0, 3.0)

@@ -282,12 +282,6 @@ class TestCorners:
         assert distances == sorted(distances)
         np.testing.assert_allclose(distances[3:], [2.6, 8.0, 16.0], rtol=0.3)
 
-    def test_a_motion_between_equal_points_takes_no_time(self):
-        point = random_points(13, 1)[0]
-        motion = plan([point, point, point], SIX_AXES)
-        assert motion.duration == 0.0
-        np.testing.assert_array_equal(motion.sample(np.array([0.0, 1.0]))[0], [point, point])
-
     def test_a_miss_at_three_neighbouring_shares_is_avoided(self):
         # Speeds 0.07 % apart: at the second, full, 0.999 and 0.97 of the corner fall on a miss.
         limits = JointLimits(

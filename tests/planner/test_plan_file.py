@@ -85,11 +85,6 @@ def test_degrees_restore_every_bit(angle):
     assert isinstance(tomllib.loads(f"x = {text}")["x"], float)
 
 
-def test_degrees_convert_as_in_numpy():
-    for angle in (0, 30, 90, 155, -720, 12.5, 516.667):
-        assert radians_of(Decimal(str(angle))) == np.radians(angle)
-
-
 @pytest.fixture
 def planned():
     points = random_points(3)
@@ -172,20 +167,14 @@ def test_a_file_can_be_written_by_hand():
     ("old", "new", "problem"),
     [
         ("version = 1", "version = 2", "version"),
-        ("version = 1", "", "version: Field required"),
         ('"joint motion plan"', '"poem"', "format"),
         ("fly_percent = 50", "fly_percent = 50\nfly_distance = 0.1", "not both"),
         ("fly_percent = 50", "fly_percent = 150", "fly percentage"),
-        ("fly_percent = 50", 'fly_percent = "much"', "not a plan"),
         ("fly_percent = 50", "flyby = 50", "flyby: Extra"),
-        ("speed = 0.5", "speed = 50", "speed"),
         ("target_deg = [30, 60.5]", "target_deg = [30]", "joints are named"),
         ("target_deg = [30, 60.5]", 'target_deg = ["30", 60.5]', "not a number of degrees"),
         ("target_deg = [30, 60.5]", "target_deg = [30, 60.5]\ntarget = [1, 2]", "both"),
         ("target_deg = [30, 60.5]", "target_deg = [30, nan]", "finite"),
-        ("target_deg = [30, 60.5]", "", "target: Field required"),
-        ("start_deg = [0, 0]", "", "start: Field required"),
-        ("start_deg = [0, 0]", "start_deg = 0", "start: .* list"),
         ("lower_deg = [-90, -90]", "lower_deg = [-90, 95]", "lower"),
         ("jerk_deg = [3000, 3000]", "", "limits.jerk: Field required"),
         ("[[moves]]", "[moves]", "TOML"),
@@ -211,67 +200,28 @@ SMALLEST = {
     "start": [0, 0],
     "moves": [{"target": [1, 1]}],
 }
-HUGE = 10**400
+DAMAGE = [
+    {"version": True},
+    {"joints": ["a", "a"]},
+    {"start": [10**400, 0]},
+    {"start": ["0", 0]},
+    {"moves": [{"target": [1, 1], "speed": 10**400}]},
+    {"moves": [{"target": [1, 1], "fly_distance": True}]},
+    {"overrides": {"joint": ["1", 1]}},
+    {"limits": {"lower": [0, 0]}},
+    {"motion": {"type": "piecewise_cubic", "knots": [["0", 1]], "coefficients": [[[0] * 4]]}},
+    {"motion": {"type": "piecewise_cubic", "knots": 5, "coefficients": 5}},
+]
 
 
-def nested(depth: int) -> list:
-    inner: list = []
-    for _ in range(depth):
-        inner = [inner]
-    return inner
-
-
-DAMAGED_MOVES = {
-    "target": [["1", "2"]],
-    "speed": [HUGE, "1", True],
-    "fly_percent": ["50", HUGE],
-    "fly_distance": [True],
-    "joint_speed": [[True, 1]],
-    "termination": [["fine"]],
-}
-DAMAGE = {
-    "version": [True, 1.0, "1"],
-    "joints": ["ab", ["a", "a"], [1, 2], None],
-    "start": [[HUGE, 0], ["0", 0], [True, 0], [[0, 0]], nested(5000)],
-    "moves": [
-        *(None, {"target": [1, 1]}, [5]),
-        *(
-            [{"target": [1, 1], name: value}]
-            for name, values in DAMAGED_MOVES.items()
-            for value in values
-        ),
-    ],
-    "overrides": [None, {"joint": ["1", 1]}, {"speed": True}],
-    "limits": [[1], {"lower": [HUGE, 0]}],
-    "motion": [
-        [1],
-        *(
-            {"type": "piecewise_cubic", "knots": knots, "coefficients": coefficients}
-            for knots, coefficients in (([[0, HUGE]], []), ([["0", 1]], [[[0] * 4]]), (5, 5))
-        ),
-    ],
-}
-
-
-@pytest.mark.parametrize(
-    "damage", [{name: value} for name, values in DAMAGE.items() for value in values]
-)
+@pytest.mark.parametrize("damage", DAMAGE)
 def test_a_damaged_file_is_invalid(damage):
     assert PlanFile.from_dict(SMALLEST).joint_names == ("a", "b")
     with pytest.raises(InvalidPlanFile):
         PlanFile.from_dict(SMALLEST | damage)
 
 
-def test_data_of_another_type_are_refused():
-    with pytest.raises(InvalidPlanFile, match=r"not a plan: top level: .* dictionary"):
-        PlanFile.from_dict([])
-
-
-@pytest.mark.parametrize(
-    "angle",
-    ["1.2345678901234567e9999999", "1e999999999", "1" * 5000, "[" * 5000 + "]" * 5000, "true"],
-    ids=["no float", "infinite", "too many digits", "too deep", "truth"],
-)
+@pytest.mark.parametrize("angle", ["1e999999999", "1" * 5000, "[" * 5000 + "]" * 5000], ids=len)
 def test_impossible_numbers_are_refused(angle):
     with pytest.raises(InvalidPlanFile):
         PlanFile.from_toml(HAND_WRITTEN.replace("start_deg = [0,", f"start_deg = [{angle},"))

@@ -753,13 +753,6 @@ class TestLeaving:
 
 
 class TestPauses:
-    @pytest.mark.parametrize("mode", [500, 502])
-    def test_every_axis_reports_it_for_so_long_then_closed_axes(self, mode: int) -> None:
-        controller = opened()
-        controller.pause(mode, 5)
-        modes = [tuple(step(controller).axes["mode"].tolist()) for _ in range(6)]
-        assert modes == [(mode, mode)] * 5 + [(0, 0)]
-
     def test_without_a_drive_there_is_nothing_to_pause(self) -> None:
         controller = opened()
         controller.lose_drive("emergency stop")

@@ -178,6 +178,7 @@ def test_a_warm_restart_is_the_init_packet_next() -> None:
     [
         ("axis-leaves@100:axis=2", [(4, 4), (4, 0), (4, 0), (4, 0)]),
         ("pause@100x20", [(4, 4), (502, 502), (502, 502), (0, 0)]),
+        ("pause@100x20:500", [(4, 4), (500, 500), (500, 500), (0, 0)]),
     ],
 )
 def test_modes_change_in_the_cycles_of_the_fault(fault: str, modes: list[tuple[int]]) -> None:
@@ -262,11 +263,3 @@ class TestOwnMotion:
         pc = run(2500, own_motion=self.POSTURES, open_mode=8, own_speed=0.8)
         assert pc.controller.phase is Phase.OPEN
         np.testing.assert_allclose(pc.controller.plant.position, self.POSTURES[-1], atol=1e-3)
-
-
-def test_one_seed_is_one_run_with_faults_too() -> None:
-    def packets() -> list[bytes]:
-        faults = ("following-error@90x10:axis=2:slip", "pause@110x20", "restart@200:warm")
-        return run(400, *faults, encoder_noise=0.5, current_noise=0.02).packets
-
-    assert packets() == packets()

@@ -104,45 +104,6 @@ def test_limits_are_the_controllers_mapped_to_dh_angles(model: pin.Model) -> Non
     np.testing.assert_allclose(ends[1], model.upperPositionLimit, atol=1e-12)
 
 
-class Collisions:
-    """Distances between the shapes of links that are not neighbours."""
-
-    def __init__(self, model: pin.Model) -> None:
-        self.model = model
-        self.shapes = pin.buildGeomFromUrdfString(
-            model, ns16.urdf_text(), pin.GeometryType.COLLISION
-        )
-        objects = list(self.shapes.geometryObjects)
-        for a, first in enumerate(objects):
-            for b, second in enumerate(objects[:a]):
-                if abs(first.parentJoint - second.parentJoint) > 1:
-                    self.shapes.addCollisionPair(pin.CollisionPair(b, a))
-
-    def smallest_distance(self, q: Array) -> float:
-        data, shapes = self.model.createData(), self.shapes.createData()
-        pin.computeDistances(self.model, data, self.shapes, shapes, q)
-        return min(result.min_distance for result in shapes.distanceResults)
-
-
-@pytest.fixture(scope="module")
-def collisions(model: pin.Model) -> Collisions:
-    return Collisions(model)
-
-
-@pytest.mark.parametrize("wrist_deg", [-120.0, -90.0, 0.0, 90.0, 120.0])
-@pytest.mark.parametrize("forearm_deg", [-130.0, -90.0, -45.0, 0.0, 45.0])
-@pytest.mark.parametrize("arm_deg", [-50.0, 0.0, 45.0, 90.0])
-def test_working_postures_are_free_by_the_cells_margin(
-    collisions: Collisions, arm_deg: float, forearm_deg: float, wrist_deg: float
-) -> None:
-    q = dh([0.0, arm_deg, forearm_deg, 30.0, wrist_deg, 0.0])
-    assert collisions.smallest_distance(q) > 0.05
-
-
-def test_a_folded_arm_collides(collisions: Collisions) -> None:
-    assert collisions.smallest_distance(dh([0.0, 0.0, -165.0, 0.0, 0.0, 0.0])) <= 0.0
-
-
 TENSOR_ORDER = ("xx", "xy", "yy", "xz", "yz", "zz")  # of pinocchio's parameter vector
 
 

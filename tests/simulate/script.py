@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -128,22 +128,6 @@ def _event(line: str) -> ScriptedEvent:
             raise ValueError(f"{line!r} has no option {option!r}; lines are\n{GRAMMAR}")
     count = int(match["count"]) if match["count"] else 1
     return ScriptedEvent(line, match["kind"], int(match["at"]), count, value, word)
-
-
-def simpler(line: str) -> Sequence[str]:
-    """Return variants of a line with smaller counts and rounder numbers."""
-    found: list[str] = []
-    for pattern, lead, trail in ((r"x(\d+)", "x", ""), (r":(\d+)ms", ":", "ms")):
-        match = re.search(pattern, line)
-        if match is not None and (number := int(match[1])) > 1:
-            head, tail = line[: match.start()] + lead, trail + line[match.end() :]
-            found += [f"{head}{less}{tail}" for less in (1, number // 2, number - 1)]
-    match = re.search(r"@(\d+)", line)
-    if match is not None:
-        rounder = (round(int(match[1]), -2), round(int(match[1]), -1))
-        head, tail = line[: match.start()], line[match.end() :]
-        found += [f"{head}@{at}{tail}" for at in rounder]
-    return [one for one in dict.fromkeys(found) if one != line]
 
 
 class Story(NamedTuple):

@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.exchange.loop import ReceiveQueue
 from drivers.execution import Execution
 from drivers.guard import Guard
-from drivers.reply_policy import ReplyPolicy
 from drivers.session import PacketSequence
 from drivers.state_machine import StateMachine
 from hil.archive.recorder import Recorder
@@ -59,76 +57,6 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Guard, "check_set_point", lambda *arguments: None)
 
 
-def continues_after_a_gap(patch: pytest.MonkeyPatch) -> None:
-    """The motion is neither stopped nor compared after any number of missed packets."""
-    record_gap, compare = StateMachine.record_gap, ReplyPolicy.check_gap
-    patch.setattr(
-        StateMachine,
-        "record_gap",
-        lambda self, missed, unanswered, most: record_gap(self, missed, 0, most),
-    )
-    patch.setattr(
-        ReplyPolicy, "check_gap", lambda self, unanswered, *others: compare(self, 0, *others)
-    )
-
-
-def answers_all_waiting_packets(patch: pytest.MonkeyPatch) -> None:
-    """The motion runs ahead of the arm."""
-
-    def every(self: ReceiveQueue, first: Any, period: float) -> Any:
-        arrivals = [first]
-        while (packet := self._transport.receive(0.0)) is not None:
-            arrivals.append(first._replace(packet=packet))
-        return tuple(arrivals)
-
-    patch.setattr(ReceiveQueue, "_newest", every)
-
-
-def enters_stopped_motions_as_completed(patch: pytest.MonkeyPatch) -> None:
-    add = CampaignFolder.add
-
-    def added(self: CampaignFolder, name: str, outcome: str, reason: str = "") -> None:
-        add(self, name, "completed" if outcome == "stopped" else outcome, reason)
-
-    patch.setattr(CampaignFolder, "add", added)
-
-
-def repeats_complete_motions(patch: pytest.MonkeyPatch) -> None:
-    """A run ignores the entries of the run before."""
-    whole, play = CampaignFolder.whole, Runner.run_motion
-    begun: list[bool] = []
-
-    def own_entries(self: CampaignFolder, kind: str, index: int) -> str | None:
-        return whole(self, kind, index) if begun else None
-
-    def played(self: Runner, *arguments: Any) -> str:
-        begun.append(True)
-        return play(self, *arguments)
-
-    unchanged = CampaignFolder.require_unchanged
-
-    def begins(self: CampaignFolder) -> None:
-        begun.clear()
-        unchanged(self)
-
-    patch.setattr(CampaignFolder, "whole", own_entries)
-    patch.setattr(CampaignFolder, "require_unchanged", begins)
-    patch.setattr(Runner, "run_motion", played)
-
-
-def smooths_what_it_archives(patch: pytest.MonkeyPatch) -> None:
-    """Positions in archives are not those of the wire."""
-    write = Recorder._write
-
-    def written(self: Recorder, records: Any) -> None:
-        records = records.copy()
-        position = records["position"]
-        position[1:] = 0.5 * (position[1:] + position[:-1])
-        write(self, records)
-
-    patch.setattr(Recorder, "_write", written)
-
-
 def replaced(owner: type, name: str, value: Any) -> Plant:
     return lambda patch: patch.setattr(owner, name, value)
 
@@ -149,17 +77,10 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "set-points are not checked": (accepts_set_points, ("lurch@{moving}x3:0.0001",), "guard"),
     "feedback is not checked": (
         accepts_feedback, ("following-error@{moving}x60:axis=1:slip",), "guard"),
-    "a motion continues after a gap": (continues_after_a_gap, ("lose@{moving}x4",), "gaps"),
     "open mode is left before the arm settles": (leaves_at_once, ("lose@{moving}x4",), "rest"),
-    "waiting packets are answered": (
-        answers_all_waiting_packets, ("stall@{moving}:7ms",), "piles"),
     "a lost record is not stated": (loses_a_record, (), "archives"),
-    "a stopped motion is valid": (
-        enters_stopped_motions_as_completed, ("stop@{moving}",), "folder"),
-    "complete motions are repeated": (repeats_complete_motions, ("stop@{late}",), "folder"),
     "a truncated archive is valid": (
         ignores_checksums, ("power-cut@{late}x2:keep=0.6",), "folder"),
-    "archives are smoothed": (smooths_what_it_archives, (), "archives"),
 }  # fmt: skip
 """Defect, script with which it has an effect, and the law that finds it."""
 

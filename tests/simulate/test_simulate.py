@@ -14,7 +14,7 @@ from tests.simulate import world
 from tests.simulate.__main__ import main
 from tests.simulate.many import recorded, stage_folder
 from tests.simulate.scenes import NEIGHBOURS, scene_of
-from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script, simpler
+from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script
 from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
 from tests.simulate.world import SceneError, _twin, twin_of
 
@@ -44,14 +44,6 @@ class TestScript:
 
 
 class TestShrinking:
-    def test_the_failing_line_remains_with_small_numbers(self) -> None:
-        lines = ("kill@3", "lose@1234x9", "stop@70", "e-stop@5", "hold@8x2")
-
-        def fails(candidate: tuple[str, ...]) -> bool:
-            return any(line.startswith("lose@") and "x1" not in line for line in candidate)
-
-        assert shrunk(lines, fails) == ("lose@1200x2",)
-
     def test_two_lines_that_fail_only_together_remain(self) -> None:
         lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
         both = {"kill@200", "kill@700"}
@@ -67,11 +59,6 @@ class TestShrinking:
 
         shrunk(lines, fails, tries=5)
         assert len(tried) == 5
-
-    def test_a_simpler_line_is_valid(self) -> None:
-        for line in ("lose@1234x9:to_controller", "stall@987:37ms", "delay@55x4:30ms"):
-            assert simpler(line)
-            parse_script(simpler(line))
 
 
 def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:

@@ -18,7 +18,7 @@ from drivers.events import AnswersLost, Event, GapSeen, InitReceived, LinkLost, 
 from tests.simulate.laws import LAWS as OTHERS
 from tests.simulate.observed import Broken, Exchanged, Law, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS
-from tests.simulate.script import DISTURBS_THE_ARM, DRAWS, kind_of, parse_script, simpler
+from tests.simulate.script import DISTURBS_THE_ARM, DRAWS, kind_of, parse_script
 from tests.simulate.world import Twin, UndisturbedError, play, twin_of
 
 _NUMBERS: Final = 0x7FFF  # largest packet number
@@ -128,7 +128,7 @@ Fails = Callable[[tuple[str, ...]], bool]
 
 
 def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple[str, ...]:
-    """Return a failing script with as few and as simple lines as found in some tries."""
+    """Return a failing script with as few lines as found in some tries."""
     left, current = [tries], tuple(lines)
 
     def still(candidate: tuple[str, ...]) -> bool:
@@ -145,14 +145,6 @@ def shrunk(lines: Sequence[str], fails: Fails, tries: int = MOST_TRIES) -> tuple
             else:
                 start += size
         size //= 2
-    for row in range(len(current)):
-        others = simpler(current[row])
-        while others:
-            candidate = (*current[:row], others[0], *current[row + 1 :])
-            if still(candidate):
-                current, others = candidate, simpler(candidate[row])
-            else:
-                others = others[1:]
     return current
 
 

@@ -1,15 +1,14 @@
-"""Second reader of archives, from the published formats of container, chunks and messages.
+"""Second reader of archives: records by the `mcap` library, messages from the published layout.
 
-The container is MCAP, messages are CDR, laid out as in `docs/archive-format.md`. The `mcap` library
-reads one file of each campaign in `archives`; it takes a hundred times as long.
+Messages are CDR, laid out as in `docs/archive-format.md`.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import zlib
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -17,13 +16,14 @@ from typing import Any, Final
 
 import numpy as np
 import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Chunk, McapRecord, Metadata
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from numpy.typing import NDArray
 
-MAGIC: Final = b"\x89MCAP0\r\n"
-_RECORD: Final = struct.Struct("<BQ")
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-_CHUNK: Final = struct.Struct("<QQQI")
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _ATTACHMENT, _METADATA = (2, 3, 4, 5, 6, 9, 12)
+_CHANNEL_OP, _MESSAGE_OP = 4, 5
 _ARRAYS: Final = (
     *("target_position", "target_velocity", "position", "velocity", "torque", "target_current"),
     *("model_current", "diagonal_inertia", "extra3", "commanded_position", "commanded_velocity"),
@@ -109,49 +109,15 @@ def read(path: Path) -> Archived:
 def _read(path: Path, _changed: int, _size: int) -> Archived:
     found = Archived(path)
     reading = _Reading(found)
-    data = path.read_bytes()
     try:
-        for opcode, body in _records(data):
-            reading.read(opcode, body)
-            if opcode == _FOOTER:
-                found.whole = True
-                break
-    except (
-        _DamagedError,
-        struct.error,
-        ValueError,
-        UnicodeDecodeError,
-        zstandard.ZstdError,
-    ) as error:
+        with path.open("rb") as stream:
+            for record in StreamReader(stream, emit_chunks=True, validate_crcs=True).records:
+                reading.read(record)
+        found.whole = True
+    except (McapError, struct.error, ValueError, zstandard.ZstdError) as error:
         found.problem = f"{type(error).__name__}: {error}"
-    if found.whole and not data.endswith(MAGIC):
-        found.whole, found.problem = False, "no magic at the end"
     reading.finish()
     return found
-
-
-class _DamagedError(ValueError):
-    """The file ends, or is damaged, here."""
-
-
-def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
-    if data[:8] != MAGIC:
-        raise _DamagedError("no magic at the beginning")
-    view, at = memoryview(data), 8
-    while at < len(data):
-        if at + 9 > len(data):
-            raise _DamagedError("a record begins and its length is missing")
-        opcode, length = _RECORD.unpack_from(data, at)
-        if at + 9 + length > len(data):
-            raise _DamagedError(f"{at + 9 + length - len(data)} bytes of a record are missing")
-        yield opcode, view[at + 9 : at + 9 + length]
-        at += 9 + length
-    raise _DamagedError("no footer")
-
-
-def _string(body: memoryview, at: int) -> tuple[str, int]:
-    (length,) = struct.unpack_from("<I", body, at)
-    return bytes(body[at + 4 : at + 4 + length]).decode(), at + 4 + length
 
 
 class _Reading:
@@ -162,75 +128,43 @@ class _Reading:
         self._stamps: list[int] = []
         self._sequences: list[int] = []
 
-    def read(self, opcode: int, body: memoryview) -> None:
+    def read(self, record: McapRecord) -> None:
         """Read one record of the data section, or of the summary, which repeats some."""
-        if opcode == _CHUNK_OP:
-            self._chunk(body)
-        elif opcode == _METADATA:
-            self._metadata(body)
-        elif opcode == _ATTACHMENT:
-            self._attachment(body)
-        elif opcode == _CHANNEL:
-            self._channel(body)
+        if isinstance(record, Chunk):
+            content, size = get_chunk_data_stream(record, validate_crc=True)
+            self._messages(content.read(size))
+            self._found.chunks += 1
+        elif isinstance(record, Metadata):
+            self._metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            self._found.attachments[record.name] = record.data
+        elif isinstance(record, Channel):
+            self._topics[record.id] = record.topic
 
-    def _metadata(self, body: memoryview) -> None:
-        name, at = _string(body, 0)
-        (size,) = struct.unpack_from("<I", body, at)
-        at, end, entries = at + 4, at + 4 + size, {}
-        while at < end:
-            key, at = _string(body, at)
-            entries[key], at = _string(body, at)
+    def _metadata(self, name: str, entries: dict[str, str]) -> None:
         rest = {key: value for key, value in entries.items() if key != "checksum"}
         text = json.dumps(rest, sort_keys=True, separators=(",", ":"))
         if entries.get("checksum") != f"{zlib.crc32(text.encode()):08x}":
-            raise _DamagedError(f"metadata {name} fail their checksum")
+            raise ValueError(f"metadata {name} fail their checksum")
         if name == "hil":
             self._found.metadata = entries
         elif name == "hil.outcome":
             self._found.outcome = entries
 
-    def _attachment(self, body: memoryview) -> None:
-        name, at = _string(body, 16)
-        _, at = _string(body, at)
-        (size,) = struct.unpack_from("<Q", body, at)
-        content = bytes(body[at + 8 : at + 8 + size])
-        (crc,) = struct.unpack_from("<I", body, at + 8 + size)
-        if crc and crc != zlib.crc32(body[:-4]):
-            raise _DamagedError(f"attachment {name} fails its checksum")
-        self._found.attachments[name] = content
-
-    def _channel(self, body: memoryview) -> None:
-        number = int.from_bytes(body[:2], "little")
-        self._topics[number], _ = _string(body, 4)
-
-    def _chunk(self, body: memoryview) -> None:
-        _, _, size, crc = _CHUNK.unpack_from(body)
-        compression, at = _string(body, _CHUNK.size)
-        (packed,) = struct.unpack_from("<Q", body, at)
-        content = bytes(body[at + 8 : at + 8 + packed])
-        if compression == "zstd":
-            content = zstandard.decompress(content, size)
-        elif compression:
-            raise _DamagedError(f"a chunk compressed by {compression}")
-        if not crc or crc != zlib.crc32(content) or len(content) != size:
-            raise _DamagedError("a chunk fails its checksum")
-        self._messages(content)
-        self._found.chunks += 1
-
     def _messages(self, content: bytes) -> None:
-        at, topics, parts = 0, self._topics, self._parts
+        """Divide a chunk into messages: the library takes a hundred times as long."""
+        at, parts = 0, self._parts
         while at < len(content):
-            if content[at] == _MESSAGE_OP:
-                _, length, channel, sequence, stamp, _ = _MESSAGE.unpack_from(content, at)
-                topic = topics[channel]
+            opcode, length, channel, sequence, stamp, _ = _MESSAGE.unpack_from(content, at)
+            if opcode == _MESSAGE_OP:
+                topic = self._topics[channel]
                 parts.setdefault(topic, []).append(content[at + 31 : at + 9 + length])
                 if topic == "/hil/cycle":
                     self._stamps.append(stamp)
                     self._sequences.append(sequence)
-            else:
-                opcode, length = _RECORD.unpack_from(content, at)
-                if opcode == _CHANNEL:
-                    self._channel(memoryview(content)[at + 9 : at + 9 + length])
+            elif opcode == _CHANNEL_OP:
+                stream = ReadDataStream(io.BytesIO(content[at + 9 : at + 9 + length]))
+                self.read(Channel.read(stream))
             at += 9 + length
 
     def finish(self) -> None:
