@@ -286,4 +286,3 @@ def _parts(times: Histogram) -> tuple[float, float, float]:
 def _spread(times: Histogram) -> str:
     median, most, longest = (f"{1e6 * seconds:.0f} µs" for seconds in _parts(times))
     return f"{median} median, {most} 99 %, {longest} maximum"
-
