@@ -32,7 +32,6 @@ MIDDLE: Final = 0.4
 """Share of the motion that is complete in the picture."""
 HEIGHT, MARGIN = 20, 14
 """Height of a letter and margin of the picture, pixels."""
-EIGHTHS: Final = " ▏▎▍▌▋▊▉█"
 THEME: Final[TerminalTheme] = MONOKAI
 
 Colour = tuple[int, int, int]
@@ -85,9 +84,8 @@ def picture(shown: Shown) -> Image.Image:
                 box = (x, y, x + wide, y + high - 1)
                 if paper != THEME.background_color:
                     draw.rectangle(box, fill=paper)
-                if letter in EIGHTHS[1:]:
-                    share = EIGHTHS.index(letter) / 8
-                    draw.rectangle((x, y + 2, x + share * wide, y + high - 3), fill=ink)
+                if letter == "█":
+                    draw.rectangle((x, y + 2, x + wide, y + high - 3), fill=ink)
                 else:
                     draw.text((x, y), letter, font=fonts[bool(style.bold)], fill=ink)
                 column += 1

@@ -23,6 +23,7 @@ from functools import partial
 from typing import Any, Final, Literal, TextIO
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -34,6 +35,8 @@ from hil.cell import Cell
 from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
 
+Array = NDArray[np.float64]
+
 # --- keys
 
 STEP: Final = 0.1
@@ -41,7 +44,6 @@ STEP: Final = 0.1
 _LONGEST_TYPED: Final = 3
 """Most keys at once from an operator; of more, which are pasted, only stop and hold count."""
 HELP: Final = "h hold   space resume   s stop   + - override   1…9: 10…90 %   0: 100 %"
-SHORT_HELP: Final = "h hold  r resume  s stop  + - 1…0 %"
 _ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
     **dict.fromkeys("hH\x1b", "hold"),
     **dict.fromkeys(" rR", "resume"),
@@ -169,13 +171,12 @@ def _chunk(fd: int) -> bytes:
 
 # --- the picture
 
-WIDE: Final = 64
-"""Least width with bars beside the numbers, columns."""
 STALE: Final = 1.0
 """Age of a status that is reported, s."""
 SIMULATED: Final = "SIMULATED"
-_LEAST_TITLE: Final = 8  # columns
-_NUMBERS: Final = 28  # columns of a joint beside its name and bars
+_TITLE: Final = 20  # Most columns of the title
+_NAME: Final = 14  # Columns of a joint's name
+_NUMBERS: Final = 28  # Columns of a joint's numbers, beside its name and bars
 _HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 WARNING: Final = 0.8
 """Share of a limit from which it is coloured."""
@@ -198,33 +199,30 @@ class Shown:
 
 
 def lines(shown: Shown, width: int, height: int) -> list[Text]:
-    """Return the picture, at most `height` lines of at most `width` columns."""
+    """Return the picture, made for 80 columns and 24 lines; a smaller terminal shows a part."""
     status = shown.status
     motion = None if status is None else status.motion
-    head = [
-        _heading(shown, width),
-        _bar_of_motion(motion, width),
-        _state(shown, motion, width),
-        _health(motion, width),
-    ]
-    room = height - len(head) - 1
-    joints = _joints(shown.joint_names, motion, width)
-    body = [Text(), *joints] if len(joints) < room else joints[:room]
-    drift = None if status is None else status.drift
-    if drift is not None and len(body) + 2 <= room:
-        body += [Text(), _drift(drift, width)]
+    screen = [_heading(shown, width), Text("nothing moves", style="dim"), _state(shown), Text()]
+    if motion is not None:
+        screen[1] = _bar_of_motion(motion, width)
+        troubled = motion.missed or motion.late or motion.not_accepted
+        screen[3] = Text(f"cycles {motion.cycles}, {_packets(motion)}")
+        screen[3].stylize("bold yellow" if troubled else "green")
+        screen += [Text(), *_joints(shown.joint_names, motion, width)]
+    if status is not None and status.drift is not None:
+        screen += [Text(), _drift(status.drift, width)]
     notes, events = status.notes if status else (), motion.events if motion else ()
     rows = [
         row
         for line in (*shown.messages, *notes, *events)
         for row in textwrap.wrap(printable(line, keep=""), max(8, width), subsequent_indent="  ")
     ]
-    left = room - len(body) - 1
-    if left > 0 and rows:
-        body += [Text(), *(Text(row, style="dim") for row in rows[-left:])]
-    keys = HELP if len(HELP) <= width else SHORT_HELP
-    help_ = Text((keys if shown.keys else "Ctrl-C stops on the path").ljust(width), style="reverse")
-    screen = [*head, *body, *[Text()] * max(0, room - len(body)), help_][:height]
+    room = height - len(screen) - 2
+    if room > 0:
+        screen += [Text(), *(Text(row, style="dim") for row in rows[-room:])]
+    screen += [Text()] * (height - 1 - len(screen))
+    keys = HELP if shown.keys else "Ctrl-C stops on the path"
+    screen = [*screen[: height - 1], Text(keys.ljust(width), style="reverse")]
     for line in screen:
         line.truncate(width, overflow="ellipsis")
     return screen
@@ -232,172 +230,133 @@ def lines(shown: Shown, width: int, height: int) -> list[Text]:
 
 def status_line(status: RunStatus, left: str = "") -> str:
     """Return the progress of a run in one line; `left` is the waiting time to its end."""
-    parts = [f"{status.phase} {status.number} of {status.total}"]
+    parts = [_phase(status)]
     motion = status.motion
     if motion is not None:
-        if motion.motion_time is not None and motion.duration:
-            parts.append(f"{motion.motion_time:.1f} of {motion.duration:.1f} s")
-        if motion.held:
-            parts.append("held")
-        if motion.override != 1.0:
-            parts.append(f"override {100.0 * motion.override:.0f} %")
-        parts += [f"{motion.missed} missed", f"{motion.late} late"]
-        if motion.not_accepted:
-            parts.append(f"{motion.not_accepted} not accepted")
-        if motion.latency is not None:
-            parts.append(f"latency {duration(motion.latency.p99)} (99 %)")
+        held = "held" if motion.held else f"override {100.0 * motion.override:.0f} %"
+        parts += [_times(motion), held, _packets(motion)]
         shares = {"following error": motion.following_share, "current": motion.current_share}
         parts += [
             f"{what} {100.0 * share.max():.0f} % of its limit"
             for what, share in shares.items()
             if share is not None
         ]
-    if status.drift is not None and np.isfinite(status.drift.change).any():
-        parts.append(_drift_words(status.drift))
+    if status.drift is not None:
+        parts.append(_drift_text(status.drift))
     return ", ".join([*parts, left or f"{clock(status.time_left)} left"])
 
 
-def _heading(shown: Shown, width: int) -> Text:
-    status, far = shown.status, "bold green" if shown.controller == SIMULATED else "bold yellow"
-    at, style, left = "  beginning", "dim", ""
-    if status is not None:
-        at, style = f"  {status.phase} {status.number} of {status.total}", "bold cyan"
-        left = shown.left or f"{clock(status.time_left)} left"
-    where = Text.assemble((f"  {shown.controller}" if shown.controller else "", far), (at, style))
-    room = max(0, width - len(left) - 2)
-    text = Text(printable(shown.title), style="bold")
-    # The title is shortened first.
-    text.truncate(max(min(_LEAST_TITLE, room), room - where.cell_len), overflow="ellipsis")
-    text.append_text(where)
-    text.truncate(room, overflow="ellipsis")
-    return text.append(left.rjust(width - text.cell_len))
+def _phase(status: RunStatus) -> str:
+    return f"{status.phase} {status.number} of {status.total}"
 
 
-def _bar_of_motion(motion: MotionProgress | None, width: int) -> Text:
-    if motion is None:
-        return Text("nothing moves", style="dim")
+def _times(motion: MotionProgress) -> str:
     if motion.motion_time is None or not motion.duration:
-        return Text(f"{motion.state.name.lower()}, {motion.cycles} cycles")
-    times = f"{motion.motion_time:.1f} of {motion.duration:.1f} s"
-    room = width - len(times) - 1
-    if room < 10:
-        return Text(times)
-    filled = round(room * min(1.0, motion.motion_time / motion.duration))
-    parts = ("━" * filled, "cyan"), ("─" * (room - filled), "dim"), f" {times}"
-    return Text.assemble(*parts)
+        return motion.state.name.lower()
+    return f"{motion.motion_time:.1f} of {motion.duration:.1f} s"
 
 
-def _state(shown: Shown, motion: MotionProgress | None, width: int) -> Text:
-    text = Text()
+def _packets(motion: MotionProgress) -> str:
+    """Return the packet counts of a motion and its reply times."""
+    text = f"{motion.missed} missed, {motion.late} late, {motion.not_accepted} not accepted"
+    if (latency := motion.latency) is None:
+        return text
+    median, p99, worst = map(duration, (latency.median, latency.p99, latency.worst))
+    return f"{text}, {median}, 99 % {p99}, worst {worst}"
+
+
+def _heading(shown: Shown, width: int) -> Text:
+    status, title = shown.status, Text(printable(shown.title), style="bold")
+    title.truncate(_TITLE, overflow="ellipsis")
+    simulated = shown.controller == SIMULATED
+    text = title.append(f"  {shown.controller}", "bold green" if simulated else "bold yellow")
+    if status is None:
+        return text.append("  beginning", "dim")
+    left = shown.left or f"{clock(status.time_left)} left"
+    text.append(f"  {_phase(status)}", "bold cyan")
+    text.truncate(max(0, width - len(left) - 2), overflow="ellipsis")
+    return text.append(left.rjust(width - text.cell_len), "bold")
+
+
+def _bar_of_motion(motion: MotionProgress, width: int) -> Text:
+    times = _times(motion)
+    done = 0.0 if motion.motion_time is None else motion.motion_time / (motion.duration or math.inf)
+    return _bar(done, width - len(times) - 1, "cyan").append(f" {times}")
+
+
+def _state(shown: Shown) -> Text:
+    text, motion = Text(), None if shown.status is None else shown.status.motion
     if shown.stopping or shown.request.held:
         word, hue = ("STOPPING", "red") if shown.stopping else ("HELD", "yellow")
         text.append(f" {word} ", style=f"bold {hue} reverse").append("  ")
     if shown.age > STALE and shown.status is not None:
         text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
     override = shown.request.override if motion is None else motion.override
-    style = "" if override >= 1.0 else "bold yellow"
-    text.append(f"override {100.0 * override:.0f} %", style=style)
+    text.append(f"override {100.0 * override:.0f} %")
     if motion is not None and motion.rate is not None:
         text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")
-    if motion is not None and width >= WIDE:
+    if motion is not None:
         text.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
     return text
 
 
-def _health(motion: MotionProgress | None, width: int) -> Text:
-    if motion is None:
-        return Text.assemble(("cycles ", "bold"), ("-", "dim"))
-    text = Text.assemble(("cycles ", "bold"), f"{motion.cycles}")
-    for count, what in (
-        (motion.missed, "missed"), (motion.late, "late"), (motion.not_accepted, "not accepted")
-    ):  # fmt: skip
-        if count or width >= WIDE:
-            text.append(f"  {count} {what}", style="bold yellow" if count else "green")
-    if (latency := motion.latency) is not None:
-        worst = duration(latency.worst)
-        usual = f"{duration(latency.median)}, 99 % {duration(latency.p99)}, worst "
-        text.append(f"  {usual if width >= WIDE else ''}{worst}")
-    return text
-
-
-def _joints(names: Sequence[str], motion: MotionProgress | None, width: int) -> list[Text]:
+def _joints(names: Sequence[str], motion: MotionProgress, width: int) -> list[Text]:
     """Return a line per joint: following error and current with their shares of the limits."""
-    if motion is None or motion.following_error is None or motion.current is None:
+    if motion.following_error is None or motion.current is None:
         return []
     assert motion.following_share is not None
     assert motion.current_share is not None
-    name_width = min(max(map(len, [*names, "joint"])), max(5, width // 5))
-    bars = max(0, (width - name_width - _NUMBERS) // 2) if width >= WIDE else 0
-    titles = (
-        ("following error / threshold", "current / limit") if bars else ("following", "current")
+    bars = max(1, (width - _NAME - _NUMBERS) // 2)
+    titles = "".join(
+        f"  {title}".ljust(14 + bars)
+        for title in ("following error / threshold", "current / limit")
     )
-    rule = "".join(f"  {title}".ljust(14 + bars) for title in titles)
-    rows = [Text("joint".ljust(name_width) + rule, style="bold")]
+    rows = [Text("joint".ljust(_NAME) + titles, style="bold")]
     for index, name in enumerate(names):
-        line = Text(name[:name_width].ljust(name_width))
+        line = Text(name[:_NAME].ljust(_NAME))
         for value, share in (
             (f"{np.degrees(motion.following_error[index]):8.3f}°", motion.following_share[index]),
             (f"{motion.current[index]:7.2f} A", motion.current_share[index]),
         ):
-            line.append(value).append(" ")
-            if bars:
-                line.append(bar(share, bars - 1)).append(" ")
-            line.append(percent(share), style=colour(share))
+            line.append(f"{value} ").append_text(_bar(share, bars - 1, colour(share)))
+            line.append(f" {100.0 * share:3.0f}%", style=colour(share))
         rows.append(line)
     return rows
 
 
 def _drift(drift: DriftCurve, width: int) -> Text:
-    known = [float(value) for value in drift.change if np.isfinite(value)]
-    if not known:
-        return Text("warm-up: one motion so far")
-    style = "green" if known[-1] < drift.threshold else "yellow"
-    text = Text.assemble("warm-up: ", (_drift_words(drift), style), "  ")
-    return text.append(curve(known, max(0, width - text.cell_len)), style="cyan")
+    text = Text(f"warm-up: {_drift_text(drift)}  ")
+    return text.append(curve(drift.change, max(0, width - text.cell_len)), style="cyan")
 
 
-def _drift_words(drift: DriftCurve) -> str:
-    change = 100.0 * drift.change[np.isfinite(drift.change)][-1]
-    return f"friction changed by {change:.1f} % (warm below {100.0 * drift.threshold:g} %)"
+def _drift_text(drift: DriftCurve) -> str:
+    known = drift.change[np.isfinite(drift.change)]
+    change = f"{100.0 * known[-1]:.1f} %" if len(known) else "?"
+    return f"friction changed by {change} (warm below {100.0 * drift.threshold:g} %)"
 
 
-def bar(share: float, width: int) -> Text:
-    """Return a bar of a share of a limit; above 1 its last character is an arrow."""
-    if not math.isfinite(share):
-        return Text("?".ljust(width), style="bold red")
-    if share > 1.0:
-        return Text("█" * (width - 1) + "▶", style=colour(share))
-    whole, rest = divmod(round(8 * width * max(share, 0.0)), 8)
-    blocks = "█" * whole + " ▏▎▍▌▋▊▉"[rest].strip()
-    return Text(blocks, style=colour(share)).append("·" * (width - len(blocks)), style="dim")
+def _bar(share: float, width: int, style: str) -> Text:
+    """Return a bar of a share of a limit, full from 1 on."""
+    filled = round(max(0, width) * float(np.clip(np.nan_to_num(share), 0.0, 1.0)))
+    return Text.assemble(("█" * filled, style), ("·" * (width - filled), "dim"))
 
 
 def colour(share: float) -> str:
     """Return the style of a share of a limit."""
-    if share > 1.0:
-        return "bold red"
-    return "yellow" if share > WARNING else "green"
+    if share <= WARNING:
+        return "green"
+    return "yellow" if share <= 1.0 else "bold red"
 
 
-def percent(share: float) -> str:
-    """Return a share in four characters."""
-    if not math.isfinite(share):
-        return "  ?%"
-    value = min(100.0 * share, 999.0)
-    return f"{value:3.1f}%" if value < 9.95 else f"{value:3.0f}%"
-
-
-def curve(values: Sequence[float], width: int) -> str:
-    """Return the last `width` values as a row of blocks, from 0 to the largest of them."""
-    shown = [max(value, 0.0) for value in values if math.isfinite(value)][-width:]
-    step = (max(shown, default=0.0) or 1.0) / len(_HEIGHTS)
+def curve(values: Array, width: int) -> str:
+    """Return the last `width` finite values as a row of blocks, from 0 to the largest of them."""
+    shown = np.maximum(values[np.isfinite(values)], 0.0)[-max(1, width) :]
+    step = (shown.max(initial=0.0) or 1.0) / len(_HEIGHTS)
     return "".join(_HEIGHTS[min(len(_HEIGHTS) - 1, int(value / step))] for value in shown)
 
 
-def clock(seconds: float | None) -> str:
+def clock(seconds: float) -> str:
     """Return a time as h:mm:ss or m:ss."""
-    if seconds is None or not math.isfinite(seconds):
-        return "?"
     minutes, rest = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -75,9 +75,7 @@ def status(**changes: Any) -> RunStatus:
     )  # fmt: skip
 
 
-def screen_lines(width: int, height: int, shown: Shown | None = None) -> list[str]:
-    if shown is None:
-        shown = Shown("ns16-october", NAMES, status(), OperatorRequest(0.8))
+def screen_lines(width: int, height: int, shown: Shown) -> list[str]:
     console = Console(width=width, height=height, file=StringIO(), color_system=None)
     with console.capture() as capture:
         console.print(Group(*lines(shown, width, height)))
@@ -87,85 +85,63 @@ def screen_lines(width: int, height: int, shown: Shown | None = None) -> list[st
 # --- what is shown ---------------------------------------------------------------------------
 
 
-def test_friction_of_the_last_motion_remains() -> None:
-    before = status()
-    assert before.drift is not None
-    change = np.append(before.drift.change, np.nan)
-    after = replace(before, drift=replace(before.drift, change=change))
-    for shown in (
-        "\n".join(screen_lines(80, 24, Shown("x", NAMES, after))),
-        layout.status_line(after),
-    ):
-        assert "friction changed by 1.7 % (warm below 2 %)" in shown
-
-
-def test_80_by_24_show_everything() -> None:
-    screen = screen_lines(80, 24)
-    assert len(screen) == 24
-    text = "\n".join(screen)
-    for words in (
-        "ns16-october", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
-        "override 80 %", "now 75 %", "123456", "2 missed", "1 late", "0 not accepted",
-        "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 % (warm below 2 %)",
-        "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
-        "h hold", "space resume", "s stop", "+ - override",
-    ):  # fmt: skip
-        assert words in text
-    (second,) = [line for line in screen if line.startswith("joint_2")]
-    assert second.split()[1] == "0.150°"
-    assert "31%" in second and "-7.10 A" in second and "72%" in second
-    bars = [second.count(mark) for mark in "█·"]
-    assert all(bars)
-    line = layout.status_line(status())
-    assert layout.status_line(status(), "0:42 left").endswith(", 0:42 left")
-    for words in (
-        "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
-        "following error 130 % of its limit", "current 88 % of its limit", "19:05 left",
-    ):  # fmt: skip
-        assert words in line
-
-
-@pytest.mark.parametrize("width", [20, 40, 48, 63, 64, 79, 80, 132, 300])
-@pytest.mark.parametrize("height", [3, 8, 12, 24, 60])
-def test_nothing_is_wider_or_higher_than_the_terminal(width: int, height: int) -> None:
-    whole = status()
-    nothing = status(following_error=None, following_share=None, current=None, current_share=None)
-    between = RunStatus("move", 1, 3, 1.0)
-    for at in (whole, nothing, between, None):
-        screen = screen_lines(
-            width, height, Shown("a title that is long " * 4, NAMES, at, stopping=True)
+class TestPicture:
+    def test_80_by_24_show_everything(self) -> None:
+        """Friction is that of the last motion that has one."""
+        at = status()
+        assert at.drift is not None
+        at = replace(at, drift=replace(at.drift, change=np.append(at.drift.change, np.nan)))
+        shown = Shown(
+            "a long title " * 6, NAMES, at, OperatorRequest(0.8), controller="10.2.12.150"
         )
-        assert len(screen) <= height
-        assert max(map(len, screen)) <= width
+        screen = screen_lines(80, 24, shown)
+        text = "\n".join(screen)
+        for words in (
+            "10.2.12.150", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s", "override 80 %",
+            "now 75 %", "cycles 123456, 2 missed, 1 late, 0 not accepted",
+            "41 µs, 99 % 87 µs, worst 340 µs", "friction changed by 1.7 % (warm below 2 %)  █▆▃▂",
+            "repetition 5 rejected: its current differs", "2 packets missed before cycle 16002",
+            "h hold", "space resume", "s stop", "+ - override",
+        ):  # fmt: skip
+            assert words in text
+        (second,) = [line for line in screen if line.startswith("joint_2")]
+        assert second.split()[1] == "0.150°"
+        assert "31%" in second and "-7.10 A" in second and "72%" in second
+        line = layout.status_line(at, "0:42 left")
+        for words in (
+            "repetition 7 of 30", "6.2 of 18.6 s", "override 80 %", "2 missed", "1 late",
+            "following error 130 % of its limit", "current 88 % of its limit", "by 1.7 % (warm",
+        ):  # fmt: skip
+            assert words in line
+        assert line.endswith(", 0:42 left")
 
+    @pytest.mark.parametrize(("width", "height"), [(20, 3), (80, 24), (300, 60)])
+    def test_fits_the_terminal(self, width: int, height: int) -> None:
+        nothing = status(
+            following_error=None, following_share=None, current=None, current_share=None
+        )
+        for at in (status(), nothing, RunStatus("move", 1, 3, 1.0), None):
+            shown = Shown("a title that is long " * 4, NAMES, at, stopping=True)
+            screen = screen_lines(width, height, shown)
+            assert len(screen) == height
+            assert max(map(len, screen)) <= width
 
-def test_stop_hold_and_silence_are_shown() -> None:
-    at = status()
-    assert "HELD" in screen_lines(80, 24, Shown("x", NAMES, at, OperatorRequest(held=True)))[2]
-    assert "STOPPING" in screen_lines(80, 24, Shown("x", NAMES, at, stopping=True))[2]
-    assert "no news for 3 s" in screen_lines(80, 24, Shown("x", NAMES, at, age=3.2))[2]
+    def test_shows_stop_hold_and_silence(self) -> None:
+        at = status()
+        for shown, words in (
+            (Shown("x", NAMES, at, OperatorRequest(held=True)), "HELD"),
+            (Shown("x", NAMES, at, stopping=True), "STOPPING"),
+            (Shown("x", NAMES, at, age=3.2), "no news for 3 s"),
+        ):
+            assert words in screen_lines(80, 24, shown)[2]
 
-
-@pytest.mark.parametrize("width", [48, 64, 80])
-@pytest.mark.parametrize("controller", ["SIMULATED", "10.2.12.150"])
-def test_the_first_line_names_the_controller(width: int, controller: str) -> None:
-    shown = Shown("a long title " * 6, NAMES, status(), controller=controller, left="0:42 left")
-    first = screen_lines(width, 24, shown)[0]
-    assert controller in first
-    assert first.endswith("0:42 left")
-    assert "repetition" in first
-
-
-def test_the_controller_is_simulated_or_has_an_address() -> None:
-    cell = Cell.load(CELL_PATH)
-
-    def reported(**link: Any) -> str:
-        return controller_of(cell.with_link(**link))
-
-    assert reported() == reported(transport="udp", host="127.0.0.1") == "SIMULATED"
-    assert reported(transport="udp") == "10.2.12.150"
-    can = CanTable(interface="socketcan", channel="can0")
-    assert reported(transport="can", can=can) == "socketcan:can0"
+    def test_names_the_controller(self) -> None:
+        cell = Cell.load(CELL_PATH)
+        can = CanTable(interface="socketcan", channel="can0")
+        assert controller_of(cell) == "SIMULATED"
+        assert controller_of(cell.with_link(transport="udp", host="127.0.0.1")) == "SIMULATED"
+        assert controller_of(cell.with_link(transport="udp")) == "10.2.12.150"
+        assert controller_of(cell.with_link(transport="can", can=can)) == "socketcan:can0"
 
 
 def test_in_virtual_time_the_time_left_is_that_of_waiting() -> None:
