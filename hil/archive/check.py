@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from os import PathLike
 from pathlib import Path
@@ -16,7 +16,6 @@ from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import ChunkParser, Messages
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
-    CHUNKS,
     FORMAT_VERSION,
     KIND_NAMES,
     KINDS,
@@ -57,7 +56,7 @@ _STATES = {
 }
 """Columns of the cycles that each channel repeats; targets replace commands that are NaN."""
 _CYCLE_FIELDS = {"cycle", "gap"}.union(*(columns.values() for columns in _STATES.values()))
-_MOST = 5  # faults of one aspect that are shown
+_MOST = 5  # different faults of one aspect that are reported
 
 
 @dataclass(frozen=True)
@@ -83,89 +82,66 @@ def check_archive(path: str | PathLike[str]) -> Check:
     """Check whether a file conforms to the profile; ArchiveError if it cannot be read."""
     path = Path(path)
     checker = _Checker()
-    found, add = scan_file(path, checker.visit), checker.add
-    outcome = found.outcome
-    if not found.faults and found.header is not None and not has_valid_index(path, found):
-        add("index", "the message indexes or the summary do not fit the content")
-    if found.metadata is None:
-        if not any(fault.aspect == "metadata" for fault in found.faults):
-            open_archive(path, fields=())  # raises with the reason
-        add("metadata", "without the record hil the rest cannot be checked")
-    else:
-        for text in _description_faults(path, found.metadata):
-            add("metadata", text)
-    if outcome is not None and outcome.outcome not in OUTCOMES:
-        add("outcome", f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}")
-    if outcome is not None and CHUNKS in outcome.record and outcome.chunks is None:
-        add("outcome", f"{CHUNKS} is not a list of checksums")
-    if found.header is not None and found.pieces:
-        checker.finish(found)
-    texts: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
-    for aspect, text in [*((one.aspect, one.text) for one in found.faults), *checker.faults]:
-        texts[aspect].append(text)
+    found = scan_file(path, checker.check_chunk)
+    for fault in found.faults:
+        checker.faults[fault.aspect].append(fault.text)
+    checker.finish(path, found)
     return Check(
         path=path,
         version=(found.metadata or {}).get("format_version", "unknown"),
-        faults={aspect: _shortened(found) for aspect, found in texts.items() if found},
+        faults={
+            aspect: tuple(dict.fromkeys(texts))[:_MOST]
+            for aspect, texts in checker.faults.items()
+            if texts
+        },
         samples=found.samples,
-        repaired=outcome is not None and outcome.repaired,
+        repaired=found.outcome is not None and found.outcome.repaired,
     )
 
 
-def _shortened(texts: list[str]) -> tuple[str, ...]:
-    unique = list(dict.fromkeys(texts))
-    more = len(unique) - _MOST
-    return tuple([*unique[:_MOST], f"and {more} more"] if more > 0 else unique)
-
-
-def _description_faults(path: Path, entries: Mapping[str, str]) -> list[str]:
-    """Return the faults of the ``hil`` record."""
+def _metadata_faults(path: Path, entries: Mapping[str, str]) -> Iterator[str]:
+    """Yield the faults of the ``hil`` record."""
     if not is_supported(entries):
-        return [f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"]
-    faults = []
+        yield f"format_version is {entries.get('format_version')!r}, known is '{FORMAT_VERSION}'"
+        return
     kind = entries.get("kind", "")
     if kind not in KINDS:
-        faults.append(f"kind is {kind!r}, not one of {', '.join(KINDS)}")
+        yield f"kind is {kind!r}, not one of {', '.join(KINDS)}"
     try:
         ArchiveHeader.of(entries)
     except HeaderError as error:
-        faults += [f"{name} {problem}" for name, problem in error.problems.items()]
+        yield from (f"{name} {problem}" for name, problem in error.problems.items())
     if "period" not in entries and kind != "imported":
-        faults.append("period is missing")
+        yield "period is missing"
     name = ArchiveName.parse(path)
     for key, value in (name.metadata() if name else {}).items():
         if entries.get(key) != value:
-            faults.append(f"{key} is {entries.get(key)!r}, but {value!r} in the file name")
-    return faults
+            yield f"{key} is {entries.get(key)!r}, but {value!r} in the file name"
 
 
 class _Checker:
-    """Checks of valid chunks, then of the rest; collects aspect and sentence of each fault."""
+    """Checks of valid chunks, then of the rest; `faults` are sentences by aspect."""
 
     def __init__(self) -> None:
-        self.faults: list[tuple[str, str]] = []
+        self.faults: dict[str, list[str]] = {aspect: [] for aspect in ASPECTS}
         self._layouts: dict[str, MessageLayout | None] = {}
         self._gaps = 0
 
-    def add(self, aspect: str, text: str) -> None:
-        """Add a fault."""
-        self.faults.append((aspect, text))
-
-    def visit(self, found: Scan, messages: Mapping[str, Messages], offset: int) -> None:
+    def check_chunk(self, found: Scan, messages: Mapping[str, Messages], offset: int) -> None:
         """Check the next chunk."""
         if found.header is None:
             return
         place = f"the chunk at byte {offset}"
         compression = container.parse_chunk(found.record).compression
         if compression != "zstd":
-            self.add("chunks", f"{place} is compressed with {compression or 'nothing'}, not zstd")
+            self.faults["chunks"].append(f"{place} has the compression {compression!r}, not zstd")
         rows: dict[str, Rows] = {}
-        for topic, of_topic in messages.items():
-            if topic in schema.ONCE:
-                continue
+        for topic in messages.keys() - schema.ONCE:
+            of_topic = messages[topic]
             times = of_topic.of_heads("log_time"), of_topic.of_heads("publish_time")
             if not all(np.array_equal(time, of_topic.stamps) for time in times):
-                self.add("times", f"{place} has messages logged at another time than their stamp")
+                text = f"{place} has messages logged at another time than their stamp"
+                self.faults["times"].append(text)
             try:
                 if topic == schema.EVENTS:
                     for message in of_topic.all():
@@ -173,26 +149,39 @@ class _Checker:
                 else:
                     rows[topic] = self._rows(found, topic, of_topic)
             except LayoutError as error:
-                self.add("sizes", f"{place} has messages of {topic}: {error}")
+                self.faults["sizes"].append(f"{place} has messages of {topic}: {error}")
         if schema.CYCLE in rows and set(rows[schema.CYCLE].dtype.names or ()) >= _CYCLE_FIELDS:
             self._check_cycles(found.header.period, messages, rows, place)
 
-    def finish(self, found: Scan) -> None:
-        """Check channels and outcome."""
-        header, outcome, parser = found.header, found.outcome, found.parser
-        assert header is not None
-        imported = header.kind == "imported"
+    def finish(self, path: Path, found: Scan) -> None:
+        """Check metadata, index, channels and outcome, after all chunks."""
+        header, outcome = found.header, found.outcome
+        if found.metadata is None:
+            if not self.faults["metadata"]:
+                open_archive(path, fields=())  # raises with the reason
+            self.faults["metadata"].append("without the record hil the rest cannot be checked")
+        else:
+            self.faults["metadata"] += _metadata_faults(path, found.metadata)
+        if outcome is not None and outcome.outcome not in OUTCOMES:
+            text = f"outcome is {outcome.outcome!r}, not one of {', '.join(OUTCOMES)}"
+            self.faults["outcome"].append(text)
+        if header is None:
+            return
+        if not found.faults and not has_valid_index(path, found):
+            text = "the message indexes or the summary do not fit the content"
+            self.faults["index"].append(text)
+        imported, parser = header.kind == "imported", found.parser
         if parser.channels:
             cycles = () if imported else (schema.CYCLE, schema.COMMANDED)
             for topic in sorted({schema.MEASURED, schema.EVENTS, *cycles} - parser.topics):
-                self.add("channels", f"there is no {topic}")
+                self.faults["channels"].append(f"there is no {topic}")
             for channel in parser.channels.values():
                 self._check_channel(channel, parser, len(header.joint_names))
         if imported or outcome is None or outcome.repaired or found.losses:
             return
         if "lost_packets" in outcome.record and outcome.lost_packets != self._gaps:
             stated = outcome.record["lost_packets"]
-            self.add("outcome", f"lost_packets is {stated}, the cycles lack {self._gaps}")
+            self.faults["outcome"].append(f"lost_packets is {stated}, the cycles lack {self._gaps}")
 
     def _check_channel(self, channel: Channel, parser: ChunkParser, n_joints: int) -> None:
         topic = channel.topic
@@ -206,14 +195,14 @@ class _Checker:
             ("schemas", "encoding of the schema", found.encoding, "ros2msg"),
         ):
             if is_now != must_be:
-                self.add(aspect, f"{topic}: {what} is {is_now!r}, not {must_be!r}")
+                self.faults[aspect].append(f"{topic}: {what} is {is_now!r}, not {must_be!r}")
         text = found.data.decode(errors="replace")
         same = text == profile.definition
         if topic == schema.CYCLE and not same:  # fields may be added at its end, as age was
             expected, recorded = _fields(profile.definition), _fields(text)
             same = recorded[: len(expected)] in (expected, expected[:-1])
         if not same:
-            self.add("schemas", f"that of {topic} is not the text of the profile")
+            self.faults["schemas"].append(f"that of {topic} is not the text of the profile")
 
     def _rows(self, found: Scan, topic: str, messages: Messages) -> Rows:
         """Return the messages as a structured array; LayoutError if one differs from the first."""
@@ -241,14 +230,16 @@ class _Checker:
         if period is not None:
             period_ns = period * 1e9
             if not np.array_equal(stamp, np.rint(number * period_ns)):
-                self.add("times", f"{place} has cycles whose stamp is not cycle times period")
+                text = f"{place} has cycles whose stamp is not cycle times period"
+                self.faults["times"].append(text)
             if (int(number[-1]) - int(number[0])) * period_ns >= max(_CHUNK_NS, period_ns):
-                self.add("chunks", f"{place} spans more than 100 ms")
+                self.faults["chunks"].append(f"{place} spans more than 100 ms")
         self._gaps += int(cycles["gap"].sum())
         for topic in _STATES.keys() & rows.keys():
             same = np.array_equal(found[topic].stamps, stamp)
             if not (same and _repeats(rows[topic], cycles, _STATES[topic])):
-                self.add("joint_states", f"{place} has messages of {topic} unlike its cycles")
+                text = f"{place} has messages of {topic} unlike its cycles"
+                self.faults["joint_states"].append(text)
 
 
 def _fields(text: str) -> list[str]:
@@ -315,23 +306,25 @@ class Overview:
 def read_overview(path: str | PathLike[str]) -> Overview:
     """Return the overview of an archive; ArchiveError if it cannot be read."""
     archive, found = open_archive(path, fields=()), scan_file(Path(path))
-    header, outcome, stamp = archive.header, archive.outcome, archive.columns["stamp"]
-    ended, lost = _ended(outcome)
-    further = {
-        **header.entries,
-        **{f"outcome.{key}": text for key, text in (outcome.entries if outcome else {}).items()},
-    }
+    header, stamp = archive.header, archive.columns["stamp"]
+    outcome = archive.outcome or ArchiveOutcome(outcome="missing")
+    entries = {**header.entries, **{f"outcome.{k}": text for k, text in outcome.entries.items()}}
     title, duration = KIND_NAMES.get(header.kind, header.kind), 0.0
     if header.index is not None:
-        attempt = 1 if header.attempt is None else header.attempt
-        title = f"{motion_name(header.kind, header.index)}, attempt {attempt}"
+        title = f"{motion_name(header.kind, header.index)}, attempt {header.attempt or 1}"
     if len(stamp):
         duration = float(stamp[-1] - stamp[0]) * 1e-9
+    counts = {
+        "lost packets": outcome.lost_packets,
+        "records lost": outcome.records_lost,
+        "events lost": outcome.events_lost,
+        "samples lost": "unknown" if outcome.samples_lost is None else outcome.samples_lost,
+    }
     return Overview(
         path=archive.path,
         title=title,
-        outcome=ended,
-        lost=lost,
+        outcome=f"{outcome.outcome}: {outcome.reason}" if outcome.reason else outcome.outcome,
+        lost="; ".join([*(f"{k} {n}" for k, n in counts.items() if n), *outcome.losses]),
         samples=archive.n_samples,
         duration=duration,
         period=archive.period,
@@ -346,25 +339,9 @@ def read_overview(path: str | PathLike[str]) -> Overview:
         attachments={name: len(data) for name, data in archive.attachments.items()},
         metadata={
             key: text
-            for key, text in further.items()
+            for key, text in entries.items()
             if key.removeprefix("outcome.") not in _SHOWN_ELSEWHERE
         },
         events=tuple((one.time, one.name, one.text) for one in archive.events[:_MOST_EVENTS]),
         damage=archive.damage,
     )
-
-
-def _ended(outcome: ArchiveOutcome | None) -> tuple[str, str]:
-    """Return sentences on how a recording ended, and on what was lost."""
-    if outcome is None:
-        return "missing", ""
-    reason = f": {outcome.reason}" if outcome.reason else ""
-    counts = {
-        "lost packets": outcome.lost_packets,
-        "records lost": outcome.records_lost,
-        "events lost": outcome.events_lost,
-        "samples lost": "unknown" if outcome.samples_lost is None else outcome.samples_lost,
-    }
-    lost = [f"{name} {count}" for name, count in counts.items() if count]
-    repaired = ", repaired with loss" if outcome.repaired else ""
-    return f"{outcome.outcome}{reason}{repaired}", "; ".join([*lost, *outcome.losses])

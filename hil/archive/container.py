@@ -339,8 +339,11 @@ class Summary:
         return [record for record in self.records if record.opcode in (SCHEMA, CHANNEL)]
 
     def entries(self, opcode: int) -> list[Any]:
-        """Return the entries of one kind of index."""
-        return [parse_item(record) for record in self.records if record.opcode == opcode]
+        """Return the entries of one kind of index; none where one of them is damaged."""
+        try:
+            return [parse_item(record) for record in self.records if record.opcode == opcode]
+        except Damage:
+            return []
 
     @property
     def places(self) -> list[tuple[int, int]]:

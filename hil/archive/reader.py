@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
@@ -25,11 +24,6 @@ from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json
 
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
-_REMEDIES: Final = {
-    errno.ENOENT: "check whether it was moved or removed",
-    errno.EACCES: "make it readable",
-    errno.EIO: "its disk fails: restore it from a copy",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +170,7 @@ class _Content:
             self.events += [event for event in events if start <= event.stamp < stop]
         if not wanted:
             return
-        room = scan.expected.samples if self._times == ALWAYS else 0
+        room = scan.expected_samples if self._times == ALWAYS else 0
         for topic in layouts.keys() - self._layouts.keys():
             self._begin(topic, layouts[topic], max(room, len(self._stamps)))
         stamps, chosen = found[wanted[0]].stamps, None
@@ -315,7 +309,7 @@ def open_archive(
 
 def refusal(path: Path, error: OSError) -> ArchiveError:
     """Return the error of an archive that the system cannot read."""
-    remedy = _REMEDIES.get(error.errno or 0, "")
+    remedy = "check whether it was moved or removed, and whether it can be copied"
     return ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy)
 
 
@@ -323,8 +317,8 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
     """Return the error of a file without a valid header."""
     if scan.header_error is not None:
         field, problem = next(iter(scan.header_error.problems.items()))
-        remedy = f"correct the program that wrote its metadata record {METADATA!r}, "
-        return ArchiveError(path, problem, field=field, remedy=f"{remedy}and write it again")
+        remedy = f"correct the program that wrote its metadata record {METADATA!r}"
+        return ArchiveError(path, problem, field=field, remedy=remedy)
     if scan.metadata is not None:
         version = scan.metadata.get("format_version")
         return ArchiveVersionError(
@@ -332,16 +326,11 @@ def _unreadable(path: Path, scan: Scan) -> ArchiveError:
             f"is of profile version {version}; this software reads version {FORMAT_VERSION}",
             remedy="install a newer hil",
         )
-    remedy = "record it again"
-    if scan.size == 0:
-        problem = "is empty: the recording ended before anything was written"
-    elif scan.damage is None:
+    if scan.damage is None:
         problem = f"is an MCAP file, but not an archive: it has no {METADATA!r} metadata record"
-        remedy = "name a file that hil recorded or imported"
     elif scan.damage.offset == 0:
         problem = "is not an MCAP file"
-        remedy = "name a file that hil recorded, or import this one first"
     else:
         place = f"the record at byte {scan.damage.offset} {scan.damage}"
         problem = f"is truncated before its first data: {place}"
-    return NotAnArchiveError(path, problem, remedy=remedy)
+    return NotAnArchiveError(path, problem, remedy="name a file that hil recorded or imported")

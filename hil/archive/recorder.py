@@ -38,66 +38,61 @@ from drivers.exchange.event_log import (
 )
 from hil.archive.events import Level
 from hil.archive.writer import ArchiveWriter
-from hil.terminal_text import plural
 
-_SENTENCES: Final[Mapping[type, str]] = {
-    StateChanged: "{0.before.name} -> {0.after.name} in cycle {0.cycle}",
-    MotionStarted: "first set-point in cycle {0.cycle}",
-    MotionEnded: "{0.outcome} in cycle {0.cycle}: {0.reason}",
-    Refused: "{0.error}; {0.error.remedy}",
-    Leaving: "the exchange is ending: {0.reason}",
-    ExchangeEnded: "the exchange ended: {0.reason}",
-    OverrideRefused: "no override of {0.fraction:g}: {0.reason}",
-    HoldRefused: "no motion to hold: {0.reason}",
-    ResumeRefused: "the motion cannot be resumed: {0.reason}",
-    EventsLost: "{0.count} events were overwritten before they could be archived",
+_TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
+    InitReceived: (Level.INFO, "the controller started a session{details}"),
+    StateChanged: (Level.INFO, "{0.before.name} -> {0.after.name} in cycle {0.cycle}"),
+    GapSeen: (Level.WARN, "packets missed before cycle {0.cycle}: {0.missed}"),
+    AnswersLost: (
+        Level.WARN,
+        "replies not accepted by the controller until cycle {0.cycle}: {0.count}",
+    ),
+    PacketRejected: (Level.WARN, "packets {0.kind}: {0.count}{details}"),
+    MotionStarted: (Level.INFO, "first set-point in cycle {0.cycle}"),
+    OverrideChanged: (Level.INFO, "override {0.fraction:g} in cycle {0.cycle}"),
+    HoldChanged: (Level.INFO, "{details} at cycle {0.cycle}"),
+    MotionEnded: (Level.INFO, "{0.outcome} in cycle {0.cycle}: {0.reason}"),
+    Refused: (Level.ERROR, "{0.error}; {0.error.remedy}"),
+    LinkLost: (
+        Level.ERROR,
+        "no valid packet for {0.silence:.3f} s in state {0.state.name}; stale packets: {0.stale}",
+    ),
+    ExchangeStarted: (Level.INFO, "the exchange is running{details}"),
+    Leaving: (Level.INFO, "the exchange is ending: {0.reason}"),
+    ExchangeEnded: (Level.INFO, "the exchange ended: {0.reason}"),
+    ExchangeFailed: (Level.ERROR, "the exchange failed: {details}"),
+    EventsLost: (
+        Level.ERROR,
+        "events that were overwritten before they could be archived: {0.count}",
+    ),
+    OverrideRefused: (Level.WARN, "no override of {0.fraction:g}: {0.reason}"),
+    HoldRefused: (Level.WARN, "no motion to hold: {0.reason}"),
+    ResumeRefused: (Level.WARN, "the motion cannot be resumed: {0.reason}"),
 }
 
 
 def describe(event: ExchangeEvent) -> str:
     """Return the event as one line of text."""
+    details = ""
     match event:
-        case GapSeen():
-            return f"{plural(event.missed, 'packet')} missed before cycle {event.cycle}"
-        case AnswersLost():
-            replies = plural(event.count, "reply")
-            return f"{replies} not accepted by the controller, until cycle {event.cycle}"
-        case OverrideChanged():
-            return f"override {100.0 * event.fraction:.4g} % in cycle {event.cycle}"
-        case HoldChanged():
-            return f"{'held' if event.held else 'resumed'} at cycle {event.cycle}"
-        case PacketRejected(kind="answered late"):
-            packet = "its packet" if event.count == 1 else "their packets"
-            return f"{plural(event.count, 'reply')} sent more than a cycle after {packet}"
-        case PacketRejected():
-            reason = f" ({event.reason})" if event.reason else ""
-            return f"{plural(event.count, f'{event.kind} packet')} got no reply{reason}"
-        case LinkLost(stale=stale):
-            stale_only = f"only {plural(stale, 'packet')} that cannot follow the last one"
-            received = stale_only if stale else "no packet"
-            return f"{received} for {event.silence:.3f} s in state {event.state.name}"
+        case InitReceived() if event.unusable:
+            return event.unusable
         case InitReceived():
-            started = ["the controller started a session", *event.differences]
-            return event.unusable or "; ".join(started)
-        case ExchangeFailed():
-            return f"the exchange failed: {event.trace.strip().splitlines()[-1]}"
+            details = "".join(f"; {one}" for one in event.differences)
+        case PacketRejected() if event.reason:
+            details = f" ({event.reason})"
+        case HoldChanged():
+            details = "held" if event.held else "resumed"
         case ExchangeStarted():
-            return "; ".join(["the exchange is running", *event.realtime.refused, *event.notes])
-    return _SENTENCES[type(event)].format(event)
-
-
-_ERRORS: Final = (Refused, LinkLost, ExchangeFailed, EventsLost)
-_WARNINGS: Final = (
-    *(GapSeen, AnswersLost, PacketRejected),
-    *(OverrideRefused, ResumeRefused, HoldRefused),
-)
+            details = "".join(f"; {one}" for one in (*event.realtime.refused, *event.notes))
+        case ExchangeFailed():
+            details = event.trace.strip().splitlines()[-1]
+    return _TEXTS[type(event)][1].format(event, details=details)
 
 
 def level_of(event: ExchangeEvent) -> Level:
     """Return the severity of an event."""
-    if isinstance(event, _ERRORS):
-        return Level.ERROR
-    return Level.WARN if isinstance(event, _WARNINGS) else Level.INFO
+    return _TEXTS[type(event)][0]
 
 
 Records = NDArray[np.void]

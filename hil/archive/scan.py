@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import BinaryIO, Final, NamedTuple
 
 import numpy as np
@@ -44,72 +44,6 @@ _ASPECTS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """The content that begin and end of a file state.
-
-    Attributes:
-        written_by: profile and library, None where the record is damaged.
-        chunks: their checksums in order, (k,); None where not stated.
-        mixed: whether the end is of another recording than the beginning.
-        repaired: whether messages were lost before the file was written.
-        samples: how many were written, limited to what fits into the file.
-    """
-
-    written_by: tuple[str, str] | None = None
-    chunks: NDArray[np.uint32] | None = None
-    mixed: bool = False
-    repaired: bool = False
-    samples: int = 0
-
-    @classmethod
-    def read(cls, stream: BinaryIO, size: int, summary: Summary | None) -> Expected:
-        """Read it by the summary or from head to head; moves the stream."""
-        found, by = {}, None
-        stream.seek(0)
-        try:
-            record = next(container.records(stream, size, check_end=False))
-            if record.opcode == container.HEADER:
-                head = container.parse(Header, record)
-                by = head.profile, head.library
-        except Damage:
-            pass
-        if summary is not None:
-            entries = summary.entries(container.METADATA_INDEX)
-            found = _own_metadata(
-                container.record_at(stream, one.offset, one.length) for one in entries
-            )
-        if found.keys() != {METADATA, OUTCOME}:
-            stream.seek(0)
-            only = (container.METADATA,)
-            found = _own_metadata(container.records(stream, size, only=only, check_end=False))
-        try:
-            header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
-        except (HeaderError, KeyError):
-            return cls(by)
-        if not outcome.belongs_to(header):
-            return cls(by, mixed=True)
-        # Another program that copies a file may divide it into other chunks, and writes its name.
-        has_list = outcome.chunks is not None and by is not None and by[1] == schema.LIBRARY
-        chunks = np.array(outcome.chunks, np.uint32) if has_list else None
-        samples = min(outcome.samples or 0, size // _LEAST)
-        return cls(by, chunks, repaired=outcome.repaired, samples=samples)
-
-
-def _own_metadata(records: Iterable[Record]) -> dict[str, dict[str, str]]:
-    """Return the first record of header and outcome that passes its checksum, by name."""
-    found: dict[str, dict[str, str]] = {}
-    try:
-        for record in records:
-            name, entries = container.parse_metadata(record)
-            claimed = entries.pop("checksum", None)
-            if name in (METADATA, OUTCOME) and claimed == checksum(entries):
-                found.setdefault(name, entries)
-    except Damage:
-        pass
-    return found
-
-
 class Fault(NamedTuple):
     """A violation of the profile: its aspect, a sentence, and whether content is lost."""
 
@@ -134,6 +68,7 @@ class Scan:
         metadata, header: the ``hil`` record as read, and parsed: None where invalid
             (`header_error`) or of another version.
         outcome: the ``hil.outcome`` record, None until it was read.
+        expected_samples: how many the outcome states, limited to what fits into the file.
         definitions: schema and channel records of the summary.
         counts: messages by topic.
         chunks: number of valid chunks.
@@ -176,7 +111,14 @@ class Scan:
         self._newest = -1  # stamp of a cycle [ns]
         start = _data_end(stream, self.size) if past_damage else None
         summary = Summary.read(stream, self.size, start=start)
-        self.expected = Expected.read(stream, self.size, summary)
+        self._written_by = _written_by(stream, self.size)
+        stated, self._mixed_ends = _stated_outcome(stream, self.size, summary)
+        self._repaired = stated.repaired
+        self._chunk_list: NDArray[np.uint32] | None = None
+        # Another program that copies a file may divide it into other chunks, and writes its name.
+        if self._written_by[1] == schema.LIBRARY and stated.chunks is not None:
+            self._chunk_list = np.array(stated.chunks, np.uint32)
+        self.expected_samples = min(stated.samples or 0, self.size // _LEAST)
         self.definitions = summary.definitions if summary else []
         stream.seek(0)
         if past_damage:
@@ -233,7 +175,7 @@ class Scan:
                         self._check_metadata(record.offset)
             finally:
                 self._flush()  # pending chunks precede any damage found so far
-            chunks = self.expected.chunks
+            chunks = self._chunk_list
             if outside and chunks is not None and self._place < len(chunks):
                 raise Damage(self.size, "is not there: a chunk is missing")
             if not outside and self.header is not None:
@@ -262,11 +204,7 @@ class Scan:
         except Damage as damage:
             self._gap = True  # counts and outcome show what is lost
             self._add_fault("container", damage, loss=False)
-        try:
-            places = summary.places if summary else []
-        except Damage:
-            places = []
-        for place in places:
+        for place in summary.places if summary else ():
             if place[0] not in seen:
                 seen.add(place[0])
                 try:
@@ -274,7 +212,7 @@ class Scan:
                 except Damage as damage:
                     self._add_fault("container", damage, loss=True)
         if self.metadata is not None:
-            if self.expected.written_by != (schema.PROFILE, schema.LIBRARY):
+            if self._written_by != (schema.PROFILE, schema.LIBRARY):
                 self._add_fault("container", "the header is not that of the profile", loss=False)
             if self.mixed:
                 self._add_fault("outcome", "the outcome is that of another recording", loss=True)
@@ -384,18 +322,18 @@ class Scan:
             if known and (self._past_damage or not set(topics).isdisjoint(self.topics)):
                 count = max(self.counts.get(topic, 0) for topic in topics)
                 found[key] = getattr(outcome, key), count
-        if self.expected.chunks is not None:
-            found["chunks"] = len(self.expected.chunks), self.chunks
+        if self._chunk_list is not None:
+            found["chunks"] = len(self._chunk_list), self.chunks
         for key, (stated, count) in found.items():
             if stated != count:
                 yield "outcome", f"{stated} {key} were written, {count} are there"
 
     def _check_order(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum is the next of those that were written."""
-        if self.expected.mixed and not self._past_damage:
+        if self._mixed_ends and not self._past_damage:
             reason = "(chunk) may be of either of two: the outcome is that of another recording"
             raise Damage(offset, reason)
-        chunks = self.expected.chunks
+        chunks = self._chunk_list
         if chunks is None:
             return
         if self._place < len(chunks) and chunks[self._place] == crc:
@@ -468,13 +406,13 @@ class Scan:
     def _check_gap(self, topics: Collection[str], offset: int) -> None:
         """Handle missing messages of these topics in front of the chunk at `offset`."""
         if not self._past_damage:
-            if not self.expected.repaired:
+            if not self._repaired:
                 reason = "(chunk) does not continue the one before it: a chunk is missing"
                 raise Damage(offset, reason)
             return
         if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
             raise Damage(offset, "(chunk) follows a gap that no cycle number would show")
-        if not self._gap and not self.expected.repaired:
+        if not self._gap and not self._repaired:
             damage = Damage(offset, "(chunk) does not continue the one before")
             self._add_fault("sequence", damage, loss=True)
 
@@ -503,6 +441,49 @@ class Scan:
         return int(stamp[-1])
 
 
+def _written_by(stream: BinaryIO, size: int) -> tuple[str, str]:
+    """Return profile and library of a file, empty where its first record is damaged."""
+    stream.seek(0)
+    with suppress(Damage):
+        record = next(container.records(stream, size, check_end=False))
+        if record.opcode == container.HEADER:
+            head = container.parse(Header, record)
+            return head.profile, head.library
+    return "", ""
+
+
+def _stated_outcome(
+    stream: BinaryIO, size: int, summary: Summary | None
+) -> tuple[ArchiveOutcome, bool]:
+    """Return the outcome, found by the summary or from head to head; empty if it is damaged.
+
+    And whether it is of another recording than the header; then it is empty as well.
+    """
+    found: dict[str, dict[str, str]] = {}
+
+    def add(records: Iterable[Record]) -> None:
+        with suppress(Damage):
+            for record in records:
+                name, entries = container.parse_metadata(record)
+                claimed = entries.pop("checksum", None)
+                if name in (METADATA, OUTCOME) and claimed == checksum(entries):
+                    found.setdefault(name, entries)
+
+    if summary is not None:
+        places = summary.entries(container.METADATA_INDEX)
+        add(container.record_at(stream, one.offset, one.length) for one in places)
+    if found.keys() != {METADATA, OUTCOME}:
+        found.clear()
+        stream.seek(0)
+        add(container.records(stream, size, only=(container.METADATA,), check_end=False))
+    try:
+        header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
+    except (HeaderError, KeyError):
+        return ArchiveOutcome(), False
+    mixed = not outcome.belongs_to(header)
+    return (ArchiveOutcome() if mixed else outcome), mixed
+
+
 def _data_end(stream: BinaryIO, size: int) -> int | None:
     """Return where the data section ends, from head to head: records may have moved."""
     walk = container.records(stream, size, only=(container.DATA_END,), check_end=False)
@@ -519,10 +500,7 @@ def _chunks_outside(summary: Summary | None, times: tuple[int, int]) -> Collecti
     """
     if summary is None or times == ALWAYS:
         return ()
-    try:
-        chunks = summary.entries(container.CHUNK_INDEX)
-    except Damage:
-        return ()
+    chunks = summary.entries(container.CHUNK_INDEX)
     start, stop = times
     within = {
         one.chunk_start_offset

@@ -11,7 +11,6 @@ import typer
 
 from hil.archive.check import ASPECTS, Check, Overview, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
-from hil.archive.repair import repaired_name
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import ArchiveError, InputError
@@ -149,36 +148,26 @@ def _check_dict(found: Check) -> dict[str, Any]:
 
 
 def _info_lines(found: Overview) -> list[str]:
-    rate = "" if found.period is None else f" at {1.0 / found.period:g} Hz"
-    size = f"{_size(found.size)}, {found.chunks} chunks"
-    facts = {
-        "kind": found.title,
-        "outcome": found.outcome,
-        "recorded": f"{found.samples} samples, {found.duration:.3f} s{rate}",
-        "lost": found.lost,
-        "joints": ", ".join(found.joint_names),
-        "file": size + (f", {_size(found.per_minute)} per minute" if found.per_minute else ""),
-        "damage": found.damage or "none",
-    }
-    parts = {
-        "channels": [f"{topic:<26} {count:>9}  {kind}" for topic, kind, count in found.channels],
-        "attachments": [f"{name:<26} {_size(n):>9}" for name, n in found.attachments.items()],
-        "metadata": [f"{key:<26} {value}" for key, value in found.metadata.items()],
-        "events": [f"{time:>10.3f} s  {name}: {text}" for time, name, text in found.events],
-    }
-    lines = [f"{found.path}", *(f"  {key:<10} {text}" for key, text in facts.items() if text)]
-    for title, content in parts.items():
-        if content or title != "events":
-            lines += [f"  {title}", *(f"    {line}" for line in content)]
+    """Return the entries of the overview, tables row by row; times in s, sizes in bytes."""
+    lines = [str(found.path)]
+    for key, value in found.to_dict().items():
+        if key in ("file", "archive"):
+            continue
+        rows = value.items() if isinstance(value, dict) else value
+        if isinstance(value, dict) or (isinstance(value, tuple) and key != "joint_names"):
+            lines.append(f"  {key}")
+            for first, *others in rows:
+                lines.append(f"    {_cell(first):<26} {'  '.join(map(_cell, others))}")
+        else:
+            lines.append(f"  {key:<12} {_cell(value)}")
     if found.damage:
-        name = repaired_name(found.path).name
-        lines.append(f"  to repair it: hil archive repair {found.path}, which writes {name}")
+        lines.append(f"  to repair it: hil archive repair {found.path}")
     return lines
 
 
-def _size(size: float) -> str:
-    for unit in ("B", "kB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}" if unit != "B" else f"{size:.0f} B"
-        size /= 1000
-    return f"{size:.3g} MB"
+def _cell(value: object) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(map(str, value))
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return str(value or "none")

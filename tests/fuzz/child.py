@@ -4,8 +4,6 @@
 ``python -m tests.fuzz.child TARGET --once FILE`` runs one input without libFuzzer: exit status 0,
 or 1 with the traceback, 3 where more than 1 GB was resident, or a signal: SIGPROF where it takes
 more than 5 s of processor time.
-``python -m tests.fuzz.child TARGET --shorten FOLDER`` writes the shortest input with the same
-cause beside the one in a folder of findings.
 """
 
 from __future__ import annotations
@@ -15,16 +13,13 @@ import logging
 import resource
 import signal
 import sys
-import time
 import traceback
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 LONGEST = 5  # s of processor time for one input
 MEMORY = 1 << 10  # MB resident
 ADDRESSES = 6 << 30  # bytes of address space, so that an absurd array is refused and not tried
-_SHORTENING = 10.0  # s of processor time
 
 
 def main(arguments: list[str]) -> int:
@@ -39,15 +34,12 @@ def main(arguments: list[str]) -> int:
 
     target = targets.load(name)
     _limit()
-    if act == "--once":
-        faulthandler.enable()
-        # Then the default action: the process ends by this signal.
-        faulthandler.register(signal.SIGPROF, chain=True)
-        signal.setitimer(signal.ITIMER_PROF, LONGEST)
-        target.run(Path(place).read_bytes())
-        return 3 if _most_resident() > MEMORY else 0
-    _shorten(target.run, Path(place))
-    return 0
+    faulthandler.enable()
+    # Then the default action: the process ends by this signal.
+    faulthandler.register(signal.SIGPROF, chain=True)
+    signal.setitimer(signal.ITIMER_PROF, LONGEST)
+    target.run(Path(place).read_bytes())
+    return 3 if _most_resident() > MEMORY else 0
 
 
 def _most_resident() -> int:
@@ -64,14 +56,13 @@ def _limit() -> None:
 def _fuzz(name: str, folder: Path, options: list[str]) -> int:
     import atheris
 
-    from tests.fuzz.lives import OURS, Findings, signature
+    from tests.fuzz.libfuzzer import OURS, record_finding, signature
 
     with atheris.instrument_imports(include=[*OURS, "tomllib", "rosbags", "mcap"]):
         from tests.fuzz import targets
 
         target = targets.load(name)
     _limit()
-    findings = Findings(folder)
 
     def one(data: bytes) -> None:
         try:
@@ -79,9 +70,9 @@ def _fuzz(name: str, folder: Path, options: list[str]) -> int:
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            story = "".join(traceback.format_exception(error, limit=-60))
-            if findings.keep(signature(error), data, story[-20_000:]):
-                sys.stderr.write(f"FINDING: {findings.new[-1]}\n")
+            cause, text = signature(error), "".join(traceback.format_exception(error, limit=-60))
+            if record_finding(folder, cause, data, text):
+                sys.stderr.write(f"FINDING: {cause}\n")
 
     def mutate(data: bytes, most: int, seed: int) -> bytes:
         # Half of the changes are libFuzzer's own, which knows what comparisons were missed.
@@ -96,33 +87,6 @@ def _fuzz(name: str, folder: Path, options: list[str]) -> int:
     )
     atheris.Fuzz()
     return 0
-
-
-def _shorten(run: Callable[[bytes], object], folder: Path) -> None:
-    """Take pieces out of an input, ever smaller ones, as long as the cause stays the same."""
-    from tests.fuzz.lives import INPUT, SHORTEST, signature
-
-    def cause(data: bytes) -> str:
-        try:
-            run(data)
-        except Exception as error:
-            return signature(error)
-        return ""
-
-    data = (folder / INPUT).read_bytes()
-    wanted = cause(data)
-    until = time.process_time() + _SHORTENING
-    size = len(data) // 2 if wanted else 0
-    while size and time.process_time() < until:
-        at = 0
-        while at < len(data) and time.process_time() < until:
-            shorter = data[:at] + data[at + size :]
-            if cause(shorter) == wanted:
-                data = shorter
-            else:
-                at += size
-        size //= 2
-    (folder / SHORTEST).write_bytes(data)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz import targets
-from tests.fuzz.lives import CORPORA, MOST_BYTES, MOST_FILES
+from tests.fuzz.libfuzzer import CORPORA
+
+MOST_FILES, MOST_BYTES = 40, 200_000
 
 
 def inputs(name: str) -> list[bytes]:

@@ -24,13 +24,12 @@ from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
-from tests.fuzz import lives, targets
-from tests.fuzz.child import main as child
+from tests.fuzz import libfuzzer, targets
 from tests.fuzz.draw import Draw
 from tests.fuzz.mutate_mcap import join_file, split_file
 from tests.fuzz.test_corpora import inputs
 
-PIECE = lives.Piece("codec", 10.0, 100, 5, 7, 3, 80)
+PIECE = libfuzzer.Piece("codec", 10.0, 100, 5, 7, 3, 80)
 
 
 class TestDraw:
@@ -98,7 +97,7 @@ def test_a_planted_defect_is_found(what: str, monkeypatch: pytest.MonkeyPatch) -
         try:
             target.run(data if seed < 0 else target.mutate(data, target.most, seed))
         except Exception as error:
-            causes.add(lives.signature(error))
+            causes.add(libfuzzer.signature(error))
     assert any(cause.startswith(wanted) for cause in causes), causes
 
 
@@ -134,100 +133,46 @@ class TestFindings:
             return error
 
     def test_one_cause_has_one_folder(self, tmp_path: Path) -> None:
-        findings = lives.Findings(tmp_path)
-        name = lives.signature(self.raised("x"))
-        assert name == lives.signature(self.raised("y"))
-        assert sum(findings.keep(name, data, "story") for data in (b"1", b"2", b"3", b"4")) == 1
-        assert lives.known(tmp_path) == {name: 4}
-        assert (tmp_path / name / lives.INPUT).read_bytes() == b"1"
-        assert not lives.Findings(tmp_path).keep(name, b"5", "story")
-
-    def test_the_shortest_input_has_the_same_cause(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def run(data: bytes) -> bool:
-            if b"needle" in data:
-                raise ValueError(data)
-            return True
-
-        target = targets.Target(run, list, lambda data, most, seed: data)
-        monkeypatch.setattr(targets, "load", lambda name: target)
-        monkeypatch.setattr("tests.fuzz.child._limit", lambda: None)
-        (tmp_path / lives.INPUT).write_bytes(b"hay" * 50 + b"needle" + b"stack" * 50)
-        assert child(["codec", "--shorten", str(tmp_path)]) == 0
-        assert (tmp_path / lives.SHORTEST).read_bytes() == b"needle"
+        name = libfuzzer.signature(self.raised("x"))
+        assert name == libfuzzer.signature(self.raised("y"))
+        new = [libfuzzer.record_finding(tmp_path, name, data, "text") for data in (b"1", b"2")]
+        assert new == [True, False]
+        assert (tmp_path / name / libfuzzer.INPUT).read_bytes() == b"1"
 
 
 class TestJournal:
     def test_pieces_add_up_without_a_truncated_line(self, tmp_path: Path) -> None:
         path = tmp_path / "j.jsonl"
-        lives.append(path, PIECE)
+        libfuzzer.append(path, PIECE)
         with path.open("a") as stream:
             stream.write('{"target": "codec", "sec')  # killed while writing
-        lives.append(path, lives.Piece("codec", 5.0, 50, 9, 6, 4, 70, "timeout", False))
-        total = lives.summary(path)["codec"]
-        assert (total["pieces"], total["seconds"], total["inputs"]) == (2, 15.0, 150)
-        assert (total["edges"], total["features"], total["not_reproduced"]) == (9, 7, 1)
+        libfuzzer.append(path, libfuzzer.Piece("codec", 5.0, 50, 9, 6, 4, 70, "timeout", False))
+        assert command.reported(("codec",), path)["targets"]["codec"] == {
+            "inputs": 150, "seconds": 15.0, "edges": 9, "features": 7, "not_reproduced": 1,
+            "findings": [],
+        }  # fmt: skip
 
     def test_completed_work_is_not_repeated(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         path = tmp_path / "j.jsonl"
-        lives.append(path, lives.Piece("codec", 61.0, 100, 5, 7, 3, 80))
+        libfuzzer.append(path, replace(PIECE, seconds=61.0))
         arguments = ["codec", "--minutes", "1", "--journal", str(path), "--json"]
         assert command.main(arguments) == 0
         report = json.loads(capsys.readouterr().out)
         assert (report["inputs"], report["seconds"], report["findings"]) == (100, 61.0, 0)
-        lives.Findings(Path(f"{path}.files/codec/findings")).keep("a", b"", "")
+        libfuzzer.record_finding(Path(f"{path}.files/codec/findings"), "a", b"", "")
         assert command.main(arguments) == 1
 
-    @pytest.mark.parametrize("ended", ["crash", "memory", "killed"])
+    @pytest.mark.parametrize(("ended", "status"), [("crash", 1), ("killed", 1), ("stopped", 0)])
     def test_early_end_that_no_input_repeats_is_reported(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], ended: str
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], ended: str, status: int
     ) -> None:
         path = tmp_path / "j.jsonl"
-        lives.append(path, replace(PIECE, seconds=61.0))
-        lives.append(path, replace(PIECE, ended=ended))
-        arguments = ["codec", "--minutes", "1", "--journal", str(path)]
-        assert command.main(arguments) == 1
-        assert "does not repeat: 1" in capsys.readouterr().out
-        assert command.main([*arguments, "--json"]) == 1
-        assert json.loads(capsys.readouterr().out)["not_reproduced"] == 1
-
-    def test_stopped_piece_is_no_early_end(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        path = tmp_path / "j.jsonl"
-        lives.append(path, replace(PIECE, seconds=61.0, ended="stopped"))
-        assert command.main(["codec", "--journal", str(path)]) == 0
-        assert "deaths that" not in capsys.readouterr().out
-
-
-def test_short_inputs_that_reach_more_are_chosen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    own, corpus = tmp_path / "corpora" / "codec", tmp_path / "j.files" / "codec" / "corpus"
-    findings, scratch = corpus.with_name("findings"), tmp_path / "scratch"
-    scratch.mkdir()
-    monkeypatch.setattr("tempfile.mkdtemp", lambda *_, **__: str(scratch))
-    monkeypatch.setattr(lives, "CORPORA", own.parent)
-    monkeypatch.setattr(lives, "MOST_FILES", 4)
-
-    def merged(name: str, target: Path, sources: list[Path], places: lives.Places) -> None:
-        assert sources == [corpus, own]
-        lives.plant(target, [b"reaches more", b"too", bytes(30_000)])
-
-    monkeypatch.setattr(lives, "_merge", merged)
-    lives.plant(own, [b"olm"])
-    (own / "seed-1").write_bytes(b"abc")
-    for name, data in (("short", b"x"), ("long", bytes(30_000))):
-        (findings / name).mkdir(parents=True)
-        (findings / name / lives.SHORTEST).write_bytes(data)
-    words = lives.keep("codec", tmp_path / "j")
-    assert words.endswith("longer than 20000 bytes: long (30000 bytes)")
-    left = {path.read_bytes() for path in own.iterdir()}
-    assert left == {b"abc", b"x", b"too", b"reaches more"}
-    assert not scratch.exists()
+        libfuzzer.append(path, replace(PIECE, seconds=61.0))
+        libfuzzer.append(path, replace(PIECE, ended=ended))
+        assert command.main(["codec", "--journal", str(path), "--json"]) == status
+        assert json.loads(capsys.readouterr().out)["not_reproduced"] == status
 
 
 @pytest.mark.slow
@@ -257,7 +202,7 @@ def test_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
     run.send_signal(signal.SIGINT)
     output, _ = run.communicate(timeout=60.0)
     assert run.returncode == 0, output
-    (piece,) = lives.pieces(path)
+    (piece,) = libfuzzer.pieces(path)
     assert piece.ended == "stopped"
     assert piece.inputs > planted
     before = {one.name for one in corpus.iterdir()}

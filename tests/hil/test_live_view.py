@@ -110,7 +110,7 @@ def test_events_come_all_of_them() -> None:
             except TimeoutError:
                 continue
             assert message.name == "GapSeen"
-            assert message.msg == "3 packets missed before cycle 1000"
+            assert message.msg == "packets missed before cycle 1000: 3"
             assert message.level == 30
             assert message.stamp.sec == 1
             return

@@ -143,9 +143,8 @@ class Outcome:
         assert self.archive is not None
         found: Counter[str] = Counter()
         for event in self.archive.events:
-            if match := re.match(r"(\d+|a|one) (\w+) packets? got no reply", event.text):
-                count = int(match[1]) if match[1].isdigit() else 1
-                found[match[2]] += count
+            if match := re.match(r"packets (\w+): (\d+)", event.text):
+                found[match[1]] += int(match[2])
         return found
 
 

@@ -167,13 +167,11 @@ class TestAnotherFile:
         with pytest.raises(NotAnArchiveError, match="is an MCAP file, but not an archive"):
             check_archive(path)
 
-    @pytest.mark.parametrize(
-        ("data", "sentence"), [(b"hello" * 9, "is not an MCAP file"), (b"", "is empty")]
-    )
-    def test_other_file_is_refused(self, tmp_path, data, sentence):
+    @pytest.mark.parametrize("data", [b"hello" * 9, b""])
+    def test_other_file_is_refused(self, tmp_path, data):
         (tmp_path / "x").write_bytes(data)
         for read in (check_archive, open_archive):
-            with pytest.raises(NotAnArchiveError, match=sentence):
+            with pytest.raises(NotAnArchiveError, match="is not an MCAP file"):
                 read(tmp_path / "x")
 
     def test_missing_file_is_refused_with_a_remedy(self, tmp_path):
@@ -257,17 +255,17 @@ class TestInfo:
         for words in (
             "validation 4, attempt 1",
             "completed",
-            "43 samples, 0.420 s at 100 Hz",
+            "samples      43",
             "a, b",
             "/hil/cycle",
             "hil_msgs/msg/Cycle2",
             "robot.urdf",
-            "tick: text",
+            "tick  text",
         ):
             assert words in done.stdout
         done = run("info", truncated)
         assert done.exit_code == 0
-        assert "30 samples" in done.stdout
+        assert "samples      30" in done.stdout
         assert "hil archive repair" in done.stdout
         assert run("info", text_file).exit_code == 2
 

@@ -439,6 +439,13 @@ class TestSizes:
         assert peak(lambda: outcomes(path)) < MEMORY
         assert open_archive(path, start=50.0, stop=50.2).n_samples == 20
 
+    @pytest.mark.parametrize("kind", [container.CHUNK_INDEX, container.METADATA_INDEX])
+    def test_an_index_with_a_truncated_entry_is_not_used(self, kind, written, tmp_path):
+        truncated = container.RECORD.pack(kind, 3) + b"abc"
+        path = self.with_entries(written, tmp_path, lambda _: [truncated], kind)
+        assert set(outcomes(path).values()) == {""}
+        assert open_archive(path, start=50.0, stop=50.2).n_samples == 20
+
     @pytest.mark.parametrize("line", ["float64[999999999] x", "uint8[99999999999999999999] x",
                                       "float64 x\nfloat64 x"])  # fmt: skip
     def test_a_message_that_is_too_large(self, line):
@@ -446,8 +453,13 @@ class TestSizes:
             assert peak(lambda: fixed_layout(line)) < MEMORY
 
     @staticmethod
-    def with_entries(written, folder: Path, change: Callable[[bytes], list[bytes]]) -> Path:
-        """The small archive, each chunk's entry of its index changed, checksum and all."""
+    def with_entries(
+        written,
+        folder: Path,
+        change: Callable[[bytes], list[bytes]],
+        kind: int = container.CHUNK_INDEX,
+    ) -> Path:
+        """The small archive, each entry of an index changed, with a valid checksum."""
         data = written.data
         start = struct.unpack_from("<Q", data, len(data) - len(container.MAGIC) - 20)[0]
         body = data[start : -container.FOOTER_SIZE - len(container.MAGIC)]
@@ -455,7 +467,7 @@ class TestSizes:
         for record in (one.data for one in container.split_records(body, 0)):
             if record[0] == container.SUMMARY_OFFSET:
                 continue
-            summary += b"".join(change(record) if record[0] == container.CHUNK_INDEX else [record])
+            summary += b"".join(change(record) if record[0] == kind else [record])
         summary += struct.pack("<BQQQ", container.FOOTER, 20, start, 0)
         path = folder / NAME
         crc = struct.pack("<I", zlib.crc32(summary))
