@@ -14,7 +14,7 @@ import pytest
 from tests.disk import damage
 from tests.endurance import __main__ as endurance
 from tests.fuzz import __main__ as fuzz
-from tests.fuzz.lives import Piece
+from tests.fuzz.libfuzzer import Piece
 from tests.journal import Journal, JournalError, entries, rounds
 from tests.process_death import __main__ as process_death
 from tests.simulate import __main__ as simulate
