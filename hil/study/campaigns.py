@@ -202,8 +202,7 @@ class Plans:
         executions, missing = dict[str, dict[str, Execution]](), list(self.missing)
         for condition, some in self.executions.items():
             executions[condition] = {key: e for key, e in some.items() if e.root not in ended}
-            for key in some.keys() - executions[condition].keys():
-                root = some[key].root
+            for key, root in ((key, e.root) for key, e in some.items() if e.root in ended):
                 if key == B or (condition != ABLATION and key != AP):
                     raise StudyError(
                         f"{root}: the controller ended the excitation: {ended[root]}; search"
@@ -336,19 +335,20 @@ def _sine_motions(
 def execute_all(
     executions: Sequence[Execution], reporter: Reporter, workers: LocalWorkers
 ) -> dict[Path, str]:
-    """Run the incomplete campaigns side by side; return by folder why the controller ended one.
+    """Run the campaigns side by side; return by folder why the controller ended one.
 
     StudyError: a campaign was refused, or its process ended.
     """
-    missing = [one for one in executions if not one.complete]
-    calls = [(one.root, (one,)) for one in missing]
-    ended = in_children(execute, calls, "running campaigns", reporter, workers, of=len(executions))
-    return {one.root: why for one, why in zip(missing, ended, strict=True) if why is not None}
+    calls = [(one.root, (one,)) for one in executions]
+    ended = in_children(execute, calls, "running campaigns", reporter, workers)
+    return {one.root: why for one, why in zip(executions, ended, strict=True) if why is not None}
 
 
 def execute(execution: Execution) -> str | None:
     """Run or resume one campaign; return the reason if the controller ended it."""
     root = execution.root
+    if execution.complete:
+        return None
     if (root / "manifest.json").exists():
         campaign = Campaign.open(root)
     else:
@@ -375,17 +375,14 @@ def in_children(
     title: str,
     reporter: Reporter,
     workers: LocalWorkers,
-    of: int,
 ) -> list[T]:
     """Call a function in child processes with the arguments of each place; results in order.
 
-    `of` counts the calls including those already done. StudyError: a call failed, crashed or timed
-    out.
+    StudyError: a call failed, crashed or timed out.
     """
     tasks = [ArchiveTask(str(place), function, own) for place, own in calls]
     found: list[T] = []
-    with reporter.task(title, of) as task:
-        task.advance(of - len(tasks))
+    with reporter.task(title, len(tasks)) as task:
         for one in workers.results(tasks, task.advance):
             if isinstance(one, Unused):
                 raise StudyError(f"{one.path}: {one.reason}; start the study again to resume")

@@ -362,7 +362,7 @@ class Reader:
             paths = [CampaignFolder(root).archives / one for one in sums]
             inputs = json_digest([VERSION, list(sums.items()), others])
             calls.append((place, (place, function, inputs, paths, *arguments)))
-        return in_children(made, calls, title, self.reporter, self.workers, of=len(tasks))
+        return in_children(made, calls, title, self.reporter, self.workers)
 
 
 def made(place: Path, function: Callable[..., R], inputs: str, *arguments: Any) -> R:

@@ -431,7 +431,7 @@ class TestPlans:
     def test_an_error_in_a_child_is_one_sentence(self, tmp_path: Path) -> None:
         calls = [(tmp_path, (tmp_path / "none.toml",))]
         with LocalWorkers(2) as workers, pytest.raises(StudyError, match=r"none\.toml.*resume"):
-            in_children(Cell.load, calls, "loading", Silent(), workers, of=1)
+            in_children(Cell.load, calls, "loading", Silent(), workers)
 
 
 # A whole study on an arm of two joints
