@@ -147,11 +147,6 @@ def surface_points(shape: coal.CollisionGeometry) -> Array | None:
         ball = shape.radius * _sphere()
         along = np.where(ball[:, 2:] < 0.0, -1.0, 1.0) * shape.halfLength
         return np.asarray(ball + along * [0.0, 0.0, 1.0], dtype=np.float64)
-    if isinstance(shape, coal.Cone):
-        base = _ring(shape.radius, -shape.halfLength)
-        return np.concatenate((base, [[0.0, 0.0, shape.halfLength]]))
-    if isinstance(shape, coal.Ellipsoid):
-        return np.asarray(_sphere() * shape.radii, dtype=np.float64)
     if isinstance(shape, coal.BVHModelBase):
         shape.buildConvexHull(True, "Qt")
         shape = shape.convex

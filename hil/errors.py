@@ -21,7 +21,6 @@ HilError                   exit status 1
     ├── CellError          the cell file
     ├── SettingsError      the settings of a design
     ├── CampaignFolderError     the campaign folder
-    ├── WrongObjectError   an argument of the wrong type (also a TypeError)
     └── SourceError        a foreign recording (CSV, rosbag2) that cannot be imported
 ```
 """

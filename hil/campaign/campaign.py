@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +19,7 @@ from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
 
-from .errors import CampaignFolderError, WrongObjectError
+from .errors import CampaignFolderError
 from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
 from .motion_link import MotionLink
@@ -68,19 +67,9 @@ class Campaign:
             CampaignFolderError: the folder is not empty; with `exist_ok`, it is another campaign.
             MotionRefusedError: the plan cannot run on the cell; no folder was created.
             NoExcitationError: no validation motion satisfies the constraints of the cell.
-            WrongObjectError: `cell` or `excitation` has the wrong type.
             OutputError: the disk refuses; the folder is unchanged.
         """
-        root, plan = _path(folder), excitation
-        if not isinstance(cell, Cell):
-            remedy = "give one that was loaded (`hil.Cell.load(path)`)"
-            raise WrongObjectError("cell", cell, remedy)
-        if not isinstance(plan, Excitation | CampaignPlan):
-            remedy = (
-                "give an Excitation (`hil.design.load_design(folder, cell)`, "
-                "`hil.campaign.design`) or a CampaignPlan"
-            )
-            raise WrongObjectError("excitation", plan, remedy)
+        root, plan = Path(folder), excitation
         if exist_ok and CampaignFolder(root).plan.exists():
             return cls.open(root)._require_same(cell, plan)
         if isinstance(plan, Excitation):
@@ -116,7 +105,7 @@ class Campaign:
             CampaignFolderError: it is not one.
             InputError: its cell or plan cannot be read.
         """
-        there = CampaignFolder(_path(folder))
+        there = CampaignFolder(Path(folder))
         if not there.plan.exists():
             raise CampaignFolderError(
                 there.root, "is not a campaign folder", "name one that has plan.json"
@@ -138,9 +127,6 @@ class Campaign:
                 self.folder.root, f"holds a campaign with another {what}", "name a new folder"
             )
         return self
-
-    def __repr__(self) -> str:
-        return f"Campaign({str(self.folder.root)!r}, cell {self.cell.name!r})"
 
     def status(self) -> CampaignStatus:
         """Return which steps are done, and the command for the next one."""
@@ -284,13 +270,6 @@ class Campaign:
             live=live,
             repetitions=repetitions,
         ).execute()
-
-
-def _path(folder: object) -> Path:
-    """Check the type of a folder."""
-    if not isinstance(folder, str | PathLike):
-        raise WrongObjectError("folder", folder, "give the path of a folder")
-    return Path(folder)
 
 
 _FILES = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)

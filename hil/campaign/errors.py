@@ -20,15 +20,6 @@ class CampaignFolderError(InputError):
         super().__init__(folder, problem, remedy=remedy)
 
 
-class WrongObjectError(InputError, TypeError):
-    """An argument of the wrong type."""
-
-    def __init__(self, argument: str, given: object, remedy: str) -> None:
-        what = "None" if given is None else f"an object of type {type(given).__name__}"
-        problem = f"is {what}"
-        super().__init__(None, problem, field=argument, remedy=remedy)
-
-
 class MotionRefusedError(UnsafeError):
     """A motion failed its check and was not sent."""
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from drivers.drive_train import TURN
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ArchiveError
 
-from .dry_run import DryRun, DryRunStage, not_accepted, yes_or_no
+from .dry_run import DryRunStage, not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
 from .motion_link import Connection, narrower_limits
@@ -132,7 +129,7 @@ def _sent_by(cell: Cell) -> dict[str, Any]:
     }
 
 
-def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None) -> None:
+def require_as_rehearsed(run: Run, connection: Connection) -> None:
     """Refuse a controller whose figures are not those of the rehearsal and the checks.
 
     Raises:
@@ -150,16 +147,10 @@ def require_as_rehearsed(run: Run, connection: Connection, found: DryRun | None)
     below = narrower_limits(cell, connection, "following_error")
     if not below:
         return
-    needed = "what the motions need at full speed is unknown"
-    if found is not None:
-        turns = np.abs(cell.drive_train.motor_from_joint) @ np.array(found.following_error) / TURN
-        both = zip(cell.joint_names, turns, strict=True)
-        seen = ", ".join(f"{joint} {turn:.3g}" for joint, turn in both)
-        needed = f"at {found.override:.0%} of the speed the dry run needed {seen}"
     raise NotRehearsedError(
         root,
         "was planned and rehearsed with wider following-error thresholds than those of the "
-        f"controller ({'; '.join(below)}; {needed})",
+        f"controller ({'; '.join(below)})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "
         "or widen them in the controller",
     )

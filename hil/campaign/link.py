@@ -68,9 +68,6 @@ class Link(MotionLink):
     _archiving: _Archiving | None = None
     _READY: ClassVar[frozenset[State]] = frozenset((State.CLOSED,))
 
-    def __repr__(self) -> str:
-        return f"Link({self.cell!r}, {self.cycles} cycles archived)"
-
     @classmethod
     def over(
         cls,

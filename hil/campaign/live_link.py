@@ -83,8 +83,6 @@ T = TypeVar("T")
 
 HEARTBEAT_PERIOD: Final = 0.05  # s; the exchange stops the arm after 0.5 s without a heartbeat
 STALL: Final = 1.0  # Longest time between two turns of the loop that supervises a motion, s
-_STARVED: Final = 0.4
-"""Time between two heartbeats that is reported, s: the exchange may have missed them."""
 HUNG: Final = 5.0
 """s without a heartbeat after which an exchange process is killed: the controller, without replies
 for so long, has acted by its own watchdog."""
@@ -114,8 +112,7 @@ class Heartbeat:
     ) -> None:
         self._beat, self._clock = beat, clock
         self._turned: float | None = None
-        self._stalled = self._starved = 0.0
-        self._last = clock()
+        self._stalled = 0.0
         self._ended = False
 
     def start(self) -> None:
@@ -134,7 +131,7 @@ class Heartbeat:
 
     def begin(self) -> None:
         """A motion is requested: forget the delays of before, and require turns of the loop."""
-        self._stalled = self._starved = 0.0
+        self._stalled = 0.0
         self.turn()
 
     def turn(self) -> None:
@@ -148,7 +145,6 @@ class Heartbeat:
     def update(self) -> None:
         """Beat, unless the supervising loop stalls."""
         now, turned = self._clock(), self._turned
-        self._starved, self._last = max(self._starved, now - self._last), now
         stalled = 0.0 if turned is None else now - turned
         if stalled > STALL:
             self._stalled = max(self._stalled, stalled)
@@ -156,22 +152,13 @@ class Heartbeat:
             self._beat()
 
     def with_cause(self, text: str) -> str:
-        """Return a reason of the exchange, with the cause where it missed our heartbeat."""
-        starved = max(self._starved, self._clock() - self._last)
-        if NO_SUPERVISOR not in text:
+        """Return a reason of the exchange, with the cause where heartbeats paused for a stall."""
+        if not self._stalled:
             return text
-        if self._stalled:
-            cause = (
-                f"show or request of the motion's watch did not return for {self._stalled:.1f} s, "
-                "so that no stop could be passed on"
-            )
-        elif starved > _STARVED:
-            cause = (
-                f"this program got no processor time for {starved:.1f} s, load average "
-                f"{os.getloadavg()[0]:.1f} on {os.cpu_count()} processors: end what else runs here"
-            )
-        else:
-            return text
+        cause = (
+            f"show or request of the motion's watch did not return for {self._stalled:.1f} s, "
+            "so that no stop could be passed on"
+        )
         return text.replace(NO_SUPERVISOR, f"{NO_SUPERVISOR} ({cause})")
 
 
@@ -557,9 +544,6 @@ class LiveLink(MotionLink):
             tuple(status.latencies),
             1e-6 * status.worst_turnaround_us,
         )
-
-    def _with_cause(self, reason: str) -> str:
-        return self.heart.with_cause(reason)
 
     def _shut(self) -> str | None:
         """End both processes; return what was wrong with them, None if nothing was."""

@@ -233,8 +233,7 @@ class MotionLink(ABC):
                     continue  # stopped, held or slowed meanwhile, or a new session began
                 except RequestError as error:
                     self.complete("refused", str(error))
-                    reason = self._with_cause(str(error))
-                    raise ControllerFault(f"{reason}; see the outcome of {spec.path}") from error
+                    raise ControllerFault(f"{error}; see the outcome of {spec.path}") from error
                 return self._supervise(spec, steering, stop)
             self.complete("stopped", NOT_STARTED)
             return MotionEnded("stopped", NOT_STARTED, -1, -1)
@@ -305,10 +304,6 @@ class MotionLink(ABC):
             raise ControllerFault(f"{self._no_session(wait)}: nothing was recorded")
 
     # --- what the two kinds of link do differently
-
-    def _with_cause(self, reason: str) -> str:
-        """Return a reason with its cause, where that is known here."""
-        return reason
 
     def _show_recording(self, watch: Watch, over: str = "") -> None:
         """Show the state of a recording; in virtual time only when records are archived."""

@@ -145,7 +145,7 @@ class Run:
             if not slow:
                 dry_run.accept()
             if slow or full:
-                with self._connected(dry_run, warm_up, slow, full) as runner:
+                with self._connected(warm_up, slow, full) as runner:
                     dry_run.run(runner)
                     if full:
                         self._run_at_full_speed(runner, warm_up)
@@ -169,11 +169,7 @@ class Run:
 
     @contextmanager
     def _connected(
-        self,
-        dry_run: DryRunStage,
-        warm_up: WarmUpStage,
-        slow: Sequence[Interval],
-        full: Sequence[Interval],
+        self, warm_up: WarmUpStage, slow: Sequence[Interval], full: Sequence[Interval]
     ) -> Iterator[Runner]:
         """Connect the controller, check all motions with its limits, and close the link after."""
         from hil.cell_link import cell_link  # which opens links of campaigns
@@ -194,7 +190,7 @@ class Run:
                 if link.live is not None:
                     reporter.say(link.live.notice)
             start = link.connect(self.stop)
-            require_as_rehearsed(self, link.connection, dry_run.found())
+            require_as_rehearsed(self, link.connection)
             narrowed = active_checks(cell, link.connection, checks)
             if narrowed is not checks:  # the controller's own limits are known only now
                 require_allowed(sent, narrowed)

@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from hil.archive import ArchiveName, ArchiveOutcome, open_archive
 from hil.errors import ArchiveError, HilError
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
     from .campaign import Campaign
 
 State = Literal["done", "next", "blocked"]
-
-_WANTED: Final = ("standstill", "excitation", "validation", "dryrun")
-"""Kinds of motion that a campaign requires."""
 
 
 @dataclass(frozen=True)
@@ -254,7 +251,11 @@ def _notes(folder: CampaignFolder) -> tuple[str, ...]:
     """Return archives that are not used, with the reason."""
     entries = folder.manifest()
     there = {path.name for path in folder.archives.glob("*.mcap")}
-    left = [_left_behind(folder, name) for name in sorted(there - {one.name for one in entries})]
+    left = [
+        f"{name} was left by a run that was killed; the next run uses it if it is complete and "
+        "needed"
+        for name in sorted(there - {one.name for one in entries})
+    ]
     bad = [
         f"{one.name} is {one.outcome}" + (f": {one.reason}" if one.reason else "")
         for one in entries
@@ -262,22 +263,6 @@ def _notes(folder: CampaignFolder) -> tuple[str, ...]:
     ]
     busy = ["it is in use by a run or a rehearsal"] if folder.busy else []
     return (*busy, *folder.damaged(), *left, *bad)
-
-
-def _left_behind(folder: CampaignFolder, name: str) -> str:
-    """Describe an archive that is not in the manifest."""
-    parsed = ArchiveName.parse(name)
-    needed = (
-        parsed is not None
-        and parsed.kind in _WANTED
-        and folder.whole(parsed.kind, parsed.index) is None
-    )
-    becomes = (
-        "it is used if it is complete, its motion run again if not"
-        if needed
-        else "it is not needed"
-    )
-    return f"{name} was left by a run that was killed; {becomes}"
 
 
 def conduct_of(folder: CampaignFolder) -> ConductResult:

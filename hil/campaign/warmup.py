@@ -149,10 +149,8 @@ class WarmUp:
 
     def rested(self, now: float) -> str:
         """Return how long the arm has rested, as the beginning of a sentence."""
-        if self.moved_at is None:
-            return "the arm had rested"
-        if now < self.moved_at:
-            return "the last motion of the arm is dated in the future (a clock was reset)"
+        if self.moved_at is None or now < self.moved_at:
+            return "the arm had rested for an unknown time"
         return f"the arm had rested for {(now - self.moved_at) / 60.0:.0f} min"
 
 

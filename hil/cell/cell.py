@@ -31,7 +31,6 @@ from .schema import (
     ControllerTable,
     DriveTrainTable,
     JointFrictionTable,
-    LimitsTable,
     NominalTable,
     SimulationTable,
 )
@@ -80,9 +79,6 @@ class Cell:
         _ = cell.model
         _check(cell)
         return cell
-
-    def __repr__(self) -> str:
-        return f"Cell({str(self.path)!r}, {self.name!r})"
 
     @property
     def name(self) -> str:
@@ -472,8 +468,6 @@ class AngleFrame:
 
 URDF_ROUNDING = 1e-5  # Relative tolerance for the rounding of degrees and radians
 
-_SAME_NUMBER = 0.01  # relative
-_FULL_TURN = 6.3  # 2π, rounded up
 _MAY_BE_EMPTY = {"nominal.third", "limits.torque"} | {
     f"simulation.{name}" for name in ("elasticity", "inertia_scale")
 }
@@ -511,9 +505,9 @@ def _check(cell: Cell) -> None:
             _ = getattr(cell, attribute) if wanted else None
         except (ValueError, DriverError) as error:
             raise cell.error(table, None, str(error), "correct that table") from error
-    if placed and file.limits is not None:
-        _check_limits(cell, file.limits)
-        _check_postures(cell, file.limits)
+    if placed:
+        _check_limits(cell)
+        _check_postures(cell)
 
 
 def _check_assumed(cell: Cell) -> None:
@@ -545,16 +539,10 @@ def _check_lengths(cell: Cell) -> None:
                 raise cell.error(field, value, problem, remedy)
 
 
-def _check_postures(cell: Cell, table: LimitsTable) -> None:
+def _check_postures(cell: Cell) -> None:
     """Check that the postures of the file lie inside its limits."""
     limits, file = cell.joint_limits, cell.file
-    remedy = "choose a posture inside the limits"
-    furthest = np.abs([table.lower_deg, table.upper_deg]).max()
-    if furthest < _FULL_TURN:
-        remedy += (
-            f", or correct the limits, which are at most {furthest:.4g}°; are they in rad? 1 rad "
-            "is 57.2958°"
-        )
+    remedy = "choose a posture inside the limits, which are in degrees"
     postures = {} if file.campaign is None else {"campaign.home_deg": cell.home}
     postures |= {} if file.simulation is None else {"simulation.initial_deg": cell.initial}
     for field, posture in postures.items():
@@ -563,19 +551,9 @@ def _check_postures(cell: Cell, table: LimitsTable) -> None:
             raise cell.error(field, None, problem, remedy)
 
 
-def _check_limits(cell: Cell, table: LimitsTable) -> None:
-    """Check that limits are in degrees, and not wider than those of the URDF."""
+def _check_limits(cell: Cell) -> None:
+    """Check that limits are not wider than those of the URDF."""
     limits, allowed = cell.joint_limits, urdf_limits(cell.urdf, cell.joint_names)
-    ranges = np.subtract(table.upper_deg, table.lower_deg)
-    for field, given, radians, unit, too in (
-        ("lower_deg", ranges, allowed.upper - allowed.lower, "rad", " (those of upper_deg too)"),
-        ("velocity_deg", np.array(table.velocity_deg), allowed.velocity, "rad/s", ""),
-    ):
-        stated = np.isfinite(radians)
-        if stated.any() and np.allclose(given[stated], radians[stated], rtol=_SAME_NUMBER):
-            problem = f"must be in degrees, but has the values of the URDF in {unit}"
-            remedy = f"multiply them by 57.2958{too}"
-            raise cell.error(f"limits.{field}", getattr(table, field), problem, remedy)
     for field, values, bounds, beyond in (
         ("lower_deg", limits.lower, allowed.lower, -1.0),
         ("upper_deg", limits.upper, allowed.upper, 1.0),

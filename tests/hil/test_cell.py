@@ -168,29 +168,6 @@ def test_a_bad_field_gets_a_sentence(folder: Path, fault: tuple[str, ...]) -> No
         assert word in sentence
 
 
-@pytest.mark.parametrize(
-    ("fields", "words"),
-    [
-        (("velocity_deg",), "values of the URDF in rad/s; multiply them by 57.2958"),
-        (("lower_deg", "upper_deg"), "values of the URDF in rad; multiply them by 57.2958"),
-    ],
-)
-def test_radians_where_degrees_belong_are_guessed(
-    ns16: Cell, folder: Path, fields: tuple[str, ...], words: str
-) -> None:
-    """A narrow range in degrees is none, unless the home posture leaves it."""
-    limits = {field: np.radians(getattr(ns16.file.limits, field)).round(4) for field in fields}
-    edits = [(rf"^{field} = .*", f"{field} = {limits[field].tolist()}") for field in fields]
-    assert f"has the {words}" in error_of(folder, *edits)
-    (folder / "cell.toml").write_text(ns16.text)
-    loaded(folder, (r"^velocity_deg = .*", "velocity_deg = [3, 3, 3, 3, 3, 3]"))
-    assert "which are at most 3°; are they in rad? 1 rad is 57.2958°" in error_of(
-        folder,
-        (r"^lower_deg = .*", "lower_deg = [-3, -0.8, -2.9, -3, -2, -3]"),
-        (r"^upper_deg = .*", "upper_deg = [3.0, 1.6, 1.9, 3.0, 2.0, 3.0]"),
-    )
-
-
 def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
     with pytest.raises(CellError, match=r"nothing\.toml.*cannot be read"):
         Cell.load(folder / "nothing.toml")

@@ -348,15 +348,6 @@ def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:
     assert beats_in(heart, clock, given, 60.0) >= 1_199
 
 
-def test_a_lack_of_processor_time_is_named() -> None:
-    clock = Clock()
-    heart = Heartbeat(lambda: None, clock)
-    assert heart.with_cause(NO_SUPERVISOR) == NO_SUPERVISOR
-    clock.now += 0.7
-    assert "got no processor time for 0.7 s, load average" in heart.with_cause(NO_SUPERVISOR)
-    assert heart.with_cause("stopped by the operator") == "stopped by the operator"
-
-
 class Failing:
     """An operator whose methods fail on demand."""
 
