@@ -49,12 +49,8 @@ def open_controller_link(
 def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.ControllerLink:
     interface, _, rest = text.partition(":")
     channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
-    if profile not in ("fd", "classic"):
-        problem = f"--can {text!r} ends in {profile!r}, which is neither fd nor classic"
-        remedy = "end it with :fd or :classic (required for a channel with a colon)"
-        raise InputError(None, problem, remedy=remedy)
-    if not (interface and channel):
-        remedy = "write INTERFACE:CHANNEL, for instance socketcan:can0 or socketcan:can0:classic"
+    if not (interface and channel) or profile not in ("fd", "classic"):
+        remedy = "write INTERFACE:CHANNEL:fd or :classic, for instance socketcan:can0:fd"
         raise InputError(None, f"--can {text!r} is not a bus", remedy=remedy)
     from sim_fixtures import can_link  # python-can is slow to load
 

@@ -10,7 +10,7 @@ from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.controller import SimulatedController
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.errors import PlantDiverged, SettingError, SimulationError
-from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth, standard_parameters
+from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
 from sim_fixtures.program import Phase
 from sim_fixtures.settings import ControllerSettings, ServoSettings
 
@@ -23,7 +23,6 @@ __all__ = [
     "Plant",
     "ElasticPlant",
     "PlantTruth",
-    "standard_parameters",
     "UnmodelledEffects",
     "SimulationError",
     "SettingError",

@@ -46,7 +46,7 @@ from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.errors import SettingError
 from sim_fixtures.faults import ControllerFault
-from sim_fixtures.plant import PlantTruth, standard_parameters
+from sim_fixtures.plant import PlantTruth
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import NominalModel, Servo
 from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
@@ -522,10 +522,6 @@ class SimulatedController:
     def current_delay_cycles(self) -> float:
         """Cycles by which the current lags its position in the recording, without `effects`."""
         return 0.5 - self.settings.servo.current_lag / self.period
-
-    def standard_parameters(self) -> dict[str, float]:
-        """Return the true standard parameters by name (m1, mc1x, ..., I6zz, I1m, ...)."""
-        return standard_parameters(self.plant.model, self.truth.rotor_inertia)
 
     def finish(self) -> None:
         """End the session when the arm is at rest: drive off, 504, no more packets."""

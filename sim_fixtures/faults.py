@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from drivers.transports import faults as link
 from sim_fixtures.errors import SimulationError
@@ -38,28 +38,6 @@ pause@2000x50:502                the controller pauses; :500 for the other kind"
 SLIP = 1.5  # encoder error as a multiple of the following-error threshold
 LOAD = 0.9  # load as a share of the largest motor torque
 PUSH = 0.15  # push as a share of the largest motor torque; it does not trip the drive
-
-
-@dataclass(frozen=True)
-class _Kind:
-    """Options of a kind of fault: an axis, a default count (0: none), words (default first)."""
-
-    axis: bool = False
-    count: int = 0
-    words: tuple[str, ...] = ("",)
-
-
-_OF_CONTROLLER: Final[Mapping[str, _Kind]] = {
-    "restart": _Kind(words=("cold", "warm")),
-    "drive-drop": _Kind(),
-    "e-stop": _Kind(),
-    "axis-leaves": _Kind(axis=True),
-    "following-error": _Kind(axis=True, count=500, words=("jam", "slip")),
-    "saturate": _Kind(axis=True, count=500),
-    "push": _Kind(axis=True, count=50),
-    "pause": _Kind(count=50, words=("502", "500")),
-}
-_OF_LINK: Final = ("lose", "delay", "duplicate", "reorder", "corrupt")
 
 
 @dataclass(frozen=True)
@@ -100,8 +78,42 @@ class ControllerFault:
 
 Fault = link.Fault | ControllerFault
 
-_HEAD: Final = re.compile(r"(?P<kind>[a-z-]+)@(?P<cycle>\d+)(?:x(?P<count>\d+))?")
-_TIME: Final = re.compile(r"(?P<value>\d+(?:\.\d+)?)(?P<unit>us|ms|s|cycles?)")
+
+class _Kind(NamedTuple):
+    """Kind of fault: default count (0: none), names of its options, the required one, a word."""
+
+    times: int = 0
+    options: tuple[str, ...] = ()
+    needed: str = ""
+    word: str = ""
+
+
+_KINDS: Final[Mapping[str, _Kind]] = {
+    "lose": _Kind(1, ("to",)),
+    "delay": _Kind(1, ("time", "to"), "time"),
+    "duplicate": _Kind(1, ("to",)),
+    "reorder": _Kind(0, ("to",)),
+    "corrupt": _Kind(1, ("offset", "mask", "to"), "offset"),
+    "restart": _Kind(0, ("start",), word="cold"),
+    "drive-drop": _Kind(),
+    "e-stop": _Kind(),
+    "axis-leaves": _Kind(0, ("axis",), "axis"),
+    "following-error": _Kind(500, ("axis", "how"), "axis", "jam"),
+    "saturate": _Kind(500, ("axis",), "axis"),
+    "push": _Kind(50, ("axis",), "axis"),
+    "pause": _Kind(50, ("mode",), word="502"),
+}
+_HEAD: Final = re.compile(r"([a-z-]+)@(\d{1,10})(?:x(\d{1,10}))?")
+_OPTIONS: Final = {
+    "to": re.compile(r"to_pc|to_controller"),
+    "time": re.compile(r"(\d+(?:\.\d+)?)(us|ms|s|cycles?)"),
+    "offset": re.compile(r"offset=(0x[\da-fA-F]+|\d+)"),
+    "mask": re.compile(r"mask=(0x[\da-fA-F]+|\d+)"),
+    "axis": re.compile(r"axis=([1-9]\d*)"),
+    "start": re.compile(r"cold|warm"),
+    "how": re.compile(r"jam|slip"),
+    "mode": re.compile(r"500|502"),
+}
 _SECONDS: Final = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 
 
@@ -114,59 +126,6 @@ class FaultScriptError(SimulationError, ValueError):
         super().__init__(f"{text!r} is not a fault: {reason}. A fault is written\n\n{GRAMMAR}")
 
 
-class _Line:
-    """The parts of a text; each option is removed when it is read."""
-
-    def __init__(self, text: str) -> None:
-        head, *self.options = text.strip().split(":")
-        match = _HEAD.fullmatch(head)
-        if match is None:
-            raise ValueError(f"{head!r} is not KIND@CYCLE or KIND@CYCLExCOUNT")
-        self.kind: str = match["kind"]
-        self.cycle = self._cycles("cycle", match["cycle"])
-        self.count = None if match["count"] is None else self._cycles("count", match["count"])
-
-    @staticmethod
-    def _cycles(what: str, digits: str) -> int:
-        # By length first: int() rejects thousands of digits.
-        if len(digits.lstrip("0")) > len(str(link.MOST_CYCLES)) or int(digits) > link.MOST_CYCLES:
-            raise ValueError(f"the {what} is more than {link.MOST_CYCLES}")
-        return int(digits)
-
-    def word(self, *words: str) -> str:
-        """Return the one of `words` that is an option; the first if none is."""
-        found = next((option for option in self.options if option in words), None)
-        if found is None:
-            return words[0]
-        self.options.remove(found)
-        return found
-
-    def number(self, name: str, default: int | None = None) -> int:
-        """Return the value of option NAME=..., decimal or hexadecimal with 0x."""
-        found = next((option for option in self.options if option.startswith(f"{name}=")), None)
-        if found is None:
-            if default is None:
-                raise ValueError(f"{name}=NUMBER is missing")
-            return default
-        self.options.remove(found)
-        try:
-            return int(found.partition("=")[2], 0)
-        except ValueError:
-            raise ValueError(f"{found!r} is not {name}=NUMBER") from None
-
-    def time(self) -> dict[str, float]:
-        """Return the duration as keyword arguments of `Delay`."""
-        for option in self.options:
-            match = _TIME.fullmatch(option)
-            if match is not None:
-                self.options.remove(option)
-                value = float(match["value"])
-                if match["unit"].startswith("cycle"):
-                    return {"cycles": value}
-                return {"seconds": value * _SECONDS[match["unit"]]}
-        raise ValueError("a time such as 5ms or 2cycles is missing")
-
-
 def parse_fault(text: str) -> Fault:
     """Return the fault of a text; see `GRAMMAR`.
 
@@ -174,48 +133,62 @@ def parse_fault(text: str) -> Fault:
         FaultScriptError: the text is not a fault.
     """
     try:
-        line = _Line(text)
-        kind = _OF_CONTROLLER.get(line.kind)
-        takes_count = line.kind != "reorder" if kind is None else kind.count > 0
-        if line.kind not in _OF_LINK and kind is None:
-            kinds = ", ".join((*_OF_LINK, *_OF_CONTROLLER))
-            raise ValueError(f"{line.kind!r} is none of {kinds}")
-        if line.count is not None and not takes_count:
-            raise ValueError(f"{line.kind} takes no count")
-        if line.count == 0:
-            raise ValueError("the count is not positive")
-        fault = _of_link(line) if kind is None else _of_controller(line, kind)
-        if line.options:
-            raise ValueError(f"{line.kind} has no option {line.options[0]!r}")
+        return _parsed(text)
     except ValueError as error:
         raise FaultScriptError(text, str(error)) from error
-    return fault
 
 
-def _of_controller(line: _Line, kind: _Kind) -> ControllerFault:
-    axis = line.number("axis") if kind.axis else 1
-    if axis < 1:
-        raise ValueError("axes count from 1")
-    count = max(1, kind.count) if line.count is None else line.count
-    return ControllerFault(line.kind, line.cycle, axis, count, line.word(*kind.words))
-
-
-def _of_link(line: _Line) -> link.Fault:
-    to: link.Direction = (
-        "to_pc" if line.word("to_pc", "to_controller") == "to_pc" else "to_controller"
-    )
-    at, count = line.cycle, 1 if line.count is None else line.count
-    match line.kind:
+def _parsed(text: str) -> Fault:
+    head, *options = text.strip().split(":")
+    match = _HEAD.fullmatch(head)
+    if match is None:
+        raise ValueError(f"{head!r:.80} is not KIND@CYCLE or KIND@CYCLExCOUNT")
+    name, cycle, times = match[1], int(match[2]), match[3]
+    kind = _KINDS.get(name)
+    if kind is None:
+        raise ValueError(f"{name!r} is none of {', '.join(_KINDS)}")
+    if times is not None and not kind.times:
+        raise ValueError(f"{name} takes no count")
+    count = max(1, kind.times) if times is None else int(times)
+    if not 1 <= count <= link.MOST_CYCLES or cycle > link.MOST_CYCLES:
+        raise ValueError(f"the cycle is at most {link.MOST_CYCLES}, the count 1 to as many")
+    found = _matched(name, kind, options)
+    to: link.Direction = "to_controller" if "to_controller" in options else "to_pc"
+    match name:
         case "lose":
-            return link.Lose(at, to, count)
+            return link.Lose(cycle, to, count)
         case "delay":
-            return link.Delay(at, **line.time(), direction=to, count=count)
+            value, unit = float(found["time"][1]), found["time"][2]
+            if unit.startswith("cycle"):
+                return link.Delay(cycle, cycles=value, direction=to, count=count)
+            return link.Delay(cycle, seconds=value * _SECONDS[unit], direction=to, count=count)
         case "duplicate":
-            return link.Duplicate(at, to, count)
+            return link.Duplicate(cycle, to, count)
         case "reorder":
-            return link.Reorder(at, to)
-    offset, mask = line.number("offset"), line.number("mask", 0xFF)
-    return link.Corrupt(at, to, count, offset=offset, mask=mask)
+            return link.Reorder(cycle, to)
+        case "corrupt":
+            mask = int(found["mask"][1], 0) if "mask" in found else 0xFF
+            offset = int(found["offset"][1], 0)
+            return link.Corrupt(cycle, to, count, offset=offset, mask=mask)
+    axis = int(found["axis"][1]) if "axis" in found else 1
+    words = (found[option][0] for option in ("start", "how", "mode") if option in found)
+    return ControllerFault(name, cycle, axis, count, next(words, kind.word))
+
+
+def _matched(name: str, kind: _Kind, options: Iterable[str]) -> dict[str, re.Match[str]]:
+    """Return the options of a fault by their names."""
+    found: dict[str, re.Match[str]] = {}
+    for text in options:
+        for option in kind.options:
+            match = _OPTIONS[option].fullmatch(text)
+            if match is not None and option not in found:
+                found[option] = match
+                break
+        else:
+            raise ValueError(f"{name} has no option {text!r}")
+    if kind.needed and kind.needed not in found:
+        raise ValueError(f"{name} needs the option {kind.needed}")
+    return found
 
 
 def split_faults(

@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 from sim_fixtures.errors import PlantDiverged, SettingError
 
 Array = NDArray[np.float64]
-_TENSOR_KEYS = ("xx", "xy", "yy", "xz", "yz", "zz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +83,6 @@ class PlantTruth:
             factor = factor + self.third * shape
         smooth: Array = factor * velocity
         return smooth
-
-
-def standard_parameters(model: pin.Model, rotor_inertia: ArrayLike) -> dict[str, float]:
-    """Return a model's standard parameters by name: m1, mc1x ..., I1xx ... I1zz, then I1m ....
-
-    First moments [kg m] and tensors [kg m2] are about the origin of the joint frame, in its axes.
-    """
-    named: dict[str, float] = {}
-    for i in range(1, model.njoints):
-        values = model.inertias[i].toDynamicParameters()
-        keys = [f"m{i}", *(f"mc{i}{a}" for a in "xyz"), *(f"I{i}{k}" for k in _TENSOR_KEYS)]
-        named |= {key: float(value) for key, value in zip(keys, values, strict=True)}
-    rotors = np.asarray(rotor_inertia, dtype=np.float64)
-    named |= {f"I{i}m": float(value) for i, value in enumerate(rotors, start=1)}
-    return named
 
 
 MAX_SWEEPS = 200

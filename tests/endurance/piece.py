@@ -138,7 +138,6 @@ class _Piece:
             t=self.at,
             load=os.getloadavg()[0],
             processes=used,
-            shared=count("/dev/shm"),
             counters={name: getattr(status, name) for name in COUNTERS},
             latencies=list(status.latencies),
             stalls=stalls,

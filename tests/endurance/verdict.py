@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -203,11 +202,7 @@ def _otherwise(piece: Piece, samples: Sequence[Line], name: str) -> float:
 
 
 def _counts(piece: Piece) -> Iterator[Finding]:
-    """Threads and descriptors of each process, and files of shared memory.
-
-    More of a process in the second half is growth. Of the files, which may be of others, the fewest
-    in each quarter are compared.
-    """
+    """Threads and descriptors of each process: more in the second half is growth."""
     settled = [one for one in piece.samples if one["t"] >= WARM_UP]
     idle = [one["descriptors"] for one in piece.campaigns if not one["stopped"]]
     threads = [{name: use["threads"] for name, use in one["processes"].items()} for one in settled]
@@ -221,11 +216,6 @@ def _counts(piece: Piece) -> Iterator[Finding]:
             if after > before:
                 words = f"the {name} has {after} {what} in the second half, {before} in the first"
                 yield "faults", words
-    quarters = np.array_split([one["shared"] for one in settled], 4)
-    fewest = [int(part.min()) for part in quarters if part.size]
-    if len(fewest) == 4 and all(after > before for before, after in pairwise(fewest)):
-        least = ", ".join(map(str, fewest))
-        yield "faults", f"files in shared memory grow in number: {least} at least in the quarters"
 
 
 def _memory(piece: Piece, figures: dict[str, Any]) -> Iterator[Finding]:

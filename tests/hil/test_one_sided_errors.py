@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import hil.identify.sources
@@ -25,7 +26,13 @@ from hil.results import VerdictResult
 from hil.simulation import planted_truth, planted_values, simulated_controller, simulated_drive
 from identification.model.friction import COULOMB
 from sim_fixtures import SimulatedDrive
-from sim_fixtures.ns16 import CELL_PATH, base_from_standard, standard_parameters
+from sim_fixtures.ns16 import (
+    CELL_PATH,
+    base_from_standard,
+    load_truth,
+    standard_parameters,
+    urdf_text,
+)
 
 Run = Callable[..., Campaign]
 
@@ -170,9 +177,13 @@ class TestInertiaScale:
         assert np.median(errors) > 0.1
 
     def test_the_controller_moves_the_simulated_arm(self) -> None:
-        moved = simulated_controller(Cell.load(CELL_PATH)).standard_parameters()
-        for name, value in standard_parameters().items():
-            assert moved[name] == pytest.approx(value, rel=1e-11, abs=1e-11), name
+        moved = simulated_controller(Cell.load(CELL_PATH)).plant.model
+        bodies, planted = (
+            [body.toDynamicParameters() for body in list(model.inertias)[1:]]
+            for model in (moved, pin.buildModelFromXML(urdf_text()))
+        )
+        np.testing.assert_allclose(bodies, planted, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(moved.armature, load_truth().rotor_inertia, rtol=1e-11)
 
     def test_without_it_the_urdf_is_true(self) -> None:
         cell = Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": []})

@@ -379,8 +379,8 @@ def invoke(*options: str) -> Any:
     [
         (["--can", "virtual:0:classic", "--cycle", "1"], "135.0 % of a cycle of 1 ms"),
         (["--can", "virtual:0:fd", "--cycle", "2", "--mode", "8"], "mode 8 does not fit"),
-        (["--can", "virtual:can0:foo"], "neither fd nor classic"),
-        (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "more than"),
+        (["--can", "virtual:can0:foo"], "fd or :classic"),
+        (["--udp", "127.0.0.1:2001", "--fault", "lose@1x100000000000000000000"], "KIND@CYCLE"),
         ([], "give --udp or --can"),
         (["--udp", "127.0.0.1:2001", "--can", "virtual:0"], "not both"),
         (["--udp", "127.0.0.1"], "HOST:PORT"),

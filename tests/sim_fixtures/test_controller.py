@@ -372,11 +372,6 @@ def test_truth_and_drive_must_have_as_many_axes() -> None:
         SimulatedController(ns16.urdf_text(), DRIVE, truth, ControllerSettings(), seed=1)
 
 
-def test_the_true_standard_parameters_are_those_of_the_urdf() -> None:
-    true, of_urdf = make().standard_parameters(), ns16.standard_parameters()
-    assert {name: true[name] for name in of_urdf} == pytest.approx(of_urdf, rel=1e-11, abs=1e-11)
-
-
 def axes_at(controller: SimulatedController, phase: Phase, n: int) -> NDArray[np.void]:
     """Axis blocks of the first packet of a phase, with everything echoed until then."""
     run_to(controller, phase)
