@@ -124,7 +124,7 @@ class DesignResult:
                 "method": excitation.method,
                 "seed": excitation.seed,
                 "tried": excitation.tried,
-                "generations": len(design.history),
+                "generations": design.generations,
                 "n_parameters": objective.n_parameters,
                 "parameters": None if chosen is None else [names[k] for k in chosen],
                 "infeasible": {name: int(n) for name, n in excitation.rejected.items()},
@@ -195,18 +195,13 @@ class DesignResult:
         except (PlannerError, *DAMAGED) as error:
             problem = f"is not a designed excitation ({' '.join(str(error).split()):.200})"
             raise InputError(path, problem, remedy=_REMEDY) from error
-        planned, installed = _positions(result.excitation.trajectory), software()
+        planned = _positions(result.excitation.trajectory)
         equal = positions.shape == planned.shape and np.all(np.abs(planned - positions) <= _SAME)
         if _motion_digest(result.excitation.trajectory) != motion and not equal:
-            versions = data["software"].items()
-            other = [
-                f"{k} {v} (here {installed.get(k)})" for k, v in versions if installed.get(k) != v
-            ]
             raise InputError(
                 path,
                 "its moves do not plan to the motion that was designed",
-                remedy=f"{_REMEDY}, or use the software it was designed with"
-                + (f": {', '.join(other)}" if other else ""),
+                remedy=f"{_REMEDY}, or use the software listed in [software]",
             )
         return result
 
@@ -221,8 +216,8 @@ class DesignResult:
         if different:
             raise InputError(
                 path,
-                f"was designed for the cell {then['name']!r}, whose {' and '.join(different)} "
-                f"{'is' if len(different) == 1 else 'are'} not that of {cell.name!r}",
+                f"was designed for the cell {then['name']!r}, which differs from {cell.name!r} in "
+                f"{' and '.join(different)}",
                 field="cell",
                 remedy=f"name its own cell, or {_REMEDY}",
             )
@@ -332,12 +327,12 @@ def references(
         result.require_cell(cell, path, ("urdf", "robot"))
         old = parameters_of(result.settings, result.data["search"].get("parameters"))
         if together or "earlier" in result.data or new != old:
-            problem = (
-                f"has criteria of {len(old)} parameters, this design of {len(new)}, of which "
-                f"{len(new & old)} are the same; with --earlier they include those archives"
+            raise InputError(
+                path,
+                "has criteria of other parameters, or one of the two includes earlier archives",
+                field="--compare",
+                remedy="name designs with the same [objective], none of them with --earlier",
             )
-            remedy = "name designs with the same [objective], none of them with --earlier"
-            raise InputError(path, problem, field="--compare", remedy=remedy)
         method = result.excitation.method
         name = f"method {method.upper()}" if len(method) == 1 else method
         name += " (kinematic)" if result.settings.unchecked else ""

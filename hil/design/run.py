@@ -250,7 +250,7 @@ def run_search(
             task.advance(total - done, "done")
     if design.exhausted:
         reporter.say(
-            f"ended after {len(design.history)} of {settings.generations} generations: mating "
+            f"ended after {design.generations} of {settings.generations} generations: mating "
             "gave no new motions; raise mutation, crossover or population in [search]"
         )
     return design

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator
 
 from identification.excitation.criteria import Criteria
 from planner import FlyPercent, FourierSeries, Move, PiecewiseCubic
 from planner.checked_data import DAMAGED, Whole, numbers, strict
 
 Array = NDArray[np.float64]
-
-# Excitations stored without a method came from a random search.
-_FIRST_METHOD: Final = "random"
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +91,10 @@ class Excitation:
             return cls(
                 trajectory=trajectory,
                 criteria=Criteria.from_dict(data["criteria"]),
-                method=strict(Name, data.get("method", _FIRST_METHOD)),
+                method=strict(str, data.get("method", "random")),  # missing in the oldest files
                 seed=strict(Whole, data["seed"]),
                 tried=strict(Whole, data["tried"]),
-                rejected=strict(dict[Name, Whole], data["rejected"]),
+                rejected=strict(dict[str, Whole], data["rejected"]),
                 **({} if sines else _planned(data, trajectory.n_joints)),
             )
         except DAMAGED as error:
@@ -110,15 +106,6 @@ def _planned(data: Mapping[str, Any], n_joints: int) -> dict[str, Any]:
     if len(points) < 2 or points.shape[1] != n_joints or len(speed) != n_joints:
         raise ValueError(f"via points {points.shape} and speeds {speed.shape} of {n_joints} joints")
     return {"via_points": points, "speed": speed, "fly": strict(float, data["fly"])}
-
-
-def _printable(name: str) -> str:
-    if not name.isprintable():
-        raise ValueError(f"{name!r:.80} cannot be printed")
-    return name
-
-
-Name = Annotated[str, AfterValidator(_printable)]
 
 
 def trajectory_from_dict(data: Mapping[str, Any]) -> PiecewiseCubic | FourierSeries:

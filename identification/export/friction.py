@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
@@ -33,8 +32,6 @@ def friction_text(model: RobotModel, coefficients: Array) -> str:
     if not friction.terms:
         return "The joints have no friction.\n"
     names = [_line(name) for name in model.joint_names]
-    # symbols that mean different terms of different joints
-    shared = {symbol for symbol, count in Counter(k.symbol for k in kinds).items() if count > 1}
     lines = [
         f"Friction torque at the speed v of a joint: {_formula(kinds)}",
         f"with {_joined([kind.description for kind in kinds])}.",
@@ -46,17 +43,11 @@ def friction_text(model: RobotModel, coefficients: Array) -> str:
     ):
         unit = "rad/s" if revolute else "m/s"
         values = _values(law, row, revolute)
-        values += [f"{t.symbol} with {t.basis}" for t in law.terms if t.symbol in shared]
         values += [f"{t.speed_symbol} = {t.speed:g} {unit}" for t in law.terms if t.speed_symbol]
         zone = " (linear zone)" if law.zone == "linear" else ""
         lines.append(
             f"{name}: {', '.join(values) or 'no friction'}; "
             f"standstill below {law.standstill:g} {unit}{zone}"
-        )
-    if any(law.asymmetric and law.coulomb for law in friction.laws):
-        lines.append(
-            "Coulomb friction is f0 + fo forwards and f0 - fo backwards: its asymmetry cannot be"
-            " distinguished from the zero error of a sensor."
         )
     for motor, row, share in zip(friction.motors, table[n:], friction.motor_speeds(), strict=True):
         speed_sum = " + ".join(

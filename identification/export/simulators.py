@@ -39,7 +39,7 @@ AGREES: Final = 1e-6
 _SEED: Final = 20140903
 # Default ranges of random states: rad or m, rad/s or m/s, rad/s² or m/s².
 _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
-_BASE: Final = "base"
+_BASE: Final = "robot_base"
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
@@ -176,12 +176,11 @@ def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     _comment(document, remarks)
     root = _add(document, "model", name=name)
     links = [arm.link(j) for j in range(model.n_joints)]
-    base = next(one for one in (_BASE, "world_base", "fixed_base") if one not in links)
-    _add(root, "link", name=base)
-    _nested(_add(root, "joint", name=f"{base}_fixed", type="fixed"), parent="world", child=base)
+    _add(root, "link", name=_BASE)
+    _nested(_add(root, "joint", name=f"{_BASE}_fixed", type="fixed"), parent="world", child=_BASE)
     for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
         parent = int(model.chain.parents[j])
-        above = links[parent] if parent >= 0 else base
+        above = links[parent] if parent >= 0 else _BASE
         link = _add(root, "link", name=links[j])
         place = _rpy(model.chain.rotation[j], model.chain.translation[j])
         _add(link, "pose", relative_to=above).text = place

@@ -16,9 +16,6 @@ Array = NDArray[np.float64]
 TOLERANCE = 1e-5
 
 _ROUNDING = 1e-13
-# The rank decision is clear with a ratio of residuals from _CLEAR and a smallest one from _WEAK on.
-_CLEAR = 100.0
-_WEAK = 1e-3
 _NEGLIGIBLE = 1e-9  # factors below this are left out of texts
 
 
@@ -41,28 +38,17 @@ class BaseParameters:
         """Number b of base parameters."""
         return len(self.names)
 
-    @property
-    def gap(self) -> float:
-        """Smallest residual of an independent column over the largest of a dependent one."""
-        return self.smallest_pivot / max(self.largest_dropped, np.finfo(np.float64).tiny)
-
     def explanation(self) -> str:
         """Return a message about the rank decision and its margin."""
         s = len(self.standard_names)
         absent = s - np.count_nonzero(np.any(np.abs(self.grouping) > _NEGLIGIBLE, axis=0))
         weakest = self.names[int(np.argmin(self.shares[self.pivots]))]
-        text = (
+        return (
             f"{self.rank} of {s} standard parameters are independent, {s - self.rank - absent} are"
             f" grouped with them, {absent} do not affect the torque. The smallest residual of an"
             f" independent column is {self.smallest_pivot:.1e} ({weakest}), the largest of a"
             f" dependent one {self.largest_dropped:.1e}; the threshold is {TOLERANCE:g}."
         )
-        if self.gap < _CLEAR or self.smallest_pivot < _WEAK:
-            text += (
-                " These are close: small lengths or angles of the robot description"
-                f" determine whether {weakest} is independent."
-            )
-        return text
 
     def expressions(self, digits: int = 6) -> tuple[str, ...]:
         """Return each group as a formula: ``I1yy + I1m + 0.09 m2 + ...``."""

@@ -82,7 +82,7 @@ def faulty(**faults: Any) -> FaultyGenome:
 
 def bits(design: Design) -> dict[str, Any]:
     """Return the fields of a design, arrays as bytes."""
-    fields = vars(design) | {"genes": design.genes.tobytes(), "history": design.history.tobytes()}
+    fields = vars(design) | {"genes": design.genes.tobytes()}
     fields["excitation"] = design.excitation.to_dict()
     fields["front"] = [array.tobytes() for array in vars(design.front).values()]
     return fields

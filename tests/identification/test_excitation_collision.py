@@ -414,8 +414,6 @@ def test_limits_and_postures_of_another_arm_are_refused():
     with pytest.raises(ShapeError, match="limits"):
         CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
 
-
-def test_postures_that_are_not_finite_are_refused():
     q = np.zeros((3, 6))
     q[1, 4] = np.nan
     for check in (checkers(0.05).clear, checkers(0.05).deepest_contact):
@@ -440,14 +438,12 @@ def violent_pieces(jerk):
     return PiecewiseCubic(tuple(np.linspace(0.0, 5.0, 501) for _ in range(6)), tuple(table))
 
 
-SIZES = [(1e-9, 1e5), (1e-3, 30.0), (0.2, 3.0), (3.0, 50.0)]
-
-
 @pytest.mark.parametrize(
     "motion",
     [
-        *(violent_sines(*own, ramp) for own in SIZES for ramp in (0.0, 1e-9, 1e-3, 2.5)),
-        *map(violent_pieces, (1e3, 1e6, 1e9, 1e12)),
+        *(violent_sines(0.2, 3.0, ramp) for ramp in (0.0, 1e-9, 1e-3)),
+        violent_sines(3.0, 50.0, 2.5),
+        violent_pieces(1e9),
     ],
 )
 def test_violent_motions_are_checked_quickly(motion):
@@ -492,16 +488,11 @@ def test_a_mesh_counts_as_its_convex_hull(tmp_path):
         assert distances[0] == pytest.approx(distances[1], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    "shape", ['<mesh filename="package://nowhere/part.stl"/>', ""], ids=["no mesh", "no shape"]
-)
-def test_a_description_without_usable_shapes_is_refused(shape):
-    urdf = robot(link("base"), link("tip", shape), joint(1, "base", "tip", "0 0 1"))
-    with pytest.raises(CollisionModelError):
-        CollisionChecker(urdf, Workspace())
-
-
-def test_a_box_without_volume_is_refused():
+def test_unusable_shapes_and_boxes_are_refused():
+    for shape in ('<mesh filename="package://nowhere/part.stl"/>', ""):
+        urdf = robot(link("base"), link("tip", shape), joint(1, "base", "tip", "0 0 1"))
+        with pytest.raises(CollisionModelError):
+            CollisionChecker(urdf, Workspace())
     with pytest.raises(WorkspaceError):
         Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import Factor, RobotModel
+from identification import RobotModel
 from identification.excitation import (
     CRITERIA,
     KINDS,
@@ -23,13 +23,11 @@ from identification.excitation import (
     correlation,
     coupling_index,
     coupling_index_max,
-    information,
     log10_det,
 )
 from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
 from identification.excitation.criteria import fitness_eq7
 from planner import FourierSeries, JointLimits, plan
-from planner.worker import load, pack
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.searching import NS16_VELOCITY
 from tests.identification.two_link import URDF
@@ -37,7 +35,6 @@ from tests.identification.two_link import URDF
 LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 MODEL = RobotModel.from_urdf(URDF)
 P = MODEL.n_parameters
-WORST = {"log10_det": -np.inf, "coupling_index": np.inf}
 seeds = st.integers(0, 999)
 
 
@@ -85,25 +82,6 @@ def test_measures_are_of_the_chosen_weighted_columns(seed: int, chosen: set[int]
     assert_measures(found, weighted, motion.n_samples)
 
 
-def test_measures_do_not_depend_on_earlier_calls() -> None:
-    motions = [midpoints(some_motion(seed, n_via)) for seed, n_via in enumerate((3, 40, 7, 90, 4))]
-    alone = [Objective(RobotModel.from_urdf(URDF)).measures(m) for m in motions]
-    objective = Objective(MODEL)
-    for order in ([0, 1, 2, 3, 4], [4, 3, 2, 1, 0], [1, 1, 3, 0, 4, 2, 2]):
-        for k in order:
-            assert objective.measures(motions[k]) == alone[k]  # to the last bit
-
-
-def test_information_agrees_with_a_factor() -> None:
-    motion, weights = midpoints(some_motion(2)), np.array([2.0, 0.5])
-    factor = Factor.from_samples(MODEL, motion, np.ones_like(motion.position))
-    for objective, gram in (
-        (Objective(MODEL, joint_weights=weights), factor.weighted(weights).A),
-        (Objective(MODEL), information(factor)),
-    ):
-        np.testing.assert_allclose(objective.information(motion), gram, rtol=1e-12)
-
-
 def test_criteria_are_the_measures_and_more() -> None:
     trajectory = some_motion(3)
     motion = midpoints(trajectory)
@@ -114,12 +92,6 @@ def test_criteria_are_the_measures_and_more() -> None:
     unit = columns / np.linalg.norm(columns, axis=0)
     assert criteria.condition == pytest.approx(np.linalg.cond(columns), rel=1e-6)
     assert criteria.scaled_condition == pytest.approx(np.linalg.cond(unit), rel=1e-6)
-
-
-@pytest.mark.parametrize("last", [[[1.0, 0.5], [-1.0, 0.5]], [[0.0, 0.5]]])
-def test_a_joint_at_rest_has_the_worst_measures(last: list[list[float]]) -> None:
-    still = plan([[0.0, 0.5], *last], LIMITS)
-    assert Objective(MODEL).measures(midpoints(still)) == WORST
 
 
 # Sequential design.
@@ -185,12 +157,6 @@ def test_rows_at_rest_are_left_out_in_sequential_design_only() -> None:
     assert np.trace(alone) > np.trace(beside) / share_of_period(motion)
 
 
-def test_repetitions_alone_change_nothing() -> None:
-    motion = midpoints(some_motion(6))
-    once, often = (Objective(MODEL, repetitions=r).measures(motion) for r in (1, 30))
-    assert once == often
-
-
 def test_the_sample_period_does_not_change_the_weight() -> None:
     trajectory = some_motion(7, n_via=12)
     known = earlier_of(trajectory)
@@ -202,15 +168,6 @@ def test_the_sample_period_does_not_change_the_weight() -> None:
         # Both rates see the same motion, but for the last sample and some at each reversal.
         room = P * 4.0 / n_earlier
         assert both.log10_det == pytest.approx(alone + P * math.log10(2.0), abs=room)
-
-
-def test_a_pickled_objective_gives_the_same_measures() -> None:
-    known = earlier_of(some_motion(9))
-    weights = np.array([1.0, 3.0])
-    objective = Objective(MODEL, np.arange(1, P), weights, **known, repetitions=3)
-    motion = midpoints(some_motion(10))
-    expected = objective.measures(motion)  # also fills what the objective caches
-    assert load(pack(objective)).measures(motion) == expected
 
 
 # Samples.
@@ -397,11 +354,6 @@ def test_motions_without_excitation_are_left_out():
     assert front_of([-np.inf, 50.0], [np.inf, 100.0]).measures.tolist() == [[50.0, 100.0]]
 
 
-def test_an_empty_front_has_no_knee():
-    with pytest.raises(ValueError, match="empty"):
-        front_of([-np.inf], [np.inf]).knee()
-
-
 BENT = ([90.0, 104.0, 104.5, 105.0], [60.0, 61.0, 80.0, 100.0])
 FAR_END = ([-300.0, 90.0, 104.0, 104.5, 105.0], [59.9, 60.0, 64.0, 80.0, 100.0])
 
@@ -423,15 +375,6 @@ FAR_END = ([-300.0, 90.0, 104.0, 104.5, 105.0], [59.9, 60.0, 64.0, 80.0, 100.0])
 def test_the_knee_is_the_corner_of_the_front(size, coupled, scale, knee):
     front = front_of(size, coupled)
     assert front.measure("log10_det")[front.knee(scale)] == knee
-
-
-@pytest.mark.parametrize("units", [(1.0, 1.0), (7.0, 0.1)])
-def test_the_knee_of_a_quarter_circle_is_in_its_middle(units):
-    angle = np.radians(np.arange(0.0, 91.0, 5.0))
-    size, coupled = 100.0 + 10.0 * np.sin(angle), 70.0 + 40.0 * (1.0 - np.cos(angle))
-    front = front_of(units[0] * size - 300.0, units[1] * coupled)
-    expected = units[1] * (70 + 40 * (1 - np.sqrt(0.5)))
-    assert front.measure("coupling_index")[front.knee()] == pytest.approx(expected)
 
 
 @pytest.fixture

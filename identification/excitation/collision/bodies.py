@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from typing import Final, NamedTuple
-from xml.etree.ElementTree import Element
 
 import coal
 import numpy as np
@@ -53,23 +52,15 @@ def _unread_shapes(urdf: str, links: Iterable[str]) -> str | None:
     read = Counter(links)
     for link in urdf_tree(urdf).findall("link"):
         name = link.get("name", "")
-        collisions = [list(_shapes(element)) for element in link.findall("collision")]
-        written = sum(max(1, len(shapes)) for shapes in collisions)
+        written = sum(max(1, len(one.findall("geometry/*"))) for one in link.findall("collision"))
         if read[name] != written:
-            visuals = [list(_shapes(element)) for element in link.findall("visual")]
-            shapes = [f"<{shape.tag}>" for each in (*collisions, *visuals) for shape in each]
             return (
                 f"of the {written} collision shapes of link {name!r} {read[name]} could be read; "
-                f"its <collision> and <visual> elements contain {', '.join(shapes) or 'none'}. "
-                "Each element needs one box, cylinder, sphere or mesh, with numbers separated by "
-                "single spaces, a filename for a mesh, and a name for a material"
+                "give each <collision> and <visual> element of the link one box, cylinder, sphere "
+                "or mesh, with numbers separated by single spaces, a filename for a mesh, and a "
+                "name for a material"
             )
     return None
-
-
-def _shapes(element: Element) -> Iterator[Element]:
-    for geometry in element.findall("geometry"):
-        yield from geometry
 
 
 _MISSING_MESH: Final = re.compile(r"Mesh (.+) could not be found")  # message of pinocchio

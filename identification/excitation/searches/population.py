@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
 from identification.excitation.criteria import Criteria
-from identification.excitation.errors import DesignError
 from identification.excitation.genomes import Genome, Motion
 from identification.excitation.objective import Objective
 from identification.excitation.searches.scores import Scores, unplanned
@@ -108,13 +107,10 @@ class Population:
     `CHUNK` motions, then of one alone), is scored as unplannable.
 
     Raises:
-        DesignError: less than one worker.
         PlannerNotStarted: in `score`: a process cannot be started.
     """
 
     def __init__(self, problem: Problem, workers: int = 1, timeout: float = 60.0) -> None:
-        if workers < 1:
-            raise DesignError("workers", workers, "at least 1")
         self.problem = problem
         self._packed = pack(problem)
         self._children = [WorkerProcess(timeout=timeout) for _ in range(workers)]

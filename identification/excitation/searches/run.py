@@ -31,7 +31,6 @@ class Progress(NamedTuple):
     generation: int  #: scored generations
     generations: int  #: all generations
     evaluated: int  #: scored motions of all phases
-    total: int  #: largest number of motions to be scored
     feasible: int  #: scored motions that satisfy all constraints
     #: `CRITERIA` of the best motion (of the knee for "front"), nan if there is none
     best: tuple[float, ...]
@@ -50,9 +49,7 @@ class Design:
     #: criteria of that motion, sampled every `RESCORE_PERIOD`; the chosen motion is not worse in
     #: its fitness or, with "front", in any measure
     origin_criteria: Criteria
-    #: (g, 1 + d) after each generation: fitness and `CRITERIA` of the best motion, nan if there is
-    #: none; with "front": nan, and the best value of each measure
-    history: Array
+    generations: int  #: number of scored generations
     complete: bool  #: whether the search ran to its end
     exhausted: bool  #: whether it ended early because mating gave no new motions
     scale: Scale | None  #: of the balanced fitness and of the knee; None if not used
@@ -277,15 +274,6 @@ class Goal:
             return int(np.argmax(self.fitness(front.measures)))
         return front.knee(self.scale)
 
-    def best(self, front: Front) -> Array:
-        """Return fitness and measures (1 + d,) of the best motion (see `Design.history`)."""
-        if len(front) == 0:
-            return np.full(1 + len(SENSE), np.nan)
-        if not self.single:
-            return np.append(np.nan, SENSE * np.max(SENSE * front.measures, axis=0))
-        k = self.choice(front)
-        return np.append(self.fitness(front.measures)[k], front.measures[k])
-
     def is_worse(self, one: Criteria, other: Criteria) -> bool:
         """Return whether a motion is worse than another, with "front" in any measure."""
         first, second = self.objectives(np.array((one.measures, other.measures)))
@@ -343,7 +331,7 @@ class _Search:
         self._stopped = self._exhausted = False
         self._phase: Phase = "sample"
         self._goal: Goal | None = None
-        self._history: list[Array] = []
+        self._generations = 0
         self._front = Front.empty(self._genome.n_genes)
         self._tried = self._feasible = 0
         self._rejected: Counter[str] = Counter()
@@ -357,7 +345,7 @@ class _Search:
         random = np.random.default_rng((_FIRST, settings.seed))
         first = self._genome.sample(random, settings.population)
         evolution = Evolution(settings, first, 1 if goal.single else len(SENSE))
-        while len(self._history) < settings.generations and not self._should_stop():
+        while self._generations < settings.generations and not self._should_stop():
             children = evolution.ask()
             if children is None:
                 self._exhausted = True
@@ -403,7 +391,7 @@ class _Search:
             chosen=winner if genes.tobytes() == start.tobytes() else None,
             origin=winner,
             origin_criteria=origin[1],
-            history=np.array(self._history).reshape(-1, 1 + len(SENSE)),
+            generations=self._generations,
             complete=not self._stopped,
             exhausted=self._exhausted,
             scale=goal.scale,
@@ -442,10 +430,9 @@ class _Search:
         return scores
 
     def _report(self) -> None:
-        """Extend the history and report progress."""
+        """Count the generation and report progress."""
         goal, front = self._goal, self._front
-        if self._phase == "search" and goal is not None:
-            self._history.append(goal.best(front))
+        self._generations += self._phase == "search"
         if self._progress is None:
             return
         best = np.full(len(SENSE), np.nan)
@@ -454,10 +441,9 @@ class _Search:
         self._progress(
             Progress(
                 self._phase,
-                len(self._history),
+                self._generations,
                 self._settings.generations,
                 self._tried,
-                most_evaluations(self._settings),
                 self._feasible,
                 tuple(best.tolist()),
             )

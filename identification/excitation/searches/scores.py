@@ -174,18 +174,13 @@ class Front:
         return type(self)(*map(np.concatenate, columns))._nondominated()
 
     def knee(self, scale: Scale | None = None) -> int:
-        """Return the index of the knee, the motion farthest beyond the chord between the ends.
+        """Return the index of the knee of a non-empty front, farthest beyond the chord of its ends.
 
         Das 1999, "On characterizing the knee of the Pareto curve based on normal-boundary
         intersection"; measures relative to the ranges of the front. With `scale` only motions
         better than the median random motion in all measures count, if any. Of several the knee has
         the largest balanced fitness; without `scale` it is the first.
-
-        Raises:
-            ValueError: the front is empty.
         """
-        if len(self) == 0:
-            raise ValueError("an empty front has no knee")
         part = np.arange(len(self))
         if scale is not None:
             better = np.flatnonzero(np.all(scale.gains(self.measures) > 0.0, axis=1))
