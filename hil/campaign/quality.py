@@ -228,13 +228,6 @@ class RepetitionCheck:
                 )
         return None
 
-    @property
-    def agreement(self) -> str:
-        """Agreement of the last accepted repetition with those before."""
-        if not self._differences:
-            return "nothing to compare with yet"
-        return f"currents agree within {self._differences[-1][1].max():.1%} (rms)"
-
     def _difference(self, executed: Executed) -> Array:
         """Return the difference from the median of the earlier ones, rms over time (2, n).
 
@@ -302,10 +295,6 @@ class ArchiveReview:
         self._folder.add(name, REJECTED, problem.sentence)
         self.rejected.append(Rejected(name, problem.sentence))
         return replace(problem, later=(*problem.later, name)) if problem.reference else problem
-
-    def agreement(self) -> str:
-        """Agreement of the last accepted repetition with those before."""
-        return self._check.agreement
 
     def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
         """Enter archives of an earlier run that was killed before it entered them."""

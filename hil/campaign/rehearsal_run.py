@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -244,23 +243,16 @@ MOST_SIGMA: Final = 4.0
 MOST_ERROR: Final = 1.2
 """Largest error on unseen motion, as a multiple of that of the simulated parameters."""
 SATURATED: Final = 0.99  # Share of the current limit from which a motor is saturated
-_NAMED: Final = 3
 
 
-def criterion(name: str, value: float | None, bound: float, good: str, bad: str = "") -> Criterion:
-    """Return a criterion that is met by a finite value up to `bound`.
-
-    `bad` is the sentence of a result that does not pass, if not `good`.
-    """
-    known = value is not None and np.isfinite(value)
-    passed = value is not None and known and value <= bound
-    return Criterion(
-        name=name,
-        value=value if known else None,
-        bound=bound,
-        passed=bool(passed),
-        sentence=good if passed else bad or good,
-    )
+def criterion(
+    name: str, value: float | None, bound: float, text: str, remedy: str = ""
+) -> Criterion:
+    """Return a criterion that is met by a finite value up to `bound`; else with a remedy."""
+    finite = None if value is None or not np.isfinite(value) else value
+    passed = finite is not None and finite <= bound
+    sentence = text if passed or not remedy else f"{text}: {remedy}"
+    return Criterion(name=name, value=finite, bound=bound, passed=passed, sentence=sentence)
 
 
 def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
@@ -298,54 +290,39 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
     undetermined = found.undetermined
     deviation = found.interval_factor / normal_limit(0.025) * found.std
     apart = np.abs(found.values - twin.truth) / deviation
-    distance = np.where(np.isfinite(apart), apart, 0.0)
-    known = int(np.isfinite(apart).sum())
-    far = [found.names[k] for k in np.argsort(-distance) if distance[k] > MOST_SIGMA]
-    sigma, asked = float(distance.max()) if known else None, f"{MOST_SIGMA:g} standard deviations"
+    known = np.isfinite(apart)
+    farthest = int(np.argmax(np.where(known, apart, 0.0)))
     ours, theirs = (
         pooled_error(prediction_error(model, values, prepared.held_out)).rms
         for values in (found.values, twin.truth)
     )
     ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)
     joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
-    error_is = (
-        f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
-        f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is allowed"
-    )
     return [
         criterion(
             "excitation",
             float(len(undetermined)),
             bounds["excitation"],
-            "the excitation determines every parameter",
-            f"the excitation does not determine {len(undetermined)} parameters "
-            f"({_some(undetermined)}): design a motion that moves every joint",
+            f"parameters not determined by the excitation: {', '.join(undetermined) or 'none'}",
+            "design a motion that moves every joint",
         ),
         criterion(
             "parameters",
-            sigma,
+            float(apart[farthest]),
             MOST_SIGMA,
-            f"all {known} parameters were found within {sigma or 0.0:.1f} standard deviations of "
-            f"the simulated values, {MOST_SIGMA:g} are allowed",
-            f"{len(far)} of {known} parameters ({_some(far)}) are more than {asked}, up to "
-            f"{sigma:.3g}, from the simulated values: the drive train or the model of the cell "
-            "file is not that of the arm"
-            if sigma is not None
-            else "parameters: no parameter has a standard deviation",
+            f"the errors of {known.sum()} parameters are at most {apart[farthest]:.3g} standard "
+            f"deviations ({found.names[farthest]}), {MOST_SIGMA:g} are allowed",
+            "the drive train or the model of the cell file is not that of the arm",
         ),
         criterion(
             "unseen motion",
             float(ratio[joint]),
             MOST_ERROR,
-            error_is,
-            f"{error_is}: the excitation is too poor; design a better one (`hil design`)",
+            f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
+            f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is allowed",
+            "design a better excitation (`hil design`)",
         ),
     ]
-
-
-def _some(names: Sequence[str]) -> str:
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 REPETITIONS: Final = 3
@@ -427,8 +404,7 @@ def _rehearsed(
                 f"motions ({name})",
                 float(bool(failure)),
                 0.0,
-                f"{name}: every motion ran to its end, none was refused by the guard or tripped",
-                f"{name}: {failure}",
+                f"{name}: {failure or 'every motion was completed'}",
             )
         )
         if rehearsal.folder.manifest():

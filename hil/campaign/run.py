@@ -163,7 +163,7 @@ class Run:
                 warm = warm_up if kind == "excitation" else None
                 runner.run_until_accepted(interval, interval.index + 1, total, warm)
                 if kind == "excitation":
-                    self.watch.add_note(f"{interval}: good, {self.review.agreement()}")
+                    self.watch.add_note(f"{interval}: good")
                 elif kind == "validation":
                     warm_up.motion_ended()
 

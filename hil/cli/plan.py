@@ -117,8 +117,6 @@ def _number(cell: str) -> float | None:
 
 
 _RATES = ("velocity", "acceleration", "jerk")
-_MOST_ROWS = 1_000_000
-"""Largest table to write, rows."""
 
 
 def plan(
@@ -186,10 +184,6 @@ def plan(
     names = loaded.joint_names
     if rate is None:
         rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
-    if csv is not None and planned.duration * rate > _MOST_ROWS:
-        problem = f"{rate:g} rows per second for {planned.duration:.3f} s exceed {_MOST_ROWS} rows"
-        remedy = "give a lower rate"
-        raise InputError(None, problem, field="--rate", remedy=remedy)
     if json:
         print_json(_summary(planned, loaded, frame))
     else:

@@ -41,7 +41,7 @@ def tiny(cell: Cell) -> Cell:
     return cell.with_campaign(validation_runs=1)
 
 
-@pytest.mark.parametrize("candidates", [1, 4, 5, 20, 60, 300, 1000])
+@pytest.mark.parametrize("candidates", [1, 5, 300])
 def test_the_quick_search_tries_no_more_than_it_may(cell: Cell, candidates: int) -> None:
     text = cell.text.replace("candidates = 20", f"candidates = {candidates}")
     search = quick_settings(Cell.from_texts(text, cell.urdf, cell.path)).search
@@ -265,8 +265,8 @@ def test_motions_out_of_bounds_are_refused(
         Campaign.create(tmp_path / "bad", quick, replace(swinging, excitation=bad))
 
 
-@pytest.mark.parametrize("ramp", [1e-9, 1e-6, 1e-4, 1e-3, 3e-3, 0.02, 0.1])
-@pytest.mark.parametrize("size", [1e-9, 1e-5, 0.01])
+@pytest.mark.parametrize("ramp", [1e-9, 1e-4, 3e-3, 0.1])
+@pytest.mark.parametrize("size", [1e-9, 0.01])
 def test_short_ramps_are_checked_within_seconds(quick: Cell, ramp: float, size: float) -> None:
     series = FourierSeries(
         quick.home, np.full((6, 1), size), np.full((6, 1), np.pi), length=5.0, ramp=ramp

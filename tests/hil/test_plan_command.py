@@ -143,11 +143,6 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
         (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
         (["--via", "VIA", "--output", "plan.yaml"], "not a plan file"),
-        (
-            ["--via", "VIA", "--csv", "motion.csv", "--rate", "1e13"],
-            "--rate: 1e.13 rows per second",
-        ),
-        (["--via", "VIA", "--csv", "motion.csv", "--rate", "0"], "--rate: 0.0 rows per second"),
         (["--via", "VIA", "--csv", "motion.csv", "--rate", "nan"], "--rate: nan rows per second"),
     ],
 )
