@@ -72,7 +72,7 @@ class CacheLocation:
         """Return the cache folder of the archives in the same folder as this one."""
         if not self.keep:
             return Store(None)
-        folder = location.rsplit("/", 1)[0] if "/" in location else "."
+        folder = location.rsplit("/", 1)[0]
         if self.root is None and "://" not in location:
             beside = Path(folder) / BESIDE
             there = os.path.lexists(beside)
@@ -81,8 +81,7 @@ class CacheLocation:
                 return Store(beside)
         xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
         own = (xdg if xdg.is_absolute() else Path.home() / ".cache") / "hil"
-        name = folder if "://" in location else _resolved(folder)
-        return Store((own if self.root is None else Path(self.root)) / digest(name)[:16])
+        return Store((own if self.root is None else Path(self.root)) / digest(folder)[:16])
 
 
 @dataclass(frozen=True)
@@ -206,11 +205,6 @@ def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of the lower triangle of a square."""
     row, column = np.tril_indices(width)
     return row, column
-
-
-@lru_cache(maxsize=1024)
-def _resolved(folder: str) -> str:
-    return str(Path(folder).resolve())
 
 
 # Keys

@@ -261,8 +261,8 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
     """
     counts = range(len(refs), 0, -1)
     cached = (cached_bundle(refs[:count], settings, cache) for count in counts)
-    begun = next(filter(None, cached), Bundle(()))
-    left = refs[len(begun.refs) :]
+    begun = next(filter(None, cached), Bundle())
+    left = refs[begun.cached :]
     summaries, broken, phase = list(begun.summaries), list[Unused](), begun.phase
     for ref in left:
         try:
@@ -273,13 +273,12 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
-    bundle = Bundle(tuple(refs), tuple(summaries), phase, tuple(broken), len(left))
     if left and not broken:
         store, used = cache.store(refs[0].location), settings_digest(settings)
-        store.put(sum_key(refs, used), bundle)
-        if begun.refs:
-            store.remove(sum_key(begun.refs, used))  # part of a longer one now
-    return bundle
+        store.put(sum_key(refs, used), Bundle(tuple(summaries), phase))
+        if begun.cached:
+            store.remove(sum_key(refs[: begun.cached], used))  # part of a longer one now
+    return Bundle(tuple(summaries), phase, tuple(broken), len(left), begun.cached)
 
 
 def cached_bundle(
@@ -288,11 +287,11 @@ def cached_bundle(
     """Return the cached bundle of these archives; None unless all are in the cache."""
     store = cache.store(refs[0].location)
     found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
-    if found is None:
+    if found is None or len(found.summaries) != len(refs):
         return None
     pairs = zip(found.summaries, refs, strict=True)  # the archives may have been moved
     summaries = tuple(replace(one, ref=ref) for one, ref in pairs)
-    return Bundle(tuple(refs), summaries, found.phase)
+    return Bundle(summaries, found.phase, cached=len(refs))
 
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:

@@ -184,7 +184,7 @@ class _Batch:
                 continue
             alone = [self._reducing(one, (ref,)) for ref in refs]
             for own in self.workers.results(alone):
-                yield Bundle((), broken=(own,)) if isinstance(own, Unused) else own
+                yield Bundle(broken=(own,), read=1) if isinstance(own, Unused) else own
 
     # Estimates
 
@@ -257,10 +257,10 @@ class _Batch:
         for bundle in self._reduced(one):
             self.broken += bundle.broken
             self.read += bundle.read
-            self.cached += len(bundle.refs) - bundle.read
+            self.cached += bundle.cached
             group.add_bundle(bundle)
             summaries += [each for each in bundle.summaries if each.ref.use == "excitation"]
-            advance(len(bundle.refs), one.key.campaign)
+            advance(bundle.read + bundle.cached, one.key.campaign)
         levels: list[LevelEstimate] = []
         if group.phase is not None:
             with self._failing(one.key.campaign):

@@ -106,12 +106,12 @@ class Summary:
 class Bundle:
     """Results of several archives of one campaign."""
 
-    refs: tuple[ArchiveRef, ...]  #: all archives, in their order
     summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
     #: sum of the factors of those that are fitted; None if there are none
     phase: PhaseFactor | None = None
     broken: tuple[Unused, ...] = ()  #: the others
-    read: int = 0  #: number of archives that were read; the others were cached
+    read: int = 0  #: number of archives that were read, broken ones included
+    cached: int = 0  #: number of the others
 
 
 @dataclass(frozen=True, eq=False)
