@@ -115,9 +115,8 @@ class LivePublisher:
         self._step = max(1, round(1.0 / (command.view.rate * command.period)))
         self._channels = [_channel(channel, self._context) for channel in cycles]
         self._events = _channel(EVENT_CHANNEL, self._context)
-        self._clock = ViewerClock()
-        waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](maxlen=QUEUE)
-        self._waiting = waiting
+        self._offset: int | None = None
+        self._waiting = deque[tuple[Records, tuple[ExchangeEvent, ...], DriveTrain]](maxlen=QUEUE)
         self._more, self._closed = threading.Event(), False
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
         self._thread.start()
@@ -150,32 +149,24 @@ class LivePublisher:
         if len(records):
             torque = drive_train.joint_torque(records["target_current"])
             encoded = cycle_messages(self._names, self._period, records, torque)
-            times = [self._clock.at(int(stamp)) for stamp in encoded.stamp]
+            times = [self._time_of(int(stamp)) for stamp in encoded.stamp]
             for channel, rows in zip(self._channels, encoded.messages.values(), strict=True):
-                size = rows.dtype.itemsize
-                data = rows.tobytes()
-                for index, log_time in enumerate(times):
-                    content = data[index * size : (index + 1) * size]
-                    channel.log(content, log_time=log_time)
+                for row, log_time in zip(rows, times, strict=True):
+                    channel.log(row.tobytes(), log_time=log_time)
         for event in events:
             seconds = self._period * (getattr(event, "cycle", None) or 0)
             message = ArchivedEvent(seconds, type(event).__name__, describe(event), level_of(event))
             self._events.log(message.encode(), log_time=time.time_ns())
 
+    def _time_of(self, stamp: int) -> int:
+        """Return the time of a message, ns since 1970, by its stamp, ns since the session began.
 
-class ViewerClock:
-    """Converts stamps, from zero in each session, to this computer's clock, evenly spaced."""
-
-    def __init__(self) -> None:
-        self._offset: int | None = None
-
-    def at(self, stamp: int) -> int:
-        """Return the time of a message, ns since 1970, by its stamp, ns since the session began."""
+        The times are evenly spaced, as the stamps, until the two clocks differ by `MAX_DRIFT`.
+        """
         now = time.time_ns()
-        offset = self._offset
-        if offset is None or abs(stamp + offset - now) > 1e9 * MAX_DRIFT:
-            self._offset = offset = now - stamp
-        return stamp + offset
+        if self._offset is None or abs(stamp + self._offset - now) > 1e9 * MAX_DRIFT:
+            self._offset = now - stamp
+        return stamp + self._offset
 
 
 def _serve(view: LiveView) -> tuple[WebSocketServer, foxglove.Context]:

@@ -10,7 +10,6 @@ import threading
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, ParamSpec, TypeVar
@@ -29,68 +28,6 @@ from hil.reading import open_file, read_text
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 
-
-def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
-    """Return arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
-
-    ``topic/stamp`` is the time of its messages [ns]: that of their header, or else the file's.
-
-    Raises:
-        SourceError: the file cannot be read, or has no topic that can be read this way.
-    """
-    known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
-    refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
-    layouts: dict[str, MessageLayout] = {}
-    found: dict[str, list[tuple[int, bytes]]] = {}
-    for name, stamp, data in messages:
-        if name in refused:
-            continue
-        try:
-            if name not in layouts:
-                definition = known[name].definition.decode(errors="replace")
-                layouts[name] = layout_of(known[name].kind, definition, data)
-            size = layouts[name].size
-            if len(data) - size not in range(4):  # a writer may pad the end to whole words
-                raise LayoutError("its messages differ in length")
-        except LayoutError as error:
-            refused[name] = str(error)
-            found.pop(name, None)
-            continue
-        found.setdefault(name, []).append((stamp, data[:size]))
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, own in found.items():
-        try:
-            columns = _columns(layouts[name], own)
-        except LayoutError as error:
-            refused[name] = str(error)
-        else:
-            arrays |= {f"{name}/{field}": column for field, column in columns.items()}
-    if not arrays:
-        reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
-        problem = f"has no topic whose messages can be read as columns ({reasons})"
-        remedy = "record joint states and currents as ROS 2 messages of constant size"
-        raise SourceError(path, problem, remedy=remedy)
-    return arrays
-
-
-def _columns(
-    layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
-) -> dict[str, NDArray[Any]]:
-    """Return the fields of messages of one topic, given with log times [ns], and their stamps."""
-    joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
-    data = joined.reshape(len(messages), layout.size)
-    if not layout.matches(data):
-        raise LayoutError("its messages differ in names or lengths of arrays")
-    rows = data.view(layout.dtype)[:, 0]
-    columns: dict[str, NDArray[Any]] = {
-        name: rows[name].copy() for name in layout.dtype.names or ()
-    }
-    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
-    if seconds is None or rest is None or not (seconds.any() or rest.any()):
-        return {"stamp": np.array([stamp for stamp, _ in messages], np.int64), **columns}
-    return {"stamp": np.asarray(seconds.astype(np.int64) * 10**9 + rest), **columns}
-
-
 Array = NDArray[np.float64]
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -103,7 +40,6 @@ _MATLAB_NUMBERS: Final = {"double", "single", "logical"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
 _MATLAB_NESTED: Final = ("struct", "cell", "object")
-_MOST_FIELDS: Final = 10_000  # of all structs of a file
 _MOST_NAMED: Final = 30
 _ASSIGNED: Final = re.compile(r"\b([A-Za-z]\w*)\s*=\s*\[([^\[\]]*)\]")
 _COMMENT: Final = re.compile(r"[%#].*")
@@ -118,55 +54,40 @@ class Stored(NamedTuple):
     load: Callable[[], NDArray[Any]]
 
 
-@dataclass(frozen=True, eq=False)
 class ArrayFile:
-    """Arrays of one file, by name; each is read on first use."""
+    """Arrays of numbers with one or two dimensions, each read on first use.
 
-    path: Path
-    stored: Mapping[str, Stored]  #: arrays of numbers with one or two dimensions
-    _loaded: dict[str, NDArray[Any]] = field(default_factory=dict)
+    The suffix of the file determines its format.
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the arrays."""
-        return tuple(self.stored)
+    Raises:
+        SourceError: it cannot be read, or has no array of numbers.
+    """
 
-    @classmethod
-    def read(cls, path: Path) -> ArrayFile:
-        """List the arrays of a file; its suffix determines the format.
-
-        Raises:
-            SourceError: it cannot be read, or has no array of numbers.
-        """
+    def __init__(self, path: Path) -> None:
+        self.path = path
         with _readable(path):
             open_file(path).close()  # raises for a pipe, which would block
             found = READERS[path.suffix.lower()](path)
-        usable = {
+        self._stored = {
             name: array
             for name, array in found.items()
             if len(array.shape) in (1, 2) and math.prod(array.shape) > 0
         }
-        if not usable:
+        if not self._stored:
             raise SourceError(path, "has no array of numbers with one or two dimensions")
-        return cls(path, usable)
+        self.names = tuple(self._stored)
+        self._loaded: dict[str, NDArray[Any]] = {}
 
-    def numbers(
-        self,
-        columns: Sequence[Column],
-        field: str,
-        array: str | None = None,
-        *,
-        rows: bool = False,
-    ) -> Array:
+    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
         """Return columns side by side, shape (m, columns).
 
-        They are arrays by name; or of the matrix `array`, columns (`rows`: rows) by index. `field`
-        is that of the map, for errors.
+        They are arrays by name, or columns by index of the matrix `array`. `field` is that of the
+        map, for errors.
 
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
         """
-        found = [self._column(one, field, array, rows=rows).astype(np.float64) for one in columns]
+        found = [self._column(one, field, array).astype(np.float64) for one in columns]
         if len({len(one) for one in found}) > 1:
             lengths = ", ".join(f"{c} {len(one)}" for c, one in zip(columns, found, strict=True))
             problem = f"its arrays differ in length: {lengths}"
@@ -174,36 +95,8 @@ class ArrayFile:
         return np.column_stack(found)
 
     def matrix(self, name: str | None, field: str) -> Array:
-        """Return an array as a matrix; without a name the only one there is.
-
-        Raises:
-            SourceError: no such array.
-        """
+        """Return an array as a matrix; without a name the only one there is, else SourceError."""
         return self._matrix(name, field).astype(np.float64)
-
-    def _matrix(self, name: str | None, field: str) -> NDArray[Any]:
-        array = self._named(name, field)
-        return array[:, None] if array.ndim == 1 else array
-
-    def _column(
-        self, column: Column, field: str, array: str | None, *, rows: bool = False
-    ) -> NDArray[Any]:
-        """Return one column (m,), in its own type."""
-        if array is None and isinstance(column, str):
-            found = self._named(column, field)
-            if found.ndim == 2 and 1 not in found.shape:
-                problem = f"array {column!r} has the shape {found.shape}"
-                remedy = "name an array of one dimension, or a column of it by index"
-                raise SourceError(self.path, problem, field=field, remedy=remedy)
-            return found.ravel()
-        matrix = self._matrix(array, field)
-        matrix = matrix.T if rows else matrix
-        if not isinstance(column, int) or column >= matrix.shape[1]:
-            what = "row" if rows else "column"
-            problem = f"array {array or next(iter(self.stored))!r} has no {what} {column!r}"
-            remedy = f"it has {matrix.shape[1]}, counted from 0"
-            raise SourceError(self.path, problem, field=field, remedy=remedy)
-        return np.asarray(matrix[:, column])
 
     def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
         """Return times as whole nanoseconds.
@@ -215,7 +108,7 @@ class ArrayFile:
             SourceError: no such array or column, or a time that is not finite.
         """
         if isinstance(column, int) and array is None:
-            times: NDArray[Any] = self.matrix(None, "time").ravel()
+            times = self._array(None, "time").ravel()
         else:
             times = self._column(column, "time", array)
         factor = 10 ** (9 - decimals)
@@ -234,14 +127,36 @@ class ArrayFile:
         part = np.rint((values - whole) * float(factor))
         return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
 
-    def _named(self, name: str | None, field: str) -> NDArray[Any]:
+    def _column(self, column: Column, field: str, array: str | None) -> NDArray[Any]:
+        """Return one column (m,), in its own type."""
+        if array is None and isinstance(column, str):
+            found = self._array(column, field)
+            if found.ndim == 2 and 1 not in found.shape:
+                problem = f"array {column!r} has the shape {found.shape}"
+                remedy = "name an array of one dimension, or a column of it by index"
+                raise SourceError(self.path, problem, field=field, remedy=remedy)
+            return found.ravel()
+        matrix = self._matrix(array, field)
+        if not isinstance(column, int) or column >= matrix.shape[1]:
+            problem = f"array {array or self.names[0]!r} has no column {column!r}"
+            remedy = f"it has {matrix.shape[1]}, counted from 0"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
+        return np.asarray(matrix[:, column])
+
+    def _matrix(self, name: str | None, field: str) -> NDArray[Any]:
+        array = self._array(name, field)
+        return array[:, None] if array.ndim == 1 else array
+
+    def _array(self, name: str | None, field: str) -> NDArray[Any]:
         """Return an array; without a name the only one there is."""
-        if name is None and len(self.stored) == 1:
-            (name,) = self.stored
-        if name is None or name not in self.stored:
-            raise self._absent(name, field)
+        name = self.names[0] if name is None and len(self.names) == 1 else name
+        if name is None or name not in self._stored:
+            problem = f"there is no array {name!r}" if name else "the name of the array is missing"
+            shapes = [f"{key} {array.shape}" for key, array in self._stored.items()]
+            remedy = f"its arrays are {', '.join(shapes[:_MOST_NAMED])}"
+            raise SourceError(self.path, problem, field=field, remedy=remedy)
         if name not in self._loaded:
-            stored = self.stored[name]
+            stored = self._stored[name]
             if math.prod(stored.shape) > MOST_NUMBERS:
                 problem = f"array {name!r} of shape {stored.shape} is too large to be read at once"
                 raise SourceError(self.path, problem, remedy="save the log in parts")
@@ -251,20 +166,6 @@ class ArrayFile:
                 raise SourceError(self.path, f"array {name!r} does not hold real numbers")
             self._loaded[name] = array
         return self._loaded[name]
-
-    def _absent(self, name: str | None, field: str) -> SourceError:
-        """Return the error of a missing array, with those that may be meant."""
-        if name is None:
-            problem, similar = "the name of the array is missing", [*self.stored]
-        else:
-            problem = f"there is no array {name!r}"
-            heads = (f"{name}.", f"{name}(", f"{name.rpartition('.')[0]}.")
-            similar = [key for key in self.stored if key.startswith(heads)] or [*self.stored]
-        shapes = [f"{key} {self.stored[key].shape}" for key in similar]
-        if len(shapes) > _MOST_NAMED:
-            shapes[_MOST_NAMED:] = [f"{len(shapes) - _MOST_NAMED} more"]
-        remedy = f"its arrays are {', '.join(shapes)}"
-        return SourceError(self.path, problem, field=field, remedy=remedy)
 
 
 @contextmanager
@@ -352,8 +253,6 @@ def _struct_fields(path: str, names: Sequence[str]) -> dict[str, NDArray[Any]]:
             return
         if value.dtype.kind in _NUMBERS:
             found[place] = np.squeeze(value) if value.ndim > 2 else value
-            if len(found) > _MOST_FIELDS:
-                raise ValueError(f"its structs have more than {_MOST_FIELDS} fields with numbers")
         elif value.dtype.names or value.dtype.kind == "O":
             one_struct = value.dtype.names and value.size == 1
             for number, element in enumerate(value.ravel(order="F"), 1):
@@ -394,14 +293,14 @@ def _within_memory(read: Callable[[], T]) -> T:
     return read()
 
 
+_lock = threading.Lock()
+_readers: list[WorkerProcess] = []
+
+
+@atexit.register
 def _close() -> None:
     while _readers:
         _readers.pop().close()
-
-
-_lock = threading.Lock()
-_readers: list[WorkerProcess] = []
-atexit.register(_close)
 
 
 def _matlab_text(path: Path) -> dict[str, Stored]:
@@ -414,8 +313,65 @@ def _matlab_text(path: Path) -> dict[str, Stored]:
     return _in_memory(found)
 
 
-def _mcap(path: Path) -> dict[str, Stored]:
-    return _in_memory(read_mcap(path))
+def read_mcap(path: Path) -> dict[str, NDArray[Any]]:
+    """Return arrays by ``topic/field``, such as ``/joint_states/position`` (m, n).
+
+    ``topic/stamp`` is the time of its messages [ns]: that of their header, or else the file's.
+
+    Raises:
+        SourceError: the file cannot be read, or has no topic that can be read this way.
+    """
+    known, messages = mcap_messages.read(path, lambda _, topic: topic.is_ros2)
+    refused = {name: f"{t} is not ROS 2" for name, t in known.items() if not t.is_ros2}
+    layouts: dict[str, MessageLayout] = {}
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    for name, stamp, data in messages:
+        if name in refused:
+            continue
+        try:
+            if name not in layouts:
+                definition = known[name].definition.decode(errors="replace")
+                layouts[name] = layout_of(known[name].kind, definition, data)
+            size = layouts[name].size
+            if len(data) - size not in range(4):  # a writer may pad the end to whole words
+                raise LayoutError("its messages differ in length")
+        except LayoutError as error:
+            refused[name] = str(error)
+            found.pop(name, None)
+            continue
+        found.setdefault(name, []).append((stamp, data[:size]))
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, own in found.items():
+        try:
+            columns = _columns(layouts[name], own)
+        except LayoutError as error:
+            refused[name] = str(error)
+        else:
+            arrays |= {f"{name}/{field}": column for field, column in columns.items()}
+    if not arrays:
+        reasons = "; ".join(f"{name}: {why}" for name, why in refused.items()) or "it has no topic"
+        problem = f"has no topic whose messages can be read as columns ({reasons})"
+        remedy = "record joint states and currents as ROS 2 messages of constant size"
+        raise SourceError(path, problem, remedy=remedy)
+    return arrays
+
+
+def _columns(
+    layout: MessageLayout, messages: Sequence[tuple[int, bytes]]
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of messages of one topic, given with log times [ns], and their stamps."""
+    joined = np.frombuffer(b"".join(data for _, data in messages), np.uint8)
+    data = joined.reshape(len(messages), layout.size)
+    if not layout.matches(data):
+        raise LayoutError("its messages differ in names or lengths of arrays")
+    rows = data.view(layout.dtype)[:, 0]
+    columns: dict[str, NDArray[Any]] = {
+        name: rows[name].copy() for name in layout.dtype.names or ()
+    }
+    seconds, rest = (columns.pop(f"header/stamp/{part}", None) for part in ("sec", "nanosec"))
+    if seconds is None or rest is None or not (seconds.any() or rest.any()):
+        return {"stamp": np.array([stamp for stamp, _ in messages], np.int64), **columns}
+    return {"stamp": np.asarray(seconds.astype(np.int64) * 10**9 + rest), **columns}
 
 
 def _in_memory(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Stored]:
@@ -431,6 +387,6 @@ READERS: Mapping[str, Callable[[Path], dict[str, Stored]]] = {
     ".npy": _npy,
     ".mat": _mat,
     ".m": _matlab_text,
-    ".mcap": _mcap,
+    ".mcap": lambda path: _in_memory(read_mcap(path)),
 }
 """Readers of files of arrays by suffix; every other file is text in columns."""

@@ -142,8 +142,6 @@ class _Log:
             return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
         columns = (columns,) if isinstance(columns, str) else columns
         self._check_count(columns, field)
-        if isinstance(file, ArrayFile) and quantity.joints_along == "rows":
-            return file.numbers(columns, field, array, rows=True)
         return file.numbers(columns, field, array)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:
@@ -194,11 +192,9 @@ class _Log:
             raise SourceError(
                 self.path,
                 f"there is no {what[:-1]} {missing[0]!r} for {self.joints[joint]}, joint "
-                f"{joint + 1} of {count}",
+                f"{joint + 1} of {count}; there are {', '.join(known) or 'none'}",
                 field=field,
-                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}"
-                + ", or skip lines before their names ([format] skip_rows)" * (what == "columns")
-                + (f"; its {what} are {', '.join(known)}" if known else ""),
+                remedy=f"{NOT_RECORDED}, name the joints of the log in joints, or list its {what}",
             )
         present = [name for name in names if name in known]
         if len(present) > count:
@@ -207,8 +203,7 @@ class _Log:
                 f"{len(present)} {what} are called {pattern!r} ({present[0]} to {present[-1]}), "
                 f"and there are {count} joints: {', '.join(self.joints)}",
                 field=field,
-                remedy=f"select: the URDF's joint of each in joints (a joint that the URDF does "
-                f"not have is left out), or a list of {count} {what}",
+                remedy=f"name the URDF's joint of each in joints, or list {count} {what}",
             )
         return found
 
@@ -241,7 +236,7 @@ class _Log:
         path = self.path if name is None else self._folder / name
         if path not in self.files:
             arrays = path.suffix.lower() in READERS
-            read = ArrayFile.read(path) if arrays else Table.read(path, self._map.format)
+            read = ArrayFile(path) if arrays else Table.read(path, self._map.format)
             self.files[path] = read
         return self.files[path]
 
@@ -253,8 +248,8 @@ class _Log:
                 self.path,
                 f"the map names the joints {', '.join(self.joints)}",
                 field="joints",
-                remedy=f"the robot's joints are {', '.join(robot.joint_names)}"
-                + (f"; {NOT_RECORDED}" if missing else ", each named once"),
+                remedy=f"the robot's joints are {', '.join(robot.joint_names)}; name each once, or "
+                f"{NOT_RECORDED}",
             )
         return [self.joints.index(name) for name in robot.joint_names]
 

@@ -11,11 +11,9 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +107,7 @@ def sums(campaign: Campaign) -> dict[str, str]:
     }
 
 
-@pytest.mark.parametrize("left", [0, 40, 400])
+@pytest.mark.parametrize("left", [0, 400])
 def test_run_on_a_full_disk_leaves_complete_archives(
     disk: Disk, campaign: Campaign, left: int
 ) -> None:
@@ -238,25 +236,6 @@ def test_campaign_that_cannot_be_created_leaves_nothing(disk: Disk, campaign: Ca
         Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
     disk.empty()
     Campaign.create(disk.root / "other", campaign.cell, campaign.plan)
-
-
-@pytest.mark.parametrize(
-    ("text", "passes"),
-    [
-        ("{root}/campaign/archives/a.mcap: cannot be written further: {full}", True),
-        ("/elsewhere/campaign/archives/a.mcap: cannot be written further: {full}", False),
-        ("{root}/second: cannot be written to ({full})", False),
-        ("the campaign cannot continue: {full}", False),
-        ("{root}/campaign: cannot be written to", False),
-    ],
-)
-def test_error_must_name_the_path_that_cannot_be_written(
-    tmp_path: Path, text: str, passes: bool
-) -> None:
-    error = HilError(text.format(root=tmp_path, full="No space left on device"))
-    result = cast("Result", SimpleNamespace(exception=error, output=""))
-    with nullcontext() if passes else pytest.raises(AssertionError):
-        require_error(result, Disk(tmp_path), "campaign")
 
 
 # The folder, or a part of it, is removed while the campaign runs

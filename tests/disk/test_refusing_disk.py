@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -163,21 +161,6 @@ def test_manifest_that_cannot_be_written_is_reported(
     assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
 
 
-def test_suppressed_error_is_detected(
-    disk: Disk, designed: Designed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    campaign = rehearsed(disk, "swallowed", designed)
-    true = Campaign.run
-
-    def swallowing(*arguments: Any, **named: Any) -> None:
-        with suppress(HilError):
-            true(*arguments, **named)
-
-    monkeypatch.setattr(Campaign, "run", swallowing)
-    with pytest.raises(AssertionError, match="struck, and it was raised: None"):
-        refused_run(disk, campaign, Rule((WRITE,), "*.mcap", error="EIO"))
-
-
 def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) -> None:
     """Without a manifest it would look like one whose cell file was edited."""
     root = disk.root / "half"
@@ -208,11 +191,7 @@ def test_many_failures_cost_one_motion_only(disk: Disk, designed: Designed) -> N
     assert rounds(disk, designed, range(100, 140)) > 20
 
 
-REFUSED = [
-    pytest.param(Rule((operation,), error=error), id=f"{error} at {operation}")
-    for operation in (SYNC, RENAME)
-    for error in sorted(REFUSALS)
-]
+REFUSED = [Rule((operation,), error="EIO") for operation in (SYNC, RENAME)]
 REFUSAL = r"cannot be written \(.+\).*nothing there was changed: make room"
 
 

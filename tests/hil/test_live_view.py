@@ -147,12 +147,8 @@ def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
     [
         ("9000", "127.0.0.1", 9000),
         ("0.0.0.0:8765", "0.0.0.0", 8765),
-        ("localhost:1", "localhost", 1),
         ("[::1]:8765", "::1", 8765),
-        *(
-            (text, "", 0)
-            for text in ("", "localhost", "a b:1", "a:99999", "::1", "ws://a:1", "a:-1")
-        ),
+        *((text, "", 0) for text in ("", "localhost", "a:99999", "::1", "ws://a:1")),
     ],
 )
 def test_an_address_is_host_and_port_or_a_port_on_this_computer(

@@ -46,7 +46,7 @@ from hil.importers.column_map import Format
 from hil.importers.rosbag2 import bag_files, topics
 from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
-from hil.reading import open_file, parse_json, parse_toml, read_text
+from hil.reading import open_file, parse_toml, read_text
 from hil.results import Results
 from hil.study.records import Record, read_record, write_record
 from hil.study.results import StudyResults
@@ -221,7 +221,7 @@ def test_link_is_no_lock(folder: Path) -> None:
 
 RECORDINGS: dict[str, Callable[[Path], object]] = {
     "log.csv": lambda path: Table.read(path, Format()),
-    **{f"log{suffix}": ArrayFile.read for suffix in READERS},
+    **{f"log{suffix}": ArrayFile for suffix in READERS},
     "bag.db3": bag_files,
     "bag.mcap": lambda path: topics(*bag_files(path)),
     "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
@@ -292,15 +292,6 @@ SHAPES = {
 }
 MEMBERS = {f"{name}.npy": member(np.zeros(shape)) for name, shape in SHAPES.items()}
 MEMBERS["example_archive.npy"] = member("one.mcap")
-NO_TIME = {
-    "no array": b"of bytes",
-    "another shape": member([1.0]),
-    "no shape": member(1.0),
-    "texts": member(["a", "b", "c"]),
-    "numbers too large for an axis": member([0.0, 1e308, -1e308]),
-    "a shape too large for any number": claiming((10**30,)),
-    "a head without end": b"\x93NUMPY\x01\x00\x04\x00((((",
-}  # Invalid times of an example
 
 
 def test_series_of_a_report_are_read_as_written(folder: Path) -> None:
@@ -326,29 +317,25 @@ def test_series_of_a_report_are_numbers_of_limited_size(
     trace = folder.parent / "unpickled"
     pickled = io.BytesIO()
     np.save(pickled, np.array([Opens(trace)], dtype=object), allow_pickle=True)
-    bombs = {
-        "nothing": b"",
-        "a pickle": pickled.getvalue(),
-        "a pickle as a member": series({"time.npy": pickled.getvalue()}),
-        "a claim of terabytes": series({"time.npy": claiming((1 << 40,))}),
-        "much out of little": series({f"{i}.npy": bytes(1 << 18) for i in range(17)}),
-    }
-    bombs |= {what: series(MEMBERS | {"example_time.npy": data}) for what, data in NO_TIME.items()}
+    bombs = (
+        b"",
+        series({"time.npy": pickled.getvalue()}),
+        series({"time.npy": claiming((1 << 40,))}),
+        series({f"{i}.npy": bytes(1 << 18) for i in range(17)}),  # much out of little
+        *(
+            series(MEMBERS | {"example_time.npy": data})
+            for data in (member([1.0]), member(["a", "b", "c"]), member([0.0, 1e308, -1e308]),
+                         claiming((10**30,)), b"\x93NUMPY\x01\x00\x04\x00((((")
+        ),
+    )  # fmt: skip
     loaded = SimpleNamespace(joint_names=["a", "b"])
     monkeypatch.setattr(Results, "load", lambda _: loaded)
     monkeypatch.setattr("hil.outcome._LARGEST", 1 << 22)
-    for data in bombs.values():
+    for data in bombs:
         (folder / SERIES).write_bytes(data)
         with pytest.raises(InputError, match="does not contain the series of a report"):
             rewrite_report(folder)
     assert not trace.exists()
-
-
-@pytest.mark.parametrize("thing", ["a pipe", "a device", DEEP])
-def test_invalid_text_is_refused(thing: str, tmp_path: Path) -> None:
-    put(tmp_path / "it", thing)
-    with within(20.0), pytest.raises((OSError, ValueError)):
-        parse_json(read_text(tmp_path / "it"))
 
 
 def test_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
@@ -362,11 +349,8 @@ def test_text_is_read_with_any_line_ends(tmp_path: Path) -> None:
 NAMES = {
     "a\x1b]0;title\x07\x1b[31mb": r"a\x1b]0;title\x07\x1b[31mb",
     "a\nerror: all is well": r"a\nerror: all is well",
-    "a\u202eb": r"a\u202eb",
     "a\udcffb": r"a\udcffb",
-    "a\\[bold]b[/]": r"a\[bold]b[/]",
     "[link=http://x]a[/link]": "[link=http://x]a[/link]",
-    ":smile:": ":smile:",
 }
 
 
@@ -504,48 +488,6 @@ def test_saved_documents_are_read_back(folder: Path) -> None:
     assert WarmUp.load(folder / "warmup.json", warm.plan_hash) == warm
 
 
-BROKEN: dict[str, list[tuple[tuple[str, ...], object]]] = {
-    "dry_run.json": [
-        (("override",), "x"), (("archives",), 3), (("current_share",), [0.1]),
-        (("current_share",), ["x", 1]), (("missed",), "x"), (("against_gravity",), 3),
-        (("against_gravity",), [3]), (("joint_names",), 3), (("accepted",), []),
-        (("accepted",), {"by": "\ud800", "at": "x"}), (("simulated",), 1),
-        (("format_version",), [2]),
-    ],
-    "warmup.json": [
-        (("outcome",), 3), (("outcome",), "\ud800"), (("outcome",), "hot"), (("threshold",), "x"),
-        (("motions",), [{"archive": "w", "friction": ["x", 1]}]),
-        (("motions",), [{"archive": "w", "friction": [1.0]}]),
-        (("moved_at",), "now"), (("earlier",), 3),
-    ],
-    "plan.json": [
-        (("excitation", "seed"), float("inf")), (("excitation", "fly"), HUGE),
-        (("excitation", "speed"), [HUGE, 1]), (("excitation", "speed"), ["0.1", "0.2"]),
-        (("excitation", "via_points"), []), (("excitation", "via_points"), 5.0),
-        (("excitation", "criteria", "log10_det"), "x"), (("excitation", "trajectory"), []),
-        (("excitation", "trajectory", "knots"), [[0, HUGE], [0, 1]]),
-        (("excitation", "rejected"), {"a": []}), (("excitation",), []),
-        (("validation",), 3), (("validation",), {"a": 1}), (("moves",), 3),
-    ],
-}  # fmt: skip
-READ_OR_REFUSED = [
-    *(
-        ("manifest.json", "archives", [ENTRY | entry])
-        for entry in (
-            {"name": f"excitation_{DIGITS}_a1.mcap"},
-            {"name": "a" * 300},
-            {"name": "a\0b"},
-            {"name": "\ud800.mcap", "reason": "\ud800"},
-        )
-    ),
-    ("manifest.json", "inputs", [[1, 2]]),
-    ("manifest.json", "inputs", {"plan.json": 3}),
-    ("dry_run.json", "missed", HUGE),
-    ("dry_run.json", "duration", HUGE),
-    ("warmup.json", "motions", [{"archive": "w", "friction": [HUGE, 1]}] * 3),
-    ("warmup.json", "moved_at", HUGE),
-    ("warmup.json", "threshold", HUGE),
-]
 LOADED: dict[str, Callable[[Path], object]] = {
     "dry_run.json": lambda folder: DryRun.load(CampaignFolder(folder)),
     "warmup.json": lambda folder: WarmUp.load(
@@ -553,6 +495,28 @@ LOADED: dict[str, Callable[[Path], object]] = {
     ),
     "plan.json": lambda folder: Campaign.open(folder).status(),
 }
+BROKEN: list[tuple[str, tuple[str, ...], object]] = [
+    ("dry_run.json", ("current_share",), [0.1]),
+    ("dry_run.json", ("against_gravity",), [3]),
+    ("dry_run.json", ("accepted",), {"by": "\ud800", "at": "x"}),
+    ("warmup.json", ("outcome",), "\ud800"),
+    ("warmup.json", ("motions",), [{"archive": "w", "friction": [1.0]}]),
+    ("plan.json", ("excitation", "seed"), float("inf")),
+    ("plan.json", ("excitation", "fly"), HUGE),
+    ("plan.json", ("excitation", "via_points"), 5.0),
+    ("plan.json", ("excitation", "trajectory", "knots"), [[0, HUGE], [0, 1]]),
+    ("plan.json", ("validation",), {"a": 1}),
+]
+READ_OR_REFUSED = [
+    *(
+        ("manifest.json", "archives", [ENTRY | entry])
+        for entry in ({"name": f"excitation_{DIGITS}_a1.mcap"}, {"name": "a" * 300},
+                      {"name": "a\0b"}, {"name": "\ud800.mcap", "reason": "\ud800"})
+    ),
+    ("manifest.json", "inputs", [[1, 2]]),
+    ("dry_run.json", "missed", HUGE),
+    ("warmup.json", "moved_at", HUGE),
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -563,9 +527,7 @@ def done(folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("file", "place", "value"), [(f, *case) for f, cases in BROKEN.items() for case in cases]
-)
+@pytest.mark.parametrize(("file", "place", "value"), BROKEN)
 def test_changed_value_is_refused(
     file: str, place: tuple[str, ...], value: object, done: Path
 ) -> None:
@@ -573,10 +535,8 @@ def test_changed_value_is_refused(
         (done / "manifest.json").unlink(missing_ok=True)
     doctored(done / file, *place, value=value)
     message = "is not a campaign plan" if file == "plan.json" else f"{file} is damaged"
-    with pytest.raises(InputError, match=re.escape(message)) as refused:
+    with pytest.raises(InputError, match=re.escape(message)):
         LOADED[file](done)
-    if file != "plan.json":
-        assert isinstance(refused.value, CampaignFolderError)
     if file == "dry_run.json":
         assert not conduct_of(CampaignFolder(done)).steps[1].done
     read(done)

