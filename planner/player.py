@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from math import ceil, isfinite, sqrt
+from math import ceil, sqrt
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -142,10 +142,6 @@ class TrajectoryPlayer:
         finished: Whether the last set-point of the motion, or of its stop, was returned.
         bounds: Bounds that the last set-point satisfies, or the next one if those are wider: "plan"
             at a constant rate, "override" or "stop" while the rate changes, "stop" after `stop`.
-
-    Raises:
-        InvalidSetting: a period, tolerance or factor outside its range, or limits of another
-            number of joints.
     """
 
     def __init__(
@@ -160,20 +156,6 @@ class TrajectoryPlayer:
         stop_jerk: float = 3.0,
         start_tolerance: float = 1e-3,
     ) -> None:
-        _check("period", period, "a time above 0 s", period > 0.0)
-        for name, override, stop in (
-            ("acceleration", override_acceleration, stop_acceleration),
-            ("jerk", override_jerk, stop_jerk),
-        ):
-            _check(f"override_{name}", override, "above 1", override > 1.0)
-            _check(f"stop_{name}", stop, "above 1", stop > 1.0)
-            least = f"at least override_{name} = {override}"
-            _check(f"stop_{name}", stop, least, stop >= override)
-        _check("start_tolerance", start_tolerance, "0 rad or more", start_tolerance >= 0.0)
-        if limits.n_joints != trajectory.n_joints:
-            raise InvalidSetting(
-                "limits", f"those of {limits.n_joints} joints", f"those of {trajectory.n_joints}"
-            )
         self._period = period
         self._tolerance = start_tolerance
         extrema = trajectory.extrema() if isinstance(trajectory, PiecewiseCubic) else None
@@ -352,7 +334,8 @@ class TrajectoryPlayer:
         Raises:
             InvalidSetting: the fraction is out of range.
         """
-        _check("override", fraction, "a number from 0 to 1", 0.0 <= fraction <= 1.0)
+        if not 0.0 <= fraction <= 1.0:
+            raise InvalidSetting("override", fraction, "a number from 0 to 1")
         self._override = float(fraction)
         if self.finished or self._stopping or self._held:
             return
@@ -406,11 +389,6 @@ class TrajectoryPlayer:
         """Set the rate at the start, where the arm is at rest."""
         self._law.restart(0.0, rate)
         self._tabled = rate == 1.0
-
-
-def _check(name: str, value: float, valid: str, allowed: bool) -> None:
-    if not (allowed and isfinite(value)):
-        raise InvalidSetting(name, value, valid)
 
 
 def _tabulate(trajectory: Trajectory, period: float) -> _SetPoints:

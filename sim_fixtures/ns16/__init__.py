@@ -1,4 +1,16 @@
-"""The COMAU SMART NS 16-1.65: geometry, true parameters, Table 2 of the paper, URDF, cell file."""
+"""The COMAU SMART NS 16-1.65: true parameters, Table 2 of the paper, URDF, cell file.
+
+Standard DH, T_i = Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Link frame i has the axes of DH frame i and
+its origin at O_{i-1}, a point of the joint axis, to which the parameters of Table 2 refer.
+
+Table 2 determines a_1, a_2, a_3, d_4 and the twists alpha_2 ... alpha_5, not the sign of alpha_1
+(a mirror image has the same table), d_1, d_6, the zero positions and the directions of rotation.
+Chosen are alpha_1 = -90 deg with z0 up, d_1 and d_6 of the data sheet, and published directions.
+With the forearm level, the elbow offset a_3 then puts the forearm *below* the elbow axis and home
+turns the flange up, the mirror image of the real arm; dynamics and identification are the same.
+
+At controller angles of zero, links 2 and 3 are upright; at -90 deg of axis 3 the forearm is level.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +25,6 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
-
-from sim_fixtures.ns16 import geometry
 
 TRUTH_PATH = Path(__file__).with_name("truth.json")
 TENSOR_KEYS = ("xx", "xy", "xz", "yy", "yz", "zz")
@@ -109,8 +119,10 @@ Terms = dict[str, float]
 TABLE2_PATH = Path(__file__).with_name("table2.csv")
 N_ESSENTIAL = 40
 
-_A1, _A2, _A3 = geometry.A[:3]
-_D4 = -geometry.D[3]
+A = (0.300, 0.700, 0.185, 0.0, 0.0, 0.0)  # link lengths a_i, m
+D = (0.600, 0.0, 0.0, -0.624, 0.0, 0.135)  # link offsets d_i, m
+_A1, _A2, _A3 = A[:3]
+_D4 = -D[3]
 
 
 @dataclass(frozen=True)

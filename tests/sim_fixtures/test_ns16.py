@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_fixtures import ControllerSettings, ns16
-from sim_fixtures.ns16 import geometry
 from tests.sim_fixtures.bench import CELL
 
 Array = NDArray[np.float64]
@@ -23,8 +22,9 @@ def model() -> pin.Model:
 
 def dh(controller_deg: list[float]) -> Array:
     """DH angles [rad] of controller angles [deg]."""
-    angles = np.array(controller_deg) - geometry.JOINT_OFFSET_DEG
-    return np.radians(angles * geometry.JOINT_SIGN)
+    train = CELL["drive_train"]
+    angles = np.array(controller_deg) - train["joint_offset_deg"]
+    return np.radians(angles * train["joint_sign"])
 
 
 def wrist_and_flange(model: pin.Model, controller_deg: list[float]) -> tuple[Array, Array]:
@@ -62,13 +62,13 @@ def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) 
     pin.forwardKinematics(model, data, q)
     before = np.eye(4)
     for i in range(6):
-        alpha = geometry.ALPHA_QUARTER_TURNS[i] * np.pi / 2
+        alpha = (-1, 0, -1, -1, -1, 0)[i] * np.pi / 2
         c, s, ca, sa = np.cos(q[i]), np.sin(q[i]), np.cos(alpha), np.sin(alpha)
         after = before @ np.array(
             [
-                [c, -s * ca, s * sa, geometry.A[i] * c],
-                [s, c * ca, -c * sa, geometry.A[i] * s],
-                [0.0, sa, ca, geometry.D[i]],
+                [c, -s * ca, s * sa, ns16.A[i] * c],
+                [s, c * ca, -c * sa, ns16.A[i] * s],
+                [0.0, sa, ca, ns16.D[i]],
                 [0.0, 0.0, 0.0, 1.0],
             ]
         )
@@ -80,7 +80,7 @@ def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) 
 
 
 def test_home_has_the_wrist_in_front_of_and_above_the_base(model: pin.Model) -> None:
-    wrist, flange = wrist_and_flange(model, list(geometry.HOME_DEG))
+    wrist, flange = wrist_and_flange(model, CELL["campaign"]["home_deg"])
     np.testing.assert_allclose(wrist, [0.300 + 0.624, 0.0, 0.600 + 0.700 - 0.185], atol=1e-12)
     # a wrist bent by 90 deg turns the flange out of the forearm's line, straight up or down
     np.testing.assert_allclose(np.abs(flange - wrist), [0.0, 0.0, 0.135], atol=1e-12)
@@ -99,7 +99,7 @@ def test_limits_are_the_controllers_mapped_to_dh_angles(model: pin.Model) -> Non
         [(-180, 180), (-140, 5), (-20, 260), (-360, 360), (-120, 120), (-360, 360)],
         atol=1e-12,
     )
-    ends = np.sort([dh(list(geometry.LOWER_DEG)), dh(list(geometry.UPPER_DEG))], axis=0)
+    ends = np.sort([dh(CELL["limits"][f"{end}_deg"]) for end in ("lower", "upper")], axis=0)
     np.testing.assert_allclose(ends[0], model.lowerPositionLimit, atol=1e-12)
     np.testing.assert_allclose(ends[1], model.upperPositionLimit, atol=1e-12)
 
@@ -204,17 +204,6 @@ class TestNominal:
         errors = np.abs(share - 1.0)
         assert np.all((errors > 0.0995) & (errors < 0.2005))  # figures of 4 digits
         assert share.min() < 1.0 < share.max()
-
-
-def test_the_limits_and_signs_are_those_of_the_geometry() -> None:
-    limits, train = CELL["limits"], CELL["drive_train"]
-    assert limits["frame"] == "controller"
-    assert tuple(limits["lower_deg"]) == geometry.LOWER_DEG
-    assert tuple(limits["upper_deg"]) == geometry.UPPER_DEG
-    assert tuple(limits["velocity_deg"]) == geometry.VELOCITY_DEG
-    assert tuple(train["joint_sign"]) == geometry.JOINT_SIGN
-    assert tuple(train["joint_offset_deg"]) == geometry.JOINT_OFFSET_DEG
-    assert tuple(CELL["campaign"]["home_deg"]) == geometry.HOME_DEG
 
 
 def test_nothing_of_the_drive_train_is_trivial() -> None:
