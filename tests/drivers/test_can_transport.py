@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import os
 import pickle
@@ -305,40 +304,19 @@ def test_missing_bus_has_a_remedy():
         open_controller_link(CanSpec("socketcan", "vcan77", period=0.002))
 
 
-@pytest.mark.parametrize(
-    ("interface", "channel"), [("udp_multicast", "nonsense"), ("slcan", "/dev/no-such-port")]
-)
-def test_failed_opening_leaves_no_warning(interface, channel, caplog):
-    with pytest.raises(TransportError, match=channel) as caught:
-        CanSpec(interface, channel, period=0.002).open()
-    del caught
-    gc.collect()
-    assert caplog.messages == []
+def test_adapter_that_refuses_the_bit_rate_is_closed(monkeypatch):
+    refused = []
 
-
-def test_adapter_that_refuses_the_bit_rate_is_closed(monkeypatch, caplog):
-    def refuse(*_):
+    def refuse(bus, *_):
+        refused.append(bus)
         raise ValueError("no such rate")
 
     monkeypatch.setattr(can.interfaces.slcan.slcanBus, "set_bitrate", refuse)
-    bus = SlcanBus()
-    with pytest.raises(TransportError, match="no such rate") as caught:
-        slcan(bus.ports[0]).open()
-    del caught
-    gc.collect()
-    bus.close()
-    assert caplog.messages == []
-
-
-def test_controller_link_is_checked_before_opening():
-    with pytest.raises(ControllerLinkError, match=r"135\.0 % of a cycle of 1 ms") as caught:
-        open_controller_link(CanSpec("virtual", "0", "classic", period=0.001))
-    assert isinstance(caught.value.__cause__, CanBusLoadError)
-    with pytest.raises(ControllerLinkError, match="mode 8") as caught:
-        open_controller_link(CanSpec("virtual", "0", period=0.002), mode=8)
-    assert isinstance(caught.value.__cause__, CanModeError)
-    with pytest.raises(ControllerLinkError, match="7 axes"):
-        open_controller_link(CanSpec("virtual", "0", period=0.002, n_axes=7))
+    adapter = SlcanBus()
+    with pytest.raises(TransportError, match="no such rate"):
+        slcan(adapter.ports[0]).open()
+    assert not refused[0].serialPortOrig.is_open
+    adapter.close()
 
 
 def test_settings_are_checked_before_opening():
@@ -350,14 +328,11 @@ def test_settings_are_checked_before_opening():
         CanSpec("virtual", "0", data_bitrate=1_000_000, period=0.001).check()
     with pytest.raises(CanAxesError, match="7 axes"):
         CanSpec("virtual", "0", period=0.002, n_axes=7).check()
-
-
-@pytest.mark.parametrize("mode", [1, 2, 8, 9, 10, 14, 3])
-def test_modes_without_code_are_refused(profile, mode):
-    spec = CanSpec("virtual", "0", profile, period=0.002)
-    with pytest.raises(CanModeError, match=f"mode {mode} ") as caught:
-        spec.check(mode=mode)
-    assert f"mode {mode} " in str(caught.value)
+    for mode in (1, 2, 3, 8, 9, 10):
+        with pytest.raises(CanModeError, match=f"mode {mode} "):
+            CanSpec("virtual", "0", period=0.002).check(mode=mode)
+    with pytest.raises(ControllerLinkError, match=r"135\.0 % of a cycle of 1 ms"):
+        open_controller_link(CanSpec("virtual", "0", "classic", period=0.001))
 
 
 def test_settings_and_errors_pickle():
@@ -442,21 +417,6 @@ def test_motion_with_lost_cycles(profile):
     (ended,) = run.seen(MotionEnded)
     assert ended.outcome == "completed", ended.reason
     assert len(run.seen(GapSeen)) > 10
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("profile", PROFILES)
-def test_complete_session_over_two_serial_adapters(profile):
-    bus = SlcanBus()
-    ends = (
-        slcan(bus.ports[0], profile, PERIOD).open(),
-        open_controller_link(slcan(bus.ports[1], profile, PERIOD)),
-    )
-    run = Run(profile, ends=ends, cycles=250, missed_replies=50)
-    bus.close()
-    (ended,) = run.seen(MotionEnded)
-    assert ended.outcome == "completed", ended.reason
-    assert bus.refused == []
 
 
 class Overflowing(queue.Queue):

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers import cycle_dtype, errors, events
+from drivers import errors, events
 from drivers.errors import (
     AxisNotInMode,
     CorrectionNotEnded,
@@ -30,16 +30,14 @@ from drivers.errors import (
 )
 from drivers.packets import InitPacket
 from drivers.record import (
-    COMMANDED,
     MEASURED,
     CycleRing,
     PacketReader,
     PacketRing,
     RingReader,
 )
-from drivers.states import State
 from drivers.transports.tapped import MAX_BUFFERED, TappedTransport
-from tests.drivers.rig import Cruise, N, Rig, init_packet, moving, running, still
+from tests.drivers.rig import Cruise, N, moving
 
 
 def put(ring: CycleRing, count: int, first: int = 0) -> None:
@@ -115,16 +113,6 @@ class TestRing:
             RingReader(ring.fd, 7)
         with pytest.raises(ValueError, match="at least 2"):
             CycleRing.shared(N, 1)
-
-
-def test_fields_of_a_record():
-    dtype = cycle_dtype(6)
-    scalars = {"cycle": "i8", "number": "i4", "arrival": "f8", "gap": "i4", "interval": "i4"}
-    for name, kind in {**scalars, "state": "u1", "status": "u1"}.items():
-        assert dtype[name] == np.dtype(kind)
-    assert dtype["mode"] == np.dtype(("i4", (6,)))
-    for name in (*MEASURED, *COMMANDED):
-        assert dtype[name] == np.dtype(("f8", (6,)))
 
 
 def test_blocks_and_fields_are_the_same_memory():
@@ -289,6 +277,7 @@ EXAMPLES = {
     AxisNotInMode: AxisNotInMode(2, 0, 4, 99),
     ModeRefused: ModeRefused(2, 3, False, 99),
     ExitTimeout: ExitTimeout(5000, 6000),
+    CorrectionNotEnded: CorrectionNotEnded(1, 2.0, 0.0, 3, "rad/s"),
     errors.SessionFailed: errors.SessionFailed("why", 7),
     errors.TargetNotFinite: errors.TargetNotFinite(2, 6, float("inf"), 8),
 }
@@ -346,36 +335,6 @@ def test_errors_pickle(kind):
         assert again.check == error.check
 
 
-def test_error_with_its_own_unit_pickles():
-    again = through_pickle(CorrectionNotEnded(1, 2.0, 0.0, 3, "rad/s"))
-    assert again.unit == "rad/s"
-    assert "2 rad/s" in str(again)
-
-
-EVENTS = {
-    events.InitReceived: events.InitReceived(init_packet(), "why not", ("a", "b"), True),
-    events.StateChanged: events.StateChanged(State.CLOSED, State.OPEN, 5),
-    events.GapSeen: events.GapSeen(2, 9),
-    events.AnswersLost: events.AnswersLost(1, 9),
-    events.MotionStarted: events.MotionStarted(0, 10),
-    events.OverrideChanged: events.OverrideChanged(0.2, 12),
-    events.HoldChanged: events.HoldChanged(True, 14),
-    events.MotionEnded: events.MotionEnded("lost", "the drive went off", 0, 20),
-    events.PacketRejected: events.PacketRejected("foreign", 3),
-    events.Refused: events.Refused(
-        errors.JerkLimit(0, 1.0, 2.0, 3), np.zeros(4, cycle_dtype(6))
-    ),
-    events.LinkLost: events.LinkLost(1.5, State.OPEN),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("kind", get_args(events.Event), ids=lambda kind: kind.__name__)
-def test_events_pickle(kind):
-    event = EVENTS[kind]
-    assert type(event) is kind
-    assert_same(event, through_pickle(event))
-
-
 def _nothing(self, *_):
     pass
 
@@ -403,24 +362,3 @@ def test_events_of_a_session_pickle():
     assert {type(event) for event in rig.events} == set(get_args(events.Event))
     for event in rig.events:
         assert_same(event, through_pickle(event))
-
-
-def test_cause_of_a_failed_source_is_in_its_message():
-    class Broken:
-        bounds, finished = "plan", False
-
-        def begin(self, position):
-            raise StopIteration
-
-        advance = stop = begin
-
-    rig = running(Broken())
-    assert "StopIteration" in str(through_pickle(rig.refusal))
-
-
-def test_counters_pickle():
-    rig = Rig()
-    rig.session.request(still(2))
-    rig.session.discarded("torn", 4)
-    rig.open()
-    assert through_pickle(rig.session.counters) == rig.session.counters

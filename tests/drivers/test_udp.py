@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import socket
 import struct
 import time
@@ -321,13 +320,6 @@ class TestOpening:
         transport.close()
         assert len(transport.notes) == 4
         assert any("SO_PRIORITY" in note for note in transport.notes)
-
-    def test_settings_and_error_pickle(self):
-        spec = UdpSpec("10.2.12.150", 1000, "10.2.12.149")
-        assert pickle.loads(pickle.dumps(spec)) == spec
-        error = TransportError("UDP port 1000", "taken", "free it")
-        copy = pickle.loads(pickle.dumps(error))
-        assert (str(copy), vars(copy)) == (str(error), vars(error))
 
 
 class TestSession:

@@ -124,7 +124,7 @@ class Bits(NamedTuple):
     data: int = 0
 
 
-def classic_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
+def classic_bits(n_bytes: int) -> Bits:
     """Return the bits of a classic data frame with 0..8 bytes, with worst-case stuffing.
 
     Bits of ISO 11898-1 with 11-bit identifiers, interframe space included. A classic frame is
@@ -132,16 +132,15 @@ def classic_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
     case is a stuff bit after the first five equal bits and then after every fourth.
     """
     stuffable = _CLASSIC_HEAD + 8 * n_bytes + 15
-    stuffing = (stuffable - 1) // 4 if stuffed else 0
-    return Bits(stuffable + stuffing + _TAIL)
+    return Bits(stuffable + (stuffable - 1) // 4 + _TAIL)
 
 
-def fd_bits(n_bytes: int, *, stuffed: bool = True) -> Bits:
+def fd_bits(n_bytes: int) -> Bits:
     """Return the bits of an FD frame with bit rate switch; see `classic_bits`."""
     crc, fixed = (17, 6) if n_bytes <= 16 else (21, 7)
     payload = _FD_CONTROL + 8 * n_bytes
-    early = (_FD_ARBITRATION - 1) // 4 if stuffed else 0
-    late = (_FD_ARBITRATION + payload - 1) // 4 - early if stuffed else 0
+    early = (_FD_ARBITRATION - 1) // 4
+    late = (_FD_ARBITRATION + payload - 1) // 4 - early
     return Bits(_FD_ARBITRATION + early + _TAIL, payload + late + 4 + crc + fixed)
 
 
@@ -153,10 +152,9 @@ class BusRates:
     bitrate: int = 1_000_000
     data_bitrate: int = 5_000_000
 
-    def duration(self, n_bytes: int, *, stuffed: bool = True) -> float:
-        """Return the time on the bus of one frame with this payload, s."""
-        fd = self.profile == "fd"
-        bits = (fd_bits if fd else classic_bits)(n_bytes, stuffed=stuffed)
+    def duration(self, n_bytes: int) -> float:
+        """Return the longest time on the bus of one frame with this payload, s."""
+        bits = (fd_bits if self.profile == "fd" else classic_bits)(n_bytes)
         return bits.nominal / self.bitrate + bits.data / self.data_bitrate
 
     def cycle_payloads(self, n_axes: int) -> tuple[int, ...]:
@@ -165,10 +163,9 @@ class BusRates:
             return 64, 48, 64
         return (8,) * (1 + n_axes + (n_axes + 1) // 2)
 
-    def load(self, n_axes: int, period: float, *, stuffed: bool = True) -> float:
+    def load(self, n_axes: int, period: float) -> float:
         """Return the share of the bus used by the cyclic frames; 1 is a full bus."""
-        payloads = self.cycle_payloads(n_axes)
-        return sum(self.duration(size, stuffed=stuffed) for size in payloads) / period
+        return sum(self.duration(size) for size in self.cycle_payloads(n_axes)) / period
 
     def require_load(self, n_axes: int, period: float) -> None:
         """Check that the frames of a cycle fit `LOAD_LIMIT`; raises CanBusLoadError."""

@@ -8,7 +8,6 @@ import os
 import re
 import tempfile
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -54,31 +53,24 @@ def open_bus(
     Raises:
         TransportError: it cannot be opened.
     """
-    link = f"CAN bus {interface}:{channel}"
+    bus: can.BusABC | None = None
     try:
         bus = can.Bus(**_arguments(interface, channel, rates), **options)
         if interface == "slcan":
             fast = rates.data_bitrate if rates.profile == "fd" else None
             bus.set_bitrate(rates.bitrate, fast)  # type: ignore[attr-defined]
     except (can.CanError, OSError, ValueError, TypeError, ImportError, RuntimeError) as error:
-        _shut_down_partial(error)
+        if bus is not None:
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
         remedy = _REMEDIES.get(interface, "see python-can's documentation of this interface")
         wanted = f"bitrate {rates.bitrate}"
         if rates.profile == "fd":
             wanted += f" dbitrate {rates.data_bitrate} fd on"
         remedy = remedy.format(channel=channel, rates=wanted)
+        link = f"CAN bus {interface}:{channel}"
         raise TransportError(link, str(error) or type(error).__name__, remedy) from error
     return bus
-
-
-def _shut_down_partial(error: BaseException) -> None:
-    """Shut down a bus that was not opened completely, which would warn on stderr when collected."""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        for value in list(frame.f_locals.values()):
-            if isinstance(value, can.BusABC):
-                # Any of its attributes may be missing.
-                with contextlib.suppress(Exception):
-                    value.shutdown()
 
 
 def _arguments(interface: str, channel: str, rates: BusRates) -> dict[str, Any]:
