@@ -175,10 +175,8 @@ def collision_checker(cell: Cell) -> CollisionChecker:
             "cell.mesh_folders",
             cell.file.cell.mesh_folders,
             f"the mesh {error.mesh} of {urdf} is in none of them",
-            "add the folder in which its package:// path begins, or name that folder in "
-            "ROS_PACKAGE_PATH"
-            if error.mesh.startswith("package://")
-            else "write its path in the URDF as package://, or with all folders from the root on",
+            "add the folder in which its package:// path begins (or to ROS_PACKAGE_PATH); write "
+            "other paths in the URDF as package://",
         ) from error
     except CollisionModelError as error:
         raise CellError(
@@ -197,25 +195,23 @@ def current_model(cell: Cell) -> CurrentModel:
     Without a drive train only torques have limits: those of `[limits] torque`.
     """
     n = cell.model.n_joints
-    if cell.file.drive_train is None:
-        return CurrentModel(
-            model=cell.model,
-            values=cell.nominal_values(),
-            motor_from_joint=np.eye(n),
-            torque_constant=np.ones(n),
-            current_limit=np.full(n, np.inf),
-            uncertainty=cell.nominal.uncertainty,
-            torque_limit=cell.torque_limit,
-        )
-    drives = cell.drive_train
-    return CurrentModel(
+    currents = CurrentModel(
         model=cell.model,
         values=cell.nominal_values(),
+        motor_from_joint=np.eye(n),
+        torque_constant=np.ones(n),
+        current_limit=np.full(n, np.inf),
+        uncertainty=cell.nominal.uncertainty,
+        torque_limit=cell.torque_limit,
+    )
+    if cell.file.drive_train is None:
+        return currents
+    drives = cell.drive_train
+    return replace(
+        currents,
         motor_from_joint=drives.motor_from_joint,
         torque_constant=drives.torque_constant,
         current_limit=drives.current_limit,
-        uncertainty=cell.nominal.uncertainty,
-        torque_limit=cell.torque_limit,
     )
 
 

@@ -326,8 +326,6 @@ class CampaignFolder:
         """Return the first file that differs from the manifest."""
         sealed, now = self._manifest().inputs, self._inputs()
         for name in sorted(sealed.keys() | now.keys()):
-            if name.startswith(MESH) and name not in sealed:
-                continue  # created by a version without checksums of meshes
             if sealed.get(name) != now.get(name):
                 return name
         return None

@@ -92,9 +92,8 @@ def _require_one_kind_of_arm(run: Run) -> None:
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
         if made_by != own:
-            whose = {"yes": "a simulated arm", "no": "a real arm"}.get(
-                made_by, "an unknown kind of arm (written by an earlier version)"
-            )
+            kinds = {"yes": "a simulated arm", "no": "a real arm"}
+            whose = kinds.get(made_by, "an unknown kind of arm")
             link = "a simulated one" if run.simulated else "a real one"
             raise CampaignFolderError(
                 run.folder.root,

@@ -210,10 +210,12 @@ def straight_move(cell: Cell, start: Array, end: Array, speed: float | None = No
         MotionRefusedError: a posture is outside the limits.
     """
     limits = cell.joint_limits
-    if (problem := beyond(cell, start)) is not None:
-        raise MotionRefusedError("the motion", problem, "jog the arm to within [limits]")
-    if (problem := beyond(cell, end, "would go to")) is not None:
-        raise MotionRefusedError("the motion", problem, "use a posture within [limits]")
+    for posture, verb, remedy in (
+        (start, "stands at", "jog the arm to within [limits]"),
+        (end, "would go to", "use a posture within [limits]"),
+    ):
+        if (problem := beyond(cell, posture, verb)) is not None:
+            raise MotionRefusedError("the motion", problem, remedy)
     speed = cell.campaign.approach_speed if speed is None else speed
     move = Move(at_limit(end, limits), speed=speed)
     motion = in_child(plan_moves, at_limit(start, limits), (move,), limits)

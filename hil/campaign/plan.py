@@ -33,10 +33,7 @@ from .errors import MotionRefusedError
 LEAST: Final = 4  # Least population of a genetic search
 SLOWEST: Final = 0.5  # Smallest share of a joint's speed in the search: slow motions excite little
 LONGEST: Final = 60.0  # Longest excitation, s
-FORMAT_VERSION = 4
-"""1 has no moves and no limits; 2 excitations through via points only, without their method; 3 no
-Fourier series as validation motions."""
-READ = (1, 2, 3, FORMAT_VERSION)
+FORMAT_VERSION: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ class CampaignPlan:
         return json.dumps(content) + "\n"
 
     def is_of(self, text: str) -> bool:
-        """Return whether a text is this plan, in any format version and layout."""
+        """Return whether a text is this plan, in any layout."""
         own = self.to_text()
         try:
             return text == own or CampaignPlan.from_text(text).to_text() == own
@@ -113,17 +110,11 @@ class CampaignPlan:
     def from_text(cls, text: str) -> CampaignPlan:
         """Return the plan from its JSON (ValueError, KeyError, TypeError, AttributeError)."""
         content: dict[str, Any] = parse_json(text)
-        version = content["format_version"]
-        if version not in READ:
+        if (version := content["format_version"]) != FORMAT_VERSION:
             raise ValueError(f"format version {version}")
         return cls(
             Excitation.from_dict(content["excitation"]),
-            tuple(
-                PlannedMotion(PiecewiseCubic.from_dict(motion))
-                if version == 1
-                else PlannedMotion.from_dict(motion)
-                for motion in content["validation"]
-            ),
+            tuple(PlannedMotion.from_dict(motion) for motion in content["validation"]),
             moves_from_dict(content),
         )
 

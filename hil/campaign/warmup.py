@@ -140,12 +140,10 @@ class WarmUp:
     def sentence(self) -> str:
         """Its state in a sentence; it has had a motion."""
         done, change = len(self.motions), float(self.curve.change[-1])
-        text = f"warm-up: friction changes by {change:.2%} a motion after {done} motions"
-        if self.outcome == "warm":
-            return f"{text}; below {self.threshold:.2%} the arm is warm"
-        if self.outcome == "not warm":
-            return f"{text}; still not below {self.threshold:.2%}, and no more motions were allowed"
-        return text
+        return (
+            f"warm-up: friction changes by {change:.2%} a motion after {done} motions, below "
+            f"{self.threshold:.2%} the arm is warm: {self.outcome}"
+        )
 
     def rested(self, now: float) -> str:
         """Return how long the arm has rested, as the beginning of a sentence."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from json import dumps as json_text
 from math import isfinite, radians
@@ -93,25 +93,24 @@ def read_via_points(path: Path, frame: AngleFrame) -> Array:
     rows = [(number, cells) for number, cells in rows if cells]
     if rows and all(_number(cell) is None for cell in rows[0][1]):  # names
         del rows[0]
-    remedy = f"write one finite angle in degrees for each of the {frame.sign.size} joints"
+    points = []
     for number, cells in rows:
-        for place, cell in enumerate(cells, 1):
-            value = _number(cell)
-            if value is None or not isfinite(value):
-                field = f"line {number}, cell {place}"
-                raise InputError(path, f"{cell!r} is not a number", field=field, remedy=remedy)
-        if len(cells) != frame.sign.size:
-            raise InputError(path, f"{len(cells)} values", field=f"line {number}", remedy=remedy)
-    if len(rows) < 2:
+        point = [value for cell in cells if (value := _number(cell)) is not None]
+        if not len(cells) == len(point) == frame.sign.size or not np.isfinite(point).all():
+            problem = f"{' '.join(cells)!r} is not a posture"
+            remedy = f"write one finite angle in degrees for each of the {frame.sign.size} joints"
+            raise InputError(path, problem, field=f"line {number}", remedy=remedy)
+        points.append(point)
+    if len(points) < 2:
         remedy = "a motion needs a start and a target"
-        raise InputError(path, f"{len(rows)} via points", remedy=remedy)
-    return frame.urdf(np.array([[*map(float, cells)] for _, cells in rows]))
+        raise InputError(path, f"{len(points)} via points", remedy=remedy)
+    return frame.urdf(np.array(points))
 
 
 def _number(cell: str) -> float | None:
-    """Parse a number; None for other text, and for the `1_000` of Python."""
+    """Parse a number; None for other text."""
     try:
-        return None if "_" in cell else float(cell)
+        return float(cell)
     except ValueError:
         return None
 
@@ -184,10 +183,11 @@ def plan(
     names = loaded.joint_names
     if rate is None:
         rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
+    summary = _summary(planned, loaded, frame)
     if json:
-        print_json(_summary(planned, loaded, frame))
+        print_json(summary)
     else:
-        typer.echo(printable(_table(planned, loaded, frame)))
+        typer.echo(printable(_table(summary, frame.shown(planned.start), names)))
     if output is not None:
         file = PlanFile.of(planned, names)
         toml = output.suffix.lower() == ".toml"
@@ -199,12 +199,14 @@ def plan(
 
 
 def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:
-    ratio, quantity, joint = _worst(plan)
+    extrema = plan.trajectory.extrema()
+    ratios = np.array([getattr(extrema, q) / getattr(plan.limits, q) for q in _RATES])
+    quantity, joint = divmod(int(np.argmax(ratios)), ratios.shape[1])
     return {
         "duration": plan.duration,
         "duration_with_stops": plan.duration_with_stops,
-        "worst_limit_ratio": ratio,
-        "worst_limit": f"{quantity} of {cell.joint_names[joint]}",
+        "worst_limit_ratio": float(ratios.max()),
+        "worst_limit": f"{_RATES[quantity]} of {cell.joint_names[joint]}",
         "reduced": plan.reduced_corners,
         "stopped": plan.stopped_corners,
         "angles": frame.name,
@@ -221,40 +223,29 @@ def _summary(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> dict[str, Any]:
     }
 
 
-def _table(plan: MotionPlan, cell: Cell, frame: AngleFrame) -> str:
-    width = max(9, *(len(name) + 1 for name in cell.joint_names))
-    heads = "".join(f"{name:>{width}}" for name in cell.joint_names)
-    degrees = f"{'deg':>{width}}" * len(cell.joint_names)
+def _table(summary: Mapping[str, Any], start: Array, joint_names: Sequence[str]) -> str:
+    width = max(9, *(len(name) + 1 for name in joint_names))
+    heads = "".join(f"{name:>{width}}" for name in joint_names)
+    degrees = f"{'deg':>{width}}" * len(joint_names)
     lines = [
         f"{'target':>6}{heads}{'time':>9}{'distance':>10}  passed",
         f"{'':6}{degrees}{'s':>9}{'deg':>10}",
     ]
-
-    def row(number: int, q: Array, time: float, distance: float, how: str) -> str:
-        angles = "".join(f"{angle:{width}.2f}" for angle in frame.shown(np.asarray(q)))
-        return f"{number:6d}{angles}{time:9.3f}{np.degrees(distance):10.3f}  {how}"
-
-    lines.append(row(0, plan.start, 0.0, 0.0, "start"))
-    for number, (move, target) in enumerate(zip(plan.moves, plan.targets, strict=True), 1):
-        fly = "" if target.how == "stopped" else f", fly {target.fly:.0%}"
-        lines.append(row(number, move.target, target.time, target.distance, target.how + fly))
-    ratio, quantity, joint = _worst(plan)
+    at_start = {"target_deg": start, "time": 0.0, "distance_deg": 0.0, "how": "start"}
+    for number, target in enumerate([at_start, *summary["targets"]]):
+        angles = "".join(f"{angle:{width}.2f}" for angle in target["target_deg"])
+        how = target["how"]
+        fly = f", fly {target['fly_percent']:.0f}%" if how not in ("start", "stopped") else ""
+        lines.append(
+            f"{number:6d}{angles}{target['time']:9.3f}{target['distance_deg']:10.3f}  {how}{fly}"
+        )
     lines += [
-        f"{plan.duration:.3f} s; {plan.duration_with_stops:.3f} s with a stop at every target; "
-        f"{plan.reduced_corners} corners rounded less than requested, "
-        f"{plan.stopped_corners} not at all",
-        f"closest to its limit: {quantity} of {cell.joint_names[joint]}, {ratio:.6f} of it "
-        f"({frame.name} angles; floor, walls, currents and self-collision were not checked)",
+        "{duration:.3f} s; {duration_with_stops:.3f} s with a stop at every target; {reduced} "
+        "corners rounded less than requested, {stopped} not at all".format_map(summary),
+        "closest to its limit: {worst_limit}, {worst_limit_ratio:.6f} of it ({angles} angles; "
+        "floor, walls, currents and self-collision were not checked)".format_map(summary),
     ]
     return "\n".join(lines)
-
-
-def _worst(plan: MotionPlan) -> tuple[float, str, int]:
-    """Return the largest fraction of a rate limit, its quantity and its joint."""
-    extrema = plan.trajectory.extrema()
-    ratios = np.array([getattr(extrema, q) / getattr(plan.limits, q) for q in _RATES])
-    quantity, joint = divmod(int(np.argmax(ratios)), ratios.shape[1])
-    return float(ratios.max()), _RATES[quantity], joint
 
 
 def _write(path: Path, text: str) -> None:

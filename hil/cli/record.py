@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -86,7 +87,7 @@ def record(
     early = _early_end(path, done, duration)
     figures = _figures(path, done, loaded)
     if not json:
-        _report(path, done, loaded)
+        say(_line(figures))
     elif early is None:
         print_json(figures)
     if early is not None:
@@ -120,14 +121,12 @@ def _figures(path: Path, done: Recorded, cell: Cell) -> dict[str, object]:
     }
 
 
-def _report(path: Path, done: Recorded, cell: Cell) -> None:
-    losses = {"records": done.records_lost, "events": done.events_lost}
-    lost = "".join(f", {count} {what} LOST" for what, count in losses.items() if count)
-    say(
-        f"{path}: {done.records * cell.period:.1f} s in {done.records} cycles, {done.missed} "
-        f"packets missed, {done.late} replies late, {done.not_accepted} not accepted{lost}; "
-        f"{done.outcome}: {done.reason}"
-    )
+def _line(figures: Mapping[str, object]) -> str:
+    return (
+        "{archive}: {duration:.1f} s in {cycles} cycles, {missed} packets missed, {late} replies "
+        "late, {not_accepted} not accepted, {records_lost} records and {events_lost} events lost; "
+        "{outcome}: {reason}"
+    ).format_map(figures)
 
 
 class View(StatusLine):

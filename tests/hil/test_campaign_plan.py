@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 import json
 import os
 import subprocess
@@ -29,7 +28,6 @@ from hil.identify import Identification, identify_campaign
 from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.outcome import FILES
 from hil.progress import Silent
-from hil.report import report_bytes
 from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures.ns16 import CELL_PATH
@@ -232,11 +230,6 @@ def test_the_model_of_a_swinging_arm_predicts_unseen_motion(found: Identificatio
     assert coverage is not None and coverage.within_3 >= 55
 
 
-def test_the_report_names_the_method_of_each_motion(found: Identification) -> None:
-    text = "8.00 s, 3 sines per joint, designed by method A of the paper"
-    assert text in html.unescape(report_bytes(found.results, found.series).decode())
-
-
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -256,13 +249,11 @@ def test_the_report_names_the_method_of_each_motion(found: Identification) -> No
     ids=["without ramp", "endless", "long", "wide", "fast", "abrupt", "many sines", "five joints"],
 )  # fmt: skip
 def test_motions_out_of_bounds_are_refused(
-    tmp_path: Path, quick: Cell, swinging: CampaignPlan, changes: dict[str, Any], reason: str
+    quick: Cell, changes: dict[str, Any], reason: str
 ) -> None:
     bad = designed(replace(sines(quick), **changes))
     with pytest.raises(MotionRefusedError, match=reason):
         plan_around(quick, bad)
-    with pytest.raises(MotionRefusedError, match=f"repetition 1 was not sent: .*{reason}"):
-        Campaign.create(tmp_path / "bad", quick, replace(swinging, excitation=bad))
 
 
 @pytest.mark.parametrize("ramp", [1e-9, 1e-4, 3e-3, 0.1])

@@ -179,21 +179,6 @@ def held_torque(cell: Cell) -> float:
     return (1.0 + cell.nominal.uncertainty) * abs(float(gravity[HELD]))
 
 
-@pytest.mark.parametrize(
-    ("torque", "words"),
-    [
-        ([100.0], ["limits.torque", "has 1 entries but the URDF has 6 joints", "or none"]),
-        ([100.0] * 5 + [0.0], ["limits.torque", "N·m at the joint"]),
-        ([100.0] * 5 + [float("nan")], ["limits.torque", "N·m at the joint"]),
-    ],
-)
-def test_what_is_no_limit_is_refused(cell: Cell, torque: list[float], words: list[str]) -> None:
-    with pytest.raises(CellError) as caught:
-        limited(cell, torque)
-    for word in words:
-        assert word in str(caught.value)
-
-
 @pytest.mark.parametrize(("share", "refused"), [(1.02, False), (0.98, True)])
 def test_home_is_refused_where_gravity_is_beyond_the_limit(
     cell: Cell, share: float, refused: bool

@@ -5,11 +5,8 @@ from __future__ import annotations
 import fcntl
 import json
 import os
-import pty
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -76,6 +73,7 @@ from hil.simulation import (
 from sim_fixtures.faults import parse_fault, split_faults
 from tests.hil.batch_work import Here
 from tests.hil.fast_cell import fast_campaign, fast_cell, mirrored, pass_rehearsal, set_points
+from tests.hil.screen_rig import on_terminal
 
 Array = NDArray[np.float64]
 Make = Callable[..., Campaign]
@@ -1216,39 +1214,17 @@ def test_on_a_terminal_a_dry_run_is_asked_for_and_ctrl_c_stops(
     campaign: Campaign,
 ) -> None:
     root = campaign.folder.root
-    master, terminal = pty.openpty()
-    process = subprocess.Popen(
-        # In the foreground of the terminal, from which keys are read.
-        ["setsid", "--ctty", sys.executable, "-m", "hil", "run", str(root), "--no-identify"],
-        stdin=terminal,
-        stdout=terminal,
-        stderr=terminal,
-        env={**os.environ, "TERM": "xterm-256color", "COLUMNS": "100", "LINES": "40"},
-    )
-    os.close(terminal)
-    seen = b""
-    answered = interrupted = False
-    deadline = time.monotonic() + 120.0
-    try:
-        while process.poll() is None and time.monotonic() < deadline:
-            try:
-                seen += os.read(master, 65536)
-            except OSError:  # the terminal is closed
-                break
-            if not answered and b"Type yes" in seen:
-                time.sleep(0.3)  # input before the question is discarded
-                os.write(master, b"yes\n")
-                answered = True
-            if not interrupted and list(campaign.folder.archives.glob("excitation_*")):
-                process.send_signal(signal.SIGINT)
-                interrupted = True
-        assert process.wait(30.0) == 130, seen[-3000:].decode(errors="replace")
-    finally:
-        process.kill()
-        process.wait()
-        os.close(master)
-    assert answered
-    assert b"hil run" in seen, "the command that resumes"
+    with on_terminal("-m", "hil", "run", root, "--no-identify", columns=100) as end:
+        end.await_seen(b"Type yes")
+        time.sleep(0.3)  # input before the question is discarded
+        end.press("yes\n")
+        until = time.monotonic() + 120.0
+        while not list(campaign.folder.archives.glob("excitation_*")):
+            assert time.monotonic() < until and end.process.poll() is None, end.seen[-3000:]
+            end.look()
+        end.process.send_signal(signal.SIGINT)
+        assert end.end(30.0) == 130, end.seen[-3000:]
+        assert b"hil run" in end.seen, "the command that resumes"
     outcomes = [entry.outcome for entry in campaign.folder.manifest()]
     assert set(outcomes) <= {"completed", "stopped"}
     rest = Campaign.open(root).run()
