@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 _LOAD = "hil_simulated_payload"
 _CHECKED = 100
 """Postures checked on each path of the controller's own motion."""
+_POSTURES = 12
+"""Postures of that motion before home."""
 
 
 def simulated_link(
@@ -150,11 +152,11 @@ def controller_settings(cell: Cell, *, effects: bool = False) -> ControllerSetti
     )
 
 
-def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
+def own_postures(cell: Cell) -> tuple[tuple[float, ...], ...]:
     """Return postures (joint angles, rad) of the controller's own program, home at the end.
 
     Random within half of each joint's range around home, by the cell's seed, with collision-free
-    straight motions in between; there may be fewer than `count`.
+    straight motions in between; there may be fewer than 13.
     """
     rng = np.random.default_rng(cell.simulation.seed)
     limits, home = cell.joint_limits, cell.home
@@ -167,11 +169,11 @@ def own_postures(cell: Cell, count: int = 12) -> tuple[tuple[float, ...], ...]:
 
     here = cell.initial
     postures: list[Array] = []
-    for _ in range(10 * count):
+    for _ in range(10 * _POSTURES):
         there = np.clip(
             home + reach * rng.uniform(-1.0, 1.0, len(home)), limits.lower, limits.upper
         )
-        if len(postures) < count and clear(here, there):
+        if len(postures) < _POSTURES and clear(here, there):
             postures.append(there)
             here = there
     if clear(here, home):

@@ -7,16 +7,12 @@ truncated one at the end, which reading skips and adding removes.
 from __future__ import annotations
 
 import json
-import lzma
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self, TypeVar
-
-COMPRESSED: Final = ".xz"
-"""Suffix of a compressed journal, which is read-only."""
+from typing import Any, Self, TypeVar
 
 Entry = TypeVar("Entry")
 
@@ -33,9 +29,7 @@ def entries(path: Path, entry: Callable[[Any], Entry], what: str) -> list[Entry]
     """
     try:
         content = path.read_bytes() if path.exists() else b""
-        if content and path.suffix == COMPRESSED:
-            content = lzma.decompress(content)
-    except (OSError, lzma.LZMAError) as error:
+    except OSError as error:
         raise JournalError(f"{path} cannot be read: {error}; name another --journal") from error
     found = []
     for number, line in enumerate(content[: _whole(content)].splitlines(), 1):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import lzma
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -118,12 +117,6 @@ def test_only_a_truncated_last_line_is_lost(tmp_path: Path) -> None:
         assert read(path) == [*known, 9]
 
 
-def test_a_compressed_journal_is_read_as_the_one_that_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "j.jsonl.xz"
-    path.write_bytes(lzma.compress(b'{"n":1}\n{"n":2}\n{"n'))
-    assert read(path) == [1, 2]
-
-
 @pytest.mark.parametrize("line", ["no", "{}", "[]", "7", "null", '{"n":1}{"n":2}'])
 def test_a_line_that_is_no_entry_is_named(tmp_path: Path, line: str) -> None:
     path = tmp_path / "j.jsonl"
@@ -138,9 +131,6 @@ def test_unreadable_journals_are_errors(tmp_path: Path) -> None:
         read(tmp_path)
     with pytest.raises(JournalError, match="cannot be written: Is a directory"):
         Journal(tmp_path)
-    (tmp_path / "j.jsonl.xz").write_bytes(b"no archive\n")
-    with pytest.raises(JournalError, match="cannot be read"):
-        read(tmp_path / "j.jsonl.xz")
 
 
 def test_rounds_are_known_by_number_and_the_last_of_one_counts(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ each process and the histogram of latencies go to the journal; each archive is c
 when there are three newer campaigns. Campaigns with incomplete archives remain.
 
 Each call is a piece and appends to the journal; --merge prints the verdict over all pieces of the
-journals given (also `.jsonl.xz`). Ctrl-C or SIGTERM end a piece, SIGKILL costs the last 5 s.
+journals given. Ctrl-C or SIGTERM end a piece, SIGKILL costs the last 5 s.
 Four hours in three pieces:
 
     for piece in 1 2 3; do
@@ -35,7 +35,7 @@ from hil.progress import reporter
 from tests.arguments import parser_of, time_above_0
 from tests.endurance.piece import run_piece
 from tests.endurance.verdict import Piece, Verdict, judge, read_journal
-from tests.journal import COMPRESSED, JournalError
+from tests.journal import JournalError
 
 LONGEST = 90.0  # min of a piece
 
@@ -80,8 +80,8 @@ def _run(given: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
         parser.error("--minutes and --folder are needed to run a piece")
     if given.minutes > LONGEST:
         parser.error(f"--minutes must be at most {LONGEST:g}")
-    if len(given.journal) > 1 or given.journal[0].suffix == COMPRESSED:
-        parser.error("a piece is appended to one --journal, and not to a compressed one")
+    if len(given.journal) > 1:
+        parser.error("a piece is appended to one --journal")
     with stop_on_interrupt() as stop:
         tell = reporter(quiet=given.json)
         run_piece(given.folder, given.journal[0], 60.0 * given.minutes, given.rate, stop, tell)

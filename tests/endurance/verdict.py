@@ -55,7 +55,7 @@ class Piece:
 
 
 def read_journal(path: Path) -> list[Piece]:
-    """Return all pieces of a journal, compressed if its name ends in `.xz`; none without the file.
+    """Return all pieces of a journal; none without the file.
 
     Raises:
         JournalError: it cannot be read, or has another line.

@@ -287,24 +287,6 @@ def test_a_fork_cannot_receive_the_result_of_its_parent():
         assert child.receive() == child.pid
 
 
-def test_a_worker_used_in_a_fork_gets_another_child():
-    points = np.array([random_points(seed) for seed in range(64)])
-    with workers(1) as children:
-        before, pid = together(children, points, SIX_AXES), children[0].pid
-
-        def backwards() -> bool:
-            other = children[0].pid is None and children[0].call(os.getpid)
-            motions = together(children, points[::-1], SIX_AXES)
-            children[0].close()
-            unchanged = all(same(a, b) for a, b in zip(motions, before[::-1], strict=True))
-            return unchanged and other not in (False, pid)
-
-        assert in_fork(backwards)
-        after = together(children, points, SIX_AXES)
-        assert all(same(a, b) for a, b in zip(after, before, strict=True))
-        assert children[0].pid == pid
-
-
 def test_a_fork_while_a_thread_plans_can_plan_and_end():
     in_child(os.getpid)
     busy = threading.Thread(target=in_child, args=(time.sleep, 1.0))

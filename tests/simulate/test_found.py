@@ -16,7 +16,6 @@ from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
 from hil.campaign import Link
 from hil.campaign import link as link_module
 from hil.campaign.intervals import START_TOLERANCE
-from hil.campaign.motion_link import not_ready
 from hil.campaign.operator import Stop
 from hil.cell import Cell
 from hil.errors import ControllerFault
@@ -63,10 +62,6 @@ class TestControllerWithoutInitPacket:
         with pytest.raises(ControllerFault, match="ended the session within 0") as raised:
             link.connect(Stop())
         assert "60 s" not in str(raised.value)
-
-    def test_the_error_of_a_drive_that_is_off_names_it(self) -> None:
-        assert "switch the drive on" in str(not_ready(State.DRIVE_OFF, 60.0))
-        assert "within 60 s" in str(not_ready(State.DRIVE_OFF, 60.0))
 
 
 def test_a_motion_does_not_wait_forever_for_a_drive_that_went_off(
