@@ -101,11 +101,9 @@ def other_text(content: Content) -> None:
 BROKEN = {
     "another profile": (lambda c: setattr(c, "profile", "ros1"), "container"),
     "another library": (lambda c: setattr(c, "library", "mcap 1.6"), "container"),
-    "unknown kind": (entry("kind", "dance"), "metadata"),
     "a kind that the name denies": (entry("kind", "excitation"), "metadata"),
     "a joint twice": (entry("joint_names", '["a", "a"]'), "metadata"),
     "no period": (lambda c: c.metadata.pop("period"), "metadata"),
-    "a period of zero": (entry("period", "0.0"), "metadata"),
     "an attachment too few": (lambda c: c.attachments.pop("cell.toml"), "attachments"),
     "another text": (other_text, "schemas"),
     "another encoding": (lambda c: setattr(c, "encoding", "cdr2"), "channels"),
