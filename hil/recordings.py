@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 from os import PathLike
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,23 +47,14 @@ def open_recording(
 
     Raises:
         ArchiveError: the file is not an archive, cannot be read, or has no sample (in this time).
-        ValueError: an unknown channel.
+        KeyError: an unknown channel.
     """
-    wanted = _CHANNELS.keys() if channels is None else set(channels)
-    unknown = sorted(wanted - _CHANNELS.keys())
-    if unknown:
-        raise ValueError(f"recordings have no {unknown[0]!r}; they have {', '.join(_CHANNELS)}")
+    wanted = _CHANNELS if channels is None else channels
     fields = [*_ALWAYS, *(column for name in wanted for column in _CHANNELS[name])]
-    archive = open_archive(path, fields=fields, start=start, stop=stop)
+    recording = recording_of(open_archive(path, fields=fields, start=start, stop=stop))
     if start is None and stop is None:
-        return recording_of(archive)
-    part = f"{'its beginning' if start is None else f'{start:g} s'} to "
-    part += "its end" if stop is None else f"{stop:g} s"
-    if not archive.n_samples and archive.complete:
-        raise ArchiveError(
-            Path(path), f"has no sample from {part}", remedy="name a time within the recording"
-        )
-    recording = recording_of(archive)
+        return recording
+    part = f"{'begin' if start is None else start} to {'end' if stop is None else stop} [s]"
     return replace(recording, provenance={**recording.provenance, "part": part})
 
 
@@ -77,7 +67,7 @@ def recording_of(archive: Archive) -> Recording:
     columns = archive.columns
     if not archive.n_samples or "position" not in columns:
         problem = f"has no sample{f' ({archive.damage})' if archive.damage else ''}"
-        remedy = "record it again"
+        remedy = "record it again, or name a time within the recording"
         raise ArchiveError(archive.path, problem, remedy=remedy)
     imported, own = archive.kind == "imported", archive.header.by_controller_program
     provenance = {"archive": archive.path.name, **archive.header.entries}

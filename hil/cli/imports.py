@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,12 +101,6 @@ class Described:
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
         """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
         exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
-        if self.gravity is not None and not all(map(math.isfinite, self.gravity)):
-            problem, remedy = f"{self.gravity} is not a vector", "give m/s², as in 0 0 -9.81"
-            raise InputError(None, problem, field="--gravity", remedy=remedy)
-        if not 0.0 <= self.standstill < math.inf:
-            problem, remedy = f"{self.standstill} is not a speed", "give rad/s, as in 0.01"
-            raise InputError(None, problem, field="--standstill", remedy=remedy)
         law = FrictionLaw.from_table(
             {**friction_from(self.friction), "standstill": self.standstill}
         )

@@ -265,11 +265,9 @@ def _choose(topics: Mapping[str, Topic], file: Path, topic: str | None) -> str:
         (topic,) = fitting
     if topic in fitting:
         return topic
-    problem = f"there is no topic {topic}"
-    if topic is None:
-        problem = f"{len(fitting) or 'no'} topics carry {_JOINT_STATE}"
-    elif topic in topics:
-        problem = f"topic {topic} carries {topics[topic]}, not measured joint states"
+    problem = f"{len(fitting)} topics carry {_JOINT_STATE}"
+    if topic is not None:
+        problem = f"{topic} is not a topic of {_JOINT_STATE}"
     listing = ", ".join(f"{name} ({found})" for name, found in topics.items()) or "none"
     remedy = f"name one of its topics: {listing}; `hil import log` reads other messages, with a "
     raise SourceError(file, problem, field="topic", remedy=f"{remedy}column map")
@@ -305,9 +303,8 @@ def _samples(
                 raise SourceError(source, problem, field=name)
     count = len(stamps["bag"])
     if not count:
-        seen = dict.fromkeys(name for names in orders for name in names)
-        recorded = f"recorded are {', '.join(seen)}" if seen else "it is empty"
-        problem = f"none of the joints {', '.join(joints)} was recorded; {recorded}"
+        recorded = ", ".join(dict.fromkeys(name for names in orders for name in names)) or "none"
+        problem = f"none of the joints {', '.join(joints)} was recorded; recorded are {recorded}"
         remedy = "give the URDF of this robot, or map its joints: --rename RECORDED=URDF"
         raise SourceError(source, problem, field="joints", remedy=remedy)
     columns: dict[str, Array | None] = {}

@@ -1134,4 +1134,5 @@ class TestRobotOptions:
             assert robot["gravity"] == gravity
             assert (robot["friction"]["third"], robot["friction"]["offset"]) == (third, offset)
             (place / "o.mcap").unlink()
-        assert "--gravity" in self.refused(place, kind, *self.LOCKED, "--gravity", "0", "nan", "0")
+        refused = self.refused(place, kind, *self.LOCKED, "--gravity", "0", "nan", "0")
+        assert "robot.gravity" in refused

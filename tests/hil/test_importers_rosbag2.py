@@ -273,8 +273,12 @@ class TestBadInput:
         ("topics", "asked", "sentence"),
         [
             ({"/a": (STATE, []), "/b": (STATE, [])}, None, r"2 topics carry .*/a \(sensor_m.*/b"),
-            ({"/a": (STATE, [])}, "/joints", "topic: there is no topic /joints; name one.*: /a"),
-            ({"/a": (STATE, [])}, None, "none of the joints hip, ankle was recorded; it is empty"),
+            ({"/a": (STATE, [])}, "/joints", "topic: /joints is not a topic of .*: /a"),
+            (
+                {"/a": (STATE, [])},
+                None,
+                "joints hip, ankle was recorded; recorded are none",
+            ),
         ],
     )
     def test_refused_topics_are_listed(self, tmp_path, robot, topics, asked, sentence):
