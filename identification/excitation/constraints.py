@@ -159,9 +159,9 @@ def check_motion(
     return constraints.violations(trajectory, sampled(trajectory, period))
 
 
-def clearance(checker: CollisionChecker, q: Array, time: Array | None = None) -> Violation | None:
-    """Return the deepest contact in postures (m, n) at times (m,), if there is one."""
-    contact = checker.deepest_contact(q, time)
+def clearance(checker: CollisionChecker, q: Array) -> Violation | None:
+    """Return the deepest contact in postures (m, n), if there is one."""
+    contact = checker.deepest_contact(q)
     return None if contact is None else _collision(checker, contact)
 
 

@@ -31,7 +31,7 @@ def friction_text(model: RobotModel, coefficients: Array) -> str:
     table, kinds = friction.table(coefficients), friction.kinds
     if not friction.terms:
         return "The joints have no friction.\n"
-    names = [_line(name) for name in model.joint_names]
+    names = model.joint_names
     lines = [
         f"Friction torque at the speed v of a joint: {_formula(kinds)}",
         f"with {_joined([kind.description for kind in kinds])}.",
@@ -140,11 +140,6 @@ def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool)
 
 def _formula(kinds: Sequence[FrictionTerm]) -> str:
     return " + ".join(kind.formula for kind in kinds)
-
-
-def _line(name: str) -> str:
-    """Return a name without line ends and control characters."""
-    return "".join(c if c.isprintable() else " " for c in name)
 
 
 def _joined(parts: list[str]) -> str:

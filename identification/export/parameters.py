@@ -121,7 +121,8 @@ def standard_csv(
     rows: list[list[object]] = [[*heading]]
     for joint, name in enumerate(model.joint_names):
         numbers = [*inertial[joint], *rotors[joint : joint + 1], float(consistent.margin[joint])]
-        rows.append([_cell_text(name), *numbers, _cell_text(consistent.reference[joint])])
+        formula = name.lstrip().startswith(("=", "+", "-", "@"))
+        rows.append([f"'{name}" if formula else name, *numbers, consistent.reference[joint]])
     return _table(remarks, rows)
 
 
@@ -133,12 +134,6 @@ def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
         out.write("# " + re.sub(r"(?<=[,;])[=+@-]", r"'\g<0>", line) + "\n")
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()
-
-
-def _cell_text(text: str) -> str:
-    """Return text on one line that no spreadsheet takes for a formula."""
-    line = "".join(c if c.isprintable() else " " for c in text)
-    return f"'{line}" if line.lstrip().startswith(("=", "+", "-", "@")) else line
 
 
 def _rows(model: RobotModel, estimate: Estimate) -> list[tuple[str, str, str, float, float]]:

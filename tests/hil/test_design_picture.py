@@ -20,7 +20,7 @@ from hil.cell import Cell
 from hil.plots import save, style
 from hil.plots.design_picture import POSTURES, draw_design
 from hil.plots.posture_strip import Strip, covered, outlines
-from identification.excitation import Design, SearchSettings, information
+from identification.excitation import Design, information
 from identification.excitation.constraints import sampled
 from identification.excitation.criteria import Criteria
 from identification.excitation.excitation import Excitation
@@ -81,7 +81,6 @@ def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Des
     found = excitation(cell, trajectory)
     measures = np.array([[100.0, 70.0], [105.7, 80.0], [108.0, 110.0]])
     return Design(
-        settings=SearchSettings(),
         genes=np.zeros(1),
         excitation=found,
         front=Front(np.zeros((3, 1)), measures, np.ones(3)),
@@ -91,7 +90,6 @@ def design_of(cell: Cell, trajectory: Trajectory, chosen: int | None = 1) -> Des
         generations=1,
         complete=True,
         exhausted=False,
-        scale=None,
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from identification import Factor, RobotModel, consistent_estimate, estimate
 from identification.errors import ModelError
-from identification.export.parameters import parameters_json
 from identification.model.elements import (
     Anchors,
     Element,
@@ -249,11 +247,3 @@ class TestIdentifiedElements:
         assert len(found.friction) == len(model.friction.terms)
         own = model.element_part
         assert np.all(np.abs(found.estimate.values - values)[own] <= 4.5 * free.std[own])
-
-    def test_the_parameter_file_names_them(self, model: RobotModel, factor: Factor) -> None:
-        free = estimate(model, factor)
-        consistent = consistent_estimate(model, factor, free)
-        content = json.loads(parameters_json(model, free, consistent=consistent))
-        assert [one["parameters"] for one in content["elements"]] == [["spring_1"], ["balancer_2"]]
-        assert list(content["standard"]["elements"]) == ["spring_1", "balancer_2"]
-        assert "springs and balancers" in content["standard"]["not_in_urdf"]

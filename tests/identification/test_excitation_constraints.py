@@ -100,15 +100,6 @@ def test_a_current_beyond_its_limit_is_named(make_currents, swing):
             assert word in str(violation)
 
 
-def test_a_torque_limit_is_checked_besides(make_currents, swing):
-    check = check_motion(
-        swing, LIMITS, currents=make_currents([100.0, 100.0], torque_limit=np.array([5.0, 1e3]))
-    )
-    (violation,) = check
-    assert (violation.kind, violation.subject) == ("torque", "shoulder")
-    assert violation.value > 9.81 * 2.5
-
-
 def test_every_joint_and_quantity_beyond_is_named(swing):
     slow = JointLimits([-3.0, -0.5], [1.0, 3.0], [1.0, 3.0], [10.0, 4.0], [100.0, 30.0])
     violations = {v.subject: v for v in check_motion(swing, slow)}

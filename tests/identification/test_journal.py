@@ -161,12 +161,7 @@ def test_the_journal_of_another_release_is_refused(monkeypatch):
 FIRST_LINE = b"hil search journal 2\n"
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        *(b"x", b"PK\x03\x04" * 100, FIRST_LINE + b"{}" * 50, FIRST_LINE),
-    ],
-)
+@pytest.mark.parametrize("content", [b"x", FIRST_LINE + b"{}" * 50, FIRST_LINE])
 def test_another_file_is_refused_and_unchanged(content):
     file = io.BytesIO(content + b" ")
     with pytest.raises(JournalError):

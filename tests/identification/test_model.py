@@ -18,7 +18,6 @@ from identification.model.pseudo_inertia import (
     ASSUMED,
     MADE_POSSIBLE,
     Body,
-    NoMassError,
     body,
     inertial_parameters,
     margin,
@@ -55,7 +54,7 @@ CASES = {
     "ns16 tilted": (urdf_text, TILTED),
     "ur10": (lambda: robot_text("ur_description/urdf/ur10_robot.urdf"), (0.0, 0.0, -9.81)),
     "panda with its fingers": (lambda: robot_text("panda_description/urdf/panda.urdf"), TILTED),
-    **{f"random tree {seed}": ((lambda s=seed: random_urdf(s)), TILTED) for seed in range(8)},
+    **{f"random tree {seed}": ((lambda s=seed: random_urdf(s)), TILTED) for seed in range(4)},
 }
 
 
@@ -215,7 +214,7 @@ def panda() -> str:
     return robot_text("panda_description/urdf/panda.urdf")
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
     """Torques of the other joints agree with constant positions of the locked ones."""
     urdf = random_urdf(seed)
@@ -236,11 +235,6 @@ def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
     all_q[:, free], all_qd[:, free], all_qdd[:, free] = q, qd, qdd
     expected = whole.torque(values(whole), all_q, all_qd, all_qdd)[:, free]
     np.testing.assert_allclose(model.torque(values(model), q, qd, qdd), expected, atol=1e-9)
-
-
-def test_any_kind_of_joint_can_be_locked_at_zero() -> None:
-    model = RobotModel.from_urdf(followed(one_joint("floating")), locked={"strange": 0.0})
-    assert model.joint_names == ("turns",)
 
 
 def text(element: ElementTree.Element | None) -> str:
@@ -339,11 +333,6 @@ def test_body_and_parameters_are_those_of_pinocchio(seed: int) -> None:
     order = list(FROM_PINOCCHIO)
     np.testing.assert_allclose(expected.toDynamicParameters()[order], inertial, atol=1e-12)
     np.testing.assert_allclose(inertial_parameters(found), inertial, atol=1e-12)
-
-
-def test_a_body_without_mass_has_no_centre() -> None:
-    with pytest.raises(NoMassError):
-        body(np.zeros(10))
 
 
 STEPS = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.4]])

@@ -66,7 +66,7 @@ class TestReadBack:
     """Inverse dynamics of the file agree with the supported parts of the model."""
 
     @FORMS
-    @pytest.mark.parametrize("seed", [1, 2, 3])
+    @pytest.mark.parametrize("seed", [1, 2])
     def test_trees_of_any_joints(self, form: str, seed: int) -> None:
         readable(form)
         arm = an_arm(random_urdf(seed), friction=FrictionLaw(third="cubic"))

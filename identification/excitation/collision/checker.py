@@ -68,7 +68,7 @@ class Contact(NamedTuple):
     first: str  #: link
     second: str  #: link or obstacle ("floor", "wall 0", "box 1")
     sample: int  #: index of the posture
-    time: float | None  #: [s], if postures have times
+    time: float | None  #: [s], of a motion
     posture: tuple[float, ...]  #: joint positions there [rad]
     distance: float  #: [m], negative if they overlap
 
@@ -281,16 +281,14 @@ class CollisionChecker:
         """Return the distances of a pair in the sampled postures (k,) [m]."""
         return np.array([self.distance(pair, self._tried, k) for k in range(_N_POSTURES)])
 
-    def deepest_contact(self, q: Array, time: Array | None = None) -> Contact | None:
-        """Return the deepest contact in postures (m, n) at times (m,), None if all are clear.
+    def deepest_contact(self, q: Array) -> Contact | None:
+        """Return the deepest contact in postures (m, n), None if all are clear.
 
         Another contact may be deeper by up to 5 mm.
         """
         path = self.path(q)
-        if len(q) == 0:
-            return None
         touch = _deepest(self, path, _candidates(self, path, np.zeros((2, 1, 1))))
-        return None if touch is None else _contact(self, touch, q, time)
+        return None if touch is None else _contact(self, touch, q)
 
     def deepest_along(
         self,
@@ -365,7 +363,9 @@ class Candidates(NamedTuple):
     bulge: Array
 
 
-def _contact(checker: CollisionChecker, touch: Touch, q: Array, time: Array | None) -> Contact:
+def _contact(
+    checker: CollisionChecker, touch: Touch, q: Array, time: Array | None = None
+) -> Contact:
     sample = touch.sample
     return Contact(
         *checker.names(touch.pair),

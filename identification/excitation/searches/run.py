@@ -40,7 +40,6 @@ class Progress(NamedTuple):
 class Design:
     """Result of a search."""
 
-    settings: SearchSettings  #: of the search
     genes: Array  #: (n_genes,) of the chosen motion
     excitation: Excitation  #: the motion and its criteria, sampled every `RESCORE_PERIOD`
     front: Front  #: of all motions before the polish, sampled at the search's period
@@ -52,7 +51,6 @@ class Design:
     generations: int  #: number of scored generations
     complete: bool  #: whether the search ran to its end
     exhausted: bool  #: whether it ended early because mating gave no new motions
-    scale: Scale | None  #: of the balanced fitness and of the knee; None if not used
 
 
 RESCORE_PERIOD: Final = 0.001
@@ -376,7 +374,6 @@ class _Search:
             if criteria == origin[1] or goal.is_worse(criteria, origin[1]):
                 genes, (trajectory, criteria) = start, origin
         return Design(
-            settings=settings,
             genes=genes.copy(),
             excitation=Excitation(
                 trajectory=trajectory,
@@ -394,7 +391,6 @@ class _Search:
             generations=self._generations,
             complete=not self._stopped,
             exhausted=self._exhausted,
-            scale=goal.scale,
         )
 
     def _make_goal(self) -> Goal:
