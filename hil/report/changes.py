@@ -65,16 +65,11 @@ def comparison_page(found: Comparison) -> bytes:
         ", ".join(found.axes[j].joint for j in np.flatnonzero(own))
         for own in found.friction.changed.T
     ]
-    part = {
+    part = vars(found) | {
         "key": "t0",
-        "arm": found.arm,
         "good": not found.changed,
         "line": found.verdict,
-        "findings": found.findings,
-        "warnings": found.warnings,
         "campaigns": list(zip(found.names, found.campaigns, differ, strict=True)),
-        "payload": found.payload,
-        "dated": found.dated,
     }
     return _page(title=found.arm, kind="Comparison of campaigns", comparison=found, parts=[part])
 
@@ -107,19 +102,15 @@ def _trend(arm: ArmTrend, key: str) -> dict[str, Any]:
                 what = " and ".join(name for name, departs in which.items() if departs)
                 names.append(f"{axis.joint} ({what})")
     differ = [", ".join(names) for names in departing]
-    return {
+    return vars(arm) | {
         "key": key,
         "arm": arm.name,
         "good": all(one.level != "alarm" for one in found),
         "line": summary(arm),
         "findings": found,
-        "warnings": arm.warnings,
         "campaigns": list(zip(arm.names, arm.campaigns, differ, strict=True)),
-        "payload": arm.payload,
-        "dated": arm.dated,
         "friction": friction,
         "error": error,
-        "axes": arm.axes,
     }
 
 

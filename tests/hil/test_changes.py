@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -584,21 +583,6 @@ def test_a_change_too_small_to_matter_is_a_difference() -> None:
 def test_campaigns_of_one_name_in_different_folders() -> None:
     found = in_memory(Condition(), Condition(), folders=("/runs/cold/b", "/runs/warm/b"))
     assert [name[:6] for name in found.names] == ["cold/b", "warm/b"]
-
-
-@pytest.mark.slow
-def test_a_repeated_killed_run_is_no_warning(folders: dict[str, Path], tmp_path: Path) -> None:
-    killed = tmp_path / "killed"
-    shutil.copytree(folders["june"], killed)
-    (whole,) = killed.glob("archives/excitation_001_a1.mcap")
-    later = whole.with_name("excitation_001_a2.mcap")
-    manifest = killed / "manifest.json"
-    whole.rename(later)
-    manifest.write_text(manifest.read_text("utf-8").replace(whole.name, later.name), "utf-8")
-    whole.write_bytes(later.read_bytes()[:5000])
-    found = compared(folders["march"], killed)
-    assert found.friction.changed.any()
-    assert not any(whole.name in warning for warning in found.warnings)
 
 
 def test_a_page_of_hostile_names_is_inert() -> None:
