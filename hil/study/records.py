@@ -332,7 +332,7 @@ class Reader:
         """Estimate from the excitations of each campaign, by key."""
         records = self._read(
             fit,
-            [(key, root, "excitation", {}, ()) for key, root in roots.items()],
+            [(key, root, "excitation", ()) for key, root in roots.items()],
             "estimating (excitations)",
         )
         return dict(zip(roots, records, strict=True))
@@ -343,7 +343,7 @@ class Reader:
         """Predict the held-out motions of each class, see :func:`score`."""
         values = {name: estimate.tolist() for name, estimate in estimates.items()}
         tasks = [
-            (f"{key}-{name}", roots[key], "validation", values, (key, values))
+            (f"{key}-{name}", roots[key], "validation", (key, values))
             for key, name in OWN_CLASS.items()
         ]
         records = self._read(score, tasks, "predicting (classes of motion)")
@@ -352,15 +352,15 @@ class Reader:
     def _read(
         self,
         function: Callable[..., R],
-        tasks: Sequence[tuple[str, Path, str, object, tuple[Any, ...]]],
+        tasks: Sequence[tuple[str, Path, str, tuple[Any, ...]]],
         title: str,
     ) -> list[R]:
-        """Return the records of tasks: name, root, kind of archives, other inputs, arguments."""
+        """Return the records of tasks: name, campaign, kind of archives, arguments."""
         calls = []
-        for name, root, kind, others, arguments in tasks:
+        for name, root, kind, arguments in tasks:
             sums, place = archives_of(root, kind, "standstill"), self.fits / f"{name}.json"
             paths = [CampaignFolder(root).archives / one for one in sums]
-            inputs = json_digest([VERSION, list(sums.items()), others])
+            inputs = json_digest([VERSION, list(sums.items()), arguments])
             calls.append((place, (place, function, inputs, paths, *arguments)))
         return in_children(made, calls, title, self.reporter, self.workers)
 
