@@ -175,18 +175,11 @@ class EventReader(_Log):
             at += length
             missing = index - (index if self._expected is None else self._expected)
             self._expected = index + 1
-            if missing:
-                self._add_lost(missing, events)
-            if zlib.crc32(body) == checksum:
+            intact = zlib.crc32(body) == checksum
+            lost = missing + (not intact)
+            if lost:
+                self.lost += lost
+                events.append(EventsLost(lost))
+            if intact:
                 events.append(pickle.loads(body))
-            else:
-                self._add_lost(1, events)
         return events
-
-    def _add_lost(self, count: int, events: list[ExchangeEvent]) -> None:
-        self.lost += count
-        last = events[-1] if events else None
-        if isinstance(last, EventsLost):
-            events[-1] = EventsLost(last.count + count)
-        else:
-            events.append(EventsLost(count))

@@ -5,17 +5,19 @@ from __future__ import annotations
 import re
 from collections import Counter
 
+import can
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers import CyclicPacket
+from drivers import CycleRing, CyclicPacket, Guard, Session, exchange
 from drivers.packets import LAST_NUMBER, next_number
 from drivers.transports.can.codecs import NEVER, words_of
 from drivers.transports.can.ends import LONGEST, SegmentAssembler, Segmenter
 from drivers.transports.can.layout import (
     LOAD_LIMIT,
+    SEGMENT_DOWN,
     SEGMENT_UP,
     BusRates,
     CanBusLoadError,
@@ -23,10 +25,16 @@ from drivers.transports.can.layout import (
     classic_bits,
 )
 from tests.drivers.can_bench import (
+    NS16,
     PROFILES,
+    Cycles,
     N,
+    PacedByPackets,
     Wire,
+    ns16_controller,
     random_packet,
+    virtual_ends,
+    wide_limits,
 )
 
 FRESH = (0, 1, 3, 5)
@@ -337,3 +345,23 @@ class TestBusLoad:
         frames = wire.far.packet(packet) + wire.near.drive_off()
         sizes = sorted(len(frame.data) for frame in frames)
         assert sizes == sorted(BusRates(profile).cycle_payloads(n_axes))
+
+    @pytest.mark.parametrize(("profile", "period"), [("fd", 0.001), ("classic", 0.002)])
+    def test_load_of_a_recorded_bus_is_the_computed_one(self, profile, period):
+        """A third node records 100 cycles after the init packet."""
+        clock = Cycles()
+        near, far = virtual_ends(profile, clock)
+        session = Session(NS16.drive_train, Guard(wide_limits(), period), CycleRing(N, 64))
+        link = PacedByPackets(near, far, ns16_controller(period=period), clock=clock)
+        with can.Bus(near._port._bus.channel_id, "virtual") as logger:
+            exchange(link, session, until=lambda: link.cycle == 112)
+            frames = list(iter(lambda: logger.recv(0.0), None))
+        link.close()
+        rates = BusRates(profile)
+        segments = (SEGMENT_UP, SEGMENT_DOWN)
+        busy = sum(
+            rates.duration(len(frame.data))
+            for frame in frames
+            if frame.arbitration_id not in segments
+        )
+        assert busy / (100 * period) == pytest.approx(rates.load(N, period))

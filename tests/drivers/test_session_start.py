@@ -20,7 +20,7 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import ControllerLimits, InitCheck, compare, float32_text, is_narrower
+from drivers.init_check import ControllerLimits, InitCheck, compare, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
@@ -648,11 +648,6 @@ def test_values_far_off_are_not_accepted(changes, words):
     theirs = adopted(arm(6), **changes)
     assert theirs.adopted == (not words)
     assert words in (theirs.unusable or "")
-
-
-def test_shortest_text_of_float32():
-    texts = [float32_text(np.float32(value)) for value in (5.0, -120.0, 0.1, 2.5)]
-    assert texts == ["5", "-120", "0.1", "2.5"]
 
 
 def test_limits_are_those_of_the_arm_and_of_its_joints():

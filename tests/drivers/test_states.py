@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import itertools
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 
@@ -141,7 +140,6 @@ def test_requests_that_wait_are_retained(before):
 
 
 SCRIPT = Path(__file__).resolve().parents[2] / "docs" / "state_machine.py"
-SVG = "{http://www.w3.org/2000/svg}"
 _spec = importlib.util.spec_from_file_location("state_machine", SCRIPT)
 drawing = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(drawing)
@@ -150,36 +148,3 @@ _spec.loader.exec_module(drawing)
 def test_page_and_picture_are_generated_from_the_table():
     assert drawing.PAGE.read_text() == drawing.page(), "run: python docs/state_machine.py"
     assert drawing.TARGET.read_text() == drawing.svg(), "run: python docs/state_machine.py"
-
-
-def read_back(text: str) -> dict[tuple[State, Input], State]:
-    """The table, from nothing but the arrows of the picture."""
-    inputs = {drawing.label(what): what for what in Input}
-    states = {drawing.label(state): state for state in State}
-    started = [state for state, row in TRANSITIONS.items() if Input.OFF in row]
-    found: dict[tuple[State, Input], State] = {}
-    for group in ElementTree.fromstring(text).iter(f"{SVG}g"):
-        title, shown = group.findtext(f"{SVG}title"), group.findtext(f"{SVG}text")
-        assert title is not None and shown is not None
-        source, names, target = title.split(" | ")
-        assert shown.removeprefix("↻ ") == names, "what is seen is what is meant"
-        for before in started if source == "any" else [states[source]]:
-            for name in names.split(", "):
-                key = before, inputs[name]
-                assert key not in found, f"two arrows leave {before.name} for {name}"
-                found[key] = states[target]
-    return found
-
-
-def test_arrows_of_the_picture_are_the_table():
-    table = {
-        (before, what): after for before, row in TRANSITIONS.items() for what, after in row.items()
-    }
-    assert read_back(drawing.svg()) == table
-
-
-def test_inputs_have_meanings_and_states_are_in_the_picture():
-    assert set(drawing.meanings()) == set(Input)
-    assert all(text.endswith(".") for text in drawing.meanings().values())
-    picture = drawing.TARGET.read_text()
-    assert all(f">{drawing.label(state)}</text>" in picture for state in State)
