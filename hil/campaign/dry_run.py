@@ -145,15 +145,10 @@ class DryRun:
         """Return the dry run of a plan (by default the folder's) from its file; None without one.
 
         Raises:
-            CampaignFolderError: the file is damaged, or of another version.
+            CampaignFolderError: the file cannot be read, or is of another version.
         """
-        found = load_record(
-            cls,
-            folder.dry_run,
-            "is damaged, or of another version",
-            "remove it; its archives are evaluated again, or the dry run is repeated",
-            version=FORMAT_VERSION,
-        )
+        remedy = "remove it; its archives are evaluated again, or the dry run is repeated"
+        found = load_record(cls, folder.dry_run, remedy, version=FORMAT_VERSION)
         now = folder.plan_hash if plan_hash is None and found is not None else plan_hash
         return found if found is not None and found.plan_hash == now else None
 

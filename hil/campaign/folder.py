@@ -64,12 +64,12 @@ def read_back(kind: type[T], text: str, *, strict: bool = True) -> T:
 
 
 def load_record(
-    kind: type[T], path: Path, problem: str, remedy: str, *, version: int = 0, strict: bool = True
+    kind: type[T], path: Path, remedy: str, *, version: int = 0, strict: bool = True
 ) -> T | None:
     """Read the file of a campaign's step; return None where there is none.
 
-    A file that cannot be read, or of another `format_version` than `version` (0 for any), is a
-    CampaignFolderError with this problem and remedy; see `read_back` for `strict`.
+    CampaignFolderError, with this remedy: it cannot be read, or has another `format_version` than
+    `version` (0 for any); see `read_back` for `strict`.
     """
     if not path_exists(path):
         return None
@@ -80,8 +80,8 @@ def load_record(
         return read_back(kind, text, strict=strict)
     except (OSError, ValueError, KeyError, TypeError) as error:
         cause = getattr(error, "strerror", None) or error
-        text = f"{path.name} {problem} ({cause})"
-        raise CampaignFolderError(path.parent, text, remedy) from error
+        problem = f"{path.name} cannot be read ({cause})"
+        raise CampaignFolderError(path.parent, problem, remedy) from error
 
 
 def save_record(path: Path, record: Any, version: int) -> None:
@@ -370,7 +370,7 @@ class CampaignFolder:
         return sums
 
     def _manifest(self) -> _Manifest:
-        found = load_record(_Manifest, self._path, "is damaged", "restore it or start a new folder")
+        found = load_record(_Manifest, self._path, "restore it or start a new folder")
         return found or _Manifest({}, [])
 
     def _save(self, manifest: _Manifest) -> None:

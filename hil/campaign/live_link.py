@@ -273,7 +273,6 @@ class LiveLink(MotionLink):
         heart: heartbeat of this process.
         finish: asks the controller to end the session; only a simulated one can be asked.
         inits: init packets until the controller was connected.
-        late, not_accepted: replies so far that were late or left out, and not accepted.
         job: number of the archive opened last.
         open_path: of the archive that is open; "" if none is.
         live: where viewers connect, None if nowhere.
@@ -286,8 +285,6 @@ class LiveLink(MotionLink):
     finish: Callable[[], None] = field(default=lambda: None)
     inits: int = 0
     cycles: int = 0
-    late: int = 0
-    not_accepted: int = 0
     live: LiveView | None = None
     only_simulated: bool = False
     connection: Connection = field(init=False)
@@ -440,8 +437,6 @@ class LiveLink(MotionLink):
     def _add_counts(self, recorded: Recorded) -> None:
         self.open_path = ""
         self.cycles += recorded.records
-        self.late += recorded.late
-        self.not_accepted += recorded.not_accepted
 
     def _write_failed(self, failed: Failed) -> ArchiveWriteError:
         self.open_path = ""

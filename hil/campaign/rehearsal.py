@@ -77,13 +77,8 @@ class Rehearsal(Frozen):
         Raises:
             CampaignFolderError: the file cannot be read.
         """
-        return load_record(
-            cls,
-            folder.rehearsal,
-            "cannot be read",
-            f"rehearse again (`hil rehearse {folder.root} --again`)",
-            strict=False,
-        )
+        remedy = f"rehearse again (`hil rehearse {folder.root} --again`)"
+        return load_record(cls, folder.rehearsal, remedy, strict=False)
 
     def save(self, path: Path) -> None:
         """Write the file (OutputError if the disk refuses)."""

@@ -94,7 +94,7 @@ class WarmUp:
     @classmethod
     def load(cls, path: Path, plan_hash: str) -> Self | None:
         """Read the file; return None without one for this plan (CampaignFolderError if damaged)."""
-        found = load_record(cls, path, "is damaged", "remove that file")
+        found = load_record(cls, path, "remove that file")
         return found if found is not None and found.plan_hash == plan_hash else None
 
     def save(self, path: Path) -> None:

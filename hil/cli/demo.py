@@ -15,7 +15,6 @@ from hil.campaign import (
     Campaign,
     CampaignFolder,
     CampaignFolderError,
-    LiveLink,
     MotionLink,
     design,
     plan_around,
@@ -98,7 +97,7 @@ def demo(
         plan = (
             design(cell, reporter)
             if excitation is None
-            else plan_around(cell, _designed(excitation, cell, reporter))
+            else plan_around(cell, _designed(excitation, cell))
         )
         require_runnable(cell, plan)  # before an earlier campaign is removed
         _make_room(output)
@@ -130,12 +129,6 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
             if stop.requested:
                 raise OperatorStopError(f"{fault} Resume with --resume.") from fault
             raise
-        finally:
-            if isinstance(link, LiveLink):
-                reporter.say(
-                    f"{link.late} replies were late, {link.not_accepted} were not accepted by the "
-                    "simulated controller"
-                )
     took = time.perf_counter() - started
     seconds = link.cycles * cell.period
     reporter.say(
@@ -154,17 +147,10 @@ def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
         yield link
 
 
-def _designed(path: Path, cell: Cell, reporter: Reporter) -> Excitation:
-    """Load the motion of a design; print what its search did not check."""
+def _designed(path: Path, cell: Cell) -> Excitation:
+    """Load the motion of a design for the cell; it is checked before it runs."""
     result = DesignResult.load(path)
     result.require_cell(cell, path)
-    lacking = [f"{what} not checked" for what in result.settings.unchecked]
-    lacking += [] if result.complete else ["interrupted"]
-    if lacking:
-        reporter.say(
-            f"note: search for {path}: {', '.join(lacking)}; the motion is checked against all "
-            "limits of the cell before it runs"
-        )
     return result.excitation
 
 

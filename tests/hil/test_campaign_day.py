@@ -272,9 +272,7 @@ def test_steps_of_another_plan_or_unreadable_are_not_done(folder: CampaignFolder
     (folder.archives / gone.name).unlink()
     found = conduct_of(folder)
     assert all(not one.done for one in found.steps[:3])
-    assert ["cannot be read" in found.steps[0].words, "damaged" in found.steps[1].words] == [
-        True
-    ] * 2
+    assert all("cannot be read" in one.words for one in found.steps[:2])
     assert gone.name not in {one.archive for one in found.recorded}
 
 

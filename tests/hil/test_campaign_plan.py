@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -328,39 +327,3 @@ def test_an_earlier_campaign_is_not_removed_for_a_bad_motion(
     with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):
         demo_module.demo(output=tmp_path, excitation=tmp_path / "x.toml", force=True, quiet=True)
     assert earlier.read_text() == "{}"
-
-
-@pytest.mark.parametrize(
-    ("constraints", "complete", "words"),
-    [
-        ({}, True, ()),
-        ({"collision": False}, True, ("the arm itself not checked",)),
-        ({"current": False}, False, ("motor currents not checked", "interrupted")),
-    ],
-)
-def test_checks_that_a_design_left_out_are_printed(
-    cell: Cell,
-    wild: Excitation,
-    monkeypatch: pytest.MonkeyPatch,
-    constraints: dict[str, bool],
-    complete: bool,
-    words: tuple[str, ...],
-) -> None:
-    result = SimpleNamespace(
-        require_cell=lambda cell, path: None,
-        settings=preset("a").replaced(constraints=constraints),
-        complete=complete,
-        excitation=replace(wild),
-    )
-    if not constraints:  # whatever the preset leaves out
-        everything = {"collision": True, "current": True}
-        result.settings = preset("a").replaced(constraints=everything)
-    monkeypatch.setattr(
-        demo_module, "DesignResult", SimpleNamespace(load=lambda path: result), raising=True
-    )
-    printed: list[str] = []
-    reporter = SimpleNamespace(say=printed.append)
-    demo_module._designed(Path("x"), cell, reporter)
-    assert len(printed) == bool(words)
-    for word in words:
-        assert word in printed[0]

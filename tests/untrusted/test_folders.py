@@ -170,7 +170,7 @@ def test_unreadable_manifest_is_not_a_missing_one(thing: str, folder: Path) -> N
     put(folder / "manifest.json", thing)
     campaign = Campaign.open(folder)
     for step in (campaign.status, campaign.folder.accept_changes):
-        with pytest.raises(CampaignFolderError, match=r"manifest\.json is damaged"):
+        with pytest.raises(CampaignFolderError, match=r"manifest\.json cannot be read"):
             step()
 
 
@@ -534,7 +534,7 @@ def test_changed_value_is_refused(
     if file == "plan.json":
         (done / "manifest.json").unlink(missing_ok=True)
     doctored(done / file, *place, value=value)
-    message = "is not a campaign plan" if file == "plan.json" else f"{file} is damaged"
+    message = "is not a campaign plan" if file == "plan.json" else f"{file} cannot be read"
     with pytest.raises(InputError, match=re.escape(message)):
         LOADED[file](done)
     if file == "dry_run.json":
