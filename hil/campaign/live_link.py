@@ -696,15 +696,14 @@ class LiveLink(MotionLink):
     # --- one recording
 
     def _no_session(self, wait: float) -> str:
-        status, table = self.view.status, self.cell.controller
+        return f"no init packet within {wait:g} s; {self._waiting()}"
+
+    def _waiting(self) -> str:
+        """Return what was received from a controller without a session."""
+        table, problem = self.cell.controller, self.view.not_understood
         who = table.host if table.transport == "udp" else "the controller"
-        some = status.answered > 0 or self.view.not_understood
-        what = "no init packet" if some else "nothing"
-        also = f"; {self.view.not_understood}" if self.view.not_understood else ""
-        return (
-            f"{what} received from {who} within {wait:g} s ({status.foreign} packets from "
-            f"other addresses{also})"
-        )
+        what = f"{who}: {problem}" if problem else f"no packet from {who}"
+        return f"{what} ({self.view.status.foreign} packets from other addresses)"
 
     def _record(
         self, spec: ArchiveSpec, stop: Stop, duration: float | None, watch: Watch
@@ -769,9 +768,7 @@ class LiveLink(MotionLink):
                 self._position,
                 late=status.late,
                 not_accepted=status.unanswered,
-                foreign=status.foreign,
-                connected=status.answered > 0,
-                not_understood=self.view.not_understood,
+                waiting="" if status.answered else self._waiting(),
                 over=over,
             )
         )

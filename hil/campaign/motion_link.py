@@ -71,9 +71,7 @@ class Progress:
         cycles: archived so far.
         missed, late, not_accepted: see `Recorded`.
         position: (n,) rad, measured last; None before the first record.
-        foreign: packets from other addresses; they get no reply.
-        connected: whether any packet of the controller was replied to yet.
-        not_understood: number and cause of packets without a reply; "" for none.
+        waiting: what was received until a packet of the controller was replied to; "" since then.
         over: why nothing is recorded any more while replies continue; "" during the recording.
     """
 
@@ -83,9 +81,7 @@ class Progress:
     position: Array | None = None
     late: int = 0
     not_accepted: int = 0
-    foreign: int = 0
-    connected: bool = True
-    not_understood: str = ""
+    waiting: str = ""
     over: str = ""
 
 

@@ -155,13 +155,8 @@ class View(StatusLine):
             self.say(self._line(progress))
 
     def _line(self, progress: Progress) -> str:
-        if not progress.connected:
-            table = self._cell.controller
-            who = table.host if table.transport == "udp" else "the controller"
-            what = f"no packet from {who}"
-            if progress.not_understood:
-                what = f"{who}: {progress.not_understood}"
-            return f"{what} ({progress.foreign} packets from other addresses)"
+        if progress.waiting:
+            return progress.waiting
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",

@@ -361,7 +361,7 @@ def test_a_missing_controller_is_waited_for_as_stated(
     with recorder_of(path, "--wait", "0.5") as recorder:
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 4
-    assert "nothing received from 127.0.0.1 within 0.5 s" in " ".join(errors.split())
+    assert "no init packet within 0.5 s; no packet from 127.0.0.1" in " ".join(errors.split())
 
 
 def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Path, int]) -> None:
