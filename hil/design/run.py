@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -32,16 +32,12 @@ _HEAD = f"{_MARK}, for `hil design --resume`.\n"
 
 
 class DesignFolder:
-    """Paths of a design's files in a folder, and their lock."""
+    """Paths of a design's files in a folder."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.result, self.picture = root / RESULT, root / PICTURE
         self.settings, self.journal = root / SETTINGS, root / JOURNAL
-
-    def locked(self) -> AbstractContextManager[None]:
-        """Create the folder, and lock it against other searches."""
-        return lock_folder(self.root, "search", "-o")
 
     def create(self, settings: DesignSettings, *, force: bool) -> None:
         """Write the settings of a new design; with `force` remove an earlier one.
@@ -153,7 +149,7 @@ def run_design(
     """
     problem = problem_of(cell, settings, earlier)  # before anything is replaced
     archives = () if earlier is None else earlier.archives
-    with folder.locked():
+    with lock_folder(folder.root, "search", "-o"):
         if resume:
             if settings != folder.resumed_settings():
                 raise SettingsError(

@@ -22,8 +22,8 @@ from hil.cell import Cell
 from hil.cli.design import design
 from hil.design import DesignResult, load_design
 from hil.design.advice import NoExcitationError
-from hil.design.run import DesignFolder
 from hil.errors import InputError
+from hil.files import lock_folder
 from hil.plots import design_picture
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -160,7 +160,7 @@ def test_a_locked_folder_is_refused(invoke, settings, copied, option):
     before = content()
     given = () if option == ("--resume",) else ("--settings", settings, "--kinematic")
     with (
-        DesignFolder(copied).locked(),
+        lock_folder(copied, "search", "-o"),
         pytest.raises(InputError, match=r"copied: a search is running in it; wait") as caught,
     ):
         invoke(CELL_PATH, *given, "-o", copied, *option)
@@ -171,8 +171,8 @@ def test_a_locked_folder_is_refused(invoke, settings, copied, option):
 
 def test_the_folder_is_locked_until_the_picture_is_saved(invoke, copied):
     def meanwhile(*_, **__):
-        with pytest.raises(InputError, match="a search is running"), DesignFolder(copied).locked():
-            pass
+        with pytest.raises(InputError, match="a search is running"):
+            lock_folder(copied, "search", "-o").__enter__()
         return Figure()
 
     invoke(CELL_PATH, "--resume", "-o", copied, draw=meanwhile)
