@@ -1,9 +1,9 @@
 """Damage archives of a finished campaign, many times: `python -m tests.disk.damage --rounds 1000`.
 
 Each round damages an archive or two by its number (`draw`) and runs all readers: `hil archive
-check`, `hil.open_recording`, `hil plot`, `hil identify` of archives or of the folder, every tenth
-round `hil reidentify`. Each must raise a named error, return what it returned before, or state what
-was left out (`tests/disk/laws.py`).
+check`, `hil.open_recording`, `hil plot`, `hil identify` of archives or of the folder. Each must
+raise a named error, return what it returned before, or state what was left out
+(`tests/disk/laws.py`).
 
 Rounds in the journal are not run again. A failure is printed with the command that repeats it. The
 exit code is 1 if a law was broken in any round of the journal, 2 if the journal is none of these.
@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from hil.archive import container
-from hil.batch.workers import LocalWorkers, Workers
 from hil.campaign import stop_on_interrupt
 from hil.progress import reporter
 from tests.arguments import parser_of, whole_number
@@ -185,25 +184,22 @@ KINDS: Final[dict[str, Callable[[random.Random, Path, Files], tuple[Files, str]]
 }
 
 
-EVERY = 10  # Rounds of which one is also pooled
 SEED = 20261120
 
 
-def campaign(folder: Path, workers: Workers | None, repetitions: int = 3) -> Undamaged:
+def campaign(folder: Path, repetitions: int = 3) -> Undamaged:
     made = fast_campaign(folder / "campaign", fast_cell(folder, repetitions=repetitions))
     made.run(durable=False, unrehearsed=True)
-    return undamaged(made.folder.root, workers)
+    return undamaged(made.folder.root)
 
 
-def play(
-    truth: Undamaged, number: int, workers: Workers | None, kind: str | None = None
-) -> tuple[str, list[str]]:
+def play(truth: Undamaged, number: int, kind: str | None = None) -> tuple[str, list[str]]:
     """Run one round; return the damage and the violated laws. The files are restored."""
     changed, words = draw(random.Random(f"{SEED}/{number}"), truth.files, kind)
     try:
         for path, data in changed.items():
             path.write_bytes(data)
-        return words, list(broken(truth, sorted(changed), number, workers))
+        return words, list(broken(truth, sorted(changed), number))
     finally:
         for path in changed:
             path.write_bytes(truth.files[path])
@@ -221,16 +217,14 @@ def run(
     with (
         stop_on_interrupt() as stop,
         tempfile.TemporaryDirectory(dir=given.folder) as folder,
-        LocalWorkers(1) as workers,
         Journal(given.journal) as journal,
         progress.task("damaging archives (rounds)", len(left)) as task,
     ):
-        truth = campaign(Path(folder), workers)
+        truth = campaign(Path(folder))
         for number in left:
             if stop.requested:
                 break
-            pooled = workers if number % EVERY == 0 else None
-            words, laws = play(truth, number, pooled)
+            words, laws = play(truth, number)
             rounds[number] = {"round": number, "harm": words, "broken": laws}
             journal.add(**rounds[number])
             for law in laws:

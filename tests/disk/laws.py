@@ -16,12 +16,8 @@ from numpy.typing import NDArray
 
 from hil.archive import Archive, open_archive
 from hil.archive.check import check_archive
-from hil.batch.cache import CacheLocation
-from hil.batch.run import reidentify
-from hil.batch.workers import Workers
 from hil.errors import HilError
 from hil.identify import Identification, identify_archives, identify_campaign
-from hil.identify.options import FIXED
 from hil.plots.archive_view import view_of
 from hil.progress import Silent
 
@@ -34,7 +30,6 @@ class Undamaged:
 
     Attributes:
         loose: the estimate from the archives without their folder.
-        batch: estimates of the batch by archive, "" for all; values and standard deviations.
         rows: every sample of all archives, see `_rows`.
     """
 
@@ -42,7 +37,6 @@ class Undamaged:
     files: Mapping[Path, bytes]
     archives: Mapping[Path, Archive]
     loose: Identification
-    batch: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     rows: frozenset[bytes]
 
     @property
@@ -51,8 +45,8 @@ class Undamaged:
         return [p for p in sorted(self.files) if not p.name.startswith("move")]
 
 
-def undamaged(root: Path, workers: Workers | None) -> Undamaged:
-    """Read a campaign; without workers, without a batch."""
+def undamaged(root: Path) -> Undamaged:
+    """Read a campaign."""
     paths = sorted((root / "archives").glob("*.mcap"))
     fitted = [path for path in paths if not path.name.startswith("move")]
     archives = {path: open_archive(path) for path in paths}
@@ -61,26 +55,20 @@ def undamaged(root: Path, workers: Workers | None) -> Undamaged:
         {path: path.read_bytes() for path in paths},
         archives,
         identify_archives(fitted, Silent()),
-        {} if workers is None else _by_archive(root, workers)[0],
         frozenset().union(*(_rows(one.columns) for one in archives.values())),
     )
 
 
-def broken(
-    truth: Undamaged, harmed: Sequence[Path], number: int, workers: Workers | None = None
-) -> Iterator[str]:
+def broken(truth: Undamaged, harmed: Sequence[Path], number: int) -> Iterator[str]:
     """Yield a sentence for each violated law, of the archives that were damaged.
 
-    Even rounds identify the archives, the others the folder, which has their checksums. With
-    workers there is a batch of the folder.
+    Even rounds identify the archives, the others the folder, which has their checksums.
     """
     readers: list[Callable[[], Iterator[str]]] = [
         partial(law, truth, path) for path in harmed for law in (_reads, _checks, _looks)
     ]
     if any(path in truth.paths for path in harmed):  # moves are never read for it
         readers.append(partial(_identifies, truth, harmed, campaign=bool(number % 2)))
-    if workers is not None:
-        readers.append(partial(_pools, truth, harmed, workers))
     for reader in readers:
         try:
             yield from reader()
@@ -136,57 +124,22 @@ def _identifies(truth: Undamaged, harmed: Sequence[Path], *, campaign: bool) -> 
     else:
         found, what = identify_archives(truth.paths, Silent()), "identify"
     before, now = truth.loose.estimate.pooled, found.estimate.pooled
-    if _alike(before.values, now.values):
+    same_parameters = before.values.shape == now.values.shape
+    if same_parameters and np.allclose(before.values, now.values, rtol=SAME, atol=0.0):
         return
     messages = [*found.results.notes, *found.results.verdict.warnings]
     if not any(path.name in text for path in harmed for text in messages):
         yield f"{what}: another estimate without a message about {harmed[0].name}"
-    yield from _within(before.values, before.std, now.values, now.std, what)
-
-
-def _alike(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    """Return whether two estimates are equal; those of other parameters are not."""
-    return one.shape == other.shape and np.allclose(one, other, rtol=SAME, atol=0.0)
-
-
-def _within(
-    before: NDArray[Any], std: NDArray[Any], now: NDArray[Any], other: NDArray[Any], what: str
-) -> Iterator[str]:
-    """Compare two estimates; with too few samples left, the parameters may be others."""
-    if before.shape != now.shape:
-        return
-    apart = np.abs(now - before) / np.hypot(std, other)
-    if np.nanmax(apart) > APART:
-        yield f"{what}: an estimate {np.nanmax(apart):.1f} standard deviations from that before"
+    if same_parameters:  # with too few samples left, they may be others
+        apart = np.nanmax(np.abs(now.values - before.values) / np.hypot(before.std, now.std))
+        if apart > APART:
+            yield f"{what}: an estimate {apart:.1f} standard deviations from that before"
 
 
 SAME = 1e-9  # Relative difference of two sums of the same terms in another order
 APART = 5.0
 """Standard deviations of the difference of two estimates that share most of their samples; these
 are correlated, so that 5 is generous, and a wrong sample moves an estimate by far more."""
-
-
-def _by_archive(
-    root: Path, workers: Workers
-) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], list[str]]:
-    """Return estimates of a batch by archive or "" for all, and its messages."""
-    result = reidentify([str(root)], FIXED, workers, Silent(), cache=CacheLocation(keep=False))
-    found = {Path(one.archive).name: (one.values, one.std) for one in result.repetitions}
-    found[""] = (result.pooled[0].values, result.pooled[0].std)
-    messages = [f"{one.path}: {one.reason}" for one in (*result.broken, *result.skipped)]
-    levels = (*result.repetitions, *result.campaigns, *result.pooled)
-    messages += [warning for one in levels for warning in one.warnings]
-    return found, messages
-
-
-def _pools(truth: Undamaged, harmed: Sequence[Path], workers: Workers) -> Iterator[str]:
-    found, messages = _by_archive(truth.root, workers)
-    same = found.keys() == truth.batch.keys() and all(
-        _alike(found[name][0], truth.batch[name][0]) for name in found
-    )
-    if not same and not any(path.name in text for path in harmed for text in messages):
-        yield f"batch: another estimate without a message about {harmed[0].name}"
-    yield from _within(*truth.batch[""], *found[""], "batch")
 
 
 def _same(one: Archive, other: Archive) -> bool:

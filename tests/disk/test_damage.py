@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from hil.archive import open_archive
-from hil.batch.workers import LocalWorkers
 from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
@@ -20,25 +19,20 @@ from tests.hil.mcap_bytes import chunks
 
 @pytest.fixture(scope="module")
 def truth(tmp_path_factory: pytest.TempPathFactory) -> Undamaged:
-    return campaign(tmp_path_factory.mktemp("damage"), None, repetitions=2)
+    return campaign(tmp_path_factory.mktemp("damage"), repetitions=2)
 
 
 def test_each_kind_of_damage_is_named_or_harmless(truth: Undamaged) -> None:
     for number, kind in enumerate(sorted(KINDS)):
-        words, laws = play(truth, number, None, kind)
+        words, laws = play(truth, number, kind)
         assert not laws, f"round {number}, {words}"
 
 
 @pytest.mark.slow
 def test_hundreds_of_damages_are_named_or_harmless(tmp_path: Path) -> None:
-    failed = {}
-    with LocalWorkers(1) as workers:
-        truth = campaign(tmp_path, workers)
-        for number in range(1000, 1300):
-            words, laws = play(truth, number, workers if number % 10 == 0 else None)
-            if laws:
-                failed[number] = (words, laws)
-    assert not failed
+    truth = campaign(tmp_path)
+    rounds = {number: play(truth, number) for number in range(1000, 1300)}
+    assert not {number: one for number, one in rounds.items() if one[1]}
 
 
 def excitations(truth: Undamaged) -> list[Path]:
