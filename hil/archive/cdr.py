@@ -267,10 +267,6 @@ def _field(line: str, package: str) -> _Field:
     if match is None:
         raise LayoutError(f"its definition has the line {line!r}")
     kind, count = match["type"], match["count"]
-    if kind in ("time", "duration"):
-        raise LayoutError("its definition is that of ROS 1")
-    if kind == "wstring":
-        raise LayoutError(f"its field {match['name']} is a wstring")
     if kind not in _PRIMITIVES and kind != "string":
         kind = _short(kind) if "/" in kind else f"{package}/{kind}"
     if count is None:

@@ -289,12 +289,9 @@ def open_archive(
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
     columns, text = content.columns(), None
     if damage is not None:
-        dropped, stamp = scan.size - damage.offset, columns["stamp"]
         text = f"the record at byte {damage.offset} {damage.reason}"
-        text += f" ({dropped} bytes from there on are unused)"
-        if fields is None or fields:  # else samples are not counted
-            duration = 1e-9 * float(stamp[-1] - stamp[0]) if len(stamp) else 0.0
-            text += f"; {len(stamp)} samples ({duration:.6g} s) could be read"
+        text += f" ({scan.size - damage.offset} bytes from there on are unused)"
+        text += f"; {len(columns['stamp'])} samples could be read"
         text += "; the outcome is missing" if scan.outcome is None else ""
     return Archive(
         path=path,

@@ -123,12 +123,10 @@ def _shown(lines: Sequence[str]) -> str:
 def _check_lines(found: Check) -> list[str]:
     verdict = "conforms to" if found.conforms else "does not conform to"
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
-    if found.repaired:
-        lines[0] += ", repaired with loss"
-    for aspect, meaning in ASPECTS.items():
+    for aspect in ASPECTS:
         faults = found.faults.get(aspect, ())
-        lines.append(f"  {aspect:<13} {'no' if faults else 'ok':<3} {meaning}")
-        lines += [f"  {'':<13}     {fault}" for fault in faults]
+        lines.append(f"  {aspect:<13} {'no' if faults else 'ok'}")
+        lines += [f"    {fault}" for fault in faults]
     if not found.conforms:
         lines.append(f"  to repair it: hil archive repair {found.path}")
     return lines
