@@ -371,7 +371,7 @@ def test_a_stop_lasts_beyond_the_end_of_the_motion(points):
     assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
     queue(interpolator, points[2:3], first=2)
     step = interpolator.get_next_step()
-    assert (step.status, step.events) == (Status.FINAL_STEP, ())
+    assert (step.status, step.events, step.elapsed_time) == (Status.FINAL_STEP, (), 0.0)
     np.testing.assert_array_equal(step.position, points[1])
     interpolator.continue_motion()
     assert events(steps_to_rest(interpolator)) == [(EventKind.MOTION_ENDED, 2)]
