@@ -531,11 +531,11 @@ def test_a_rate_at_the_start_applies_at_once(live_motions, fraction):
     np.testing.assert_array_equal(held.times[100:], arm.times)
 
 
-@pytest.mark.parametrize("request", ["hold", "stop"])
-def test_begin_clears_a_hold_or_stop_and_keeps_an_override(live_motions, request):
+@pytest.mark.parametrize("paused_by", ["hold", "stop"])
+def test_begin_clears_a_hold_or_stop_and_keeps_an_override(live_motions, paused_by):
     arm = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("override", 0.5)
-    arm.ask(request).run(500)
-    assert arm.player.finished is (request == "stop")
+    arm.ask(paused_by).run(500)
+    assert arm.player.finished is (paused_by == "stop")
     arm.begin()
     assert arm.player.rate == 0.5
     arm.ask("override", 1.0)
