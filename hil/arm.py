@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Self
 
 import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from identification.excitation.collision.bodies import described_shapes
 from identification.excitation.collision.hulls import joint_poses
@@ -33,18 +30,6 @@ class Solid:
     name: str
     joint: int
     vertices: Array
-
-    @cached_property
-    def faces(self) -> NDArray[np.intp]:
-        """Triangles as corner indices (f, 3), anticlockwise from outside; both sides if flat."""
-        hull = _hull(self.vertices)
-        if hull is None:
-            return np.zeros((0, 3), dtype=np.intp)
-        a, b, c = (self.vertices[hull.simplices[:, k]] for k in range(3))
-        turn = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3])
-        faces: NDArray[np.intp] = hull.simplices.astype(np.intp)
-        faces[turn < 0.0] = faces[turn < 0.0][:, ::-1]
-        return faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,13 +110,6 @@ def _described(model: pin.Model, urdf: str, mesh_folders: Sequence[str]) -> tupl
             if np.all(np.abs(placed) <= FARTHEST):  # what the collision check refuses, too
                 solids.append(Solid(name, item.parentJoint - 1, placed))
     return tuple(solids)
-
-
-def _hull(points: Array) -> ConvexHull | None:
-    for options in ("Qt", "QJ"):  # the second moves points a little, so that a plate is a body
-        with suppress(QhullError):
-            return ConvexHull(points, qhull_options=options)
-    return None
 
 
 def surface_points(shape: coal.CollisionGeometry) -> Array | None:

@@ -24,7 +24,6 @@ class MotionRefusedError(UnsafeError):
     """A motion failed its check and was not sent."""
 
     def __init__(self, motion: str, problem: str, remedy: str) -> None:
-        self.motion = motion
         super().__init__(f"{motion} was not sent: {problem}; {remedy}.")
 
 
@@ -32,7 +31,6 @@ class MotionFailedError(ControllerFault):
     """A motion ended otherwise than planned; what was recorded is archived.
 
     Attributes:
-        motion: its name, counted from 1: "repetition 1".
         outcome: "stopped", "refused" or "lost".
         sentence: motion, archive, outcome and reason.
         flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to a refusal, or None.
@@ -46,7 +44,7 @@ class MotionFailedError(ControllerFault):
         flight_recorder: NDArray[np.void] | None = None,
         archive: str | None = None,
     ) -> None:
-        self.motion, self.outcome, self.reason = motion, outcome, reason
+        self.outcome, self.reason = outcome, reason
         self.flight_recorder = flight_recorder
         which = motion if archive is None else f"{motion} ({archive})"
         how = reason if reason.startswith(outcome) else f"{outcome}: {reason}"
@@ -90,10 +88,9 @@ class RepetitionsRejectedError(HilError):
     exit_code: ClassVar[int] = 5
 
     def __init__(self, motion: str, reasons: Sequence[str]) -> None:
-        self.motion, self.reasons = motion, tuple(reasons)
         super().__init__(
-            f"{motion} was rejected {plural(len(self.reasons), 'time')}, the last time because "
-            f"{self.reasons[-1]}; all attempts are archived with their reasons: find the cause, "
+            f"{motion} was rejected {plural(len(reasons), 'time')}, the last time because "
+            f"{reasons[-1]}; all attempts are archived with their reasons: find the cause, "
             "then run the campaign again to continue."
         )
 
@@ -107,7 +104,6 @@ class ArmChangedError(RepetitionsRejectedError):
     def __init__(
         self, motion: str, differs: str, reference: Sequence[str], later: Sequence[str]
     ) -> None:
-        self.motion, self.reasons = motion, (differs,)
         self.reference, self.later = tuple(reference), tuple(later)
         HilError.__init__(
             self,
