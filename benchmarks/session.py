@@ -35,8 +35,10 @@ PERIOD_MS = 2
 N = 6
 AMPLITUDE = np.array([0.8, 0.5, 0.6, 0.9, 0.7, 1.2])
 FREQUENCY = np.array([0.21, 0.17, 0.26, 0.31, 0.37, 0.29])
+FADE_TIME = 2.0
+"""Time in which the sinusoids fade in, s."""
 FADE = 1_000
-"""Cycles in which the sinusoids fade in."""
+"""Cycles of that time."""
 LOOP = 50_000
 """Cycles after which all of them, being multiples of 0.01 Hz, begin again."""
 START = np.array([0.1, -0.2, 0.3, -0.4, 0.5, -0.6])
@@ -52,19 +54,25 @@ def sines(t: Array, start: Array, fade_time: float) -> tuple[Array, Array]:
     return start + AMPLITUDE * fade * np.sin(phase), AMPLITUDE * slope
 
 
-class Sinusoid:
-    """Joint sinusoids from rest, faded in over two seconds and going on for ever, as a table."""
+class Sinusoids:
+    """Joint sinusoids from rest, faded in over two seconds, as a table of `cycles` periods.
+
+    With `loop`, the last `loop` rows are repeated without end.
+    """
 
     bounds: BoundsName = "plan"
-    finished = False
 
-    def __init__(self, start: Array) -> None:
-        period = PERIOD_MS / 1000.0
-        self.position, self.velocity = sines(
-            np.arange(FADE + LOOP, dtype=np.float64) * period, start, FADE * period
-        )
-        self.start = start
+    def __init__(self, cycles: int, period: float, loop: int = 0) -> None:
+        times = np.arange(cycles, dtype=np.float64) * period
+        self.position, self.velocity = sines(times, START, FADE_TIME)
+        self.start = START
+        self._loop = loop
         self._index = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether the table is at its end."""
+        return not self._loop and self._index + 1 >= len(self.position)
 
     def begin(self, position: Array) -> None:
         """Shift the table to where the arm is."""
@@ -73,13 +81,14 @@ class Sinusoid:
     def advance(self) -> tuple[Array, Array]:
         """The next row."""
         self._index += 1
-        if self._index == FADE + LOOP:
-            self._index = FADE
+        if self._loop and self._index == len(self.position):
+            self._index -= self._loop
         return self.position[self._index], self.velocity[self._index]
 
     def stop(self) -> None:
-        """Hold where it is; at speed the guard refuses that, and the benchmark fails."""
-        self.position = np.broadcast_to(self.position[self._index], self.position.shape)
+        """End here; at speed the guard refuses that, and the benchmark fails."""
+        self.position = self.position[: self._index + 1]
+        self._loop = 0
 
 
 def drive_train() -> DriveTrain:
@@ -142,7 +151,7 @@ def record() -> list[bytes]:
     init = init_packet(PERIOD_MS)
     packets = [init]
     session.reply(init, 0.0)
-    session.request(Sinusoid(START))
+    session.request(Sinusoids(FADE + LOOP, PERIOD_MS / 1000.0, LOOP))
     axes = CyclicPacket.zeros(1, N).axes
     axes["d"][:, 0] = axes["d"][:, 2] = drive_train().motor_revolutions(START)
     axes["d"][:, 4] = 1.0
@@ -176,7 +185,7 @@ def begun(packets: list[bytes]) -> Session:
     """A session that has had the init packet and a motion requested."""
     session = new_session(4096)
     session.reply(packets[0], 0.0)
-    session.request(Sinusoid(START))
+    session.request(Sinusoids(FADE + LOOP, PERIOD_MS / 1000.0, LOOP))
     return session
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import socket
 import tempfile
 import time
 from dataclasses import replace
@@ -25,13 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
-from benchmarks.session import drive_train, limits
+from benchmarks.session import Sinusoids, drive_train, limits
 from benchmarks.turnaround_ends import (
     HOST,
     PERIOD,
     WARM_UP,
     Settings,
-    Sweep,
     control,
     drain,
     echo,
@@ -41,6 +39,7 @@ from drivers import MotionEnded
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.transports.udp import UdpSpec
+from hil.demo_link import free_port
 
 Array = NDArray[np.float64]
 
@@ -59,16 +58,9 @@ def exchange_settings(port: int, realtime: RealTimeSettings) -> ExchangeSettings
         session,
         realtime=realtime,
         needs_archive=False,
-        preload=("benchmarks.turnaround_ends",),
+        preload=("benchmarks.session",),
         max_late=1_000_000,
     )
-
-
-def free_port() -> int:
-    """Return a free UDP port."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind((HOST, 0))
-        return int(probe.getsockname()[1])
 
 
 def steal_ticks() -> int:
@@ -97,7 +89,7 @@ def measure(cycles: int, blocks: int, folder: Path) -> dict[str, Any]:
             exchange.send_heartbeat()
         settings = Settings(port, ours.recv(), cycles, blocks, asking, str(ends))
         controller = _spawn.Process(target=control, args=(settings,))
-        exchange.submit(Sweep(cycles + 2 * WARM_UP))
+        exchange.submit(Sinusoids(cycles + 2 * WARM_UP + 1, PERIOD))
         controller.start()
         while controller.is_alive():
             exchange.send_heartbeat()

@@ -14,10 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.session import START, N, drive_train, init_packet, sines
+from benchmarks.session import START, N, drive_train, init_packet
 from drivers import CyclicPacket, Mode
 from drivers.exchange.realtime import RealTimeSettings, enter
-from drivers.motion_source import BoundsName
 from drivers.packets import DRIVE_ON, LAST_NUMBER, next_number
 from drivers.record import RingReader
 
@@ -29,38 +28,6 @@ PERIOD: Final = PERIOD_MS / 1000.0
 WARM_UP: Final = 300
 """Cycles at the beginning that are not measured."""
 _TIMEVAL: Final = struct.Struct("@qq")
-
-
-class Sweep:
-    """Joint sinusoids, faded in over two seconds, for a given number of cycles; from a table."""
-
-    bounds: BoundsName = "plan"
-
-    def __init__(self, cycles: int) -> None:
-        self.position, self.velocity = sines(
-            np.arange(cycles + 1, dtype=np.float64) * PERIOD, START, 2.0
-        )
-        self.start = START
-        self._offset = np.zeros(N)
-        self._index = 0
-
-    @property
-    def finished(self) -> bool:
-        """Whether the table is at its end."""
-        return self._index + 1 >= len(self.position)
-
-    def begin(self, position: Array) -> None:
-        """Shift the table to where the arm is."""
-        self._offset = position - self.start
-
-    def advance(self) -> tuple[Array, Array]:
-        """The next row."""
-        self._index += 1
-        return self.position[self._index] + self._offset, self.velocity[self._index]
-
-    def stop(self) -> None:
-        """End here; at speed the guard refuses that, and the benchmark fails as it should."""
-        self.position = self.position[: self._index + 1]
 
 
 @dataclass(frozen=True)
