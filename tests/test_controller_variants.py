@@ -130,7 +130,9 @@ def test_any_arm_in_any_slots_moves_and_no_other(
         others=others,
     )  # fmt: skip
     assert_moved(controller)
-    np.testing.assert_array_equal(controller.foreign_targets, np.arange(1.0, 1.0 + foreign) / 4.0)
+    layout = controller._layout
+    targets = layout.axes["d"][layout._foreign, 0]
+    np.testing.assert_array_equal(targets, np.arange(1.0, 1.0 + foreign) / 4.0)
 
 
 @pytest.mark.parametrize(
