@@ -343,8 +343,12 @@ def _load(payload: Payload | None) -> str:
 
 
 def _describe(change: Change) -> str:
+    if not math.isfinite(change.mass):
+        return "centre or inertia (this arm does not determine the mass)"
     mass = f"{change.mass:+.2f} ± {change.mass_std:.2g} kg"
-    if not abs(change.mass) > _SIGNIFICANT * change.mass_std:  # or unknown
+    if abs(change.mass) < _SIGNIFICANT * change.mass_std:
         return f"centre or inertia, not significantly the mass ({mass})"
+    if not np.isfinite(change.moment).all():
+        return mass
     centre = ", ".join(f"{one:.0f}" for one in 1e3 * change.moment / change.mass)
     return f"{mass}, centred at ({centre}) mm in the frame of the last joint"
