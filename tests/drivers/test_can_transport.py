@@ -12,6 +12,7 @@ from pathlib import Path
 import can
 import numpy as np
 import pytest
+from can.interfaces.slcan import slcanBus
 
 from drivers import (
     CycleRing,
@@ -311,7 +312,7 @@ def test_adapter_that_refuses_the_bit_rate_is_closed(monkeypatch):
         refused.append(bus)
         raise ValueError("no such rate")
 
-    monkeypatch.setattr(can.interfaces.slcan.slcanBus, "set_bitrate", refuse)
+    monkeypatch.setattr(slcanBus, "set_bitrate", refuse)
     adapter = SlcanBus()
     with pytest.raises(TransportError, match="no such rate"):
         slcan(adapter.ports[0]).open()
