@@ -24,6 +24,7 @@ from hil.archive import (
     schema,
 )
 from hil.archive.cdr import fixed_layout
+from hil.archive.check import check_archive
 from hil.errors import ArchiveError, ArchiveVersionError, ArchiveWriteError
 
 JOINTS = ("joint_1", "joint_2", "joint_3")
@@ -125,7 +126,7 @@ class TestRoundTrip:
 
     def test_the_outcome_counts_what_was_written(self, tmp_path):
         rows = records(120)
-        rows["gap"][[30, 60]] = 2
+        rows["gap"][[30, 110]] = 2
         with writer(tmp_path / NAME) as archive:
             archive.write(rows, torques(rows))
             archive.close("stopped", reason="Ctrl-C", details={"operator": "me"})
@@ -139,6 +140,7 @@ class TestRoundTrip:
             "first_cycle": "12000",
             "last_cycle": "12119",
         }
+        assert "outcome" not in check_archive(tmp_path / NAME).faults
 
     def test_cycles_or_torques_may_be_missing(self, tmp_path):
         """An unknown torque is NaN; the default outcome is ``unknown``."""

@@ -406,10 +406,10 @@ class TestArrays:
     @pytest.mark.parametrize(
         ("stamps", "unit"),
         [
-            (1_700_000_000_123_456_000 + 10_000_000 * np.arange(40), "ns"),
+            (1_700_000_000_123_456 + 10_000 * np.arange(40), "us"),
             (np.datetime64("2024-05-01T12:00:00") + np.arange(40) * np.timedelta64(10, "ms"), "s"),
             (-3.0 + TIME[:, None], "s"),
-            (1e12 + 10.0 * np.arange(40.0), "us"),
+            (1e6 + 10.0 * np.arange(40.0), "ms"),
         ],
     )
     def test_stamps_of_any_kind(self, tmp_path, robot, stamps, unit):
@@ -417,8 +417,7 @@ class TestArrays:
         time = {"column": "t", "unit": unit}
         found = read(tmp_path / "a.npz", robot, position={"columns": "q"}, time=time)
         elapsed = (found["stamp"] - found["stamp"][0]) * 1e-9
-        scale = 1e-3 if unit == "us" else 1.0
-        assert elapsed == pytest.approx(TIME * scale, abs=3e-7)  # of a float that counts from 1970
+        assert elapsed == pytest.approx(TIME, abs=1e-9)
 
     def test_matlab_files_and_text(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"q": Q.T, "t": TIME[None, :]})

@@ -29,10 +29,10 @@ from drivers.record import LONGEST_PACKET, PACKET_DTYPE, PacketRing, cycle_dtype
 from drivers.states import State
 from drivers.transports.faults import Lose
 from drivers.transports.simulated import SimulatedTransport
-from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
+from hil.archive import Archive, ArchiveSpec, Level, Recorder, open_archive
 from hil.archive.check import check_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
-from hil.archive.recorder import describe
+from hil.archive.recorder import describe, level_of
 from hil.archive.repair import repair
 from hil.archive.schema import CYCLE, PACKETS
 from hil.campaign import Link, Stop
@@ -157,6 +157,7 @@ class TestRecorder:
 )
 def test_event_texts(event: Event, text: str) -> None:
     assert text in describe(event)
+    assert level_of(event) == (Level.ERROR if isinstance(event, LinkLost) else Level.WARN)
 
 
 def at(*numbers: int) -> NDArray[np.void]:
