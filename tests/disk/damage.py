@@ -33,139 +33,120 @@ from tests.journal import Journal, JournalError
 from tests.journal import rounds as known
 
 SECTORS: Final = (512, 4096)
+SWAPPED: Final = "names swapped"
 _CHUNK_CRC: Final = 9 + 24  # bytes from the beginning of a chunk's record
 
 Files = Mapping[Path, bytes]
+Random = random.Random
+Changed = tuple[bytes, str]  # content, and where it was changed
 
 
-def draw(rng: random.Random, files: Files, kind: str | None = None) -> tuple[Files, str]:
+def draw(rng: Random, files: Files, kind: str | None = None) -> tuple[Files, str]:
     """Return the files changed by one random damage, and its description.
 
     Damage by disks, cables and file systems: also sectors and chunks of one archive in another, and
-    files that swap their names. No checksum is recomputed.
+    two archives of one kind that swap their names. No checksum is recomputed.
     """
-    path = rng.choice(sorted(files))
-    kind = kind or rng.choice(sorted(KINDS))
-    changed, detail = KINDS[kind](rng, path, files)
-    return changed, f"{kind} in {path.name}{detail}"
+    path, kind = rng.choice(sorted(files)), kind or rng.choice([SWAPPED, *KINDS])
+    if kind == SWAPPED:
+        alike = [one for one in files if one.name.startswith(path.name.partition("_")[0])]
+        other = rng.choice(sorted(alike))
+        return {path: files[other], other: files[path]}, f"{kind} in {path.name} and {other.name}"
+    other = rng.choice(sorted(set(files) - {path}))
+    content, where = KINDS[kind](rng, files[path], files[other])
+    return {path: content}, f"{kind} in {path.name} {where}, other archive {other.name}"
 
 
-def _flip(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data, places = bytearray(files[path]), []
-    for _ in range(rng.choice((1, 1, 2, 8))):
-        at = rng.randrange(len(data))
-        data[at] ^= 1 << rng.randrange(8)
-        places.append(at)
-    return {path: bytes(data)}, f" at {places}"
+def _flip(rng: Random, data: bytes, _: bytes) -> Changed:
+    changed, places = bytearray(data), rng.choices(range(len(data)), k=rng.choice((1, 1, 2, 8)))
+    for at in places:
+        changed[at] ^= 1 << rng.randrange(8)
+    return bytes(changed), f"at {places}"
 
 
-def _burst(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data = bytearray(files[path])
+def _burst(rng: Random, data: bytes, _: bytes) -> Changed:
     at, length = rng.randrange(len(data)), rng.randrange(1, 5000)
-    data[at : at + length] = rng.randbytes(min(length, len(data) - at))
-    return {path: bytes(data)}, f" at {at}, {length} bytes"
+    noise = rng.randbytes(min(length, len(data) - at))
+    return data[:at] + noise + data[at + length :], f"at {at}, {length} bytes"
 
 
-def _zeroed_sector(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data, size = bytearray(files[path]), rng.choice(SECTORS)
+def _zeroed_sector(rng: Random, data: bytes, _: bytes) -> Changed:
+    size = rng.choice(SECTORS)
     at = rng.randrange(0, len(data), size)
-    data[at : at + size] = bytes(min(size, len(data) - at))
-    return {path: bytes(data)}, f" at {at}, {size} bytes"
+    return data[:at] + bytes(min(size, len(data) - at)) + data[at + size :], f"at {at}, {size}"
 
 
-def _copied_sector(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """From this archive or another one."""
-    source, size = rng.choice(sorted(files)), rng.choice(SECTORS)
-    data, other = bytearray(files[path]), files[source]
-    at, came = rng.randrange(0, len(data), size), rng.randrange(0, len(other), size)
-    length = min(size, len(data) - at, len(other) - came)
-    data[at : at + length] = other[came : came + length]
-    return {path: bytes(data)}, f" at {at} from {source.name} at {came}, {length} bytes"
+def _copied_sector(rng: Random, data: bytes, other: bytes) -> Changed:
+    """From this archive or the other one."""
+    source, size = rng.choice((data, other)), rng.choice(SECTORS)
+    at, begin = rng.randrange(0, len(data), size), rng.randrange(0, len(source), size)
+    part = source[begin : begin + min(size, len(data) - at)]
+    return data[:at] + part + data[at + len(part) :], f"at {at} from {begin}, {len(part)} bytes"
 
 
-def _cut(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    length = rng.randrange(len(files[path]))
-    return {path: files[path][:length]}, f" to {length} bytes"
+def _cut(rng: Random, data: bytes, _: bytes) -> Changed:
+    length = rng.randrange(len(data))
+    return data[:length], f"to {length} bytes"
 
 
-def _zeroed_tail(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
+def _zeroed_tail(rng: Random, data: bytes, _: bytes) -> Changed:
     """As after a power failure on file systems that set the length first."""
-    data = files[path]
     at = rng.randrange(0, len(data), rng.choice(SECTORS))
-    return {path: data[:at] + bytes(len(data) - at)}, f" from {at} on"
+    return data[:at] + bytes(len(data) - at), f"from {at} on"
 
 
-def _grown(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
+def _grown(rng: Random, data: bytes, _: bytes) -> Changed:
     length = rng.randrange(1, 5000)
-    return {path: files[path] + rng.randbytes(length)}, f" by {length} bytes"
+    return data + rng.randbytes(length), f"by {length} bytes"
 
 
-def _swapped_chunks(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data, (one, other) = files[path], sorted(rng.sample(chunks(files[path]), 2))
-    changed = (
-        data[: one[0]] + data[slice(*other)] + data[one[1] : other[0]] + data[slice(*one)]
-        + data[other[1] :]
-    )  # fmt: skip
-    return {path: changed}, f" at {one[0]} and {other[0]}"
+def _swapped_chunks(rng: Random, data: bytes, _: bytes) -> Changed:
+    (a, b), (c, d) = sorted(rng.sample(chunks(data), 2))
+    return data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:], f"at {a} and {c}"
 
 
-def _doubled_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data, (begin, end) = files[path], rng.choice(chunks(files[path]))
-    return {path: data[:end] + data[begin:]}, f" at {begin}"
+def _doubled_chunk(rng: Random, data: bytes, _: bytes) -> Changed:
+    begin, end = rng.choice(chunks(data))
+    return data[:end] + data[begin:], f"at {begin}"
 
 
-def _missing_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    data, (begin, end) = files[path], rng.choice(chunks(files[path]))
-    return {path: data[:begin] + data[end:]}, f" at {begin}"
+def _missing_chunk(rng: Random, data: bytes, _: bytes) -> Changed:
+    begin, end = rng.choice(chunks(data))
+    return data[:begin] + data[end:], f"at {begin}"
 
 
-def _strange_chunk(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """The same chunk of another archive instead, with its checksum."""
-    source = rng.choice(sorted(set(files) - {path}))
-    ours, theirs = chunks(files[path]), chunks(files[source])
-    k = rng.randrange(min(len(ours), len(theirs)))
-    data, part = files[path], files[source][slice(*theirs[k])]
-    return {path: data[: ours[k][0]] + part + data[ours[k][1] :]}, f", number {k} of {source.name}"
+def _foreign_chunk(rng: Random, data: bytes, other: bytes) -> Changed:
+    """The same chunk of the other archive instead, with its checksum."""
+    (begin, end), (a, b) = rng.choice([*zip(chunks(data), chunks(other), strict=False)])
+    return data[:begin] + other[a:b] + data[end:], f"at {begin}"
 
 
-def _strange_tail(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """The content of another archive from some chunk on."""
-    source = rng.choice(sorted(set(files) - {path}))
-    ours, theirs = chunks(files[path]), chunks(files[source])
-    k = rng.randrange(min(len(ours), len(theirs)))
-    changed = files[path][: ours[k][0]] + files[source][theirs[k][0] :]
-    return {path: changed}, f", from chunk {k} on that of {source.name}"
+def _foreign_tail(rng: Random, data: bytes, other: bytes) -> Changed:
+    """The content of the other archive from some chunk on."""
+    (begin, _), (a, _) = rng.choice([*zip(chunks(data), chunks(other), strict=False)])
+    return data[:begin] + other[a:], f"from {begin} on"
 
 
-def _no_checksum(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
+def _no_checksum(rng: Random, data: bytes, _: bytes) -> Changed:
     """The checksum of a chunk is 0, which means none in MCAP, and one of its bits is flipped."""
-    data, (begin, end) = bytearray(files[path]), rng.choice(chunks(files[path]))
-    struct.pack_into("<I", data, begin + _CHUNK_CRC, 0)
+    changed, (begin, end) = bytearray(data), rng.choice(chunks(data))
+    struct.pack_into("<I", changed, begin + _CHUNK_CRC, 0)
     at = rng.randrange(begin + _CHUNK_CRC + 4, end)
-    data[at] ^= 1 << rng.randrange(8)
-    return {path: bytes(data)}, f" of the chunk at {begin}, and a bit at {at}"
+    changed[at] ^= 1 << rng.randrange(8)
+    return bytes(changed), f"of the chunk at {begin}, and a bit at {at}"
 
 
-def _index_unchecked(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
+def _index_unchecked(rng: Random, data: bytes, _: bytes) -> Changed:
     """The checksum of the summary is 0, and one of its bits is flipped."""
-    data = bytearray(files[path])
-    footer = len(data) - len(container.MAGIC) - container.FOOTER_SIZE
-    (summary,) = struct.unpack_from("<Q", data, footer + 9)
-    struct.pack_into("<I", data, footer + 9 + 16, 0)
+    changed, footer = bytearray(data), len(data) - len(container.MAGIC) - container.FOOTER_SIZE
+    (summary,) = struct.unpack_from("<Q", changed, footer + 9)
+    struct.pack_into("<I", changed, footer + 9 + 16, 0)
     at = rng.randrange(summary, footer)
-    data[at] ^= 1 << rng.randrange(8)
-    return {path: bytes(data)}, f", a bit at {at}"
+    changed[at] ^= 1 << rng.randrange(8)
+    return bytes(changed), f"and a bit at {at}"
 
 
-def _swapped_names(rng: random.Random, path: Path, files: Files) -> tuple[Files, str]:
-    """Two archives of one kind, each intact."""
-    kind = path.name.partition("_")[0]
-    like = [one for one in sorted(files) if one.name.startswith(kind)]
-    other = rng.choice(like)
-    return {path: files[other], other: files[path]}, f" and {other.name}"
-
-
-KINDS: Final[dict[str, Callable[[random.Random, Path, Files], tuple[Files, str]]]] = {
+KINDS: Final[dict[str, Callable[[Random, bytes, bytes], Changed]]] = {
     "bits flipped": _flip,
     "a burst of noise": _burst,
     "a sector zeroed": _zeroed_sector,
@@ -176,11 +157,10 @@ KINDS: Final[dict[str, Callable[[random.Random, Path, Files], tuple[Files, str]]
     "chunks swapped": _swapped_chunks,
     "a chunk doubled": _doubled_chunk,
     "a chunk missing": _missing_chunk,
-    "a strange chunk": _strange_chunk,
-    "a strange tail": _strange_tail,
+    "a foreign chunk": _foreign_chunk,
+    "a foreign tail": _foreign_tail,
     "no checksum": _no_checksum,
     "no checksum of the index": _index_unchecked,
-    "names swapped": _swapped_names,
 }
 
 

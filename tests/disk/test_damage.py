@@ -12,7 +12,7 @@ from hil.archive import open_archive
 from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
-from tests.disk.damage import KINDS, campaign, main, play
+from tests.disk.damage import KINDS, SWAPPED, campaign, main, play
 from tests.disk.laws import Undamaged, broken
 from tests.hil.mcap_bytes import chunks
 
@@ -23,7 +23,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Undamaged:
 
 
 def test_each_kind_of_damage_is_named_or_harmless(truth: Undamaged) -> None:
-    for number, kind in enumerate(sorted(KINDS)):
+    for number, kind in enumerate([SWAPPED, *KINDS]):
         words, laws = play(truth, number, kind)
         assert not laws, f"round {number}, {words}"
 
