@@ -176,7 +176,6 @@ class ArchiveHeader(BaseModel):
     motion: str = ""
     simulated: str = ""
     use: str = "excitation"
-    cell: str = ""
     plan_hash: str = ""
     recorded_at: str | None = None
     effects: _Names = ()
@@ -260,8 +259,6 @@ class ArchiveOutcome(BaseModel):
     samples: _Count = None
     events: _Count = None
     packets: _Count = None
-    first_cycle: _Count = None
-    last_cycle: _Count = None
     lost_packets: _Count = None
     records_lost: _Count = None
     events_lost: _Count = None
