@@ -25,7 +25,7 @@ from identification.excitation import (
 from identification.excitation.collision import checker as checker_module
 from identification.excitation.collision.bodies import link_bodies
 from identification.excitation.collision.hulls import joint_poses
-from identification.excitation.constraints import sampled
+from identification.excitation.constraints import Motion, sampled
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
@@ -275,6 +275,18 @@ def test_contacts_between_samples_are_found(steps):
     assert (contact.first, contact.second) == ("arm", "box 0")
     assert abs(np.sin(contact.posture[0])) < 0.011
     assert none is None
+
+
+@pytest.mark.parametrize("touches", [True, False])
+def test_a_reversal_between_samples_is_found(touches):
+    """The ball is in the same place at both samples, and 2 cm nearer to the wall between them."""
+    motion = FourierSeries([0.0], [[0.5]], [[2.0 * np.pi]], length=3.0, ramp=0.5)
+    time = np.linspace(0.0, 3.0, 31)
+    nearest = np.sin(0.5) + 0.01  # y at 1.25 s
+    wall = Box((0.8, nearest + (-0.01 if touches else 0.001), -1.0), (1.2, 1.0, 1.0))
+    checker = CollisionChecker(ball_on_a_turntable(0.01), replace(NOWHERE, boxes=(wall,)))
+    contact = checker.deepest_along(motion, Motion(time, *motion.sample(time)))
+    assert (contact is not None) == touches
 
 
 @given(st.integers(0, 10**6))
