@@ -65,7 +65,7 @@ def broken(truth: Undamaged, harmed: Sequence[Path], number: int) -> Iterator[st
     Even rounds identify the archives, the others the folder, which has their checksums.
     """
     readers: list[Callable[[], Iterator[str]]] = [
-        partial(law, truth, path) for path in harmed for law in (_reads, _checks, _looks)
+        partial(law, truth, path) for path in harmed for law in (_reads, _checks, _shows)
     ]
     if any(path in truth.paths for path in harmed):  # moves are never read for it
         readers.append(partial(_identifies, truth, harmed, campaign=bool(number % 2)))
@@ -102,7 +102,7 @@ def _checks(truth: Undamaged, path: Path) -> Iterator[str]:
         yield f"{path.name}: conforms with other content"
 
 
-def _looks(truth: Undamaged, path: Path) -> Iterator[str]:
+def _shows(truth: Undamaged, path: Path) -> Iterator[str]:
     """Check a part of the time, found by the index, and what `hil plot` shows."""
     if path.read_bytes() in truth.files.values():
         return  # intact, under the name of another

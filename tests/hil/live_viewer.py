@@ -1,7 +1,7 @@
-"""A viewer of the live view that knows nothing of the library that serves it.
+"""A client of the live view, independent of the library that serves it.
 
-It does what the documentation of the protocol says (https://github.com/foxglove/ws-protocol, in its
-present form `foxglove.sdk.v1`), over another WebSocket library, and decodes with another one still.
+It follows the protocol (https://github.com/foxglove/ws-protocol, in its present
+form `foxglove.sdk.v1`) with other libraries for WebSockets and messages.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ SUBPROTOCOL = "foxglove.sdk.v1"
 
 
 class Viewer:
-    """What a viewer does, by the protocol's documentation."""
+    """A connection that subscribes to channels and decodes their messages."""
 
     def __init__(self, port: int) -> None:
         self.socket = client.connect(
             f"ws://127.0.0.1:{port}",
             subprotocols=[SUBPROTOCOL],
             compression=None,
-            close_timeout=0.5,  # s; one that reads nothing does not read the answer either
+            close_timeout=0.5,  # s; a client that reads nothing does not read the reply either
         )
         self.info = self._text("serverInfo")
         self.channels: dict[str, dict[str, Any]] = {}
@@ -42,22 +42,22 @@ class Viewer:
         while True:
             message = self.socket.recv(timeout=5.0)
             if isinstance(message, str):
-                said: dict[str, Any] = json.loads(message)
-                if said["op"] == op:
-                    return said
+                content: dict[str, Any] = json.loads(message)
+                if content["op"] == op:
+                    return content
 
     def subscribe(self, *topics: str) -> None:
-        """The identifier of a subscription is that of its channel."""
+        """Subscribe; the identifier of a subscription is that of its channel."""
         wanted = [self.channels[topic]["id"] for topic in topics]
         subscriptions = [{"id": number, "channelId": number} for number in wanted]
         self.socket.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
     def message(self, timeout: float = 5.0) -> tuple[str, int, Any]:
-        """Topic, log time and decoded content of the next one."""
+        """Return topic, log time and decoded content of the next message."""
         return self._decoded(self._data(timeout))
 
     def last_message(self, silence: float) -> tuple[str, int, Any]:
-        """The last one before a silence of so many seconds."""
+        """Return the last message before a silence of so many seconds."""
         last = self._data(5.0)
         while True:
             try:

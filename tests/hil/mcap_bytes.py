@@ -1,4 +1,4 @@
-"""Bytes of MCAP files as tests make and change them; sound by their own checksums."""
+"""Bytes of MCAP files that tests create and change, with valid checksums."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hil.archive.schema import CYCLE
 
 
 class Head(NamedTuple):
-    """Where a message stands in a chunk, and what precedes its data."""
+    """Place of a message in a chunk, and the head of its record."""
 
     channel: int
     sequence: int
@@ -55,7 +55,7 @@ def attachment(name: str, content: bytes) -> bytes:
 
 
 def heads(chunk: bytes) -> Iterator[Head]:
-    """The messages of a decompressed chunk."""
+    """Yield the messages of a decompressed chunk."""
     head = struct.Struct("<HIQQ")
     for item in container.split_records(chunk, 0):
         if item.opcode == container.MESSAGE:
@@ -65,7 +65,7 @@ def heads(chunk: bytes) -> Iterator[Head]:
 
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
-    """Where each chunk of a file begins and ends."""
+    """Return begin and end of each chunk of a file."""
     found, at = [], len(container.MAGIC)
     while at < len(data) and data[at] != container.DATA_END:
         opcode, end = container.record_bounds(data, at, 0)
@@ -76,7 +76,7 @@ def chunks(data: bytes) -> list[tuple[int, int]]:
 
 
 def with_attachment(source: Path, target: Path, old: str, new: str) -> Path:
-    """A copy with other words, of the same length, in an attachment; its checksum is right."""
+    """Copy a file with another text of the same length in an attachment, checksum included."""
     assert len(old.encode()) == len(new.encode())
     data, changed = bytearray(source.read_bytes()), 0
     with source.open("rb") as stream:
@@ -105,7 +105,7 @@ class Message:
 
 @dataclass
 class Content:
-    """What an archive holds, to be changed, and written by the library."""
+    """Content of an archive, to be changed and written by the library."""
 
     messages: list[Message]
     metadata: dict[str, str]
@@ -165,7 +165,7 @@ class Content:
 
 
 class Indexed:
-    """A file that grows record by record, and gets an index that fits."""
+    """A file to which records are appended, completed with a valid index."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -175,7 +175,7 @@ class Indexed:
 
     @property
     def checksums(self) -> list[int]:
-        """Those of the chunks so far."""
+        """Checksums of the chunks so far."""
         return self._writer.checksums
 
     def put(self, data: bytes) -> None:
@@ -191,6 +191,6 @@ class Indexed:
         self._writer.add_chunk(head, entries_of(found))
 
     def ended(self) -> bytes:
-        """The file, whole."""
+        """Return the complete file."""
         self._writer.finish()
         return bytes(self.data)

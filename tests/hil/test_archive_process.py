@@ -1,4 +1,4 @@
-"""The archive process against memory filled here: how an archive ends, whoever dies or hangs.
+"""The archive process on memory that the tests fill: how an archive ends, whichever process fails.
 
 After a power cut, what was flushed is on the disk. What its own death costs: `tests/process_death`.
 """
@@ -44,7 +44,7 @@ NAME = "excitation_000_a1.mcap"
 
 
 class Memory:
-    """What an exchange process would share, and a process to be taken for it."""
+    """Shared memory as of an exchange process, and a process in its place."""
 
     def __init__(self) -> None:
         self.ring = CycleRing.shared(2, 4000)
@@ -58,7 +58,7 @@ class Memory:
         self.cycle = 0
 
     def cycles(self, count: int) -> None:
-        """Records of an arm at rest."""
+        """Add records of an arm at rest."""
         for _ in range(count):
             slot = self.ring.slot
             self.ring.rows[slot] = np.zeros((), self.ring.rows.dtype)
@@ -67,7 +67,7 @@ class Memory:
             self.cycle += 1
 
     def end(self) -> None:
-        """The exchange dies."""
+        """Kill the exchange process."""
         self.exchange.kill()
         self.exchange.communicate()
 
@@ -90,7 +90,7 @@ def drive_train() -> DriveTrain:
 
 
 class Rig:
-    """An archive process on such memory."""
+    """An archive process on this memory."""
 
     def __init__(self, memory: Memory, folder: Path) -> None:
         self.memory, self.folder = memory, folder
@@ -135,7 +135,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 def wait(for_what: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 30.0
     while not for_what():
-        assert time.monotonic() < deadline, "it never happened"
+        assert time.monotonic() < deadline, "timeout"
         time.sleep(0.02)
 
 
@@ -211,7 +211,7 @@ class TestArchiveProcess:
         path = rig.open(1)
         memory.control.program_accepted = 1
         memory.cycles(20)
-        assert rig.process.answer(4.0, 1) is None, "it was taken for dead"
+        assert rig.process.answer(4.0, 1) is None, "its archive was closed"
         memory.control.exchange_heartbeat = time.monotonic()
         memory.cycles(30)
         memory.events.write(MotionEnded("completed", "the path is at its end", 0, 40))
@@ -227,7 +227,7 @@ class TestArchiveProcess:
         second = rig.open(2, "excitation_001_a1.mcap")
         assert outcome(first).outcome == "interrupted"
         rig.process.send(Close(1, "completed", "too late"))
-        rig.process.send(Close(2, "completed", "enough"))  # what answers for the first is dropped
+        rig.process.send(Close(2, "completed", "enough"))  # answers about the first are dropped
         assert rig.closed(2).reason == "enough"
         assert outcome(second).outcome == "completed"
         assert rig.memory.control.archive_state == ArchiveState.NONE
@@ -280,7 +280,7 @@ class TestRawPackets:
         with with_packets(tmp_path / NAME) as (process, memory, ring):
             memory.cycles(3)
             process._transfer()
-            for cycle in range(30):  # after the last look, and before the archive is closed
+            for cycle in range(30):  # after the last reading, and before the archive is closed
                 ring.put(cycle // 10, 0.0, False, b"packet")
             process._close("completed", "")
         found = outcome(tmp_path / NAME)
@@ -288,7 +288,7 @@ class TestRawPackets:
         assert found.entries["packets_lost"] != "0"
 
     def test_packets_behind_their_cycle_are_waited_for(self, tmp_path: Path) -> None:
-        """The exchange was held up between the two, as the archive is closed."""
+        """The exchange was delayed between record and packet while the archive is closed."""
         with with_packets(tmp_path / NAME) as (process, memory, ring):
             memory.cycles(3)
             for cycle in range(2):

@@ -1,7 +1,4 @@
-"""The live view, seen by a WebSocket client that knows nothing of the library that serves it.
-
-Protocol: https://github.com/foxglove/ws-protocol, as `foxglove.sdk.v1` has it.
-"""
+"""The live view, received by an independent WebSocket client (`tests/hil/live_viewer.py`)."""
 
 from __future__ import annotations
 
@@ -71,13 +68,17 @@ def test_a_viewer_receives_the_channels_of_an_archive() -> None:
         assert viewer.channels["/joint_states"]["schemaName"] == "sensor_msgs/msg/JointState"
 
 
-def test_it_gets_what_was_measured_at_the_rate_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "MAX_DRIFT", 3600.0)  # the cycles come slower here than they say
+def test_messages_are_the_measured_cycles_at_the_requested_rate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(
+        live, "MAX_DRIFT", 3600.0
+    )  # cycles are published more slowly than their period
     with served(rate=100.0) as publisher, Viewer(publisher.port) as viewer:
         viewer.subscribe("/joint_states")
         seen: list[tuple[int, Any]] = []
         first = 0
-        while len(seen) < 20:  # the subscription takes its time; what came before is not sent
+        while len(seen) < 20:  # messages before the subscription are not sent
             publisher.publish(records(first, 20), ())
             first += 20
             try:
@@ -86,7 +87,7 @@ def test_it_gets_what_was_measured_at_the_rate_asked_for(monkeypatch: pytest.Mon
                     assert topic == "/joint_states"
                     seen.append((log_time, message))
             except TimeoutError:
-                assert first < 2000, "nothing came"
+                assert first < 2000, "no message arrived"
         for _, message in seen:
             assert list(message.name) == list(NAMES)
             cycle = round(message.position[0] * 1e3)
@@ -100,7 +101,7 @@ def test_it_gets_what_was_measured_at_the_rate_asked_for(monkeypatch: pytest.Mon
         assert abs(seen[-1][0] - time.time_ns()) < 5e9
 
 
-def test_events_come_all_of_them() -> None:
+def test_all_events_are_sent() -> None:
     with served() as publisher, Viewer(publisher.port) as viewer:
         viewer.subscribe("/hil/events")
         for _ in range(100):
@@ -114,14 +115,11 @@ def test_events_come_all_of_them() -> None:
             assert message.level == 30
             assert message.stamp.sec == 1
             return
-        pytest.fail("no event came")
+        pytest.fail("no event arrived")
 
 
 def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
-    """Ten times as much as waits for one client: what was recorded is left behind, not waited for.
-
-    Meanwhile another viewer sees the newest.
-    """
+    """Its oldest messages are dropped; another client receives the newest."""
     with served(rate=1000.0) as publisher, Viewer(publisher.port) as dead:
         dead.subscribe("/hil/cycle", "/joint_states", "/joint_states_commanded")
         with Viewer(publisher.port) as viewer:
@@ -134,7 +132,6 @@ def test_a_viewer_that_reads_nothing_delays_nothing() -> None:
                 took.append(time.perf_counter() - began)
                 first += 100
                 time.sleep(0.01)
-            # Who waited for the other one would be slow from some moment on.
             assert np.median(took[len(took) // 2 :]) < 0.05
             assert sum(seconds > 0.05 for seconds in took) <= 5
             assert len(publisher._waiting) <= live.QUEUE

@@ -1,7 +1,6 @@
-"""One interval of a link into one archive: what belongs to it, and how it ended.
+"""Recording of one interval of a link: which rows belong to it, how it ended, raw packets.
 
-And what came while no archive was open: the newest of it, of the session that began last. And
-raw packets in an archive: on request, byte by byte, and each with its cycle.
+Also the buffer of what arrives while no archive is open.
 """
 
 from __future__ import annotations

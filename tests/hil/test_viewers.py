@@ -1,4 +1,4 @@
-"""What is in an archive: `hil plot`, copies for viewers, and the layouts that open them."""
+"""Content of an archive: `hil plot`, copies for viewers, and layouts of viewers."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def seen(copies: list[Path]) -> Messages:
 
 
 class TestCopies:
-    """Beside what was measured and commanded stands what the model predicts."""
+    """Copies have measured, commanded and predicted joint states."""
 
     def test_each_archive_of_a_motion_has_one_that_is_no_archive(
         self, copies: list[Path], found: Identification
@@ -95,7 +95,7 @@ class TestCopies:
     def test_copies_have_predicted_and_commanded_states(
         self, seen: Messages, found: Identification
     ) -> None:
-        """At the same instants, and as far from it as the results say."""
+        """At the same times, with the prediction error of the results."""
         torque = {time: np.array(state.effort) for time, state in seen["/joint_states"]}
         times, predicted = zip(*seen[PREDICTED], strict=True)
         error = np.array([torque[t] - one.effort for t, one in zip(times, predicted, strict=True)])
@@ -113,7 +113,7 @@ class TestCopies:
     def test_times_are_those_of_the_recording_day(
         self, short_campaign: Campaign, tmp_path: Path
     ) -> None:
-        """Where the archive knows it; a simulated one does not, and keeps its own."""
+        """If the archive states it; otherwise times are those of the archive."""
         archive = open_archive(short_campaign.folder.archives / "excitation_000_a1.mcap")
         n = len(archive.joint_names)
         prediction = {"time": np.array([0.0, 1.0]), "effort": np.zeros((2, n))}
@@ -195,7 +195,7 @@ class TestLayouts:
             assert sum(sizes) == pytest.approx(1.0)
 
     def test_rerun(self, six: Messages, monkeypatch: pytest.MonkeyPatch) -> None:
-        """The library is not needed here: what is asked of it is looked at."""
+        """The library is replaced by a mock, whose calls are checked."""
         blueprint = MagicMock()
         monkeypatch.setitem(sys.modules, "rerun", MagicMock(blueprint=blueprint))
         monkeypatch.setitem(sys.modules, "rerun.blueprint", blueprint)
@@ -248,7 +248,7 @@ class TestFrame:
     """Positions, speeds and torques of a page are in one frame, which the page names."""
 
     def test_torque_has_the_sign_of_its_angle(self, excitation: Path, campaign: Campaign) -> None:
-        """Torque times speed is the power of the joint, whoever looks at it."""
+        """Torque times speed is the power of the joint in any frame."""
         columns = open_archive(excitation).columns
         sign = np.array(campaign.cell.drive_table.joint_sign)
         assert -1 in sign
@@ -340,7 +340,7 @@ def test_a_page_has_every_sample_for_the_zoom(excitation: Path) -> None:
 
 
 def test_the_header_counts_missed_packets(excitation: Path) -> None:
-    """In also where none was, and nothing where they are not counted."""
+    """Also if none was missed, and not at all where they are not counted."""
     view = view_of(excitation)
 
     def header(view: ArchiveView) -> str:

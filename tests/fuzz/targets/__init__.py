@@ -1,4 +1,4 @@
-"""What is fuzzed: for each target a function of bytes that raises only where a law is broken."""
+"""Targets of fuzzing: for each a function of bytes that raises only where a law is violated."""
 
 from __future__ import annotations
 
@@ -9,22 +9,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
 
 NAMES = ("codec", "session", "cell_file", "archive", "importers", "urdf", "documents")
 """All targets, each a module of this package with a `TARGET`."""
 
 
-class Mutation(Protocol):
-    """Changes an input; the same seed makes the same change."""
-
-    def __call__(self, data: bytes, most: int, seed: int) -> bytes:
-        """An input of at most `most` bytes made of `data`."""
+Mutation = Callable[[bytes, int, int], bytes]
+"""Changes an input: its bytes, the largest length, and the seed that determines the change."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """One of them.
+    """One target.
 
     Attributes:
         run: raises where a law is violated; else returns whether the input is accepted, False
@@ -40,13 +36,13 @@ class Target:
 
 
 def place_of(name: str) -> Path:
-    """A temporary folder for a target's files, which goes when the process ends."""
+    """Create a temporary folder for a target's files, removed when the process ends."""
     made = Path(tempfile.mkdtemp(name))
     atexit.register(shutil.rmtree, made, ignore_errors=True)
     return made
 
 
 def load(name: str) -> Target:
-    """The target of a name out of `NAMES`, whose packages are imported now."""
+    """Import and return the target of a name in `NAMES`."""
     target: Target = import_module(f"tests.fuzz.targets.{name}").TARGET
     return target
