@@ -193,7 +193,7 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
         # A controller's delay is known; the estimate replaces it only if well determined and
         # different by more than its bias in closed loop.
         far = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
-        if sources.cell.file.controller is None or (far and found.determined.all()):
+        if sources.cell.file.controller is None or (far and found.determined):
             notes = _described(found)
             suggested = (found.common,) if found.significant else ()
     assumed = settings.preprocessing.torque_delay

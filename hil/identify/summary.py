@@ -387,6 +387,7 @@ def _judgement(
     checks, context, error = evidence.residuals, evidence.context, evidence.held_out
     assert checks is not None
     correlation, drift, inertia = checks.autocorrelation, checks.drift, context.controller_inertia
+    limit = context.torque_limit
     step = max(1, -(-len(correlation.lag) // _LAGS))
     joints = results.JointJudgement.rows(
         joint=joint_names,
@@ -395,8 +396,8 @@ def _judgement(
         relative=error.relative,
         fitted_relative=evidence.training.relative,
         explained=error.explained,
-        limit=context.torque_limit,
-        share_of_limit=evidence.share_of_limit,
+        limit=limit,
+        share_of_limit=None if limit is None else error.rms / limit,
         nominal_relative=None if evidence.nominal is None else evidence.nominal.relative,
         controller_relative=None if context.controller is None else context.controller.relative,
         nominal_scale=None if context.nominal_scale is None else context.nominal_scale.scale,

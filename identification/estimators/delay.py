@@ -162,14 +162,9 @@ class DelayEstimate:
     significant: bool
 
     @property
-    def half_interval(self) -> float:
-        """Half a 95 % interval of the common delay [s]."""
-        return self.interval_factor * self.common_std
-
-    @property
-    def determined(self) -> NDArray[np.bool_]:
-        """Whether the delay of each axis is determined (n,); equal for all."""
-        return np.full(len(self.joint_names), self.reason is None)
+    def determined(self) -> bool:
+        """Whether the delays of the axes are determined."""
+        return self.reason is None
 
     @property
     def delays(self) -> Array:

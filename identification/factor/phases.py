@@ -372,13 +372,3 @@ class StandardGram:
                 gram[joint] += table.T @ table
                 rows[joint] += len(table)
         return cls(gram, rows)
-
-
-def gravity_loads(model: RobotModel, position: Array) -> NDArray[np.bool_]:
-    """Return whether gravity can load each joint (n,) in some of the positions (m, n)."""
-    still = np.zeros_like(position)
-    plan = RegressorPlan.of_bodies(model.chain, model.gravity)
-    blocks = plan.evaluate(position, still, still).blocks
-    # A unit first moment makes a torque of g; rounding of URDF angles far less.
-    floor = 1e-3 * float(np.linalg.norm(model.gravity))
-    return np.array([bool(np.abs(block).max(initial=0.0) > floor) for block in blocks])

@@ -88,29 +88,19 @@ class Cause(NamedTuple):
     std: float  # standard deviation over the blocks
 
 
-class Causes(NamedTuple):
-    """Faults that were found in the fitted motion."""
-
-    found: tuple[Cause, ...]  # in order of their effect
-    best: Cause | None  # fault of least error if nothing was found
-
-
 def find_causes(
     model: RobotModel, recordings: Sequence[Samples], values: Array, names: Sequence[str] = ()
-) -> Causes:
-    """Find faults that explain the error of values (p,) estimated from the recordings."""
+) -> tuple[Cause, ...]:
+    """Find faults that explain the error of values (p,) from the recordings, by their effect."""
     words = tuple(names) or tuple(f"recording {k + 1}" for k in range(len(recordings)))
     search = _Search(model, recordings, values, words)
-    first = trials = search.trials()
     found: list[Cause] = []
-    while len(found) < _MOST_CAUSES and (trial := _best(trials)) is not None:
+    while len(found) < _MOST_CAUSES and (trial := _best(search.trials())) is not None:
         found.append(trial.cause)
         if trial.cause.fault.kind == "changed arm":
             break  # with separate parameters nothing is left to compare
         search.correct(trial.cause.fault)
-        trials = search.trials()
-    best = min((one.cause for one in first), key=lambda one: one.ratio)
-    return Causes(tuple(found), None if found else best)
+    return tuple(found)
 
 
 class _Trial(NamedTuple):

@@ -14,14 +14,13 @@ from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
-from identification.excitation.criteria import coupling_index, coupling_index_max, information
 from identification.factor.factor import Estimate, Factor, solve
-from identification.factor.phases import StandardGram, gravity_loads
+from identification.factor.phases import StandardGram
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
-from identification.validation.causes import Causes, find_causes
+from identification.validation.causes import Cause, find_causes
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.nominal_scale import InertiaRatio, NominalScale
 from identification.validation.plausibility import Implausible, implausibilities
@@ -236,16 +235,13 @@ class Evidence:
     #: largest torque difference of a repetition's estimate to the pooled one, as a share of the
     #: torque (n,); None without repetitions
     disagreement: Array | None = None
-    causes: Causes | None = None  #: faults whose correction reduces errors
+    causes: tuple[Cause, ...] | None = None  #: faults whose correction reduces errors
     gravity: GravityDirection | None = None  #: the direction of gravity that fits best
     load: CarriedLoad | None = None  #: body on the last link in unseen motion only
-    loaded: NDArray[np.bool_] | None = None  #: joints that gravity can load (n,)
     #: error of the nominal (CAD) model on the same unseen motion
     nominal: PredictionError | None = None
     implausible: Implausible = _PLAUSIBLE  #: physically impossible signs of the estimate
     residuals: ResidualChecks | None = None  #: patterns of the residual
-    #: coupling index I_c (paper, eq. 5), infinite with undetermined parameters, and I_c,max
-    coupling: tuple[float, float] | None = None
     context: CellContext = CellContext()  #: data on the cell
     prismatic: tuple[int, ...] = ()  #: indices of the joints that slide
     #: whether nothing was held out, so that all errors are those of the fit
@@ -263,12 +259,6 @@ class Evidence:
         power = float(self.held_out.torque_squared.sum())
         noise = float((np.nan_to_num(self.noise_floor) ** 2 * self.held_out.rows).sum())
         return float(np.sqrt(noise / power)) if power > 0.0 else None
-
-    @property
-    def share_of_limit(self) -> Array | None:
-        """RMS error on unseen motion over the torque limit (n,); None without limits."""
-        limit = self.context.torque_limit
-        return None if limit is None else np.asarray(self.held_out.rms / limit)
 
 
 def gather(
@@ -304,7 +294,6 @@ def gather(
     grams = StandardGram.of(model, few), StandardGram.of(model, unseen_few)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
-    gram = information(result.factor)
     evidence = Evidence(
         estimate=result.pooled,
         held_out=error,
@@ -313,7 +302,6 @@ def gather(
         causes=find_causes(model, training, values, names),
         gravity=find_gravity(model, *grams),
         load=find_load(model, few, unseen_few, *grams),
-        loaded=gravity_loads(model, postures),
         nominal=None
         if nominal is None
         else pooled_error(prediction_error(model, nominal, held_out)),
@@ -333,7 +321,6 @@ def gather(
             same_motion=same_motion,
             motor_from_joint=context.motor_from_joint,
         ),
-        coupling=(float(coupling_index(gram)), coupling_index_max(len(gram))),
         context=context,
         in_sample=in_sample,
         prismatic=tuple(np.flatnonzero(~model.chain.revolute).tolist()),

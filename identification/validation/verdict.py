@@ -21,7 +21,6 @@ __all__ = ["Finding", "Thresholds", "Verdict", "judge"]
 Array = NDArray[np.float64]
 Facts = dict[str, Any]
 
-_SHOWN: Final = 0.0005  # smallest share that is not displayed as zero
 # A wrong sign would increase the error of the fitted motion as well.
 _NOT_COVERED: Final = (
     "fit a longer or more varied motion: the fitted motion does not cover the predicted one"
@@ -85,7 +84,7 @@ def judge(
 
 def _measure(names: Sequence[str], evidence: Evidence) -> str:
     """Errors on held-out motion, as the end of the verdict's sentence."""
-    error, systematic = evidence.held_out, evidence.systematic
+    error = evidence.held_out
     if np.all(np.isnan(error.relative)):
         return "no torque error was measured"
     worst = int(np.nanargmax(error.relative))
@@ -95,9 +94,6 @@ def _measure(names: Sequence[str], evidence: Evidence) -> str:
     )
     if floor := evidence.floor:
         text += f"; {error.overall / floor:.1f} times the noise floor of {floor:.1%}"
-    if systematic is not None and np.nanmax(systematic, initial=0.0) >= _SHOWN:
-        axis = int(np.nanargmax(systematic))
-        text += f"; beyond noise {systematic[axis]:.1%} at worst ({names[axis]})"
     return text
 
 
@@ -111,7 +107,6 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
     none, little = explained <= limit.explained, explained < limit.little_explained
     any_explained = not np.all(np.isnan(explained))
     worst = int(np.nanargmin(explained)) if any_explained else 0
-    indices = evidence.coupling or (np.inf, np.inf)
     facts: Facts = {
         "limit": limit, "error": error, "relative": relative, "explained": explained,
         "evidence": evidence, "times": times, "condition": estimate.condition,
@@ -121,8 +116,6 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         "undetermined": ", ".join(estimate.undetermined),
         "poor": not estimate.undetermined and estimate.condition > limit.condition,
         "rich": not estimate.undetermined and not estimate.condition > limit.condition,
-        "coupling": f", coupling index {indices[0]:.0f} of at most {indices[1]:.0f}"
-        if np.isfinite(indices[0]) else "",
         "overall_covered": overall and not error.overall > covered,
         "overall_grown": overall and error.overall > covered,
         "large_covered": large & ~grown, "large_grown": large & grown,
@@ -136,11 +129,9 @@ def _facts(names: tuple[str, ...], evidence: Evidence, limit: Thresholds) -> Fac
         # Undetermined parameters vary between repetitions.
         facts |= {"disagreement": share, "disagree": share > limit.inconsistency}
     floor, causes = evidence.floor, evidence.causes
-    if floor is not None and causes is not None and not causes.found:
+    if floor is not None and causes is not None and not causes:
         much = error.overall > max(limit.unexplained, limit.multiple * floor)
-        best = causes.best
-        left = "" if best is None else f"; the best one leaves {best.ratio:.0%} of the error"
-        facts |= {"unexplained": much, "floor": floor, "left": left}
+        facts |= {"unexplained": much, "floor": floor}
         facts["multiple"] = error.overall / max(floor, 1e-300)
     facts |= _systematic_facts(names, evidence, limit) | _context_facts(evidence, limit)
     facts |= _cause_facts(evidence, limit)
@@ -153,27 +144,11 @@ def _systematic_facts(names: tuple[str, ...], evidence: Evidence, limit: Thresho
     share = nothing if known is None else np.nan_to_num(known)
     apart = evidence.systematic_without_friction
     beyond = (share if apart is None else np.nan_to_num(apart)) > limit.systematic
-    small = (share > limit.noticeable) & (share <= limit.systematic)
-    # A known weight tests torque constants where gravity loads the joint.
-    weighed = small if evidence.loaded is None else small & evidence.loaded
-    steps = [
-        step.format(joined([names[j] for j in np.flatnonzero(axes)]))
-        for axes, step in (
-            (weighed, "check the torque constant of {} with a known payload (`hil gains`)"),
-            (
-                small & ~weighed,
-                "compare the torque constant of {} with the drive's data sheet: without gravity"
-                " load no payload determines it",
-            ),
-        )
-        if axes.any()
-    ]
     facts: Facts = {
         "no_repetitions": known is None,
         "systematic": share,
         "systematic_large": (share > limit.systematic) & beyond,
-        "systematic_small": small,
-        "constants": "; ".join(steps),
+        "systematic_small": (share > limit.noticeable) & (share <= limit.systematic),
     }
     if (change := evidence.friction_change) is not None:
         by_friction = (share > limit.systematic) & ~beyond
@@ -226,17 +201,14 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
     if (scale := context.nominal_scale) is not None:
         if evidence.causes is not None:
             # Torques of another joint or with the wrong sign have no nominal size.
-            scale = scale.without(j for one in evidence.causes.found for j in one.fault.joints)
+            scale = scale.without(j for one in evidence.causes for j in one.fault.joints)
         common, known = scale.common, np.isfinite(scale.scale)
         off = known if common != 1.0 else scale.off
         impossible = abs(np.log(common)) > np.log(_IMPOSSIBLE_SCALE)
-        unit = "the unit of the torque (N·m, N·mm?), its side (motor or joint?)"
-        constant = "torque constant and gear ratio, and the payload"
         facts |= {"scale": scale.scale, "tolerance": scale.tolerance}
         facts |= {"negated": known & scale.negated}
         facts["impossible_scale"] = off & impossible & (not scale.negated)
         facts["other_scale"] = off & (not impossible) & (not scale.negated)
-        facts["to_check"] = unit if common != 1.0 else constant
     if (inertia := context.controller_inertia) is not None:
         far = np.abs(np.log(inertia.ratio)) > np.log(_INERTIA_OFF)
         known = np.isfinite(inertia.ratio)
@@ -251,14 +223,13 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         poor = bool(evidence.estimate.undetermined) or evidence.estimate.condition > limit.condition
         beyond = np.maximum(limit.delay * delays.cycle, SIGMAS * delays.std)
         late = delays.determined & (np.abs(delays.delays - assumed) > beyond)
-        on_time = delays.determined & ~late.any() & (not same) & (not poor)
         facts |= {
             "compensated": same, "common": 1e3 * delays.common, "stated": 1e3 * delays.assumed,
-            "common_half": 1e3 * delays.half_interval, "assumed": 1e3 * assumed,
+            "common_half": 1e3 * delays.interval_factor * delays.common_std,
+            "assumed": 1e3 * assumed,
             "delay": 1e3 * delays.delays, "half": 1e3 * delays.interval_factor * delays.std,
             "late": late & (not same) & (not poor),
-            "on_time": on_time & (not delays.agree),
-            "all_on_time": bool(on_time.any()) and delays.agree,
+            "on_time": delays.determined & ~late & (not late.any() and not same and not poor),
         }  # fmt: skip
     return facts
 
@@ -402,7 +373,7 @@ _CAUSES: Final[dict[Kind, _CauseRow]] = {
 def _causes(facts: Facts, names: Sequence[str]) -> Iterator[Finding]:
     """Faults whose correction makes parts of the fitted recordings more predictable."""
     causes = facts["evidence"].causes
-    for cause in () if causes is None or facts["outliers_decide"] else causes.found:
+    for cause in () if causes is None or facts["outliers_decide"] else causes:
         if cause.ratio > facts["rival"]:
             continue
         check, words, step, scale, offset = _CAUSES[cause.fault.kind]
@@ -459,11 +430,11 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "the motion does not determine {undetermined}", _RICHER),
     _Row("excitation", {"doubtful": "poor"},
          "the motion excites the parameters poorly: condition number {condition:.0f} of the"
-         " regressor with unit columns{coupling}, limit {limit.condition:.0f}; predictions are"
+         " regressor with unit columns, limit {limit.condition:.0f}; predictions are"
          " reliable for similar motions only, single parameters are not", _RICHER),
     _Row("excitation", {"good": "rich"},
          "the motion determines every parameter: condition number {condition:.0f} of the regressor"
-         " with unit columns{coupling}"),
+         " with unit columns"),
     _Row("outliers", {"wrong": "outliers_spoil", "doubtful": "outliers_exist"},
          "isolated outliers cause most of the error on {on} (<{outlying:.2%}> of the samples);"
          " without them it is {outliers.without.overall:.1%} over all axes",
@@ -482,7 +453,8 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("scale of the torque", {"wrong": "impossible_scale", "doubtful": "other_scale"},
          "ratio of measured torque to the torque of the nominal inertias:"
          " <{scale:.3g} ± {tolerance:.2g}>",
-         "check {to_check} of {joints}, and the masses of the URDF", "cause"),
+         "check unit, side (motor or joint), torque constant and gear ratio of the torque of"
+         " {joints}, the payload, and the masses of the URDF", "cause"),
     _Row("load", {"wrong": "carried"},
          "on {on} the arm carried {more} than on the fitted motion: a body on the last link"
          " explains {load.explained:.0%} of the additional error",
@@ -515,7 +487,7 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("unexplained error", {"wrong": "unexplained"},
          "the torque error on {on} is {error.overall:.1%}, {multiple:.1f} times the noise floor of"
          " {floor:.1%}; none of the tested faults explains it (delay, torque constants, signs and"
-         " order of joints, payload, changes between recordings{left})",
+         " order of joints, payload, changes between recordings)",
          "check for effects that the model lacks: friction curves of the report, elasticity,"
          " springs or balancers ([[robot.elements]] of the cell file), temperature", "symptom"),
     _Row("variance explained (R²)", {"wrong": "none"},
@@ -540,7 +512,9 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "check sign, gear ratio, coupling and torque constant of {joints}", "symptom"),
     _Row("systematic error", {"doubtful": "systematic_small"},
          "the torque error on {on} beyond noise exceeds {limit.noticeable:.1%}:"
-         " <{systematic:.1%}>", "{constants}", "symptom"),
+         " <{systematic:.1%}>",
+         "check the torque constant of {joints} with a known payload (`hil gains`), or without"
+         " gravity load against the drive's data sheet", "symptom"),
     _Row("repetitions", {"wrong": "disagree"},
          "the estimates of single repetitions differ by more than {limit.inconsistency:.0%} of the"
          " torque: <{disagreement:.0%}>",
@@ -573,9 +547,6 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          "the delay of the torque differs from the assumed one:"
          " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>",
          "compare with `hil identify --delay auto`, or correct the delay in the cell", "cause"),
-    _Row("delay", {"good": "all_on_time"},
-         "the delay of the torque is as assumed: {common:.3g} ± {common_half:.2g} ms"
-         " ({stated:.3g} ms assumed)"),
     _Row("delay", {"good": "on_time"},
          "the delay of the torque is as assumed:"
          " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from hil.archive import open_archive
 from hil.importers import ColumnMap, Robot, import_log
-from identification import RobotModel
+from identification import FrictionLaw, RobotModel
 
 Array = NDArray[np.float64]
 
@@ -136,6 +137,21 @@ def column_map(**entries: object) -> ColumnMap:
     """Of positions called q1, q2 ... at 100 Hz, unless the entries say else."""
     rate = {} if "time" in entries else {"sample_rate": 100.0}
     return ColumnMap.model_validate({"position": {"columns": "q{}"}, **rate, **entries})
+
+
+def archive_of(
+    path: Path,
+    urdf: Path,
+    entries: Mapping[str, object] | None = None,
+    law: FrictionLaw | None = None,
+    **arrays: Array,
+) -> Path:
+    """Import arrays into an archive, by default time t, positions q and torques tau."""
+    table = path.with_suffix(".npz")
+    np.savez(table, **arrays)  # type: ignore[arg-type]
+    usual = {"time": {"column": "t"}, "position": {"columns": "q"}, "torque": {"columns": "tau"}}
+    columns = ColumnMap.model_validate(entries or usual)
+    return import_log(table, path, robot=Robot.from_urdf(urdf, friction=law), columns=columns)
 
 
 def imported(source: Path, robot: Robot, **entries: object) -> dict[str, Any]:

@@ -1,10 +1,10 @@
-"""From archives to a result: what is read, estimated, judged and left behind."""
+"""Identification from archives: sources, estimators, verdict, files of the result."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from hil.identify.options import ESTIMATORS, FIXED, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.identify.summary import uncertainty_result
-from hil.importers import ColumnMap, Robot, import_log
+from hil.importers import Robot
 from hil.outcome import rewrite_report, write_outcome
 from hil.progress import Silent
 from hil.report import ReportSeries, report_bytes
@@ -44,7 +44,7 @@ from identification.estimators.consistent import Shrinkage, SolverError
 from sim_fixtures.ns16 import URDF_PATH
 
 from .identified_arm import TWO_LINK
-from .simulated_logs import simulate
+from .simulated_logs import archive_of, simulate
 
 PERIOD = 0.004
 
@@ -68,7 +68,7 @@ def judgement(found: Identification) -> JudgementResult:
 def imported(
     path: Path, names: tuple[str, ...] | None = None, *, torque: bool = True, **spoilt: object
 ) -> Path:
-    """An imported recording of smooth sines on six joints, with something wrong."""
+    """Write an imported recording of sines on six joints, with faults by name."""
     robot = Robot.from_urdf(URDF_PATH)
     time = np.arange(2000) * PERIOD
     position = 0.3 * np.sin(np.outer(time, np.linspace(1.0, 2.0, 6)))
@@ -96,36 +96,24 @@ def imported(
 
 
 def imported_ur5(folder: Path, time: np.ndarray, late: np.ndarray | float, still: int = 0) -> Path:
-    """An imported UR5 that rests for so many samples first, with torques that lag by a time [s]."""
+    """Import a UR5 at rest for `still` samples, then moving, with torques `late` by a time [s]."""
     made = simulate("ur5_robot.urdf", time, noise=0.3)
-    lag = np.broadcast_to(late, 6)
-    torque = np.column_stack(
-        [
-            np.interp(time - one, time, torque)
-            for one, torque in zip(lag, made.torque.T, strict=True)
-        ]
-    )
-    columns = np.column_stack([time, made.position, torque])[0 if still else 10 :]
-    rest = np.repeat(columns[:1], still, axis=0)
-    rest[:, 0] = columns[0, 0] + (time[1] - time[0]) * np.arange(-still, 0)
-    np.savetxt(folder / "log.csv", np.concatenate([rest, columns]))
-    (folder / "map.toml").write_text(
-        "[time]\ncolumn = 0\n[position]\ncolumns = [1, 2, 3, 4, 5, 6]\n"
-        "[torque]\ncolumns = [7, 8, 9, 10, 11, 12]\n"
-    )
-    return import_log(
-        folder / "log.csv",
-        folder / "log.mcap",
-        robot=Robot.from_urdf(made.urdf),
-        columns=ColumnMap.load(folder / "map.toml"),
-    )
+    lags = zip(np.broadcast_to(late, 6), made.torque.T, strict=True)
+    torque = np.column_stack([np.interp(time - lag, time, one) for lag, one in lags])
+    rows = slice(0 if still else 10, None)
+    t, q, tau = time[rows], made.position[rows], torque[rows]
+    before = t[0] + (time[1] - time[0]) * np.arange(-still, 0)
+    resting = (np.repeat(one[:1], still, axis=0) for one in (q, tau))
+    q, tau = (np.concatenate(both) for both in zip(resting, (q, tau), strict=True))
+    arrays = {"t": np.concatenate([before, t]), "q": q, "tau": tau}
+    return archive_of(folder / "log.mcap", made.urdf, **arrays)
 
 
 class TestCampaign:
-    """What the archives of a campaign give."""
+    """Results of a campaign."""
 
     def test_has_58_parameters_near_the_planted_ones(self, found: Identification) -> None:
-        """Of 58 normal deviates more than 3 outside 3 sigma come once in 10^5 tries."""
+        """More than 3 of 58 normal deviates beyond 3 sigma have a probability of 1e-5."""
         ids = sorted(p.table2_id or 0 for p in found.results.parameters)
         assert ids == list(range(1, 59))
         coverage = found.results.coverage
@@ -138,7 +126,7 @@ class TestCampaign:
         assert None not in calibration.joint_inside
 
     def test_planned_criteria_are_those_that_were_executed(self, found: Identification) -> None:
-        """At the same instants; stiction and noise of acceleration change columns by per mille."""
+        """At equal times; stiction and noise change the columns by per mille."""
         planned, executed = found.results.excitation.planned, found.results.excitation.executed
         assert executed.n_samples == pytest.approx(3 * planned.n_samples, abs=6)
         assert executed.log10_det == pytest.approx(planned.log10_det, abs=58 * np.log10(1.01))
@@ -148,10 +136,10 @@ class TestCampaign:
     def test_needs_the_archives_only(
         self, campaign: Campaign, found: Identification, tmp_path: Path
     ) -> None:
-        """Moved elsewhere, without the folder around them, they give the same numbers."""
+        """Copied without their folder, they give the same numbers."""
         moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
         again = identify_archives(moved, Silent(), name=found.results.name)
-        # How the campaign was run stands in its folder's own files.
+        # The conduct of the campaign is recorded in its folder.
         assert found.results.conduct is not None
         assert again.results == found.results.model_copy(update={"conduct": None})
 
@@ -165,24 +153,24 @@ class TestCampaign:
             both = np.hypot(ours.std, theirs.std)
             assert abs(ours.estimate - theirs.estimate) < 5.0 * both, ours.name
 
-    def test_says_why_there_is_no_consistent_solution(
+    def test_reports_a_failed_consistent_solution(
         self, campaign: Campaign, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         def none(*_: object, **__: object) -> None:
-            raise IdentificationError("the solver gave up")
+            raise IdentificationError("the solver failed")
 
         for name in ("check_consistency", "choose_essential"):
             monkeypatch.setattr(f"hil.identify.run.{name}", none)
         without = identify_campaign(campaign.folder.root, Silent(), FIXED)
         warnings = without.results.verdict.warnings
-        assert sum("the solver gave up" in one for one in warnings) == 2
+        assert sum("the solver failed" in one for one in warnings) == 2
         assert without.results.consistency is without.results.essential is None
 
 
 class TestOutcome:
-    """The files that are left behind."""
+    """Files of a result."""
 
-    def test_is_all_of_one_generation_or_untouched(
+    def test_is_replaced_completely_or_not_at_all(
         self, found: Identification, tmp_path: Path
     ) -> None:
         write_outcome(tmp_path, found, Silent())
@@ -199,7 +187,7 @@ class TestOutcome:
         left = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
         assert left == first
 
-    def test_that_no_page_can_be_drawn_from_is_named(
+    def test_with_inconsistent_lengths_is_refused(
         self, found: Identification, tmp_path: Path
     ) -> None:
         write_outcome(tmp_path, found, Silent())
@@ -229,9 +217,9 @@ class TestOutcome:
 
 
 class TestSources:
-    """Which archives are fitted, predicted, and refused."""
+    """Archives that are fitted, predicted, or refused."""
 
-    def test_torn_are_used_to_their_last_whole_chunk(
+    def test_truncated_are_used_to_the_last_complete_chunk(
         self, campaign: Campaign, tmp_path: Path
     ) -> None:
         moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
@@ -260,13 +248,13 @@ class TestSources:
         with pytest.raises(ArchiveError, match=r"other\.mcap.*has another"):
             identify_archives([first, other], Silent())
 
-    def test_without_repetitions_leave_something_open(self, campaign: Campaign) -> None:
+    def test_without_repetitions_are_not_tested_for_noise(self, campaign: Campaign) -> None:
         one = [campaign.folder.completed("excitation")[0], *campaign.folder.completed("validation")]
         found = identify_archives(one, Silent())
         assert any("cannot be distinguished from noise" in one for one in found.verdict.warnings)
 
-    def test_at_rest_test_nothing(self, campaign: Campaign) -> None:
-        """The end of a recording, at which the arm is held for 0.2 s, has no motion to predict."""
+    def test_at_rest_are_no_test(self, campaign: Campaign) -> None:
+        """At the end of a recording the arm rests for 0.2 s."""
         found = identify_archives([paths(campaign)[0]], Silent(), Options(split=0.985))
         assert not found.verdict.good
         assert "moved in fewer than" in found.verdict.line
@@ -284,7 +272,7 @@ class TestSources:
             ),
         ],
     )
-    def test_that_are_bad_are_refused_by_name(
+    def test_that_are_invalid_are_refused_by_name(
         self, tmp_path: Path, spoilt: dict[str, object], sentence: str
     ) -> None:
         with pytest.raises(ArchiveError, match=r"bad\.mcap.*" + sentence):
@@ -297,21 +285,21 @@ class TestSources:
         assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
         assert "unseen" not in found.verdict.line.split(":")[0]
 
-    def test_that_repeat_what_was_fitted_are_not_unseen(self, campaign: Campaign) -> None:
+    def test_that_repeat_the_fitted_motion_are_not_unseen(self, campaign: Campaign) -> None:
         found = identify_archives(campaign.folder.completed("excitation"), Silent())
         line = "The model predicts a repetition of the fitted motion"
         assert found.verdict.line.startswith(line)
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
-    def test_whose_torque_has_no_noise_are_named(self, tmp_path: Path, noise: float) -> None:
-        """It came through a low-pass, or was computed; a measured one has noise everywhere."""
+    def test_with_a_noiseless_torque_are_named(self, tmp_path: Path, noise: float) -> None:
+        """It was filtered by a low-pass, or computed."""
         found = identify_archives([imported(tmp_path / "smooth.mcap", noise=noise)], Silent())
         named = [one.check for one in found.results.judgement.findings]
         assert ("torque bandwidth" in named) == (noise == 0.0)
 
 
 class TestJudgement:
-    """What a verdict rests on: in `results.json`, on the terminal and in the report."""
+    """Numbers behind a verdict: in `results.json`, on the terminal and in the report."""
 
     def test_compares_joints_with_limit_and_other_models(
         self, judgement: JudgementResult, found: Identification
@@ -382,13 +370,9 @@ class TestJudgement:
         self, found: Identification, good: bool, capsys: pytest.CaptureFixture[str]
     ) -> None:
         verdict = found.results.verdict.model_copy(update={"good": good})
-        results = found.results.model_copy(update={"verdict": verdict})
-        if good:
-            finish(results, json=False)
-        else:
-            with pytest.raises(typer.Exit) as left:
-                finish(results, json=False)
-            assert left.value.exit_code == NOT_GOOD
+        with nullcontext() if good else pytest.raises(typer.Exit) as left:
+            finish(found.results.model_copy(update={"verdict": verdict}), json=False)
+        assert good or left.value.exit_code == NOT_GOOD
         assert capsys.readouterr().out == verdict.line + "\n"
 
     def test_shows_the_worst_first_and_a_figure_per_joint(
@@ -411,7 +395,7 @@ class TestJudgement:
 
 @pytest.fixture(scope="module")
 def prepared(campaign: Campaign) -> Prepared:
-    """Rows that slide: how friction turns round at reversals is not asked here."""
+    """Rows in sliding motion only, without velocity reversals."""
     sources = gather_sources(paths(campaign), 0.7)
     return prepare_sources(sources, Options(standstill="slow"), Silent())
 
@@ -422,24 +406,24 @@ def estimations(prepared: Prepared) -> dict[Estimator, Estimation]:
 
 
 class TestEstimators:
-    """Every estimator on one campaign, and what is said beside it."""
+    """Every estimator on one campaign, with its warnings."""
 
     @pytest.mark.parametrize("name", ESTIMATORS)
     def test_find_the_planted_arm(
         self, name: Estimator, estimations: dict[Estimator, Estimation], prepared: Prepared
     ) -> None:
-        """In torque on the fitted motion, where all parameters count by what they do."""
+        """Compared by torque on the fitted motion."""
         found = estimations[name]
         pooled = found.result.pooled
         error = pooled.values - planted_values(prepared.sources.cell)
         gram = found.result.factor.gram
         squares = np.einsum("i,jik,k->j", error, gram[:, :-1, :-1], error)
         assert np.sqrt(squares / gram[:, -1, -1]).max() < 0.005
-        # Of 58 by chance 0.03 lie so far off; three of one motion.
+        # Expected by chance: 0.03 of 58, and three of a single motion.
         assert np.count_nonzero(np.abs(error) / pooled.std > 3.5) <= 3
         assert found.estimator == name
         assert len(found.result.repetitions) == len(prepared.fitted)
-        # The bias of so good an encoder is no doubt about the result.
+        # The noise of so good an encoder causes no warning.
         assert not isinstance(found.endogeneity, str)
         assert 0.0 <= found.endogeneity.p_value <= 1.0
         assert not any("biased" in one for one in found.warnings)
@@ -476,7 +460,7 @@ class TestEstimators:
         estimations: dict[Estimator, Estimation],
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        """Data that no machine fits are estimated all the same, and the reason stands beside it."""
+        """The reason is a warning."""
 
         def none(*_: object, **__: object) -> None:
             raise SolverError("no solution was found")
@@ -549,9 +533,9 @@ def whole(log: Path) -> Identification:
 
 
 class TestInSample:
-    """Errors of the fit beside those of the prediction; and where nothing is predicted."""
+    """Errors of the fit, with and without a prediction."""
 
-    def test_error_stands_beside_that_of_the_prediction(self, split: Identification) -> None:
+    def test_error_is_reported_with_that_of_the_prediction(self, split: Identification) -> None:
         results = split.results
         pairs = zip(results.judgement.joints, results.fitted.relative_error, strict=True)
         for joint, fitted in pairs:
@@ -578,9 +562,9 @@ class TestInSample:
 
 
 class TestCalibration:
-    """Held-out means of torque beside their 95 % intervals."""
+    """Held-out means of torque and their 95 % intervals."""
 
-    def test_stands_on_the_terminal_and_in_the_report(
+    def test_is_on_the_terminal_and_in_the_report(
         self, split: Identification, capsys: pytest.CaptureFixture[str]
     ) -> None:
         results = split.results
@@ -596,8 +580,8 @@ class TestCalibration:
         assert words.startswith("88.0% of") and "50% of b" in words
 
 
-class TestSurroundings:
-    """What beside the model explains errors: delays, nominal masses, slips."""
+class TestCellContext:
+    """Delays, nominal masses, position jumps."""
 
     def test_delays_axis_by_axis_are_compensated(self, split: Identification) -> None:
         delays = split.results.delays
@@ -622,7 +606,7 @@ class TestSurroundings:
             assert joint.nominal_relative is not None and joint.relative is not None
             assert joint.nominal_relative > 2.0 * joint.relative
 
-    def test_a_slip_of_an_encoder_is_the_reason(self, split: Identification) -> None:
+    def test_a_jump_of_an_encoder_is_found(self, split: Identification) -> None:
         prepared = split.prepared
         source = prepared.sources.training[0]
         position = source.recording.position.copy()
@@ -654,15 +638,15 @@ def series(rested: Identification) -> ReportSeries:
 
 
 class TestSeries:
-    """What is computed for the figures."""
+    """Data of the figures."""
 
     def test_split_adds_up_to_the_prediction(self, series: ReportSeries) -> None:
         names = ("inertia", "coriolis", "gravity", "friction")
         parts = [getattr(series, f"example_{name}") for name in names]
         np.testing.assert_allclose(sum(parts), series.example_predicted, atol=1e-6)
 
-    def test_says_which_rows_were_fitted(self, series: ReportSeries) -> None:
-        """Rest is shown for a second, and is not fitted."""
+    def test_marks_the_fitted_rows(self, series: ReportSeries) -> None:
+        """A second of rest is displayed and not fitted."""
         first = np.argmax(series.excitation_fitted.any(axis=1))
         rest = series.excitation_time[first] - series.excitation_time[0]
         assert 0.9 < rest < 1.1
@@ -678,9 +662,9 @@ class TestSeries:
             speed, torque = series.friction_speed[known, j], series.friction_torque[known, j]
             law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
             assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise
-        assert np.isfinite(series.reversal_travel).all()  # dry friction turns round
+        assert np.isfinite(series.reversal_travel).all()  # of dry friction
         assert series.reversal_travel[-1] == pytest.approx(6e-4)
 
-    def test_shows_what_was_fitted_where_all_is(self, rest_log: Path) -> None:
+    def test_shows_the_fitted_motion_in_sample(self, rest_log: Path) -> None:
         one = identify_archives([rest_log], Silent(), replace(SLOW, in_sample=True)).series
         np.testing.assert_array_equal(one.example_time, one.excitation_time)

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from pydantic import ValidationError
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from hil import weighing
 from hil.campaign import Campaign
@@ -23,7 +23,6 @@ from hil.cli import app
 from hil.errors import ArchiveError, InputError, OperatorStopError
 from hil.identify.options import FIXED
 from hil.identify.payload_run import PayloadFound, find_payload
-from hil.importers import ColumnMap, Robot, import_log
 from hil.importers.column_map import Drive
 from hil.progress import Silent
 from hil.simulation import carrying
@@ -32,29 +31,23 @@ from identification.model.kinematics import pinocchio_model
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
 from tests.hil.fast_cell import fast_campaign, fast_cell
-from tests.hil.simulated_logs import Simulated, simulate
+from tests.hil.simulated_logs import Simulated, archive_of, simulate
 
 MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
 TENSOR = np.diag([0.01, 0.02, 0.015])
 LAW = FrictionLaw(third=None, offset=True)
-
-
-def archive(path: Path, simulated: Simulated, law: FrictionLaw = LAW) -> Path:
-    table = path.with_suffix(".npz")
-    np.savez(table, q=simulated.position, tau=simulated.torque, t=simulated.time)
-    columns = {"time": {"column": "t"}, "position": {"columns": "q"}, "torque": {"columns": "tau"}}
-    return import_log(
-        table,
-        path,
-        robot=Robot.from_urdf(simulated.urdf, friction=law),
-        columns=ColumnMap.model_validate(columns),
-    )
+BOTH = ("--loaded", "full.mcap", "--mass", "4", "--centre", "0,0.09,0.12")
 
 
 def record(folder: Path, name: str, mass: float, seed: int) -> Path:
     time = np.arange(0.0, 12.0, 8e-3)
     load = None if mass == 0.0 else pin.Inertia(mass, CENTRE, TENSOR * mass / MASS)
-    return archive(folder / name, simulate("ur5_robot.urdf", time, seed=seed, load=load))
+    return archived(folder / name, simulate("ur5_robot.urdf", time, seed=seed, load=load))
+
+
+def archived(path: Path, made: Simulated) -> Path:
+    arrays = {"t": made.time, "q": made.position, "tau": made.torque}
+    return archive_of(path, made.urdf, law=LAW, **arrays)
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +68,7 @@ def run(folder: Path, *arguments: str, command: str = "payload") -> tuple[int, s
 
 
 def weigh(folder: Path, bare: list[str], loaded: list[str]) -> PayloadFound:
-    """With settings as they are stated: nothing is chosen, which takes seconds."""
+    """Identify with stated settings: their automatic choice takes seconds."""
     sides = [[folder / f"{name}.mcap" for name in names] for names in (bare, loaded)]
     return find_payload(*sides, Silent(), options=FIXED)
 
@@ -97,7 +90,7 @@ centre = [0.3, 0.0, 0.05]
 inertia = [0.004, 0.0, 0.0, 0.006, 0.0, 0.005]
 """
 BY_HAND = {"design": ("--settings", "quick.toml"), "run": ("--accept-dry-run",)}
-"""What a test adds to a command: less of a search, and the answer of a person at a terminal."""
+"""Words that a test adds to a command: a short search, the operator's answer."""
 
 
 class TestPage:
@@ -135,12 +128,12 @@ class TestFigures:
             sum(figures[name]["value"] for name in ("Ixx", "Iyy", "Izz")), rel=0.3
         )
 
-    def test_a_check_outside_is_reported(self, printed: dict[str, list[str]]) -> None:
+    def test_a_value_outside_its_interval_is_reported(self, printed: dict[str, list[str]]) -> None:
         (sentence,) = printed["outside"]
         assert sentence.startswith("mass 4.5 kg is outside the 95 % interval")
 
     def test_each_controller_has_its_own_units(self, printed: dict[str, dict]) -> None:
-        """COMAU counts in mm; UR and Franka in m; Franka takes a whole matrix."""
+        """COMAU uses mm, UR and Franka m; Franka the complete matrix."""
         typed, figures = printed["controllers"], printed["figures"]
         centre = [figures[name]["value"] for name in ("cx", "cy", "cz")]
         assert f"$TOOL_CNTR := POS({1e3 * centre[0]:.2f}, {1e3 * centre[1]:.2f}" in typed["COMAU"]
@@ -153,36 +146,35 @@ class TestFigures:
 
 
 class TestRefusals:
-    def test_a_second_payload_is_named(self, folder: Path) -> None:
-        with pytest.raises(InputError, match=r"other\.mcap.*another payload: .* kg less"):
-            weigh(folder, ["empty"], ["full", "other"])
-
-    def test_a_bare_run_with_a_tool_is_named(self, folder: Path) -> None:
-        with pytest.raises(InputError, match=r"other\.mcap.*another tool: .* kg more"):
-            weigh(folder, ["empty", "other"], ["full"])
+    @pytest.mark.parametrize(
+        ("bare", "loaded", "sentence"),
+        [
+            (["empty"], ["full", "other"], r"other\.mcap.*another payload: .* kg less"),
+            (["empty", "other"], ["full"], r"other\.mcap.*another tool: .* kg more"),
+            (["empty"], ["empty"], "is a copy of"),
+        ],
+    )
+    def test_mixed_recordings_are_named(
+        self, folder: Path, bare: list[str], loaded: list[str], sentence: str
+    ) -> None:
+        with pytest.raises(InputError, match=sentence):
+            weigh(folder, bare, loaded)
 
     def test_another_arm_is_named(self, folder: Path, tmp_path: Path) -> None:
         time = np.arange(0.0, 6.0, 8e-3)
-        other = archive(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
+        other = archived(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
         with pytest.raises(ArchiveError, match=r"ur10\.mcap.*another arm .* robot\.urdf"):
             find_payload([folder / "empty.mcap"], [other], Silent())
-
-    def test_one_archive_on_both_sides_is_refused(self, folder: Path) -> None:
-        with pytest.raises(InputError, match="is a copy of"):
-            weigh(folder, ["empty"], ["empty"])
 
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
             (("empty.mcap",), "give both: hil payload BARE"),
-            (
-                ("empty.mcap", "--loaded", "full.mcap", "--check", "mass"),
-                "'mass' is not NAME=NUMBER",
-            ),
+            (("empty.mcap", *BOTH[:2], "--check", "mass"), "'mass' is not NAME=NUMBER"),
             (("empty.mcap", "--shape", "ball", "1", "1", "1"), "ball 1 1 1 is not a shape"),
         ],
     )
-    def test_what_cannot_be_used_is_named(
+    def test_incomplete_arguments_are_refused(
         self, folder: Path, arguments: tuple[str, ...], sentence: str
     ) -> None:
         with pytest.raises(InputError, match=sentence):
@@ -190,10 +182,15 @@ class TestRefusals:
 
 
 def payload_campaign(folder: Path) -> Campaign:
-    """Of the small cell, whose simulated arm carries 2 kg where it is loaded."""
+    """Campaign of the small cell, whose simulated arm carries 2 kg in loaded runs."""
     cell = fast_cell(folder, repetitions=2)
     carrying = Cell.from_texts(cell.text + CARRIED, cell.urdf, cell.path)
     return fast_campaign(folder / "campaign", carrying)
+
+
+def run_campaign(campaign: Campaign, *words: str) -> Result:
+    command = ["run", str(campaign.folder.root), *words]
+    return CliRunner().invoke(app, command, catch_exceptions=False)
 
 
 @pytest.fixture(scope="module")
@@ -203,18 +200,16 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 
 @pytest.fixture(scope="module")
 def pairs(designed: Campaign) -> dict[str, Any]:
-    root = str(designed.folder.root)
-    words = ["run", root, "--payload", "weight", "--accept-dry-run", "--json"]
-    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    result = run_campaign(designed, "--payload", "weight", "--accept-dry-run", "--json")
     assert result.exit_code == 0, result.output
     found: dict[str, Any] = json.loads(result.stdout)
     return found
 
 
 class TestRun:
-    """Bare and loaded runs in ABBA order, behind the gates of every run."""
+    """Bare and loaded runs in ABBA order, with the gates of every run."""
 
-    def test_the_load_of_the_simulated_arm_is_weighed(self, pairs: dict[str, Any]) -> None:
+    def test_the_load_of_the_simulated_arm_is_identified(self, pairs: dict[str, Any]) -> None:
         low, high = pairs["figures"]["mass"]["interval"]
         assert pairs["figures"]["mass"]["value"] == pytest.approx(2.0, rel=0.02)
         assert 0.0 < high - low < 0.2
@@ -223,7 +218,7 @@ class TestRun:
         assert pairs["frame"] == "fore"
         assert set(pairs["undetermined"]) >= {"cy", "Ixy", "Iyz"}
 
-    def test_each_side_is_a_campaign_that_was_seen_slowly(
+    def test_each_side_is_a_campaign_with_a_dry_run(
         self, designed: Campaign, pairs: dict[str, Any]
     ) -> None:
         assert not list(designed.folder.archives.iterdir())
@@ -234,21 +229,21 @@ class TestRun:
             assert kinds.count("dryrun") == 1
             assert "validation" not in kinds
 
-    def test_what_is_recorded_is_not_recorded_again(
+    def test_complete_recordings_are_not_repeated(
         self, designed: Campaign, pairs: dict[str, Any]
     ) -> None:
         def run(*_: object) -> None:
-            pytest.fail("nothing was missing")
+            pytest.fail("no recording was missing")
 
         again = weighing.weigh(
             designed, "weight", run=run, mount=lambda _: False, reporter=Silent()
         )
         assert again.pairs == pairs["pairs"]
 
-    def test_order_is_abba_until_another_pair_adds_nothing(
+    def test_order_is_abba_until_the_interval_is_small(
         self, folder: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Mounting is asked for only where it changes."""
+        """The operator is asked to mount the payload only when it changes."""
         found = weigh(folder, ["empty"], ["full"])
         monkeypatch.setattr(weighing, "find_payload", lambda *_: found)
         done, asked = list[str](), list[bool]()
@@ -284,12 +279,11 @@ class TestRun:
             (("--payload", "x", "--dry-run"), "includes dry run"),
         ],
     )
-    def test_what_cannot_be_run_is_named(
+    def test_invalid_options_are_refused(
         self, designed: Campaign, words: tuple[str, ...], sentence: str
     ) -> None:
-        root = str(designed.folder.root)
         with pytest.raises(InputError, match=sentence):
-            CliRunner().invoke(app, ["run", root, *words], catch_exceptions=False)
+            run_campaign(designed, *words)
 
     def test_a_real_arm_needs_an_operator(self, designed: Campaign, tmp_path: Path) -> None:
         cell = designed.cell
@@ -299,11 +293,7 @@ class TestRun:
         )
         campaign = Campaign.create(tmp_path / "real", real, designed.plan)
         with pytest.raises(InputError, match="needs an operator at a terminal"):
-            CliRunner().invoke(
-                app,
-                ["run", str(campaign.folder.root), "--payload", "gripper"],
-                catch_exceptions=False,
-            )
+            run_campaign(campaign, "--payload", "gripper")
 
     def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(CellError, match=r"simulation\.payload"):
@@ -312,29 +302,22 @@ class TestRun:
 
 CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
 RATIO = np.array([100.0, 100.0, -100.0, 60.0, 60.0, -60.0])
-BOTH = ("--loaded", "full.mcap", "--mass", "4", "--centre", "0,0.09,0.12")
 
 
 def archive_of_currents(folder: Path, name: str, simulated: Simulated) -> Path:
     """Positions in motor radians and currents in A, without torque constants."""
-    np.savez(
-        folder / f"{name}.npz",
-        q=simulated.position * RATIO,
-        i=simulated.torque / (RATIO * CONSTANTS),
-        t=simulated.time,
-    )
     columns = {
         "time": {"column": "t"},
         "position": {"columns": "q", "side": "motor"},
         "motor_current": {"columns": "i"},
         "drive": {"gear_ratio": tuple(RATIO)},
     }
-    return import_log(
-        folder / f"{name}.npz",
-        folder / f"{name}.mcap",
-        robot=Robot.from_urdf(simulated.urdf, friction=FrictionLaw(third=None, offset=True)),
-        columns=ColumnMap.model_validate(columns),
-    )
+    arrays = {
+        "q": simulated.position * RATIO,
+        "i": simulated.torque / (RATIO * CONSTANTS),
+        "t": simulated.time,
+    }
+    return archive_of(folder / f"{name}.mcap", simulated.urdf, columns, LAW, **arrays)
 
 
 @pytest.fixture(scope="module")
@@ -351,9 +334,13 @@ def gains(folder: Path, *arguments: str) -> tuple[int, str]:
     return run(folder, *arguments, command="gains")
 
 
+def gains_json(folder: Path, *arguments: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(gains(folder, *arguments, "--json")[1])
+    return found
+
+
 def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
-    _, text = gains(currents, "empty.mcap", *BOTH, "--json")
-    found = json.loads(text)
+    found = gains_json(currents, "empty.mcap", *BOTH)
     assert found["side"] == "motor"
     assert found["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
     known = 0
@@ -367,15 +354,15 @@ def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
     assert known >= 5
 
 
-def test_what_is_printed_can_be_pasted(currents: Path) -> None:
+def test_the_output_is_an_entry_of_the_column_map(currents: Path) -> None:
     status, text = gains(currents, "empty.mcap", *BOTH, "--quiet")
     pasted = tomllib.loads(text)["torque_constant"]
     assert (len(pasted) == len(CONSTANTS)) == (status == 0)
     assert "# shoulder_lift_joint ±" in text
 
 
-def test_an_axis_parallel_to_gravity_is_named_and_gets_no_number(tmp_path: Path) -> None:
-    """In slow motion the payload is only weight, which the vertical axis does not carry."""
+def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
+    """The weight of the payload does not load it."""
     time = np.arange(0.0, 150.0, 2e-2)
     load = pin.Inertia(MASS, np.array(CENTRE), np.zeros((3, 3)))
     for seed, (name, body) in enumerate({"empty": None, "full": load}.items()):
@@ -397,31 +384,25 @@ def test_an_axis_parallel_to_gravity_is_named_and_gets_no_number(tmp_path: Path)
     [
         (("empty.mcap", "--loaded", "full.mcap"), "--mass: the payload needs a mass above 0"),
         (("empty.mcap", "--mass", "4"), "has no recording with this payload"),
-        ((*("empty.mcap", *BOTH[:4]), "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
+        (("empty.mcap", *BOTH[:4], "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
+        (("empty.mcap",), r"without a known payload.*--loaded ARCHIVE"),
     ],
 )
-def test_what_cannot_be_used_is_refused(
+def test_incomplete_arguments_of_gains_are_refused(
     currents: Path, arguments: tuple[str, ...], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         gains(currents, *arguments)
 
 
-def test_a_folder_stands_for_its_archives(currents: Path, tmp_path: Path) -> None:
+def test_archives_of_a_folder_are_used(currents: Path, tmp_path: Path) -> None:
+    """One of the same name as another archive is listed by its path."""
     with pytest.raises(InputError, match="contains no complete archive; give archives"):
         gains(currents, str(tmp_path))
     (tmp_path / "empty.mcap").symlink_to(currents / "empty.mcap")
-    _, text = gains(currents, str(tmp_path), *BOTH, "--json")
-    assert json.loads(text)["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
-
-
-def test_without_any_payload_nothing_is_determined(currents: Path) -> None:
-    with pytest.raises(InputError, match=r"without a known payload.*--loaded ARCHIVE"):
-        gains(currents, "empty.mcap")
-
-
-def test_archives_of_one_name_are_two(currents: Path, tmp_path: Path) -> None:
+    loads = gains_json(currents, str(tmp_path), *BOTH)["payload_kg"]
+    assert loads == {"empty.mcap": None, "full.mcap": 4.0}
+    (tmp_path / "empty.mcap").unlink()
     (tmp_path / "empty.mcap").symlink_to(currents / "full.mcap")
-    loaded = ("--loaded", str(tmp_path), *BOTH[2:])
-    _, text = gains(currents, "empty.mcap", *loaded, "--json")
-    assert sorted(json.loads(text)["payload_kg"].values(), key=bool) == [None, 4.0]
+    loads = gains_json(currents, "empty.mcap", "--loaded", str(tmp_path), *BOTH[2:])["payload_kg"]
+    assert sorted(loads.values(), key=bool) == [None, 4.0]
