@@ -78,16 +78,18 @@ class ArrayFile:
         self.names = tuple(self._stored)
         self._loaded: dict[str, NDArray[Any]] = {}
 
-    def numbers(self, columns: Sequence[Column], field: str, array: str | None = None) -> Array:
+    def numbers(
+        self, columns: Sequence[Column], field: str, array: str | None, *, rows: bool = False
+    ) -> Array:
         """Return columns side by side, shape (m, columns).
 
-        They are arrays by name, or columns by index of the matrix `array`. `field` is that of the
-        map, for errors.
+        They are arrays by name, or columns (`rows`: rows) by index of the matrix `array`. `field`
+        is that of the map, for errors.
 
         Raises:
             SourceError: no such array or column, or arrays of different lengths.
         """
-        found = [self._column(one, field, array).astype(np.float64) for one in columns]
+        found = [self._column(one, field, array, rows=rows).astype(np.float64) for one in columns]
         if len({len(one) for one in found}) > 1:
             lengths = ", ".join(f"{c} {len(one)}" for c, one in zip(columns, found, strict=True))
             problem = f"its arrays differ in length: {lengths}"
@@ -127,8 +129,10 @@ class ArrayFile:
         part = np.rint((values - whole) * float(factor))
         return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
 
-    def _column(self, column: Column, field: str, array: str | None) -> NDArray[Any]:
-        """Return one column (m,), in its own type."""
+    def _column(
+        self, column: Column, field: str, array: str | None, *, rows: bool = False
+    ) -> NDArray[Any]:
+        """Return one column or row (m,), in its own type."""
         if array is None and isinstance(column, str):
             found = self._array(column, field)
             if found.ndim == 2 and 1 not in found.shape:
@@ -137,8 +141,11 @@ class ArrayFile:
                 raise SourceError(self.path, problem, field=field, remedy=remedy)
             return found.ravel()
         matrix = self._matrix(array, field)
+        matrix = matrix.T if rows else matrix
         if not isinstance(column, int) or column >= matrix.shape[1]:
-            problem = f"array {array or self.names[0]!r} has no column {column!r}"
+            problem = (
+                f"array {array or self.names[0]!r} has no {'row' if rows else 'column'} {column!r}"
+            )
             remedy = f"it has {matrix.shape[1]}, counted from 0"
             raise SourceError(self.path, problem, field=field, remedy=remedy)
         return np.asarray(matrix[:, column])

@@ -142,6 +142,8 @@ class _Log:
             return self._upright(file.matrix(columns or array, field), quantity, file.path, name)
         columns = (columns,) if isinstance(columns, str) else columns
         self._check_count(columns, field)
+        if isinstance(file, ArrayFile):
+            return file.numbers(columns, field, array, rows=quantity.joints_along == "rows")
         return file.numbers(columns, field, array)
 
     def _joint_by_joint(self, name: str, quantity: Quantity, names: str | Sequence[str]) -> Array:

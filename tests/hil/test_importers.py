@@ -403,6 +403,14 @@ class TestArrays:
         assert np.array_equal(found["torque"], TAU)
         assert found["stamp"].tolist() == [10_000_000 * k for k in range(40)]
 
+    def test_rows_of_a_matrix(self, tmp_path, robot):
+        np.savez(tmp_path / "a.npz", all=np.vstack([TAU.T, Q.T]), t=TIME)
+        position = {"columns": (3, 4, 5), "array": "all", "joints_along": "rows"}
+        found = read(tmp_path / "a.npz", robot, position=position, time={"column": "t"})
+        assert np.array_equal(found["position"], Q)
+        with pytest.raises(SourceError, match="'all' has no row 6; it has 6"):
+            read(tmp_path / "a.npz", robot, position=position | {"columns": (4, 5, 6)})
+
     @pytest.mark.parametrize(
         ("stamps", "unit"),
         [
