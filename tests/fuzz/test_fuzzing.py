@@ -162,7 +162,8 @@ class TestJournal:
         report = json.loads(capsys.readouterr().out)
         assert (report["inputs"], report["seconds"], report["findings"]) == (100, 61.0, 0)
         libfuzzer.record_finding(Path(f"{path}.files/codec/findings"), "a", b"", "")
-        assert command.main(arguments) == 1
+        assert command.main(arguments[:-1]) == 1
+        assert "finding   a" in capsys.readouterr().out
 
     @pytest.mark.parametrize(("ended", "status"), [("crash", 1), ("killed", 1), ("stopped", 0)])
     def test_early_end_that_no_input_repeats_is_reported(
