@@ -126,8 +126,9 @@ class _Checker:
         if compression != "zstd":
             self.faults["chunks"].append(f"{place} has the compression {compression!r}, not zstd")
         rows: dict[str, Rows] = {}
-        for topic in messages.keys() - schema.ONCE:
-            of_topic = messages[topic]
+        for topic, of_topic in messages.items():
+            if topic in schema.ONCE:
+                continue
             times = of_topic.of_heads("log_time"), of_topic.of_heads("publish_time")
             if not all(np.array_equal(time, of_topic.stamps) for time in times):
                 text = f"{place} has messages logged at another time than their stamp"
