@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -412,17 +412,14 @@ class CalibrationResult(Frozen):
     joint_inside: list[Known]  #: Share per joint; null if its intervals are unknown
     half_width: list[Known]  #: Median half width of the intervals, N·m or N
 
-    def words(self, joint_names: Sequence[str]) -> str:
-        """Return the summary, without full stop."""
-        shares = [1.0 if share is None else share for share in self.joint_inside]
-        lowest = min(shares, default=1.0)
-        text = (
+    @property
+    def words(self) -> str:
+        """Summary, without full stop."""
+        return (
             f"{self.inside:.1%} of {self.means} held-out means of torque ({self.block:g} s, per"
-            " joint) are inside their 95% intervals"
+            f" joint) are inside their 95% intervals; with intervals for white residuals"
+            f" {self.white_inside:.0%}"
         )
-        if lowest < self.inside:
-            text += f", {lowest:.0%} of {joint_names[shares.index(lowest)]}"
-        return f"{text}; with intervals for white residuals {self.white_inside:.0%}"
 
 
 class DelaysResult(Frozen):

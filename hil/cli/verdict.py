@@ -26,7 +26,7 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
     else:
         lines = sentences(results, quiet=quiet)
         if results.calibration is not None and not quiet:
-            lines.insert(0, results.calibration.words(results.joint_names))
+            lines.insert(0, results.calibration.words)
         if results.fitted is not None and not quiet:
             lines.insert(0, results.fitted.words)
         for line in [] if quiet else table(results):

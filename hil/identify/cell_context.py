@@ -128,8 +128,7 @@ def _condition(check: str, text: str, advice: str) -> Finding:
 def _clock(prepared: Prepared) -> Iterator[Finding]:
     retimed = [source for source in prepared.sources.training if source.retimed]
     if retimed:
-        more = f"; also in {len(retimed) - 1} more recordings" if len(retimed) > 1 else ""
-        text = f"{retimed[0].name}: {'; '.join(retimed[0].clock)}{more}"
+        text = f"{joined([one.name for one in retimed])}: {'; '.join(retimed[0].clock)}"
         yield _condition("clock", text, "log the controller's time with each sample")
 
 
@@ -144,10 +143,9 @@ def _torque_channel(prepared: Prepared) -> Iterator[Finding]:
             " prediction); this was compensated",
             "state it (`hil identify --delay SECONDS`), or correct it in the recording program",
         )
-    width, advice = how.torque_bandwidth, "record the torque unfiltered"
+    width = how.torque_bandwidth
+    advice = "record the torque unfiltered, or state its low-pass with --torque-bandwidth"
     if LOW_PASS in chosen and width is not None:
-        if not how.torque_shape.causal:
-            advice += ", or state its low-pass with --torque-bandwidth"
         yield _condition(
             "torque bandwidth",
             f"the recorded torque is probably filtered by a low-pass of {width:.3g} Hz"

@@ -288,16 +288,12 @@ def _not_judged(archive: Archive) -> str | None:
 def known_warnings(cell: Cell, archive: Archive) -> list[str]:
     """Return the warnings about known systematic errors."""
     assumed = "drive_train.torque_constant" in cell.file.cell.assumed
-    known = {
+    if not assumed or archive.header.only_simulated:
+        return []
+    return [
         "the torque constants are assumed: predictions of current are not affected, but all "
-        "parameters are in units of the assumed constants": assumed
-        and not archive.header.only_simulated,
-        "friction drift is simulated: the true friction stated here is that of a half-warm joint, "
-        "and estimates from a short, colder run differ from it": any(
-            "friction drift" in effect for effect in archive.header.effects
-        ),
-    }
-    return [text for text, true in known.items() if true]
+        "parameters are in units of the assumed constants"
+    ]
 
 
 def source_of(archive: Archive, cell: Cell, *, to_fit: bool = True) -> Source:

@@ -452,15 +452,13 @@ def consistent_estimate(
     `prior_weight` rows of data; `near` is the `solution` of similar samples.
 
     Raises:
-        IdentificationError: no rows, or the unconstrained estimate has other parameters.
+        IdentificationError: no rows.
         SolverError: no such parameters were found.
     """
     if weights is None:
         weights = joint_weights(factor)
     if unconstrained is None:
         unconstrained = estimate(model, factor, weights)
-    if unconstrained.names != model.parameter_names:
-        raise IdentificationError("the unconstrained estimate has other parameters")
     equations = factor.weighted(weights)
     program = Program.of(model, *rows_of(equations), prior_weight)
     solution, status = program.solve(equations.n, near)

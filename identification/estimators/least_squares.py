@@ -10,7 +10,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, block_covariance, clustered_covariance
 from identification.factor.factor import (
     Estimate,
@@ -159,10 +158,8 @@ def estimate_repetitions(
     `each` is the estimator of single repetitions, by default the same.
 
     Raises:
-        IdentificationError: no repetitions, or one without a usable row.
+        IdentificationError: a repetition without a usable row.
     """
-    if not recordings:
-        raise IdentificationError("no repetitions")
 
     def weighted(some: Sequence[Samples], factor: PhaseFactor) -> Estimate:
         return fit_least_squares(model, some, phase=factor)

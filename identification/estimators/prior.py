@@ -56,12 +56,7 @@ class GaussianPrior:
 
         An infinite standard deviation makes the direction on which its quantity acts flat. With the
         identity (p, s) and mean zero this is ridge regression in units of `std`.
-
-        Raises:
-            IdentificationError: a standard deviation is not positive.
         """
-        if not np.all(std > 0.0):
-            raise IdentificationError("the standard deviations of a prior must be positive")
         flat = np.isinf(std)
         spread = combinations[:, ~flat] * std[~flat]
         size = _length(spread, axis=1)
@@ -221,17 +216,13 @@ def nominal_prior(
     unless `known` by mean and standard deviation: `{"I3m": (1.2, 0.2), "f0_1": (40.0, 40.0)}`.
 
     Raises:
-        IdentificationError: the URDF has no inertia, a name is unknown, the share not positive.
+        IdentificationError: the URDF has no inertia.
     """
-    if not share > 0.0:
-        raise IdentificationError(f"the nominal parameters' uncertainty is {share}, not positive")
     others = model.parameter_names[model.base.rank :]
     names = model.layout.names + others
     mean = np.concatenate([model.nominal, np.zeros(len(others))])
     std = np.concatenate([_nominal_std(model, share), np.full(len(others), np.inf)])
     for name, (value, deviation) in (known or {}).items():
-        if name not in names:
-            raise IdentificationError(f"the model has no parameter {name!r}")
         mean[names.index(name)], std[names.index(name)] = value, deviation
     combinations = np.zeros((model.n_parameters, len(names)))
     combinations[: model.base.rank, : len(model.layout.names)] = model.base.grouping

@@ -14,7 +14,7 @@ from typing import ClassVar, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.model.motion import Motion
 from identification.model.regressor import CHUNK, joint_arrays
 from identification.model.robot import RobotModel
@@ -461,8 +461,6 @@ def augmented_rows(model: RobotModel, samples: Samples) -> Iterator[Rows]:
         acceleration=samples.motion.acceleration,
         torque=samples.torque,
     )
-    if samples.usable.shape != q.shape:
-        raise ShapeError("usable", samples.usable.shape, str(q.shape))
     chunks: Iterable[tuple[slice, list[Array]]]
     if samples.torque_bandwidth is None:
         chunks = model.plan.chunks(q, qd, qdd, samples.motion.direction, response=torque)

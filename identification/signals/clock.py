@@ -79,8 +79,6 @@ class TimeBase:
             lines.append(f"{self.dropped} samples are missing one by one")
         if self.gaps:
             lines.append(f"{self.gaps} gaps")
-        if not self.uniform:
-            lines.append("digital filters require resampling; the spline does not")
         return lines
 
 

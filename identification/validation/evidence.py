@@ -278,12 +278,7 @@ def gather(
     With `same_motion` the training recordings, in the order of the result, repeat one motion, and
     noise is measured. `nominal` are parameters (p,); with `in_sample` the held-out motions are the
     training.
-
-    Raises:
-        IdentificationError: nothing was held out.
     """
-    if not held_out:
-        raise IdentificationError("there is no held-out motion")
     values = result.pooled.values
     velocity = np.concatenate([run.motion.velocity for run in held_out])
     position = np.concatenate([run.motion.position for run in held_out])

@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.errors import ShapeError
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 from identification.signals.smoothing import low_pass
@@ -33,19 +32,11 @@ class PredictionError:
     torque_sum: Array  #: sum of measured torque
     torque_squared: Array  #: sum of measured torque²
 
-    def __str__(self) -> str:
-        """Relative errors over all joints and of each, with the number of rows."""
-        each = ", ".join(f"{100.0 * one:.1f}" for one in self.relative)
-        rows = "no rows" if not self.rows.size else f"{self.rows.min()} to {self.rows.max()} rows"
-        return f"{100.0 * self.overall:.1f} % of the torque ({each} % by joint; {rows} of a joint)"
-
     @classmethod
     def between(
         cls, measured: Array, predicted: Array, usable: NDArray[np.bool_] | None = None
     ) -> PredictionError:
         """Compare predicted with measured torque (m, n) over usable rows (m, n)."""
-        if measured.shape != predicted.shape:
-            raise ShapeError("predicted", predicted.shape, f"{measured.shape}, as measured")
         counts = np.ones(measured.shape, dtype=np.bool_) if usable is None else usable
         error, torque = (np.where(counts, one, 0.0) for one in (measured - predicted, measured))
         sums = (np.abs(error), error, error**2, torque, torque**2)

@@ -568,16 +568,12 @@ class TestCalibration:
         self, split: Identification, capsys: pytest.CaptureFixture[str]
     ) -> None:
         results = split.results
-        line = results.calibration.words(results.joint_names)
+        line = results.calibration.words
         with suppress(typer.Exit):
             finish(results, json=False)
         assert line in " ".join(capsys.readouterr().err.split())
         assert line in report_bytes(results, split.series).decode()
         assert json.loads(as_json(results))["calibration"]["means"] == results.calibration.means
-        shares = [1.0, 0.5, None, 1.0, 0.9, 1.0]
-        changed = {"joint_inside": shares, "inside": 0.88}
-        words = results.calibration.model_copy(update=changed).words(list("abcdef"))
-        assert words.startswith("88.0% of") and "50% of b" in words
 
 
 class TestCellContext:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from identification import Factor, FrictionLaw, IdentificationError, Motion, RobotModel
+from identification import Factor, FrictionLaw, Motion, RobotModel
 from identification.estimators.consistent import (
     Cone,
     ConsistentEstimate,
@@ -26,7 +26,7 @@ from identification.estimators.consistent import (
 )
 from identification.estimators.least_squares import fit_least_squares
 from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
-from identification.factor.factor import NormalEquations, estimate, joint_weights, rows_of
+from identification.factor.factor import NormalEquations, joint_weights, rows_of
 from identification.factor.phases import total_phase
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
@@ -297,14 +297,6 @@ class TestConsistentEstimate:
         found = simulated(values, 0.1, 1, model=model)
         assert_consistent(model, found)
         assert error_rise(found) < 1e-3
-
-    def test_an_estimate_with_other_parameters_raises(self) -> None:
-        other = RobotModel.from_urdf(URDF)
-        motion = a_motion(MODEL, 1, samples=200)
-        torque = measured(MODEL, motion, truth(), 0.1, 1)
-        wrong = estimate(other, Factor.from_samples(other, motion, torque))
-        with pytest.raises(IdentificationError, match="other parameters"):
-            fitted(MODEL, motion, torque, unconstrained=wrong)
 
 
 class TestDrives:

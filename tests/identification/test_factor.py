@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import Weighting, fit_least_squares
 from identification.estimators.robust import robust_estimate
@@ -169,10 +169,6 @@ class TestFactor:
         one = kind.of(MODEL, samples)
         with pytest.raises(IdentificationError, match="cannot be added"):
             _ = one + kind.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
-        for name in ("torque", "usable"):
-            short = getattr(samples, name)[:, :1]
-            with pytest.raises(ShapeError, match=name):
-                kind.of(MODEL, replace(samples, **{name: short}))
 
     @pytest.mark.parametrize("bandwidth", [None, np.array([60.0, 80.0])])
     def test_rows_are_regressor_and_torque(self, bandwidth: Array | None) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError, ShapeError
+from identification.errors import IdentificationError
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
@@ -107,11 +107,6 @@ def test_friction_change_is_separated() -> None:
     np.testing.assert_allclose(change, 0.5, atol=0.01)
     assert (left.rms > 0.3 * np.std(friction, axis=0)).all()
     assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
-
-
-def test_other_shapes_raise() -> None:
-    with pytest.raises(ShapeError):
-        PredictionError.between(np.zeros((5, 2)), np.zeros((5, 3)))
 
 
 def test_noise_is_measured_between_repetitions() -> None:
