@@ -39,7 +39,6 @@ class EndogeneityTest:
     statistic: float  #: F of the hypothesis of no bias; NaN if untested
     p_value: float  #: probability of a larger F without bias, NaN likewise
     freedom: tuple[int, int]  #: degrees of freedom of the F
-    coefficient: Array  #: per joint (n,): minus the noise share of its column; NaN without
     noise: Array  #: torque V pi as a share of each joint's torque (n,), both RMS
     shift: Array  #: least squares minus instrumental variables (p,)
     shifted: tuple[str, ...]  #: parameters that differ significantly (5 % over all)
@@ -80,9 +79,7 @@ def endogeneity_test(
         information[:, k, :p] = information[:, :p, k] = products[:, p : 2 * p]
         information[:, k, k] = products @ left_over
         moments[:, k] = products[:, -1]
-    statistic, freedom, gamma, gamma_std = _wald(information, moments, len(active))
-    coefficient = np.full(factor.n_joints, np.nan)
-    coefficient[active] = gamma
+    statistic, freedom = _wald(information, moments, len(active))
     shift, shift_std, count = _shift(blocks)
     known = shift_std > 0.0
     critical = student_limit(LEVEL / (2 * max(1, int(known.sum()))), max(1, count - 1))
@@ -91,7 +88,6 @@ def endogeneity_test(
         statistic=statistic,
         p_value=float(fisher_tail(statistic, *freedom)) if np.isfinite(statistic) else np.nan,
         freedom=freedom,
-        coefficient=coefficient,
         noise=noise,
         shift=shift,
         shifted=tuple(model.parameter_names[k] for k in beyond),
@@ -99,8 +95,7 @@ def endogeneity_test(
         words="",
     )
     weak = f" The instruments are too weak for {joined(result.weak)}." if result.weak else ""
-    significance = gamma / np.where(gamma_std > 0.0, gamma_std, np.inf)
-    return replace(test, words=_words(test, significance, model.joint_names) + weak)
+    return replace(test, words=_words(test, model.joint_names) + weak)
 
 
 def _share(factor: PhaseFactor, combination: Array) -> Array:
@@ -112,9 +107,7 @@ def _share(factor: PhaseFactor, combination: Array) -> Array:
     return shares
 
 
-def _wald(
-    information: Array, moments: Array, k: int
-) -> tuple[float, tuple[int, int], Array, Array]:
+def _wald(information: Array, moments: Array, k: int) -> tuple[float, tuple[int, int]]:
     """Return F of the hypothesis that the last k coefficients are zero, its degrees of freedom."""
     p = information.shape[1] - k
     solution = solve(NormalEquations(information.sum(axis=0), moments.sum(axis=0), 0.0, 0))
@@ -125,11 +118,10 @@ def _wald(
     blocks = len(moments)
     freedom = (k, blocks - k)
     gamma = solution.values[p:]
-    std = np.sqrt((moved**2).sum(axis=0))
     if k == 0 or freedom[1] < 1 or not solution.determined[p:].all():
-        return np.nan, freedom, gamma, std
+        return np.nan, freedom
     squared = float(gamma @ np.linalg.solve(moved.T @ moved, gamma))
-    return squared * freedom[1] / (k * (blocks - 1)), freedom, gamma, std
+    return squared * freedom[1] / (k * (blocks - 1)), freedom
 
 
 def _shift(blocks: Array) -> tuple[Array, Array, int]:
@@ -153,8 +145,7 @@ def _shift(blocks: Array) -> tuple[Array, Array, int]:
     return shift, np.where(known, spread, 0.0), len(moved[0])
 
 
-def _words(test: EndogeneityTest, significance: Array, joints: Sequence[str]) -> str:
-    """Describe the result; the significance is coefficients over standard deviations."""
+def _words(test: EndogeneityTest, joints: Sequence[str]) -> str:
     if np.isnan(test.p_value):
         return (
             "The bias of least squares was not tested: the instruments equal the measured motion,"
@@ -177,10 +168,5 @@ def _words(test: EndogeneityTest, significance: Array, joints: Sequence[str]) ->
     )
     if test.biased and test.shifted:
         text += f", significantly in {', '.join(test.shifted)}"
-    if test.biased and significance[np.argmax(np.abs(significance))] > 0.0:
-        text += (
-            ". Its sign is not that of measurement noise: a disturbance or model error that moves"
-            " the arm is more likely"
-        )
     advice = " Use the instrumental variables, or less noisy positions." if test.matters else ""
     return f"{text}.{advice}"

@@ -87,22 +87,19 @@ def _wrong_signs(
                 f" less than half of its Coulomb friction {coulomb @ values:.3g}"
             )
             yield words, top != 0.0
-    alone = {  # names of single parameters, and a hint
-        k: (
-            f"friction {term.name} of motor {term.owner + 1}",
-            "; a coupling ratio or a direction may have the wrong sign",
-        )
+    alone = {  # names of single parameters
+        k: f"friction {term.name} of motor {term.owner + 1}"
         for k, term in enumerate(model.friction.terms, start=first)
         if term.motor
     }
     for k, (name, row) in enumerate(zip(model.base.names, model.base.grouping, strict=True)):
         if np.count_nonzero(row) <= 1 and _NEVER_NEGATIVE.fullmatch(name):
-            alone[k] = name, ""
-    for k, (name, why) in alone.items():
+            alone[k] = name
+    for k, name in alone.items():
         direction = np.arange(count) == k
         if _is_negative(estimate, direction.astype(np.float64)):
             figures = f"{values[k]:.3g} ± {estimate.std[k]:.2g} {estimate.units[k]}"
-            yield f"{name} is negative: {figures}{why}", direction
+            yield f"{name} is negative: {figures}", direction
 
 
 def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> list[str]:
