@@ -237,7 +237,7 @@ def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
     assert base.dropped == 3
     assert not base.uniform
     words = " ".join(base.describe())
-    for part in ("repeat", "older", "missing", "gaps", "resampling"):
+    for part in ("repeat", "older", "missing", "gaps"):
         assert part in words
     reported = np.arange(100) == 50  # without a time step
     assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
