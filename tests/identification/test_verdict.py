@@ -309,6 +309,10 @@ class TestJudgement:
             ({"causes": caused("gain", 1)}, "the torque of two is 1.01 ± 0.002 times"),
             ({"disagreement": np.array([0.2, 0.0])}, "single repetitions differ by more than 10%"),
             ({"implausible": Implausible(("m1 is negative",), ())}, "m1 is negative"),
+            (
+                {"held_out": an_error(0.1), "noise_floor": np.full(2, 0.1), "causes": ()},
+                "is 10.0%, 10.0 times the noise floor of 1.0%; none",
+            ),
         ],
     )
     def test_wrong_findings_are_reasons(self, changes: dict[str, Any], words: str) -> None:
@@ -327,6 +331,7 @@ class TestJudgement:
             ({"implausible": Implausible((), ("I2m is negative",))}, "I2m is negative"),
             ({"training": an_error(0.01)}, "one 5.0 times"),
             ({"friction_change": np.array([0.0, -0.05])}, "two -5%"),
+            ({"systematic": np.array([0.025, 0.0])}, "exceeds 2.0%: one 2.5%"),
             ({}, "cannot be distinguished from noise"),
         ],
     )
