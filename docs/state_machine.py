@@ -1,8 +1,7 @@
 """Writes `state-machine.md` and its picture, `state-machine.svg`, from the session's state table.
 
-Positions of states are defined here; arrows and their labels come from `drivers.states`. Each arrow
-has a title "from | inputs | to", which a test reads. The picture has its own background, so that it
-is readable on light and dark pages.
+Positions of states are defined here; arrows and their labels come from `drivers.states`. The
+picture has its own background, so that it is readable on light and dark pages.
 """
 
 from __future__ import annotations
