@@ -229,7 +229,7 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
             "assumed": 1e3 * assumed,
             "delay": 1e3 * delays.delays, "half": 1e3 * delays.interval_factor * delays.std,
             "late": late & (not same) & (not poor),
-            "on_time": delays.determined & ~late & (not late.any() and not same and not poor),
+            "on_time": delays.determined and not (late.any() or same or poor),
         }  # fmt: skip
     return facts
 
@@ -548,8 +548,8 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
          " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>",
          "compare with `hil identify --delay auto`, or correct the delay in the cell", "cause"),
     _Row("delay", {"good": "on_time"},
-         "the delay of the torque is as assumed:"
-         " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>"),
+         "the delay of the torque is as assumed: {common:.3g} ± {common_half:.2g} ms"
+         " ({stated:.3g} ms assumed)"),
     _corrections,
     _Row("saturation", {"good": "unsaturated"}, "no torque or current was at its limit"),
     _Row("saturation", {"doubtful": "full"},
