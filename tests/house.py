@@ -29,15 +29,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 74_400,
-    "product files": 322,
-    "test lines": 71_700,
+    "product lines": 72_900,
+    "product files": 321,
+    "test lines": 68_800,
     "test files": 242,
     "import circles": 0,
     "imports inside functions": 32,
     "files with one importer": 16,
     "banned names": 0,
-    "functions over 60 lines": 27,
+    "functions over 60 lines": 23,
 }
 """Figures of today that no change may exceed: lower them with what a change removes."""
 BANNED: Final = {
