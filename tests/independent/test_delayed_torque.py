@@ -73,7 +73,7 @@ class TestDelayOfABriskMotion:
     def test_it_is_found(self, name: str, noise: Noise, delay: float) -> None:
         arm = ARMS[name]()
         found = estimate_delays(recorded(arm, 0, noise, delay, BRISK), model_of(arm))
-        assert found.determined.all() and found.agree
+        assert found.determined and found.agree
         assert found.common == pytest.approx(delay, abs=NEAR)
         assert found.significant == (delay > 0.0)
 
@@ -89,7 +89,7 @@ class TestDelayOfABriskMotion:
         for seed in range(SEEDS):
             recording = recorded(arm, seed, noise, delay, BRISK)
             found = estimate_delays(recording, model)
-            near += found.determined.all() and abs(found.common - delay) < NEAR
+            near += found.determined and abs(found.common - delay) < NEAR
             shares.append(coverage(arm, model, recording, found))
         # Within two standard errors of the share.
         share, unsure = np.mean(shares), 2.0 * np.std(shares, ddof=1) / np.sqrt(SEEDS)
@@ -124,7 +124,7 @@ class TestDelayOfASlowMotion:
     def test_it_is_not_determined(self, name: str) -> None:
         arm = ARMS[name]()
         found = estimate_delays(recorded(arm, 0, "coloured", 0.0, SLOW), model_of(arm))
-        assert not found.determined.any()
+        assert not found.determined
         assert not found.applied.any()
 
     @pytest.mark.slow
@@ -135,4 +135,4 @@ class TestDelayOfASlowMotion:
         model = model_of(arm)
         for seed in range(SEEDS):
             found = estimate_delays(recorded(arm, seed, noise, 0.01, SLOW), model)
-            assert not found.determined.any(), (seed, found.describe())
+            assert not found.determined, (seed, found.describe())
