@@ -60,4 +60,4 @@ from identification.validation.evidence import Evidence, gather
 from identification.validation.prediction import PredictionError, prediction_error
 from identification.validation.verdict import Thresholds, Verdict, judge
 
-__all__ = [name for name in globals() if not name.startswith("_")]
+__all__ = [name for name in globals() if name[0].isalpha()]
