@@ -800,7 +800,7 @@ class TestTrust:
 
 DRIVER = """
 const $ = (selector) => Array.from(document.querySelectorAll(selector));
-window.requestAnimationFrame = (draw) => setTimeout(draw, 0);  // a browser without window draws once
+window.requestAnimationFrame = (draw) => setTimeout(draw, 0);  // no frames without a window
 addEventListener("load", () => {
   const state = {};
   state.copies = $("button.copy").length;
