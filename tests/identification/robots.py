@@ -1,7 +1,5 @@
 """Robot descriptions and bodies for tests of the model."""
 
-from __future__ import annotations
-
 import sqlite3
 from importlib import metadata
 from importlib.metadata import PackageNotFoundError, distribution
@@ -9,17 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body, inertial_parameters
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 
-Array = NDArray[np.float64]
 
-
-def robot_text(path: str) -> str:
+def robot_text(path):
     try:
         package = distribution("example-robot-data")
     except PackageNotFoundError:
@@ -28,12 +23,12 @@ def robot_text(path: str) -> str:
     return (root / path).read_text(encoding="utf-8")
 
 
-def random_urdf(seed: int, n_joints: int = 7) -> str:
+def random_urdf(seed, n_joints=7):
     """A random tree: any axis, any placement, all four kinds of joint that are allowed."""
     random = np.random.default_rng(seed)
     parts = ['<robot name="random"><link name="l0"/>']
 
-    def numbers(*values: float) -> str:
+    def numbers(*values):
         return " ".join(f"{value:.6f}" for value in values)
 
     for i in range(1, n_joints + 1):
@@ -60,7 +55,7 @@ def random_urdf(seed: int, n_joints: int = 7) -> str:
     return "".join(parts) + "</robot>"
 
 
-def one_joint(kind: str, axis: str = "0 0 1") -> str:
+def one_joint(kind, axis="0 0 1"):
     return (
         '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="2"/>'
         '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
@@ -69,7 +64,7 @@ def one_joint(kind: str, axis: str = "0 0 1") -> str:
     )
 
 
-def some_bodies(n: int, seed: int = 0) -> Array:
+def some_bodies(n, seed=0):
     """Possible standard parameters that have nothing to do with the robot, rotors last."""
     rng = np.random.default_rng(seed)
     standard = np.empty((n, 11))
@@ -85,7 +80,7 @@ def some_bodies(n: int, seed: int = 0) -> Array:
 ALL_TERMS = FrictionLaw(offset=True)
 
 
-def ur10(folder: Path, friction: FrictionLaw = ALL_TERMS) -> tuple[RobotModel, Recording]:
+def ur10(folder, friction=ALL_TERMS):
     """Model with this friction, and 27.5 s at 125 Hz; skips where either is missing."""
     typesys = pytest.importorskip("rosbags.typesys")
     files = metadata.files("example-robot-data") or ()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from identification import RobotModel
-from identification.excitation import Constraints, Design, Objective, Problem, ViaPointGenome
+from identification.excitation import Constraints, Objective, Problem, ViaPointGenome
 from planner import JointLimits, PlanningError
 from tests.identification.two_link import URDF
 
@@ -29,7 +29,7 @@ NS16_LIMITS = JointLimits(
 )
 
 
-def problem(genome: Any = None, **constraints: Any) -> Problem:
+def problem(genome=None, **constraints):
     """Three via points of a two-joint arm, 13 parameters."""
     return Problem(
         genome or ViaPointGenome(LIMITS, n_via=3),
@@ -49,10 +49,10 @@ class FaultyGenome:
     elbow_at_rest: bool = False
 
     @property
-    def n_genes(self) -> int:
+    def n_genes(self):
         return self.inner.n_genes
 
-    def motions(self, genes: np.ndarray) -> list[Any]:
+    def motions(self, genes):
         if np.any(self.within(genes, self.crash)):
             os.abort()
         if np.any(self.within(genes, self.hang)):
@@ -65,22 +65,22 @@ class FaultyGenome:
             motions[index] = PlanningError("planning failed")
         return motions
 
-    def sample(self, random: np.random.Generator, count: int) -> np.ndarray:
+    def sample(self, random, count):
         return self.inner.sample(random, count)
 
-    def source(self, *args: Any) -> dict[str, Any]:
+    def source(self, *args):
         return self.inner.source(*args)
 
     @staticmethod
-    def within(genes: np.ndarray, bounds: tuple[float, float]) -> np.ndarray:
+    def within(genes, bounds):
         return (genes[:, 0] >= bounds[0]) & (genes[:, 0] <= bounds[1])
 
 
-def faulty(**faults: Any) -> FaultyGenome:
+def faulty(**faults):
     return replace(FaultyGenome(ViaPointGenome(LIMITS, n_via=3)), **faults)
 
 
-def bits(design: Design) -> dict[str, Any]:
+def bits(design):
     """Return the fields of a design, arrays as bytes."""
     fields = vars(design) | {"genes": design.genes.tobytes()}
     fields["excitation"] = design.excitation.to_dict()

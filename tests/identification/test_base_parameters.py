@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -7,20 +5,20 @@ import pinocchio as pin
 import pytest
 
 from identification import FrictionLaw, Preprocessing, Recording, RobotModel, prepare
-from identification.factor.factor import Estimate, Factor, estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.base_parameters import TOLERANCE
 from identification.model.coupling import Coupling
-from identification.validation.prediction import PredictionError, prediction_error
+from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 from tests.identification.robots import robot_text
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return RobotModel.from_urdf(urdf_text())
 
 
-def test_the_groups_of_the_ns16_are_those_of_table_2(model: RobotModel) -> None:
+def test_the_groups_of_the_ns16_are_those_of_table_2(model):
     rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
     assert set(model.base.names) == set(rows)
     for name, group in zip(model.base.names, model.base.grouping, strict=True):
@@ -40,7 +38,7 @@ def test_the_groups_of_the_ns16_are_those_of_table_2(model: RobotModel) -> None:
         ((3.0, 0.0, -9.0), True, 42),
     ],
 )
-def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: int) -> None:
+def test_the_rank_of_the_ns16(gravity, rotors, rank):
     base = RobotModel.from_urdf(urdf_text(), gravity=gravity, rotor_inertia=rotors).base
     assert base.rank == len(base.names) == rank
     assert base.largest_dropped < 1e-10 * base.smallest_pivot
@@ -50,7 +48,7 @@ def test_the_rank_of_the_ns16(gravity: tuple[float, ...], rotors: bool, rank: in
         assert np.allclose(base.grouping, upright.grouping, atol=1e-10)
 
 
-def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> None:
+def test_angles_rounded_in_the_file_do_not_split_groups(model):
     text = urdf_text()
     assert "1.5707963267948966" in text
     rounded = RobotModel.from_urdf(text.replace("1.5707963267948966", "1.5708")).base
@@ -60,7 +58,7 @@ def test_angles_rounded_in_the_file_do_not_split_groups(model: RobotModel) -> No
     assert np.array_equal(rounded.grouping != 0.0, model.base.grouping != 0.0)
 
 
-def test_groups_are_named_by_their_first_parameter(model: RobotModel) -> None:
+def test_groups_are_named_by_their_first_parameter(model):
     base, again = model.base, RobotModel.from_urdf(urdf_text()).base
     assert again.names == base.names
     assert np.array_equal(again.grouping, base.grouping)
@@ -73,7 +71,7 @@ def test_groups_are_named_by_their_first_parameter(model: RobotModel) -> None:
         assert np.all(groups < column), base.standard_names[column]
 
 
-def test_expressions_read_like_the_table(model: RobotModel) -> None:
+def test_expressions_read_like_the_table(model):
     expression = dict(zip(model.base.names, model.base.expressions(3), strict=True))
     assert expression["I1yy"] == (
         "I1yy + I1m + I2yy + 0.09 m2 + I3zz + 0.58 m3 + 0.614 m4 + 0.614 m5 + 0.614 m6"
@@ -82,14 +80,14 @@ def test_expressions_read_like_the_table(model: RobotModel) -> None:
     assert expression["I3m"] == "I3m"
 
 
-def test_the_rank_decision_is_explained_by_the_gap(model: RobotModel) -> None:
+def test_the_rank_decision_is_explained_by_the_gap(model):
     text = model.base.explanation()
     assert text.startswith("40 of 66 standard parameters are independent, 16 are grouped")
     assert "10 do not affect the torque" in text
     assert "1e-05" in text
 
 
-def test_an_unclear_rank_is_reported(model: RobotModel) -> None:
+def test_an_unclear_rank_is_reported(model):
     """The first axis a ten-thousandth of a radian off gravity: more is felt, but hardly."""
     skewed = urdf_text().replace("1.5707963267948966", "1.5709")
     base = RobotModel.from_urdf(skewed).base
@@ -116,7 +114,7 @@ ARMS = {
 ROUNDED = 1e-4
 
 
-def rank_by_pinocchio(urdf: str) -> int:
+def rank_by_pinocchio(urdf):
     """Numerical rank of pinocchio's own regressor with a column per rotor."""
     model = pin.buildModelFromXML(urdf)
     data = model.createData()
@@ -135,7 +133,7 @@ def rank_by_pinocchio(urdf: str) -> int:
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_the_rank_is_that_of_pinocchios_regressor(arm: str) -> None:
+def test_the_rank_is_that_of_pinocchios_regressor(arm):
     urdf = robot_text(ARMS[arm])
     base = RobotModel.from_urdf(urdf).base
     assert base.rank == rank_by_pinocchio(urdf)
@@ -151,7 +149,7 @@ HOME = np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording():
     if not DATA.is_dir():
         pytest.skip(f"there are no recordings at {DATA}")
     motor, torque = (
@@ -166,7 +164,7 @@ def recording() -> Recording:
     )
 
 
-def fitted(recording: Recording, coupling: Coupling | None) -> tuple[Estimate, PredictionError]:
+def fitted(recording, coupling):
     model = RobotModel.from_urdf(
         (DATA / "tx40_mdh_modified.urdf").read_text(encoding="utf-8"),
         friction=FrictionLaw(offset=True),
@@ -179,7 +177,7 @@ def fitted(recording: Recording, coupling: Coupling | None) -> tuple[Estimate, P
     return found, error
 
 
-def test_the_coupling_explains_a_published_recording(recording: Recording) -> None:
+def test_the_coupling_explains_a_published_recording(recording):
     """Comparators, with linear friction: 10.9 % with, 14.3 % without; joint 5: 19 %, 53 %."""
     _, without = fitted(recording, None)
     _, coupled = fitted(recording, Coupling(TURNS))
@@ -189,7 +187,7 @@ def test_the_coupling_explains_a_published_recording(recording: Recording) -> No
     assert without.relative[4] > 0.45
 
 
-def test_the_coupled_motors_parameters_are_the_published_ones(recording: Recording) -> None:
+def test_the_coupled_motors_parameters_are_the_published_ones(recording):
     """Iam6, fsm6 and fvm6 of the YAML beside the data: 0.00964, 1.95, 0.616."""
     found, _ = fitted(recording, Coupling(TURNS))
     values = dict(zip(found.names, found.values, strict=True))

@@ -1,21 +1,16 @@
 """Physically consistent estimates: properties of the result and of the solver."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import approx_fprime
 
-from identification import Factor, FrictionLaw, Motion, RobotModel
+from identification import Factor, FrictionLaw, RobotModel
 from identification.estimators.consistent import (
     Cone,
-    ConsistentEstimate,
     Shrinkage,
     Smooth,
     consistent_estimate,
@@ -26,25 +21,22 @@ from identification.estimators.consistent import (
 )
 from identification.estimators.least_squares import fit_least_squares
 from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
-from identification.factor.factor import NormalEquations, joint_weights, rows_of
+from identification.factor.factor import joint_weights, rows_of
 from identification.factor.phases import total_phase
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
-from identification.signals.samples import Samples
 from sim_fixtures.ns16 import load_truth, standard_parameters, table2, urdf_text
 from tests.identification.robots import robot_text
 from tests.identification.two_link import MODEL, URDF, gaussian, recording, sine_motion, truth
 from tests.identification.two_link import a_motion as two_link_motion
 
-Array = NDArray[np.float64]
 
-
-def with_friction(*friction: float) -> Array:
+def with_friction(*friction):
     """Return the true parameters of the two links with other friction."""
     return np.concatenate([truth()[: MODEL.base.rank], friction])
 
 
-def a_motion(model: RobotModel, seed: int, samples: int = 2000) -> Motion:
+def a_motion(model, seed, samples=2000):
     """Return five sines per joint, similar for all seeds."""
     rng = np.random.default_rng(seed)
     shape = (5, model.n_joints)
@@ -54,31 +46,29 @@ def a_motion(model: RobotModel, seed: int, samples: int = 2000) -> Motion:
     return sine_motion(time, size, pace, rng.uniform(0.0, 6.0, shape))
 
 
-def measured(model: RobotModel, motion: Motion, values: Array, noise: float, seed: int) -> Array:
+def measured(model, motion, values, noise, seed):
     """Return torque with noise, a share of each joint's RMS."""
     torque = model.torque(values, *motion[1:])
     rms = np.sqrt((torque**2).mean(axis=0))
     return torque + noise * rms * np.random.default_rng(seed).standard_normal(torque.shape)
 
 
-def fitted(model: RobotModel, motion: Motion, torque: Array, **options: Any) -> ConsistentEstimate:
+def fitted(model, motion, torque, **options):
     return consistent_estimate(model, Factor.from_samples(model, motion, torque), **options)
 
 
-def simulated(
-    values: Array, noise: float, seed: int, *, model: RobotModel = MODEL, samples: int = 2000
-) -> ConsistentEstimate:
+def simulated(values, noise, seed, *, model=MODEL, samples=2000):
     """Return the estimate of an arm with these parameters."""
     motion = a_motion(model, seed, samples)
     return fitted(model, motion, measured(model, motion, values, noise, seed))
 
 
-def error_rise(found: ConsistentEstimate) -> float:
+def error_rise(found):
     """Return the rise of the relative error on the fitted rows."""
     return found.relative_error - found.unconstrained_relative_error
 
 
-def assert_consistent(model: RobotModel, found: ConsistentEstimate) -> None:
+def assert_consistent(model, found):
     """Check the definition of consistency by eigenvalues."""
     rows = found.standard.reshape(model.n_joints, -1)
     for xx, xy, xz, yy, yz, zz, hx, hy, hz, m, *rotor in rows:
@@ -97,7 +87,7 @@ def assert_consistent(model: RobotModel, found: ConsistentEstimate) -> None:
 LARGE = 1e2  # times the nominal bodies, kg m² of rotor, or N·m of friction
 
 
-def largest_gain(gradient: Array, at: Array, nominal: Array) -> float:
+def largest_gain(gradient, at, nominal):
     """Return a bound on how much consistent parameters can decrease a convex function.
 
     The function stays above its tangent. The gradient of a link is a matrix Z with <Z, J(x)> =
@@ -121,7 +111,7 @@ def largest_gain(gradient: Array, at: Array, nominal: Array) -> float:
     return float(gradient @ at) + LARGE * missing
 
 
-def nearest_consistent(column: str) -> tuple[float, float]:
+def nearest_consistent(column):
     """Return the distance of a column of Table 2 from consistent parameters, and its bound."""
     model = RobotModel.from_urdf(
         urdf_text(), friction=FrictionLaw(coulomb=False, viscous=False, third=None)
@@ -149,43 +139,43 @@ def nearest_consistent(column: str) -> tuple[float, float]:
 
 
 class TestConsistentEstimate:
-    def test_poor_data_give_consistent_parameters(self) -> None:
+    def test_poor_data_give_consistent_parameters(self):
         found = simulated(truth(), 0.5, 1, samples=150)
         assert_consistent(MODEL, found)
         assert found.status == "optimal"
         assert np.all(found.margin > 0.0)
 
-    def test_base_parameters_follow_from_standard_ones(self) -> None:
+    def test_base_parameters_follow_from_standard_ones(self):
         found, rank = simulated(truth(), 0.3, 1, samples=300), MODEL.base.rank
         expected = MODEL.base.grouping @ found.standard
         np.testing.assert_allclose(found.estimate.values[:rank], expected, atol=1e-12)
         np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
 
-    def test_a_consistent_estimate_is_hardly_changed(self) -> None:
+    def test_a_consistent_estimate_is_hardly_changed(self):
         found = simulated(truth(), 0.02, 2)
         assert np.abs(found.shift).max() < 0.1
         assert error_rise(found) < 1e-5
 
-    def test_exact_nominal_data_return_all_parameters(self) -> None:
+    def test_exact_nominal_data_return_all_parameters(self):
         """Parameters without effect on the torque are nominal."""
         values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
         np.testing.assert_allclose(simulated(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
 
-    def test_negative_friction_becomes_zero(self) -> None:
+    def test_negative_friction_becomes_zero(self):
         found = simulated(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
         for name in ("f0_1", "f1_2"):
             assert found.unconstrained.value(name) < 0.0
             assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
         assert_consistent(MODEL, found)
 
-    def test_the_third_friction_term_may_have_either_sign(self) -> None:
+    def test_the_third_friction_term_may_have_either_sign(self):
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
         friction = np.array([4, 4, 2, 2, -0.1, 0.1, -1, 1])
         values = np.concatenate([model.base.grouping @ model.nominal, friction])
         found = simulated(values, 0.001, 5, model=model)
         np.testing.assert_allclose(found.friction, friction, rtol=0.05)
 
-    def test_no_other_consistent_parameters_fit_better(self) -> None:
+    def test_no_other_consistent_parameters_fit_better(self):
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
         values[MODEL.parameter_names.index("I2yy")] = -0.1  # active constraints
         motion = a_motion(MODEL, 6)
@@ -207,7 +197,7 @@ class TestConsistentEstimate:
         assert largest_gain(gradient, x, MODEL.chain.inertial) < 1e-2 * excess
 
     @pytest.mark.parametrize("noise", [0.1, 0.01, 0.0])
-    def test_inconsistent_data_give_the_closest_parameters(self, noise: float) -> None:
+    def test_inconsistent_data_give_the_closest_parameters(self, noise):
         """As after a wrong sign of one torque, for any noise."""
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
         values[MODEL.parameter_names.index("I2yy")] = -0.3
@@ -216,7 +206,7 @@ class TestConsistentEstimate:
         assert "no consistent parameters fit" in found.status
         assert error_rise(found) > 0.02
 
-    def test_errors_and_covariance_are_correct(self) -> None:
+    def test_errors_and_covariance_are_correct(self):
         motion = a_motion(MODEL, 7, samples=300)
         torque = measured(MODEL, motion, truth(), 0.3, 7)
         found = fitted(MODEL, motion, torque)
@@ -228,7 +218,7 @@ class TestConsistentEstimate:
         assert "covariance of the unconstrained estimate" in found.estimate.method
         np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
 
-    def test_a_resting_joint_keeps_its_nominal_link(self) -> None:
+    def test_a_resting_joint_keeps_its_nominal_link(self):
         law = FrictionLaw(third=None)
         model = RobotModel.from_urdf(URDF, friction=law, gravity=(0, 0, 0))
         motion = a_motion(model, 10)
@@ -244,7 +234,7 @@ class TestConsistentEstimate:
         assert np.all(np.isfinite(found.standard))
         np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
 
-    def test_missing_nominal_bodies_are_assumed(self) -> None:
+    def test_missing_nominal_bodies_are_assumed(self):
         bare = URDF
         while "<inertial>" in bare:
             start, end = bare.index("<inertial>"), bare.index("</inertial>") + len("</inertial>")
@@ -257,7 +247,7 @@ class TestConsistentEstimate:
         assert error_rise(found) < 1e-3
 
     @pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
-    def test_ns16_predicts_unseen_motion_equally_well(self, noise: float) -> None:
+    def test_ns16_predicts_unseen_motion_equally_well(self, noise):
         """The nominal bodies are 5 to 20 % wrong, without rotors."""
         model, planted_rotors = RobotModel.from_urdf(urdf_text()), load_truth()
         named = standard_parameters()
@@ -271,23 +261,23 @@ class TestConsistentEstimate:
         assert_consistent(model, found)
         unseen = measured(model, other, values, noise, 4)
 
-        def error(values: Array) -> float:
+        def error(values):
             wrong = model.torque(values, *other[1:]) - unseen
             return float(np.linalg.norm(wrong) / np.linalg.norm(unseen))
 
         assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
 
-    def test_nominal_parameters_of_the_paper_are_consistent(self) -> None:
+    def test_nominal_parameters_of_the_paper_are_consistent(self):
         assert nearest_consistent("pi_c")[0] < 1e-3
 
-    def test_method_b_of_the_paper_is_inconsistent(self) -> None:
+    def test_method_b_of_the_paper_is_inconsistent(self):
         distance, at_least = nearest_consistent("pi_b")
         assert 1.4 < at_least <= distance < 1.43
 
     @pytest.mark.parametrize(
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
     )
-    def test_other_robots(self, path: str) -> None:
+    def test_other_robots(self, path):
         """With partly inconsistent nominal parameters."""
         model = RobotModel.from_urdf(robot_text(path))
         friction = np.repeat([2.0, 1.0, 0.0], model.n_joints)
@@ -304,7 +294,7 @@ class TestDrives:
 
     TURNS = np.array([[1.0, 0.0], [0.5, 1.0]])
 
-    def coupled(self, inertia: float) -> tuple[RobotModel, Array]:
+    def coupled(self, inertia):
         law = FrictionLaw(third=None)
         model = RobotModel.from_urdf(URDF, friction=law, coupling=Coupling(self.TURNS))
         standard = model.nominal
@@ -313,7 +303,7 @@ class TestDrives:
         return model, standard
 
     @pytest.mark.parametrize("inertia", [0.12, 0.6, -0.6])
-    def test_the_rotor_matrix_is_positive(self, inertia: float) -> None:
+    def test_the_rotor_matrix_is_positive(self, inertia):
         """At no cost if the true one is."""
         model, standard = self.coupled(inertia)
         friction = np.full(len(model.friction.terms), 0.8)
@@ -323,7 +313,7 @@ class TestDrives:
         assert np.all(found.margin > 0.0)
         assert (error_rise(found) < 1e-4) == (inertia == 0.12)
 
-    def test_the_coupled_ns16_is_written_as_a_urdf(self) -> None:
+    def test_the_coupled_ns16_is_written_as_a_urdf(self):
         wrist = np.eye(6)
         wrist[4, 3], wrist[5, 4], wrist[5, 3] = -0.2, -0.3, 0.16
         law = FrictionLaw(third=None)
@@ -343,19 +333,19 @@ class TestDrives:
             "rotor inertias", "coupling inertias", "friction of coupled motors",
         )  # fmt: skip
 
-    def test_inconsistent_coupling_inertias_raise(self) -> None:
+    def test_inconsistent_coupling_inertias_raise(self):
         model, standard = self.coupled(0.3)
         with pytest.raises(NotConsistentError, match="coupling"):
             write_urdf(URDF, model, standard)
 
-    def test_all_friction_terms_dissipate(self) -> None:
+    def test_all_friction_terms_dissipate(self):
         """True friction: larger viscous difference than viscosity, smaller friction at rest."""
         law = FrictionLaw(third=None, asymmetric=True, stribeck=0.3)
         model = RobotModel.from_urdf(URDF, friction=law)
         terms = {"f0": 1.0, "f1": 0.3, "fd": 0.6, "fs": -2.0, "fo": 0.2}
         base = model.base.grouping @ model.nominal
 
-        def friction() -> Array:
+        def friction():
             return np.array([terms[term.symbol] for term in model.friction.terms])
 
         found = simulated(np.append(base, friction()), 0.01, 1, model=model)
@@ -369,7 +359,7 @@ class TestDrives:
         np.testing.assert_allclose(found.friction, friction(), rtol=0.02)
 
 
-def a_problem(seed: int) -> Smooth:
+def a_problem(seed):
     """Two links, three further variables of which two are not negative; few data."""
     rng = np.random.default_rng(seed)
     rows, columns = np.triu_indices(4)
@@ -385,7 +375,7 @@ def a_problem(seed: int) -> Smooth:
     )
 
 
-def start(scale: float = 1.0) -> Array:
+def start(scale=1.0):
     unit = np.eye(4)[np.triu_indices(4)]
     return scale * np.concatenate([unit, unit, np.ones(3)])
 
@@ -393,7 +383,7 @@ def start(scale: float = 1.0) -> Array:
 class TestNewton:
     @given(st.integers(0, 2**16))
     @settings(max_examples=20)
-    def test_gradient_and_hessian_are_the_derivatives(self, seed: int) -> None:
+    def test_gradient_and_hessian_are_the_derivatives(self, seed):
         problem = a_problem(seed)
         u = start() + 0.05 * np.random.default_rng(seed).normal(size=23)
         gradient, hessian = problem.derivatives(u)
@@ -406,7 +396,7 @@ class TestNewton:
 
     @given(st.integers(0, 2**16))
     @settings(max_examples=20)
-    def test_all_starts_reach_the_same_minimum(self, seed: int) -> None:
+    def test_all_starts_reach_the_same_minimum(self, seed):
         problem = a_problem(seed)
         found = [
             polish(problem, start()),
@@ -419,36 +409,36 @@ class TestNewton:
         u = found[0].u
         assert np.all(u[[20, 21]] >= 0.0)
 
-    def test_a_start_outside_has_not_converged(self) -> None:
+    def test_a_start_outside_has_not_converged(self):
         assert not polish(a_problem(0), start(-1.0)).converged
 
 
 @pytest.fixture(scope="module")
-def samples() -> Samples:
+def samples():
     motion = two_link_motion()
     return recording(gaussian(np.random.default_rng(3), motion), motion)
 
 
 @pytest.fixture(scope="module")
-def equations(samples: Samples) -> NormalEquations:
+def equations(samples):
     total = total_phase(MODEL, [samples]).total
     return total.weighted(joint_weights(total))
 
 
 class TestShrunkEstimate:
-    def test_strength_zero_is_least_squares(self, samples: Samples) -> None:
+    def test_strength_zero_is_least_squares(self, samples):
         shrunk = fit_shrunk(MODEL, [samples], Shrinkage(0.0))
         free = fit_least_squares(MODEL, [samples])
         np.testing.assert_allclose(shrunk.values, free.values, rtol=1e-9)
         np.testing.assert_allclose(shrunk.covariance, free.covariance, rtol=1e-6)
 
-    def test_infinite_strength_is_the_consistent_solution(self, samples: Samples) -> None:
+    def test_infinite_strength_is_the_consistent_solution(self, samples):
         total = total_phase(MODEL, [samples]).total
         centre = consistent_estimate(MODEL, total, prior_weight=0.1).estimate.values
         shrunk = fit_shrunk(MODEL, [samples], Shrinkage(math.inf))
         np.testing.assert_array_equal(shrunk.values, centre)
 
-    def test_it_solves_the_penalised_equations(self, equations: NormalEquations) -> None:
+    def test_it_solves_the_penalised_equations(self, equations):
         """(A + s D) (x - c) = b - A c with D = diag(A), for any centre c."""
         far = truth() + 1.0
         values = shrunk_values(equations, far, 0.3)
@@ -456,7 +446,7 @@ class TestShrunkEstimate:
         residual = equations.b - equations.A @ far - penalised @ (values - far)
         assert np.abs(residual).max() < 1e-8 * np.abs(equations.b).max()
 
-    def test_without_data_it_stays_at_the_centre(self, equations: NormalEquations) -> None:
+    def test_without_data_it_stays_at_the_centre(self, equations):
         unseen = equations.A.copy()
         unseen[:, 0] = unseen[0, :] = 0.0
         blind = equations._replace(A=unseen, b=np.append(0.0, equations.b[1:]))

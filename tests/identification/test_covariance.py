@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.estimators.covariance import (
@@ -19,11 +16,9 @@ from identification.factor.phases import PhaseFactor
 from identification.signals.samples import Samples
 from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
-Array = NDArray[np.float64]
-
 
 @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1])
-def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(correlation):
     motion = a_motion()
     honest, classical = [], []
     for seed in range(120):
@@ -37,7 +32,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None
         assert np.mean(classical) < 0.75
 
 
-def test_a_repeated_error_is_not_averaged() -> None:
+def test_a_repeated_error_is_not_averaged():
     motion = a_motion()
     rng = np.random.default_rng(3)
     repeated = coloured(rng, len(motion.time), 5e-3, 0.05)
@@ -54,7 +49,7 @@ def test_a_repeated_error_is_not_averaged() -> None:
     assert np.mean(error < many.pooled.interval_factor * many.pooled.std) > 0.85
 
 
-def test_independent_noise_averages_over_repetitions() -> None:
+def test_independent_noise_averages_over_repetitions():
     motion = a_motion()
     rng = np.random.default_rng(4)
     runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.02), motion) for _ in range(16)]
@@ -65,7 +60,7 @@ def test_independent_noise_averages_over_repetitions() -> None:
     assert np.median(result.classical_std / result.pooled.std) < 0.75
 
 
-def test_leverage_correction_is_leaving_out_one_block() -> None:
+def test_leverage_correction_is_leaving_out_one_block():
     # CR3: corrected score is A times the change without the block.
     motion = a_motion(4.0)
     noise = coloured(np.random.default_rng(9), len(motion.time), 5e-3, 0.02)
@@ -85,7 +80,7 @@ def test_leverage_correction_is_leaving_out_one_block() -> None:
     np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
 
 
-def test_variance_determined_by_few_blocks_is_correct() -> None:
+def test_variance_determined_by_few_blocks_is_correct():
     # The elbow moves for 0.2 s only: two blocks with almost no residual determine its friction and
     # rotor.
     motion = a_motion()
@@ -116,7 +111,7 @@ def test_variance_determined_by_few_blocks_is_correct() -> None:
     assert np.all(np.median(np.array(alone) / classical, axis=0)[elbow] > 1.0)
 
 
-def test_a_direction_of_one_block_uses_other_blocks() -> None:
+def test_a_direction_of_one_block_uses_other_blocks():
     rng = np.random.default_rng(0)
     blocks, k = 30, 3
     shares = np.zeros((blocks, k, k))
@@ -137,7 +132,7 @@ def test_a_direction_of_one_block_uses_other_blocks() -> None:
 
 
 @pytest.mark.parametrize("shared", [0.0, 0.09])
-def test_correlation_of_neighbouring_blocks_counts(shared: float) -> None:
+def test_correlation_of_neighbouring_blocks_counts(shared):
     """Mean of blocks that are correlated with the next one."""
     rng = np.random.default_rng(3)
     blocks, k = 300, 40
@@ -151,7 +146,7 @@ def test_correlation_of_neighbouring_blocks_counts(shared: float) -> None:
     assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
 
 
-def test_blocks_grow_with_the_correlation_of_the_scores() -> None:
+def test_blocks_grow_with_the_correlation_of_the_scores():
     rng = np.random.default_rng(5)
     white = rng.standard_normal((400, 30))
     slow = lfilter([1.0], [1.0, -0.8], white, axis=0)
@@ -160,7 +155,7 @@ def test_blocks_grow_with_the_correlation_of_the_scores() -> None:
     assert block_length(white[:25]) == 1  # enough blocks remain
 
 
-def test_the_factor_of_all_blocks_is_the_factor_of_the_samples() -> None:
+def test_the_factor_of_all_blocks_is_the_factor_of_the_samples():
     motion = a_motion(4.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
     whole, blocks = Factor.of(MODEL, samples), PhaseFactor.from_samples(MODEL, samples).total
@@ -168,7 +163,7 @@ def test_the_factor_of_all_blocks_is_the_factor_of_the_samples() -> None:
     np.testing.assert_array_equal(blocks.samples, whole.samples)
 
 
-def test_repetitions_are_added_at_equal_times_of_the_motion() -> None:
+def test_repetitions_are_added_at_equal_times_of_the_motion():
     motion = a_motion(4.0)
     error = np.zeros((len(motion.time), 2))
     early = recording(error, motion)
@@ -186,7 +181,7 @@ def test_repetitions_are_added_at_equal_times_of_the_motion() -> None:
         np.testing.assert_allclose(both, 2.0 * own, rtol=1e-9, atol=1e-8)
 
 
-def test_the_interval_factor_is_of_the_number_of_blocks() -> None:
+def test_the_interval_factor_is_of_the_number_of_blocks():
     motion = a_motion()
     noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
     phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))

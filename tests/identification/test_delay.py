@@ -1,13 +1,9 @@
 """Delay of the torque, of two links and of the simulated NS 16."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
@@ -19,12 +15,12 @@ from identification.estimators.delay import (
     rate_products,
     with_uncertain_delay,
 )
-from identification.factor.factor import Estimate, Factor, estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from tests.identification.robots import ur10
@@ -34,11 +30,11 @@ from tests.sim_fixtures.bench import MinimalPC
 PERIOD = 0.001
 
 
-def ns16_model() -> RobotModel:
+def ns16_model():
     return RobotModel.from_urdf(ns16.urdf_text(), friction=FrictionLaw(third=None, standstill=0.1))
 
 
-def smooth_motion(duration: float) -> tuple[Array, Array]:
+def smooth_motion(duration):
     """Positions and velocities (m, 6), DH angles: sines in and out of rest."""
     t = np.arange(round(duration / PERIOD) + 1) * PERIOD
     window = np.clip(np.minimum(t, duration - t), 0.0, 1.0)
@@ -55,7 +51,7 @@ def smooth_motion(duration: float) -> tuple[Array, Array]:
     return position, swing * (soft[:, None] * wave_slope + slope[:, None] * wave)
 
 
-def simulated_recording(duration: float, *, seed: int) -> tuple[Recording, float]:
+def simulated_recording(duration, *, seed):
     """Recording of a run on the simulated cell, and the delay of its currents [cycles]."""
     cell = Cell.load(ns16.CELL_PATH)
     train, noise = cell.drive_train, cell.simulation
@@ -82,28 +78,19 @@ def simulated_recording(duration: float, *, seed: int) -> tuple[Recording, float
     return recording, controller.current_delay_cycles
 
 
-Array = NDArray[np.float64]
-
 TRUTH = truth()
 STEP = 1e-3
 
 
-def motion(time: Array, speed: float = 1.0) -> tuple[Array, Array, Array]:
+def motion(time, speed=1.0):
     """Position, velocity and acceleration (m, 2) of four sines for each joint."""
     return four_sines(time, speed)[1:4]
 
 
 def a_recording(
-    model: RobotModel,
-    truth: Array,
-    delays: Array | float,  # s
-    *,
-    seed: int = 0,
-    speed: float = 1.0,
-    torque_noise: float = 1.0,
-    position_noise: float = 2e-5,
-    time: Array | None = None,
-) -> Recording:
+    model, truth, delays, *, seed=0, speed=1.0, torque_noise=1.0, position_noise=2e-5, time=None
+):
+    """Simulate two links whose torque is logged `delays` [s] after the position."""
     if time is None:
         time = np.arange(6000) * STEP
     rng = np.random.default_rng(seed)
@@ -121,21 +108,21 @@ def a_recording(
 
 
 @pytest.fixture(scope="module")
-def simulated() -> tuple[Recording, float]:
+def simulated():
     """A recording of the simulated cell, and the delay of its currents [s]."""
     recording, cycles = simulated_recording(6.0, seed=3)
     return recording, cycles * STEP
 
 
 class TestCommonDelay:
-    def test_it_is_exact_without_noise(self) -> None:
+    def test_it_is_exact_without_noise(self):
         recording = a_recording(MODEL, TRUTH, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
         assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=5e-6)
         time = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))  # uneven
         recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
         assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
 
-    def test_noise_does_not_bias_it_and_the_interval_covers(self) -> None:
+    def test_noise_does_not_bias_it_and_the_interval_covers(self):
         """Mean within its standard error, scatter over seeds as estimated."""
         found = [
             estimate_delays(a_recording(MODEL, TRUTH, 1.6e-3, seed=seed), MODEL)
@@ -150,32 +137,31 @@ class TestCommonDelay:
         assert all(one.agree and one.significant for one in found)
 
     @pytest.mark.parametrize("planted", [-0.043, 0.01, 0.048])
-    def test_a_delay_of_many_cycles_is_found(self, planted: float) -> None:
+    def test_a_delay_of_many_cycles_is_found(self, planted):
         found = estimate_delays(a_recording(MODEL, TRUTH, planted), MODEL)
         assert found.common == pytest.approx(planted, abs=3e-4)
         np.testing.assert_array_equal(found.applied, found.common)
 
-    def test_a_delay_beyond_the_range_is_undetermined(self) -> None:
+    def test_a_delay_beyond_the_range_is_undetermined(self):
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
         assert found.reason == "the residual decreases up to the longest delay tested"
         np.testing.assert_array_equal(found.applied, 0.0)
 
-    def test_it_is_found_in_a_filtered_torque(self) -> None:
+    def test_it_is_found_in_a_filtered_torque(self):
         time = np.arange(0.0, 8.0, 0.004)
         recording = a_recording(MODEL, TRUTH, 0.003, time=time, torque_noise=0.3)
-        assert recording.torque is not None
         filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
         found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
         assert found.common == pytest.approx(0.003, abs=4e-4)
 
-    def test_known_payload_torque_is_delayed_equally(self) -> None:
+    def test_known_payload_torque_is_delayed_equally(self):
         """It was subtracted with another delay."""
         load = Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
         model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None), payload=load)
         found = estimate_delays(a_recording(model, TRUTH, 0.01, torque_noise=0.1), model)
         assert found.common == pytest.approx(0.01, abs=1e-4)
 
-    def test_it_is_found_beside_an_assumed_delay(self) -> None:
+    def test_it_is_found_beside_an_assumed_delay(self):
         recording = a_recording(MODEL, TRUTH, 0.004)
         found = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.003))
         assert found.common == pytest.approx(0.004, abs=3e-4)
@@ -184,7 +170,7 @@ class TestCommonDelay:
         assert not right.significant
         np.testing.assert_array_equal(right.applied, 0.004)
 
-    def test_presliding_friction_is_read_at_the_same_time(self) -> None:
+    def test_presliding_friction_is_read_at_the_same_time(self):
         law = FrictionLaw(third=None, presliding=1e-3)
         model = RobotModel.from_urdf(URDF, friction=law)
         time = np.arange(6000) * STEP
@@ -195,9 +181,7 @@ class TestCommonDelay:
         )
         assert estimate_delays(recording, model).common == pytest.approx(0.005, abs=5e-5)
 
-    def test_encoder_noise_in_a_servo_loop_biases_it_little(
-        self, simulated: tuple[Recording, float]
-    ) -> None:
+    def test_encoder_noise_in_a_servo_loop_biases_it_little(self, simulated):
         """Simulated cell in closed loop: within 0.05 ms of the true 0.2 ms."""
         recording, planted = simulated
         found = estimate_delays(recording, ns16_model())
@@ -206,7 +190,7 @@ class TestCommonDelay:
 
 
 class TestUndeterminedDelay:
-    def test_a_slow_motion_does_not_determine_it(self) -> None:
+    def test_a_slow_motion_does_not_determine_it(self):
         slow = estimate_delays(a_recording(MODEL, TRUTH, 0.0, speed=0.05), MODEL)
         assert not slow.determined
         assert np.isnan(slow.delays).all()
@@ -219,20 +203,20 @@ class TestUndeterminedDelay:
         assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
         assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
 
-    def test_an_uncertain_significant_delay_is_applied(self) -> None:
+    def test_an_uncertain_significant_delay_is_applied(self):
         found = estimate_delays(a_recording(MODEL, TRUTH, 0.045, speed=0.2, seed=2), MODEL)
         assert found.reason is not None and found.significant
         np.testing.assert_array_equal(found.applied, found.common)
         (line,) = found.describe()
         assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
-    def test_a_recording_without_motion_raises(self) -> None:
+    def test_a_recording_without_motion_raises(self):
         still = a_recording(MODEL, TRUTH, 0.0, speed=0.0)
         with pytest.raises(IdentificationError, match="not one usable sample"):
             estimate_delays(still, MODEL)
 
     @pytest.mark.slow
-    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data: Path) -> None:
+    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data):
         """The effort of a real UR10 is filtered at 2 Hz."""
         model, recording = ur10(shared_data)
         found = estimate_delays(recording, model)
@@ -242,17 +226,14 @@ class TestUndeterminedDelay:
 
 class TestDeviatingAxes:
     @pytest.mark.parametrize("planted", [[3.7e-4, -1.3e-3], [0.004, 0.0], [-0.045, 0.045]])
-    def test_an_axis_with_another_delay_is_found(self, planted: list[float]) -> None:
+    def test_an_axis_with_another_delay_is_found(self, planted):
         found = estimate_delays(a_recording(MODEL, TRUTH, np.array(planted)), MODEL)
         assert not found.agree and found.significant
         assert found.applied == pytest.approx(planted, abs=3e-4)
         assert any("predicts better than the common delay" in s for s in found.describe())
 
-    def test_one_axis_of_six_leaves_the_common_delay(
-        self, simulated: tuple[Recording, float]
-    ) -> None:
+    def test_one_axis_of_six_leaves_the_common_delay(self, simulated):
         recording, planted = simulated
-        assert recording.torque is not None
         torque = recording.torque.copy()
         torque[6:, 2] = torque[:-6, 2]
         found = estimate_delays(replace(recording, torque=torque), ns16_model())
@@ -260,7 +241,7 @@ class TestDeviatingAxes:
         assert found.deviations[2] == pytest.approx(0.006, abs=1e-4)
         assert found.common == pytest.approx(planted, abs=5e-5)
 
-    def test_a_resting_axis_has_the_common_delay(self) -> None:
+    def test_a_resting_axis_has_the_common_delay(self):
         time = np.arange(6000) * STEP
         keep = np.array([1.0, 0.0])
         rng = np.random.default_rng(1)
@@ -279,14 +260,13 @@ PLANTED = np.array([0.37e-3, -1.3e-3])  # s
 
 
 class TestCompensation:
-    def test_torques_are_shifted_to_their_positions(self) -> None:
+    def test_torques_are_shifted_to_their_positions(self):
         late = a_recording(MODEL, TRUTH, PLANTED, torque_noise=0.0, position_noise=0.0)
         time = late.time
         gap = np.zeros(len(time), dtype=np.bool_)
         gap[2500] = True
         gapped = replace(late, gap_before=gap)
         there = compensate(gapped, PLANTED)
-        assert there.torque is not None
         exact = MODEL.torque(TRUTH, *motion(there.time))
         clear = np.abs(motion(there.time)[1]) > 0.1  # Coulomb friction jumps between samples
         assert np.abs(there.torque - exact)[clear].max() < 2e-3
@@ -294,10 +274,9 @@ class TestCompensation:
         # No interpolation across the gap: samples beside it are dropped.
         assert there.n_samples == gapped.n_samples - 2 * 3
 
-    def test_zero_delays_change_nothing_and_long_ones_raise(self) -> None:
+    def test_zero_delays_change_nothing_and_long_ones_raise(self):
         recording = a_recording(MODEL, TRUTH, 0.0)
         same = compensate(recording, [0.0, 0.0])
-        assert recording.torque is not None
         np.testing.assert_array_equal(same.torque, recording.torque)
         np.testing.assert_array_equal(same.time, recording.time)
         with pytest.raises(IdentificationError, match="shorter than the delay"):
@@ -305,14 +284,14 @@ class TestCompensation:
 
 
 class TestDelayUncertainty:
-    def fit(self, model: RobotModel, samples: Samples) -> Estimate:
+    def fit(self, model, samples):
         return estimate(model, Factor.of(model, samples), np.array([1.0, 25.0]))
 
-    def test_the_sensitivity_is_the_derivative_of_the_estimate(self) -> None:
+    def test_the_sensitivity_is_the_derivative_of_the_estimate(self):
         """Compared with fits at delays half a millisecond shorter and longer."""
         recording = a_recording(MODEL, TRUTH, 0.004, torque_noise=0.0, position_noise=1e-8)
 
-        def samples(delay: float) -> Samples:
+        def samples(delay):
             options = Preprocessing(torque_delay=delay, left_out="slow", rigid_bandwidth=40.0)
             return prepare(recording, MODEL, options=options)
 
@@ -326,7 +305,7 @@ class TestDelayUncertainty:
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)
 
-    def test_undetermined_parameters_stay_undetermined(self) -> None:
+    def test_undetermined_parameters_stay_undetermined(self):
         samples = prepare(a_recording(MODEL, TRUTH, 0.0), MODEL)
         fitted, products = self.fit(MODEL, samples), rate_products(MODEL, samples)
         covariance = fitted.covariance.copy()

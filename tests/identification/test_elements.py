@@ -1,21 +1,16 @@
 """Springs and balancers with known and identified parameters."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification import Factor, RobotModel, consistent_estimate, estimate
 from identification.errors import ModelError
 from identification.model.elements import (
     Anchors,
-    Element,
     ElementError,
     ExtensionSpring,
     GasCylinder,
@@ -26,8 +21,6 @@ from identification.model.elements import (
 from identification.model.friction import FrictionLaw
 from tests.identification import two_link
 from tests.identification.robots import one_joint
-
-Array = NDArray[np.float64]
 
 KR300 = Path(__file__).resolve().parents[3] / "shared" / "data" / "kr300"
 ANCHORS = Anchors(base=0.8, link=0.2, angle=math.radians(5.0))
@@ -46,7 +39,7 @@ EXTENSION = ExtensionSpring("joint2", ANCHORS, free_length=0.4, stiffness=900.0,
 POSITIONS = np.linspace(-3.0, 3.0, 41)
 
 
-def apart(anchors: Anchors, q: Array) -> Array:
+def apart(anchors, q):
     """Return the distance of two points in a plane, one of which rotates with the joint."""
     base = np.array([anchors.base, 0.0])
     turned = q + anchors.angle
@@ -54,16 +47,16 @@ def apart(anchors: Anchors, q: Array) -> Array:
     return np.asarray(np.linalg.norm(link - base, axis=1))
 
 
-def torsion_energy(q: Array) -> Array:
+def torsion_energy(q):
     return np.asarray(0.5 * 40.0 * (q - 0.3) ** 2)
 
 
-def extension_energy(q: Array) -> Array:
+def extension_energy(q):
     longer = apart(ANCHORS, q) - 0.4
     return np.asarray(0.5 * 900.0 * longer**2 + 60.0 * longer)
 
 
-def gas_energy(cylinder: GasCylinder, q: Array) -> Array:
+def gas_energy(cylinder, q):
     """Return the work on an isothermal gas, ``-p0 V0 log(V / V0)``."""
     longer = apart(cylinder.anchors, q) - cylinder.length
     volume = cylinder.volume - (longer if cylinder.pulls else -longer) * cylinder.area
@@ -80,23 +73,21 @@ class TestElementTorque:
             (GAS_SPRING, lambda q: gas_energy(GAS_SPRING, q)),
         ],
     )
-    def test_is_the_derivative_of_an_energy(
-        self, element: Element, energy: Callable[[Array], Array]
-    ) -> None:
+    def test_is_the_derivative_of_an_energy(self, element, energy):
         """The torque of the drive is the derivative of the stored energy."""
         h = 1e-5
         slope = (energy(POSITIONS + h) - energy(POSITIONS - h)) / (2.0 * h)
         np.testing.assert_allclose(element.known(POSITIONS), slope, rtol=1e-6, atol=1e-5)
 
     @pytest.mark.parametrize("element", [TORSION, BALANCER, GAS_SPRING])
-    def test_is_columns_times_nominal_values(self, element: Element) -> None:
+    def test_is_columns_times_nominal_values(self, element):
         """An identified element with its nominal values has the torque of the known one."""
         free = replace(element, identified=True)
         nominal = JointElements.of([free], ["joint2"], [True]).nominal
         torque = free.columns(POSITIONS) @ nominal + free.known(POSITIONS)
         np.testing.assert_allclose(torque, element.known(POSITIONS), rtol=1e-12)
 
-    def test_a_given_preload_stays_known(self) -> None:
+    def test_a_given_preload_stays_known(self):
         """The preload of an identified spring is a parameter unless it is given."""
         both = replace(EXTENSION, preload=None, identified=True)
         one = replace(EXTENSION, identified=True)
@@ -106,7 +97,7 @@ class TestElementTorque:
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
 
-    def test_a_published_balancer_is_reproduced(self) -> None:
+    def test_a_published_balancer_is_reproduced(self):
         """A recording with and one without its balancer differ by the computed torque."""
         if not KR300.is_dir():
             pytest.skip(f"there is no recording {KR300}")
@@ -125,17 +116,17 @@ class TestElementFigures:
             (lambda: replace(BALANCER, volume=5e-4), "the gas has -0.000168 m³ left"),
         ],
     )
-    def test_invalid_values_are_refused(self, make: Callable[[], object], words: str) -> None:
+    def test_invalid_values_are_refused(self, make, words):
         with pytest.raises(ModelError, match=words):
             make()
 
-    def test_joint_must_exist_and_be_revolute(self) -> None:
+    def test_joint_must_exist_and_be_revolute(self):
         with pytest.raises(ModelError, match="no joint 'joint2'"):
             JointElements.of([TORSION], ["a"], [True])
         with pytest.raises(ModelError, match="prismatic"):
             JointElements.of([TORSION], ["joint2"], [False])
 
-    def test_names_of_two_on_one_joint_differ(self) -> None:
+    def test_names_of_two_on_one_joint_differ(self):
         free = [replace(TORSION, identified=True), replace(EXTENSION, identified=True)]
         assert JointElements.of(free, ["joint1", "joint2"], [True] * 2).names == (
             "spring_2",
@@ -143,7 +134,7 @@ class TestElementFigures:
         )
 
 
-def with_elements(*elements: Element) -> RobotModel:
+def with_elements(*elements):
     return RobotModel.from_urdf(two_link.URDF, friction=FrictionLaw(third=None), elements=elements)
 
 
@@ -153,7 +144,7 @@ GAS = replace(BALANCER, joint=JOINTS[1], pressure=4e5, identified=True)
 
 
 class TestElementModel:
-    def test_parameters_come_last(self) -> None:
+    def test_parameters_come_last(self):
         """Base parameters, friction, then elements in the order of the file."""
         model = with_elements(SPRING, GAS)
         assert model.parameter_names[two_link.P :] == ("spring_1", "balancer_2")
@@ -162,7 +153,7 @@ class TestElementModel:
         assert model.parameter_names[model.element_part] == model.elements.names
         assert not model.friction_columns[model.element_part].any()
 
-    def test_torque_adds_to_that_of_the_arm(self) -> None:
+    def test_torque_adds_to_that_of_the_arm(self):
         """W pi with elements is W pi without them plus their torque."""
         model, motion = with_elements(SPRING, GAS), two_link.a_motion()
         values = np.concatenate([two_link.truth(), [35.0, 0.8]])
@@ -175,7 +166,7 @@ class TestElementModel:
         other = model.with_friction(coulomb=False)
         assert other.parameter_names[other.element_part] == model.elements.names
 
-    def test_ripple_turns_with_the_motor(self) -> None:
+    def test_ripple_turns_with_the_motor(self):
         """Cosine and sine of each order of the angle of a coupled motor."""
         motor = tuple(zip(JOINTS, (20.0, -30.0), strict=True))
         model, motion = with_elements(TorqueRipple(JOINTS[1], motor, (1, 2))), two_link.a_motion()
@@ -188,7 +179,7 @@ class TestElementModel:
         expected[:, 1] += 0.5 * np.sin(2.0 * angle + np.arctan2(0.3, 0.4))
         np.testing.assert_allclose(model.torque(values, *motion[1:]), expected, atol=1e-9)
 
-    def test_known_elements_are_load(self) -> None:
+    def test_known_elements_are_load(self):
         known = with_elements(replace(SPRING, identified=False))
         motion = two_link.a_motion(1.0)
         assert known.parameter_names == two_link.MODEL.parameter_names
@@ -197,11 +188,11 @@ class TestElementModel:
         assert not load[:, 1].any()
         assert known.has_load and not two_link.MODEL.has_load
 
-    def test_equal_elements_are_refused(self) -> None:
+    def test_equal_elements_are_refused(self):
         with pytest.raises(ElementError, match=r"spring_1b .* cannot be distinguished"):
             with_elements(SPRING, SPRING)
 
-    def test_an_element_equal_to_a_weight_is_refused(self) -> None:
+    def test_an_element_equal_to_a_weight_is_refused(self):
         """A spring with free length zero has the torque of a weight."""
         pendulum = one_joint("revolute", axis="1 0 0")
         spring = ExtensionSpring(
@@ -214,17 +205,17 @@ class TestElementModel:
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return with_elements(SPRING, GAS)
 
 
 @pytest.fixture(scope="module")
-def values() -> Array:
+def values():
     return np.concatenate([two_link.truth(), [-35.0, 0.8]])
 
 
 @pytest.fixture(scope="module")
-def factor(model: RobotModel, values: Array) -> Factor:
+def factor(model, values):
     motion = two_link.a_motion()
     noise = two_link.gaussian(np.random.default_rng(3), motion)
     torque = model.torque(values, *motion[1:]) + noise
@@ -232,15 +223,11 @@ def factor(model: RobotModel, values: Array) -> Factor:
 
 
 class TestIdentifiedElements:
-    def test_least_squares_finds_them(
-        self, model: RobotModel, values: Array, factor: Factor
-    ) -> None:
+    def test_least_squares_finds_them(self, model, values, factor):
         found = estimate(model, factor)
         assert np.all(np.abs(found.values - values) <= 4.5 * found.std)
 
-    def test_the_consistent_solution_leaves_them_free(
-        self, model: RobotModel, values: Array, factor: Factor
-    ) -> None:
+    def test_the_consistent_solution_leaves_them_free(self, model, values, factor):
         """A stiffness may be negative and has no prior."""
         free = estimate(model, factor)
         found = consistent_estimate(model, factor, free)

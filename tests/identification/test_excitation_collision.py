@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import gc
 import struct
 import time
@@ -34,7 +32,7 @@ from tests.hil.simulated_logs import urdf_path
 NOWHERE = Workspace(floor=None, margin=0.0)
 
 
-def link(name: str, shape: str = "", at: str = "0 0 0") -> str:
+def link(name, shape="", at="0 0 0"):
     collision = (
         f'<collision><origin xyz="{at}"/><geometry>{shape}</geometry></collision>' if shape else ""
     )
@@ -45,7 +43,7 @@ def link(name: str, shape: str = "", at: str = "0 0 0") -> str:
     )
 
 
-def joint(number: int, parent: str, child: str, axis: str, kind: str = "revolute", at="0 0 0"):
+def joint(number, parent, child, axis, kind="revolute", at="0 0 0"):
     return (
         f'<joint name="joint_{number}" type="{kind}"><parent link="{parent}"/>'
         f'<child link="{child}"/><origin xyz="{at}" rpy="0.1 -0.3 0.7"/><axis xyz="{axis}"/>'
@@ -53,11 +51,11 @@ def joint(number: int, parent: str, child: str, axis: str, kind: str = "revolute
     )
 
 
-def robot(*parts: str) -> str:
+def robot(*parts):
     return f'<robot name="r">{"".join(parts)}</robot>'
 
 
-def ball_chain(*radii: float) -> str:
+def ball_chain(*radii):
     """Balls 0.1 m apart, one per joint; radius 0 for a link without shape."""
     parts = [link("base")]
     for k, radius in enumerate(radii):
@@ -146,7 +144,6 @@ def test_the_deepest_contact_agrees_with_brute_force(arm, brute, seed, margin):
     if distances.min() >= margin:
         assert contact is None
     else:
-        assert contact is not None
         assert contact.distance == pytest.approx(distances[contact.sample], abs=1e-5)
         assert contact.distance <= min(distances.min() + 0.00501, margin)
 
@@ -315,7 +312,7 @@ def test_bulges_bound_the_deviation_from_straight_lines(seed):
         assert left <= bulge + 1e-12
 
 
-def ball_on_a_turntable(radius: float) -> str:
+def ball_on_a_turntable(radius):
     """A ball at 1 m from a vertical axis."""
     return robot(
         link("base"),
@@ -362,7 +359,6 @@ def test_only_close_pairs_of_a_wrist_are_unchecked():
     # Four joints between base and tip: permanent contact is reported.
     far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
     contact = far.deepest_contact(np.zeros((1, 4)))
-    assert contact is not None
     assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
     assert contact.distance < 0.0
 
@@ -509,7 +505,7 @@ def test_unusable_shapes_and_boxes_are_refused():
         Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
 
 
-def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting() -> None:
+def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting():
     """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
     path = urdf_path("ur5_robot.urdf")
     checker = CollisionChecker(

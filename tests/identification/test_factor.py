@@ -1,23 +1,19 @@
 """Factors of samples, Gram matrices or triangles, and least squares on them."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import with_block_covariance
-from identification.estimators.least_squares import Weighting, fit_least_squares
+from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import (
     QR_CONDITION,
@@ -34,7 +30,6 @@ from identification.factor.factor import (
 from identification.factor.phases import total_phase
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
 from tests.identification import two_link
 from tests.identification.two_link import (
@@ -48,28 +43,26 @@ from tests.identification.two_link import (
     truth,
 )
 
-Array = NDArray[np.float64]
-Kind = type[Factor]
 both = pytest.mark.parametrize("kind", [Factor, QRFactor])
 
 
 @cache
-def ns16() -> RobotModel:
+def ns16():
     return RobotModel.from_urdf(urdf_text())
 
 
-def some_samples(m: int, seed: int = 0) -> tuple[Motion, Array]:
+def some_samples(m, seed=0):
     random = np.random.default_rng(seed)
     q, qd, qdd, torque = random.uniform(-3.0, 3.0, (4, m, 6))
     return Motion(np.arange(m) * 1e-3, q, qd, qdd), 100.0 * torque
 
 
-def a_motion(samples: int = 3000, *, step: float = 2e-3, held_elbow: bool = False) -> Motion:
+def a_motion(samples=3000, *, step=0.002, held_elbow=False):
     time = np.arange(samples) * step
     return one_sine(time, centre=np.array([0.0, 0.4]), held_elbow=held_elbow)
 
 
-def ill() -> Samples:
+def ill():
     """Motion of scaled condition 1e7: the elbow turns one way at nearly constant speed."""
     time = np.arange(400) * 2e-3
     motion = one_sine(time, (0.9, 1e-5))
@@ -78,20 +71,20 @@ def ill() -> Samples:
     return recording(np.zeros((400, 2)), motion)
 
 
-def noisy(motion: Motion, noise: Array | float = 0.0, seed: int = 0) -> Samples:
+def noisy(motion, noise=0.0, seed=0):
     error = noise * np.random.default_rng(seed).standard_normal((len(motion.time), 2))
     return recording(error, motion)
 
 
-def parts_of(samples: Samples, edges: Array) -> list[Samples]:
+def parts_of(samples, edges):
     return [samples.between(a, b) for a, b in pairwise(np.unique(edges).tolist())]
 
 
-def summed(kind: Kind, parts: list[Samples]) -> Any:
+def summed(kind, parts):
     return sum((kind.of(MODEL, part) for part in parts), kind.zero(MODEL))
 
 
-def exact_solution(samples: Samples) -> Array:
+def exact_solution(samples):
     """Solve least squares in rational arithmetic from the float rows."""
     blocks = MODEL.regressor(*samples.motion[1:]).dense(P)
     table = np.concatenate([blocks, samples.torque[:, :, None]], axis=2)[samples.usable]
@@ -109,7 +102,7 @@ def exact_solution(samples: Samples) -> Array:
 
 
 class TestFactor:
-    def test_the_gram_is_that_of_the_usable_rows(self) -> None:
+    def test_the_gram_is_that_of_the_usable_rows(self):
         """Masked rows may hold any values; input arrays are unchanged."""
         model, (motion, torque) = ns16(), some_samples(200)
         mask = np.ones((200, 6), dtype=bool)
@@ -129,9 +122,7 @@ class TestFactor:
     @both
     @given(pieces=st.integers(1, 300), seed=st.integers(0, 2**16))
     @settings(max_examples=6)
-    def test_the_factor_of_a_union_is_the_sum_of_factors(
-        self, kind: Kind, pieces: int, seed: int
-    ) -> None:
+    def test_the_factor_of_a_union_is_the_sum_of_factors(self, kind, pieces, seed):
         samples = noisy(a_motion(1500), NOISE, seed)
         inner = np.random.default_rng(seed).integers(0, 1501, pieces - 1)
         many = summed(kind, parts_of(samples, np.concatenate([[0], inner, [1500]])))
@@ -143,7 +134,7 @@ class TestFactor:
         np.testing.assert_allclose(one.values, other.values, rtol=1e-9)
         np.testing.assert_allclose(one.std, other.std, rtol=1e-9)
 
-    def test_weights_are_applied_joint_by_joint_afterwards(self) -> None:
+    def test_weights_are_applied_joint_by_joint_afterwards(self):
         model, (motion, torque) = ns16(), some_samples(150)
         weights = np.array([1.0, 0.5, 2.0, 10.0, 0.0, 3.0])
         equations = Factor.from_samples(model, motion, torque).weighted(weights)
@@ -155,7 +146,7 @@ class TestFactor:
         assert equations.yy == pytest.approx(right @ right, rel=1e-13)
         assert equations.n == 900
 
-    def test_the_dense_regressor_is_not_allocated(self) -> None:
+    def test_the_dense_regressor_is_not_allocated(self):
         model, (motion, torque) = ns16(), some_samples(30_000)
         tracemalloc.start()
         Factor.from_samples(model, motion, torque)
@@ -164,14 +155,14 @@ class TestFactor:
         assert peak < 0.2 * 30_000 * 6 * 58 * 8
 
     @both
-    def test_factors_of_other_models_raise(self, kind: Kind) -> None:
+    def test_factors_of_other_models_raise(self, kind):
         samples = noisy(a_motion(50))
         one = kind.of(MODEL, samples)
         with pytest.raises(IdentificationError, match="cannot be added"):
             _ = one + kind.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
 
     @pytest.mark.parametrize("bandwidth", [None, np.array([60.0, 80.0])])
-    def test_rows_are_regressor_and_torque(self, bandwidth: Array | None) -> None:
+    def test_rows_are_regressor_and_torque(self, bandwidth):
         samples = replace(noisy(a_motion(3000), NOISE), torque_bandwidth=bandwidth)
         samples.torque[~samples.usable] = np.nan
         blocks, columns = samples.regressor(MODEL)
@@ -186,7 +177,7 @@ class TestFactor:
         assert (chunks[0][0].start, chunks[-1][0].stop) == (0, 3000)
 
     @pytest.mark.parametrize("weights", [None, np.array([0.3, 20.0])])
-    def test_gram_and_qr_agree_to_nine_digits(self, weights: Array | None) -> None:
+    def test_gram_and_qr_agree_to_nine_digits(self, weights):
         samples = noisy(a_motion(), NOISE)
         gram, factor = Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)
         expected, found = estimate(MODEL, gram, weights), estimate(MODEL, factor, weights)
@@ -200,7 +191,7 @@ class TestFactor:
 
 
 class TestConditioning:
-    def test_qr_is_more_accurate_than_gram(self) -> None:
+    def test_qr_is_more_accurate_than_gram(self):
         samples, ordinary = ill(), np.ones(2)
         exact, found = exact_solution(samples), QRFactor.of(MODEL, samples).solve(ordinary)
         assert 3e6 < found.condition < 1e8
@@ -211,7 +202,7 @@ class TestConditioning:
         # The estimate on Gram matrices reports this.
         assert not solve(equations).determined.all()
 
-    def test_qr_resolves_small_residuals(self) -> None:
+    def test_qr_resolves_small_residuals(self):
         """A residual of 1e-9 of the torque, below the resolution of a Gram matrix."""
         samples, ordinary = noisy(a_motion(), 1e-9 * NOISE), np.ones(2)
         errors = []
@@ -223,7 +214,7 @@ class TestConditioning:
         assert errors[0] < 0.05
         assert errors[1] > 1.0
 
-    def test_the_condition_selects_gram_or_qr(self) -> None:
+    def test_the_condition_selects_gram_or_qr(self):
         good, bad = noisy(a_motion(), NOISE), ill()
         assert not isinstance(reduced(MODEL, [good], Factor.of(MODEL, good)), QRFactor)
         factor = reduced(MODEL, [bad, bad], summed(Factor, [bad, bad]))
@@ -236,7 +227,7 @@ class TestConditioning:
         assert "by QR" in robust_estimate(MODEL, [bad]).estimate.method
 
     @both
-    def test_undetermined_parameters_are_named(self, kind: Kind) -> None:
+    def test_undetermined_parameters_are_named(self, kind):
         motion = a_motion(held_elbow=True)
         samples = replace(noisy(motion), usable=np.ones((3000, 2), dtype=bool))
         result = estimate(MODEL, kind.of(MODEL, samples))
@@ -251,7 +242,7 @@ class TestConditioning:
         predicted = MODEL.torque(result.values, *motion[1:])
         np.testing.assert_allclose(predicted, samples.torque, atol=1e-4)
 
-    def test_dependent_parameters_are_both_named(self) -> None:
+    def test_dependent_parameters_are_both_named(self):
         factor = Factor.of(MODEL, noisy(a_motion(), NOISE))
         # Viscous friction proportional to Coulomb friction, as at one speed.
         i, j = (MODEL.parameter_names.index(name) for name in ("f0_1", "f1_1"))
@@ -263,7 +254,7 @@ class TestConditioning:
         assert set(result.undetermined) == {"f0_1", "f1_1"}
         assert result.condition > 1e6
 
-    def test_the_condition_does_not_depend_on_units(self) -> None:
+    def test_the_condition_does_not_depend_on_units(self):
         factor = Factor.of(MODEL, noisy(a_motion(), NOISE))
         scale = np.append(np.logspace(-3, 3, P), 1.0)
         scaled = replace(factor, matrices=factor.gram * np.outer(scale, scale))
@@ -272,7 +263,7 @@ class TestConditioning:
         np.testing.assert_allclose(second.values, first.values / scale[:-1], rtol=1e-6)
 
     @both
-    def test_joints_without_rows_have_no_noise_and_no_weight(self, kind: Kind) -> None:
+    def test_joints_without_rows_have_no_noise_and_no_weight(self, kind):
         samples = noisy(a_motion(), NOISE)
         samples.usable[:, 1] = False
         factor = kind.of(MODEL, samples)
@@ -284,7 +275,7 @@ class TestConditioning:
             estimate(MODEL, kind.zero(MODEL))
 
     @given(k=st.integers(1, 12), p=st.integers(1, 8), seed=st.integers(0, 999))
-    def test_rows_are_solved_as_by_the_pseudo_inverse(self, k: int, p: int, seed: int) -> None:
+    def test_rows_are_solved_as_by_the_pseudo_inverse(self, k, p, seed):
         random = np.random.default_rng(seed)
         rows, target = random.standard_normal((k, p)), random.standard_normal(k)
         scale = np.linalg.norm(rows, axis=0)
@@ -298,22 +289,22 @@ class TestConditioning:
 
 
 class TestEstimate:
-    def trial(self, seed: int, noise: Array = NOISE) -> Factor:
+    def trial(self, seed, noise=NOISE):
         return Factor.of(MODEL, noisy(a_motion(), noise, seed))
 
-    def test_without_noise_the_true_values_are_found(self) -> None:
+    def test_without_noise_the_true_values_are_found(self):
         result = estimate(MODEL, self.trial(0, np.zeros(2)))
         np.testing.assert_allclose(result.values, truth(), rtol=1e-6, atol=1e-7)
         assert result.undetermined == ()
         assert result.value("f0_2") == pytest.approx(2.0, rel=1e-6)
 
-    def test_noise_and_weights_are_those_of_each_joint(self) -> None:
+    def test_noise_and_weights_are_those_of_each_joint(self):
         result = estimate(MODEL, self.trial(1))
         np.testing.assert_allclose(result.noise_std, NOISE, rtol=0.05)
         np.testing.assert_allclose(joint_weights(self.trial(3)), 1.0 / NOISE**2, rtol=0.2)
 
     @pytest.mark.parametrize("weights", [np.ones(2), np.array([0.3, 20.0])])
-    def test_it_solves_the_stacked_weighted_rows(self, weights: Array) -> None:
+    def test_it_solves_the_stacked_weighted_rows(self, weights):
         samples = noisy(a_motion(400), NOISE, 2)
         rows = MODEL.regressor(*samples.motion[1:]).dense(P) * np.sqrt(weights)[:, None]
         right = samples.torque * np.sqrt(weights)
@@ -325,7 +316,7 @@ class TestEstimate:
             ordinary = fit_least_squares(MODEL, [samples], "ordinary")
             np.testing.assert_allclose(ordinary.values, expected, rtol=1e-8)
 
-    def test_parameters_reduce_degrees_of_freedom(self) -> None:
+    def test_parameters_reduce_degrees_of_freedom(self):
         """With half as many parameters as rows."""
         found, weights = [], np.ones(2)
         motion = a_motion(11, step=0.4)
@@ -337,7 +328,7 @@ class TestEstimate:
         np.testing.assert_allclose(np.mean(found, axis=0), 1.0, rtol=0.15)
 
     @pytest.mark.parametrize("weighting", ["ordinary", "weighted"])
-    def test_covariance_from_rows_is_that_from_blocks(self, weighting: Weighting) -> None:
+    def test_covariance_from_rows_is_that_from_blocks(self, weighting):
         motion, rng = two_link.a_motion(), np.random.default_rng(9)
         runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.05), motion) for _ in range(3)]
         phase = total_phase(MODEL, runs)

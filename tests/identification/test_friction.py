@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import math
 import pickle
 from dataclasses import replace
@@ -8,13 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.model.coupling import Coupling
 from identification.model.friction import (
     TERMS,
-    FrictionTerm,
     JointFriction,
     dissipation,
     presliding_state,
@@ -31,17 +27,17 @@ class TestFrictionTerms:
     SPEED = np.array([-2.0, -0.3, 0.1, 0.7])
     STEP = 1e-6
 
-    def test_source_code_computes_the_column(self, kind: FrictionTerm) -> None:
+    def test_source_code_computes_the_column(self, kind):
         term = replace(kind, speed=0.4)
         names = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0}
         names |= {"E": math.e, "tanh": math.tanh}
         code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **names}) for v in self.SPEED]
         np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
 
-    def test_another_process_has_the_same_term(self, kind: FrictionTerm) -> None:
+    def test_another_process_has_the_same_term(self, kind):
         assert pickle.loads(pickle.dumps(replace(kind, speed=0.4))) == replace(kind, speed=0.4)
 
-    def test_slope_is_the_derivative_of_the_column(self, kind: FrictionTerm) -> None:
+    def test_slope_is_the_derivative_of_the_column(self, kind):
         """At a speed without change of direction, without the exponential of Stribeck."""
         if kind.label == "Stribeck":
             return
@@ -57,15 +53,13 @@ class TestFrictionTable:
     @pytest.mark.parametrize(
         "law", [FrictionLaw(), FrictionLaw(third=None, stribeck=0.1, zone="linear", offset=True)]
     )
-    def test_laws_come_back_from_their_tables(self, law: FrictionLaw) -> None:
+    def test_laws_come_back_from_their_tables(self, law):
         assert None not in law.table().values()
         assert FrictionLaw.from_table(law.table()) == law
 
-    def test_a_speed_of_zero_means_no_stribeck_term(self) -> None:
+    def test_a_speed_of_zero_means_no_stribeck_term(self):
         assert FrictionLaw.from_table({"stribeck": 0.0}).stribeck is None
 
-
-Array = NDArray[np.float64]
 
 LAWS = st.builds(
     FrictionLaw,
@@ -80,7 +74,7 @@ LAWS = st.builds(
 )
 
 
-def torque_of(law: FrictionLaw, coefficients: dict[str, float], v: float) -> float:
+def torque_of(law, coefficients, v):
     """Return the friction of one joint by the documented formula."""
     sign = np.sign(v)
     if law.zone == "linear" and abs(v) < law.standstill:
@@ -98,7 +92,7 @@ def torque_of(law: FrictionLaw, coefficients: dict[str, float], v: float) -> flo
 
 @given(st.lists(LAWS, min_size=6, max_size=6), st.integers(0, 2**16))
 @settings(max_examples=25, deadline=None)
-def test_joints_can_have_different_laws(laws: list[FrictionLaw], seed: int) -> None:
+def test_joints_can_have_different_laws(laws, seed):
     names = [f"joint_{j}" for j in range(1, 7)]
     model = RobotModel.from_urdf(
         urdf_text(), friction=laws[0], joint_friction=dict(zip(names[1:], laws[1:], strict=True))
@@ -108,7 +102,7 @@ def test_joints_can_have_different_laws(laws: list[FrictionLaw], seed: int) -> N
     values = np.concatenate([np.zeros(model.base.rank), friction])
     qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
     torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
-    own: list[dict[str, float]] = [{} for _ in names]
+    own = [{} for _ in names]
     for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
         symbol, joint = name.split("_")
         own[int(joint) - 1][symbol] = value
@@ -116,7 +110,7 @@ def test_joints_can_have_different_laws(laws: list[FrictionLaw], seed: int) -> N
     np.testing.assert_allclose(torque, expected, atol=1e-11)
 
 
-def test_parameters_are_ordered_by_term() -> None:
+def test_parameters_are_ordered_by_term():
     model = RobotModel.from_urdf(
         TWO_LINK,
         friction=FrictionLaw(third=None),
@@ -130,7 +124,7 @@ def test_parameters_are_ordered_by_term() -> None:
         model.friction.table(np.arange(4.0))
 
 
-def test_rows_at_rest_are_excluded_only_with_that_zone() -> None:
+def test_rows_at_rest_are_excluded_only_with_that_zone():
     model = RobotModel.from_urdf(
         TWO_LINK,
         friction=FrictionLaw(standstill=0.1),
@@ -141,13 +135,13 @@ def test_rows_at_rest_are_excluded_only_with_that_zone() -> None:
     np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
 
 
-def test_offsets_do_not_count_as_friction() -> None:
+def test_offsets_do_not_count_as_friction():
     model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
     friction = [n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f]
     assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
 
 
-def test_invalid_laws_are_refused() -> None:
+def test_invalid_laws_are_refused():
     with pytest.raises(ModelError, match="standstill"):
         FrictionLaw(zone="linear", standstill=0.0)
     with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
@@ -156,9 +150,7 @@ def test_invalid_laws_are_refused() -> None:
 
 @given(st.lists(LAWS, min_size=2, max_size=2), st.booleans(), st.integers(0, 2**16))
 @settings(max_examples=30, deadline=None)
-def test_dissipative_combinations_dissipate_energy(
-    laws: list[FrictionLaw], coupled: bool, seed: int
-) -> None:
+def test_dissipative_combinations_dissipate_energy(laws, coupled, seed):
     coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]])) if coupled else None
     friction = JointFriction(tuple(laws), (True, True), coupling)
     combine, not_negative = dissipation(friction)
@@ -172,7 +164,7 @@ def test_dissipative_combinations_dissipate_energy(
             assert torque_of(law, own, v) * v >= -1e-12
 
 
-def test_all_dissipative_friction_is_allowed() -> None:
+def test_all_dissipative_friction_is_allowed():
     law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
     friction = JointFriction((law,), (True,))
     combine, not_negative = dissipation(friction)
@@ -191,7 +183,7 @@ distances = st.sampled_from([1e-5, 1e-4, 1e-3])
 
 class TestPreslidingState:
     @given(steps=steps, distance=distances)
-    def test_it_is_dahls_recursion(self, steps: list[float], distance: float) -> None:
+    def test_it_is_dahls_recursion(self, steps, distance):
         """z <- s + (z - s) exp(-|dq| / d), from zero."""
         position = 0.3 + np.cumsum([0.0, *steps])
         state, expected = 0.0, [0.0]
@@ -204,12 +196,12 @@ class TestPreslidingState:
 
 
 class TestDirectionOfFriction:
-    def test_without_presliding_it_is_the_sign(self) -> None:
+    def test_without_presliding_it_is_the_sign(self):
         motion = a_motion()
         direction = MODEL.friction.direction(*motion[:3])
         np.testing.assert_array_equal(direction, np.sign(motion.velocity))
 
-    def test_a_short_displacement_is_the_sign_away_from_reversals(self) -> None:
+    def test_a_short_displacement_is_the_sign_away_from_reversals(self):
         motion = a_motion()
         sliding = MODEL.with_friction(presliding=1e-7)
         moved = motion._replace(direction=sliding.friction.direction(*motion[:3]))
@@ -221,7 +213,7 @@ class TestDirectionOfFriction:
             rtol=1e-9,
         )
 
-    def test_the_torque_uses_the_direction_of_a_motion(self) -> None:
+    def test_the_torque_uses_the_direction_of_a_motion(self):
         motion = a_motion()
         half = motion._replace(direction=0.5 * np.sign(motion.velocity))
         dry = np.zeros_like(truth())
@@ -235,7 +227,7 @@ class TestDirectionOfFriction:
 GEARS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0])
 
 
-def wrist(k54: float = 0.2, k64: float = -0.1, k65: float = 0.3) -> Array:
+def wrist(k54=0.2, k64=-0.1, k65=0.3):
     """Motors 5 and 6 are coupled to the axes before them, as in the COMAU wrist."""
     turns = np.eye(6)
     turns[4, 3], turns[5, 4], turns[5, 3] = -k54, -k65, k65 * k54 - k64
@@ -243,15 +235,15 @@ def wrist(k54: float = 0.2, k64: float = -0.1, k65: float = 0.3) -> Array:
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist()))
 
 
-def states(m: int = 40) -> Array:
+def states(m=40):
     return np.random.default_rng(4).uniform(-3.0, 3.0, (3, m, 6))
 
 
-def test_the_ns16_has_three_coupling_inertias(model: RobotModel) -> None:
+def test_the_ns16_has_three_coupling_inertias(model):
     assert model.base.rank == 43
     assert set(model.base.names) == {row.pivot for row in TABLE2[:N_ESSENTIAL]} | {
         "I45", "I46", "I56",
@@ -267,7 +259,7 @@ def test_the_ns16_has_three_coupling_inertias(model: RobotModel) -> None:
         assert np.abs(group - expected).max() < 1e-10, name
 
 
-def test_names_and_units_of_coupling_parameters(model: RobotModel) -> None:
+def test_names_and_units_of_coupling_parameters(model):
     assert model.parameter_names[40:43] == ("I45", "I46", "I56")
     assert model.parameter_names[-4:] == ("f0_m5", "f0_m6", "f1_m5", "f1_m6")
     assert model.units[40:43] == ("kg m²",) * 3
@@ -275,7 +267,7 @@ def test_names_and_units_of_coupling_parameters(model: RobotModel) -> None:
     assert model.friction_columns.tolist() == [False] * 43 + [True] * 22
 
 
-def test_rotors_and_motor_friction_act_through_the_coupling(model: RobotModel) -> None:
+def test_rotors_and_motor_friction_act_through_the_coupling(model):
     """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
     q, qd, qdd = states()
     inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
@@ -296,14 +288,14 @@ def test_rotors_and_motor_friction_act_through_the_coupling(model: RobotModel) -
     np.testing.assert_allclose(model.torque(values, q, qd, qdd), expected, atol=1e-9)
 
 
-def test_rows_need_moving_motors(model: RobotModel) -> None:
+def test_rows_need_moving_motors(model):
     qd = np.ones((1, 6))
     # Joint speeds at which motor 5 is at rest: c_5 qd = 0.
     qd[0, 4] = 0.2
     assert model.moving(qd).tolist() == [[True, True, True, False, False, True]]
 
 
-def test_either_part_can_be_left_out() -> None:
+def test_either_part_can_be_left_out():
     inertia = RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist(), friction=False))
     assert inertia.n_parameters == 43 + 18
     friction = RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist(), inertia=False))
@@ -313,7 +305,7 @@ def test_either_part_can_be_left_out() -> None:
     assert viscous.parameter_names[-2:] == ("f1_m5", "f1_m6")
 
 
-def test_uncoupled_motors_add_nothing() -> None:
+def test_uncoupled_motors_add_nothing():
     uncoupled = RobotModel.from_urdf(urdf_text())
     with_gears = RobotModel.from_urdf(urdf_text(), coupling=Coupling(GEARS))
     assert with_gears.parameter_names == uncoupled.parameter_names
@@ -330,6 +322,6 @@ def test_uncoupled_motors_add_nothing() -> None:
         (np.ones((2, 2)), "singular"),
     ],
 )
-def test_an_invalid_coupling_is_refused(matrix: Array, words: str) -> None:
+def test_an_invalid_coupling_is_refused(matrix, words):
     with pytest.raises(ModelError, match=words):
         Coupling(matrix)

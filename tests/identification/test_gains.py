@@ -1,23 +1,17 @@
 """Torque constants from a known payload, and from the nominal masses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from hil.identify.prepared import current_warnings
 from identification.errors import IdentificationError
-from identification.estimators.gains import CurrentScale, Gains, identify_gains, scale_from_nominal
-from identification.factor.phases import PhaseFactor, gain_factor, joined
+from identification.estimators.gains import CurrentScale, identify_gains, scale_from_nominal
+from identification.factor.phases import gain_factor, joined
 from identification.model.friction import FrictionLaw
-from identification.model.motion import Motion
 from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
 from tests.identification.two_link import MODEL, a_motion, as_samples, coloured, four_sines, truth
-
-Array = NDArray[np.float64]
 
 LOAD = Payload(2.0, (0.03, 0.0, 0.45))
 PLANTED = np.array([12.0, 5.0])  # N m / A
@@ -37,21 +31,21 @@ LIFT_AND_TURN = """<robot name="lift"><link name="base"/>
 <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.03"/></inertial></link></robot>"""
 
 
-def load_torque(model: RobotModel, payload: Payload, motion: Motion) -> Array:
+def load_torque(model, payload, motion):
     return Load(model.chain, model.gravity, payload).torque(*motion[1:4])
 
 
 def factor_of(
-    noise: Array = NOISE,
+    noise=NOISE,
     *,
-    seed: int = 0,
-    model: RobotModel = MODEL,
-    values: Array | None = None,
-    gains: Array = PLANTED,
-    load: Payload | None = LOAD,
-    motion: Motion | None = None,
-    transmission: Array | None = None,
-) -> PhaseFactor:
+    seed=0,
+    model=MODEL,
+    values=None,
+    gains=PLANTED,
+    load=LOAD,
+    motion=None,
+    transmission=None,
+):
     """Reduce a recording without payload and one with it; noise is on the currents."""
     motion = four_sines(TIME, n=model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
@@ -69,11 +63,11 @@ def factor_of(
     return joined(factors)
 
 
-def gains_of(factor: PhaseFactor, model: RobotModel = MODEL) -> Gains:
+def gains_of(factor, model=MODEL):
     return identify_gains(factor, model.joint_names)
 
 
-def lifted(payload: Payload) -> Gains:
+def lifted(payload):
     """Return gains of an arm that lifts along gravity and turns about it."""
     model = RobotModel.from_urdf(LIFT_AND_TURN, friction=FrictionLaw(third=None))
     standard = model.nominal.copy()
@@ -90,7 +84,7 @@ CONSTANTS = np.array([1.10, 1.10, 0.75, 0.36, 0.42, 0.42])
 NS16_LOAD = Payload(16.0, (0.10, 0.05, 0.25), (0.1, 0.0, 0.0, 0.1, 0.0, 0.05))
 
 
-def ns16(motion: Motion | None = None) -> Gains:
+def ns16(motion=None):
     """Return gains of the coupled NS 16."""
     model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None))
     planted, named = load_truth(), standard_parameters()
@@ -113,7 +107,7 @@ def ns16(motion: Motion | None = None) -> Gains:
 GAINS = np.array([12.0, 3.0])  # N·m/A
 
 
-def scale(signs: tuple[float, float]) -> CurrentScale:
+def scale(signs):
     """Return gains from currents of the nominal arm with rotors and friction, times signs."""
     motion = a_motion()
     values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
@@ -123,15 +117,15 @@ def scale(signs: tuple[float, float]) -> CurrentScale:
 
 
 @pytest.fixture(scope="module")
-def many() -> list[Gains]:
+def many():
     return [gains_of(factor_of(seed=seed)) for seed in range(SEEDS)]
 
 
 class TestGains:
-    def test_without_noise_the_true_gains_are_found(self) -> None:
+    def test_without_noise_the_true_gains_are_found(self):
         assert gains_of(factor_of(np.zeros(2))).values == pytest.approx(PLANTED, rel=1e-6)
 
-    def test_95_percent_intervals_cover(self, many: list[Gains]) -> None:
+    def test_95_percent_intervals_cover(self, many):
         inside = [np.abs(one.values - PLANTED) <= one.interval_factor * one.std for one in many]
         # Fewer than 89 of 100 have a probability of 0.5 %.
         assert np.all(np.sum(inside, axis=0) >= 89)
@@ -140,13 +134,13 @@ class TestGains:
         # The standard deviation of 100 samples has an error of 7 %.
         assert np.all(np.abs(np.log(claimed / scatter)) < 3 * 0.07)
 
-    def test_current_noise_does_not_bias_gains(self, many: list[Gains]) -> None:
+    def test_current_noise_does_not_bias_gains(self, many):
         """Unlike least squares of the equation linear in gains and parameters."""
         values = np.array([one.values for one in many])
         error = values.std(axis=0, ddof=1) / np.sqrt(SEEDS)
         assert np.all(np.abs(values.mean(axis=0) - PLANTED) < 3.0 * error)
 
-    def test_an_unloaded_axis_is_undetermined(self) -> None:
+    def test_an_unloaded_axis_is_undetermined(self):
         """An eccentric payload determines it."""
         gains = lifted(Payload(4.0, (0.0, 0.0, 0.1)))
         assert gains.values[0] == pytest.approx(PLANTED[0], abs=4.0 * gains.std[0])
@@ -157,32 +151,32 @@ class TestGains:
         gains = lifted(Payload(4.0, (0.2, 0.0, 0.1)))
         assert np.all(np.abs(gains.values - PLANTED) < 4.0 * gains.std)
 
-    def test_the_torque_constants_of_a_coupled_ns16(self) -> None:
+    def test_the_torque_constants_of_a_coupled_ns16(self):
         gains = ns16()
         assert gains.determined.all()
         assert np.all(np.abs(gains.values - CONSTANTS) < 4.0 * gains.std)
         assert np.all(gains.std < 0.02 * CONSTANTS)
 
-    def test_on_a_slow_ns16_only_loaded_axes_are_determined(self) -> None:
+    def test_on_a_slow_ns16_only_loaded_axes_are_determined(self):
         gains = ns16(four_sines(np.arange(6000) * 0.02, 0.03, n=6))
         assert not gains.determined[0]
         assert gains.determined[[1, 2]].all()
         assert np.all(np.abs(gains.values - CONSTANTS)[1:3] < 4.0 * gains.std[1:3])
 
-    def test_recordings_add_up_in_any_order(self) -> None:
+    def test_recordings_add_up_in_any_order(self):
         one, other = factor_of(seed=1), factor_of(seed=2)
         there, back = gains_of(one + other), gains_of(other + one)
         assert there.values == pytest.approx(back.values, rel=1e-9)
         assert np.all(there.std < gains_of(one).std)
 
-    def test_missing_payload_raises(self) -> None:
+    def test_missing_payload_raises(self):
         with pytest.raises(IdentificationError, match="no recording has a known payload"):
             gains_of(factor_of(load=None))
 
 
 class TestCurrentScale:
     @pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
-    def test_a_current_of_the_wrong_sign_is_reported(self, signs: tuple[float, float]) -> None:
+    def test_a_current_of_the_wrong_sign_is_reported(self, signs):
         found, names = scale(signs), MODEL.joint_names
         np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
         np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
@@ -191,6 +185,6 @@ class TestCurrentScale:
         for name, turned in zip(names, found.turned, strict=True):
             assert any(name in text for text in negative) == turned
 
-    def test_an_undetermined_gain_has_no_wrong_sign(self) -> None:
+    def test_an_undetermined_gain_has_no_wrong_sign(self):
         std, inertial = np.array([np.inf, 0.1]), np.zeros(2, dtype=np.bool_)
         assert not CurrentScale(np.array([-1.0, 2.0]), std, inertial).turned.any()

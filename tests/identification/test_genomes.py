@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from itertools import pairwise
@@ -24,7 +22,6 @@ from identification.excitation.genomes import SineGenome, ViaPointGenome
 from planner import (
     FourierSeries,
     JointLimits,
-    PiecewiseCubic,
     WorkerProcess,
     check_limits,
     plan,
@@ -45,17 +42,17 @@ GENOMES = pytest.mark.parametrize(
 )
 
 
-def genes_of(genome, rows: int = 1) -> st.SearchStrategy[np.ndarray]:
+def genes_of(genome, rows=1):
     """Genes with frequent ends of their range."""
     one = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.0, 1.0))
     return arrays(np.float64, (rows, genome.n_genes), elements=one)
 
 
-def some_genes(genome, rows: int, seed: int = 5) -> np.ndarray:
+def some_genes(genome, rows, seed=5):
     return np.random.default_rng(seed).random((rows, genome.n_genes))
 
 
-def bits(motion: PiecewiseCubic | FourierSeries) -> bytes:
+def bits(motion):
     if isinstance(motion, FourierSeries):
         return motion.amplitude.tobytes() + motion.frequency.tobytes()
     return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
@@ -222,7 +219,7 @@ ROOMY = JointLimits(
 )
 
 
-def planned(seed: int, fly: float = 0.5) -> Excitation:
+def planned(seed, fly=0.5):
     random = np.random.default_rng(seed)
     points = random.uniform(ROOMY.lower, ROOMY.upper, (5, 3))
     speed = random.uniform(0.2, 1.0, 3)
@@ -239,7 +236,7 @@ def planned(seed: int, fly: float = 0.5) -> Excitation:
     )
 
 
-def sines(seed: int) -> Excitation:
+def sines(seed):
     random = np.random.default_rng(seed)
     amplitude, frequency = random.uniform(0.1, 1.0, (2, 3, 2))
     return Excitation(
@@ -252,7 +249,7 @@ def sines(seed: int) -> Excitation:
     )
 
 
-def through_json(excitation: Excitation) -> Excitation:
+def through_json(excitation):
     return Excitation.from_dict(json.loads(json.dumps(excitation.to_dict())))
 
 

@@ -1,25 +1,20 @@
 """Settings are chosen by predicting parts of the fitted data from the rest."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from identification.model.elements import TorqueRipple
-from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import (
     DELAY,
     LOW_PASS,
-    Choice,
     Question,
     Settings,
     choose_settings,
 )
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import LowPassShape, low_passed
 from tests.identification.two_link import MODEL, a_motion, truth
 
@@ -27,7 +22,7 @@ CAUSAL = LowPassShape(order=2, causal=True)
 CUT = 1400  # of 2000 rows: what is fitted
 
 
-def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> Recording:
+def a_recording(model=MODEL, values=None):
     """Simulate a motion of the arm with noise on torque and position."""
     motion = a_motion()
     direction = model.friction.direction(*motion[:3])
@@ -41,17 +36,10 @@ def a_recording(model: RobotModel = MODEL, values: np.ndarray | None = None) -> 
     )
 
 
-def chosen(
-    recording: Recording,
-    questions: set[Question],
-    *,
-    leaks: bool = False,
-    ripple: Sequence[TorqueRipple] = (),
-    low_passes: Sequence[Preprocessing] = (),
-) -> tuple[Settings, tuple[Choice, ...]]:
+def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=()):
     """Choose settings on the rows before CUT, or on all of them with a leak."""
 
-    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+    def ready(model, how):
         samples = prepare(recording, model, options=how)
         return [samples if leaks else samples.between(0, CUT)]
 
@@ -61,21 +49,21 @@ def chosen(
 
 class TestChosenSettings:
     @pytest.mark.parametrize("distance", [1e-4, 1e-3])
-    def test_the_true_presliding_is_found(self, distance: float) -> None:
+    def test_the_true_presliding_is_found(self, distance):
         recording = a_recording(MODEL.with_friction(presliding=distance))
         settings, _ = chosen(recording, {"presliding", "bandwidth"})
         assert settings.model.friction.laws[0].presliding == distance
 
-    def test_the_true_friction_term_is_found(self) -> None:
+    def test_the_true_friction_term_is_found(self):
         cubic = MODEL.with_friction(third="cubic")
         settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
         assert settings.model.friction.laws[0].third == "cubic"
 
-    def test_no_friction_term_is_added_without_cause(self) -> None:
+    def test_no_friction_term_is_added_without_cause(self):
         settings, _ = chosen(a_recording(), {"friction"})
         assert settings.model.friction.laws[0].third is None
 
-    def test_torque_ripple_is_estimated_only_if_present(self) -> None:
+    def test_torque_ripple_is_estimated_only_if_present(self):
         ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
         rippled = MODEL.with_elements(ripple)
         strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
@@ -85,11 +73,10 @@ class TestChosenSettings:
         assert settings.model.parameter_names == MODEL.parameter_names
 
     @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
-    def test_a_delay_is_not_called_a_low_pass(self, shape: LowPassShape | None, name: str) -> None:
+    def test_a_delay_is_not_called_a_low_pass(self, shape, name):
         """Delay and low-pass of equal lag each predict best where they are the cause."""
         recording = a_recording()
         time, torque = recording.time, recording.torque
-        assert torque is not None
         if shape is None:
             late = [np.interp(time - CAUSAL.lag(6.0), time, one) for one in torque.T]
             changed = replace(recording, torque=np.column_stack(late))
@@ -100,12 +87,12 @@ class TestChosenSettings:
         assert name in [one.name for one in choices if one.chosen]
         assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
 
-    def test_least_squares_stays_if_it_predicts_equally(self) -> None:
+    def test_least_squares_stays_if_it_predicts_equally(self):
         settings, choices = chosen(a_recording(), {"estimator"})
         assert settings.shrinkage.strength == 0.0
         assert choices[-1].candidates[choices[-1].chosen] == "least squares"
 
-    def test_a_joint_may_rest_in_some_segments(self) -> None:
+    def test_a_joint_may_rest_in_some_segments(self):
         """Joints that move one after the other have segments without rows."""
         recording = a_recording()
         position = recording.position.copy()
@@ -115,7 +102,7 @@ class TestChosenSettings:
         assert [one.name for one in choices][-1] == "estimator"
         assert all(np.isfinite(one.errors).all() for one in choices)
 
-    def test_other_settings_stay(self) -> None:
+    def test_other_settings_stay(self):
         start = Settings(MODEL, Preprocessing(rigid_bandwidth=33.0))
         settings, choices = choose_settings(lambda *_: [], start, set(), lambda *_: 1.0)
         assert settings == start
@@ -128,21 +115,20 @@ class TestHeldOutRows:
     QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "friction", "estimator"})
 
     @staticmethod
-    def corrupted(recording: Recording) -> Recording:
-        assert recording.torque is not None
+    def corrupted(recording):
         torque = recording.torque.copy()
         torque[CUT:] += 40.0 * np.sign(np.sin(7.0 * recording.time[CUT:, None]))
         return replace(recording, torque=torque)
 
-    def errors(self, recording: Recording, *, leaks: bool) -> list[tuple[float, ...]]:
+    def errors(self, recording, *, leaks):
         return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
 
-    def test_changing_them_has_no_effect(self) -> None:
+    def test_changing_them_has_no_effect(self):
         recording = a_recording()
         sound = self.errors(recording, leaks=False)
         assert sound == self.errors(self.corrupted(recording), leaks=False)
 
-    def test_a_leak_would_be_detected(self) -> None:
+    def test_a_leak_would_be_detected(self):
         recording = a_recording()
         sound = self.errors(recording, leaks=True)
         assert sound != self.errors(self.corrupted(recording), leaks=True)

@@ -1,34 +1,27 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators import instrumental
 from identification.estimators.instrumental import (
-    InstrumentalEstimate,
     estimate_instrumental,
     partial_r2,
     planned_motion,
     same_plan,
 )
 from identification.factor.factor import Factor
-from identification.factor.phases import PhaseFactor, instrument_factor, measured_part
+from identification.factor.phases import instrument_factor, measured_part
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 from identification.signals.smoothing import fit_smoothing_spline
-from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
+from identification.validation.endogeneity import endogeneity_test
 from tests.identification import two_link
 from tests.identification.two_link import URDF, as_samples, four_sines, truth
-
-Array = NDArray[np.float64]
 
 TRUTH = truth()
 STEP = 5e-3
@@ -42,9 +35,7 @@ MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, standstill=0
 PLAN = four_sines(TIME)
 
 
-def executed(
-    seed: int, *, position_noise: float = 0.0, correlation: float = 0.02, noise: float = 1.0
-) -> Samples:
+def executed(seed, *, position_noise=0.0, correlation=0.02, noise=1.0):
     """Return the plan followed within 2 %, with noisy encoders and a 40 Hz smoother."""
     rng, beside = np.random.default_rng(seed), four_sines(TIME, seed=13 + seed, size=0.02)
     true = Motion(TIME, *(a + b for a, b in zip(PLAN[1:4], beside[1:4], strict=True)))
@@ -57,30 +48,30 @@ def executed(
     return samples_of(true, torque)
 
 
-def smoothed(position: Array) -> Motion:
+def smoothed(position):
     """Smooth positions (m, n) by a spline of 40 Hz."""
     tolerance = np.full(position.shape[1], 1e-14)
     spline = fit_smoothing_spline(TIME, position, tolerance, widest=40.0)
     return Motion(TIME, *(spline(TIME, order) for order in range(3)))
 
 
-def samples_of(motion: Motion, torque: Array, arm: RobotModel = MODEL) -> Samples:
+def samples_of(motion, torque, arm=MODEL):
     usable = arm.moving(motion.velocity)
     usable[:50] = usable[-50:] = False
     return as_samples(arm, motion, torque, usable=usable, origin=float(motion.time[0]))
 
 
-def fit(samples: Samples, plan: Motion = PLAN) -> tuple[PhaseFactor, InstrumentalEstimate]:
+def fit(samples, plan=PLAN):
     factor = instrument_factor(MODEL, samples, plan)
     return factor, estimate_instrumental(MODEL, factor)
 
 
-def examine(samples: Samples) -> EndogeneityTest:
+def examine(samples):
     factor, result = fit(samples)
     return endogeneity_test(MODEL, factor, result)
 
 
-def dense(samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
+def dense(samples, plan=PLAN):
     """Return Z and W (m, n, p) and y (m, n), zero in unusable rows."""
     rows = samples.usable & MODEL.moving(plan.velocity)
     p = MODEL.n_parameters
@@ -92,14 +83,14 @@ def dense(samples: Samples, plan: Motion = PLAN) -> tuple[Array, Array, Array]:
     )
 
 
-def test_without_noise_the_true_values_are_found() -> None:
+def test_without_noise_the_true_values_are_found():
     _, result = fit(executed(0, noise=0.0))
     np.testing.assert_allclose(result.estimate.values, TRUTH, rtol=1e-6, atol=1e-7)
     assert result.estimate.undetermined == ()
     assert result.weak == ()
 
 
-def test_it_solves_the_weighted_instrumental_equations() -> None:
+def test_it_solves_the_weighted_instrumental_equations():
     samples = executed(1, position_noise=LARGE)
     z, w, y = dense(samples)
     weights = np.array([0.3, 20.0])
@@ -110,7 +101,7 @@ def test_it_solves_the_weighted_instrumental_equations() -> None:
     np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
 
 
-def test_with_large_position_noise_it_beats_least_squares() -> None:
+def test_with_large_position_noise_it_beats_least_squares():
     runs = [fit(executed(s, position_noise=LARGE))[1] for s in range(30)]
     instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
     least = np.array([run.least_squares.values for run in runs]) - TRUTH
@@ -124,7 +115,7 @@ def test_with_large_position_noise_it_beats_least_squares() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(correlation):
     covered = []
     for seed in range(60):
         samples = executed(seed, position_noise=1e-4, correlation=correlation)
@@ -133,7 +124,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None
     assert 0.90 <= np.mean(covered) <= 0.99
 
 
-def test_the_measured_part_is_the_least_squares_factor() -> None:
+def test_the_measured_part_is_the_least_squares_factor():
     samples = executed(1)
     factor = instrument_factor(MODEL, samples, PLAN)
     same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
@@ -144,7 +135,7 @@ def test_the_measured_part_is_the_least_squares_factor() -> None:
     np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
 
 
-def test_strength_is_sheas_partial_r2() -> None:
+def test_strength_is_sheas_partial_r2():
     samples = executed(1, position_noise=LARGE)
     z, w, y = dense(samples)
     rows = [part.reshape(-1, MODEL.n_parameters) for part in (z, w)]
@@ -161,14 +152,14 @@ def test_strength_is_sheas_partial_r2() -> None:
         assert strength[k] == pytest.approx((apart[1] @ apart[1]) / (apart[0] @ apart[0]), rel=1e-5)
 
 
-def test_unrelated_instruments_are_weak() -> None:
+def test_unrelated_instruments_are_weak():
     samples = executed(1)
     factor, result = fit(samples, four_sines(TIME, seed=99))
     assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
     assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
 
-def test_a_resting_instrument_determines_nothing() -> None:
+def test_a_resting_instrument_determines_nothing():
     still = PLAN._replace(
         velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
     )
@@ -178,13 +169,13 @@ def test_a_resting_instrument_determines_nothing() -> None:
     assert {"f0_2", "f1_2"} <= set(result.weak)
 
 
-def test_without_noise_a_5_percent_test_rejects_3_to_8() -> None:
+def test_without_noise_a_5_percent_test_rejects_3_to_8():
     runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
     assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
     assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
 
 
-def test_large_noise_is_reported_as_bias() -> None:
+def test_large_noise_is_reported_as_bias():
     for seed in range(5):
         test = examine(executed(seed, position_noise=LARGE))
         assert test.biased
@@ -202,16 +193,14 @@ def test_large_noise_is_reported_as_bias() -> None:
         (LARGE, True, True, "Use the instrumental variables"),
     ],
 )
-def test_the_size_of_the_bias_is_reported(
-    noise: float, biased: bool, matters: bool, words: str
-) -> None:
+def test_the_size_of_the_bias_is_reported(noise, biased, matters, words):
     test = examine(executed(0, position_noise=noise))
     assert (test.biased, test.matters) == (biased, matters)
     assert (test.predicted.max() < 0.005) == (not matters)
     assert words in test.words
 
 
-def test_instruments_equal_to_the_motion_are_untested() -> None:
+def test_instruments_equal_to_the_motion_are_untested():
     samples = executed(0, position_noise=SMALL)
     factor, result = fit(samples, samples.motion)
     test = endogeneity_test(MODEL, factor, result)
@@ -223,7 +212,7 @@ def test_instruments_equal_to_the_motion_are_untested() -> None:
     )
 
 
-def test_the_statistic_is_that_of_the_refitted_regression() -> None:
+def test_the_statistic_is_that_of_the_refitted_regression():
     samples = executed(3, position_noise=1e-4)
     factor, result = fit(samples)
     test = endogeneity_test(MODEL, factor, result)
@@ -257,7 +246,7 @@ def test_the_statistic_is_that_of_the_refitted_regression() -> None:
 
 @settings(max_examples=10)
 @given(st.floats(0.002, 0.2), st.floats(0.002, 0.2))
-def test_the_plan_is_shifted_by_the_lag_of_each_axis(shoulder: float, elbow: float) -> None:
+def test_the_plan_is_shifted_by_the_lag_of_each_axis(shoulder, elbow):
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
     late = [
         np.column_stack(
@@ -277,7 +266,7 @@ def test_the_plan_is_shifted_by_the_lag_of_each_axis(shoulder: float, elbow: flo
     assert instruments.usable[inside].all()
 
 
-def test_a_known_lag_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_lag_is_used(monkeypatch):
     samples = executed(0)
     found = planned_motion(samples, PLAN.position)
     monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
@@ -286,7 +275,7 @@ def test_a_known_lag_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(again.usable, found.usable)
 
 
-def test_repetitions_share_a_plan_for_any_clock() -> None:
+def test_repetitions_share_a_plan_for_any_clock():
     plan = TIME, PLAN.position
     spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
     later, half = TIME[20:-20] + 0.3 * STEP, len(TIME) // 2
@@ -298,7 +287,7 @@ def test_repetitions_share_a_plan_for_any_clock() -> None:
     assert not any(same_plan(plan, (TIME, other)) for other in others)
 
 
-def test_missing_commands() -> None:
+def test_missing_commands():
     samples, command = executed(0), PLAN.position.copy()
     command[300:340, 1] = np.nan
     instruments = planned_motion(samples, command)

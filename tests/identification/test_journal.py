@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import errno
 import io
 import os
@@ -14,18 +12,18 @@ from identification.excitation.searches.scores import ROW, unplanned
 SEARCH = {"settings": {"seed": 1, "population": 4}, "cell": {"urdf": "a"}}
 
 
-def generation(seed: int, count: int = 4) -> tuple[np.ndarray, Scores]:
+def generation(seed, count=4):
     random = np.random.default_rng(seed)
     rows = random.normal(size=(count, ROW))
     rows[1] = unplanned()
     return random.random((count, 8)), Scores.of_rows(rows)
 
 
-def opened(file: io.BytesIO) -> Journal:
+def opened(file):
     return Journal(file, SEARCH)
 
 
-def written(count: int) -> tuple[io.BytesIO, list[int]]:
+def written(count):
     """Return a journal of some generations, and its lengths, first without any."""
     file = io.BytesIO()
     journal = opened(file)
@@ -36,7 +34,7 @@ def written(count: int) -> tuple[io.BytesIO, list[int]]:
     return file, lengths
 
 
-def known(file: io.BytesIO) -> int:
+def known(file):
     """Return the number of generations in a journal, each bit for bit."""
     journal = opened(file)
     count = 0

@@ -1,7 +1,5 @@
 """A low-pass in the recorded torque is found for each shape."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +8,9 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Factor, estimate
-from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Question, Settings, choose_settings
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, Samples, prepare
+from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
 from tests.identification.two_link import MODEL, NOISE, a_motion, truth
 
@@ -23,7 +20,7 @@ BANDWIDTH = 3.0  # Hz
 QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
 
 
-def a_recording(shape: LowPassShape | None, *, seed: int = 0) -> Recording:
+def a_recording(shape, *, seed=0):
     """Simulate a motion with noisy torque through a Butterworth low-pass."""
     motion, rng = a_motion(4000 / RATE), np.random.default_rng(seed)
     torque = MODEL.torque(truth(), *motion[1:4])
@@ -36,20 +33,20 @@ def a_recording(shape: LowPassShape | None, *, seed: int = 0) -> Recording:
     return Recording(motion.time, position, MODEL.joint_names, torque)
 
 
-def chosen(recording: Recording) -> Settings:
+def chosen(recording):
     """Choose settings on the rows before CUT."""
     fitted = recording.between(0, CUT)
 
-    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+    def ready(model, how):
         return [prepare(fitted, model, options=how)]
 
-    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+    def low_passes(model, how):
         return possible_low_passes(fitted, model, options=how)
 
     return choose_settings(ready, Settings(MODEL, Preprocessing()), QUESTIONS, low_passes)[0]
 
 
-def held_out_error(recording: Recording, settings: Settings) -> float:
+def held_out_error(recording, settings):
     """Return ||tau - tau_hat|| / ||tau|| after CUT."""
     model = settings.model
     fitted, rest = (
@@ -62,7 +59,7 @@ def held_out_error(recording: Recording, settings: Settings) -> float:
 
 
 @pytest.fixture(scope="module")
-def unfiltered_error() -> float:
+def unfiltered_error():
     recording = a_recording(None)
     return held_out_error(recording, chosen(recording))
 
@@ -72,7 +69,7 @@ class TestPlantedLowPass:
 
     @pytest.mark.parametrize("causal", [False, True])
     @pytest.mark.parametrize("order", [1, 2, 4])
-    def test_it_is_found(self, order: int, causal: bool, unfiltered_error: float) -> None:
+    def test_it_is_found(self, order, causal, unfiltered_error):
         recording = a_recording(LowPassShape(order, causal))
         settings = chosen(recording)
         assert settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
@@ -84,7 +81,7 @@ class TestNoLowPass:
     """Unfiltered torque is used as it is."""
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_none_is_found(self, seed: int) -> None:
+    def test_none_is_found(self, seed):
         assert chosen(a_recording(None, seed=seed)).preprocessing.torque_bandwidth is None
 
 
@@ -92,14 +89,14 @@ class TestLowPassShape:
     """Gain at the bandwidth: 1/2 without phase, 1/sqrt(2) if causal."""
 
     @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
-    def test_gain_at_the_bandwidth(self, shape: LowPassShape) -> None:
+    def test_gain_at_the_bandwidth(self, shape):
         time = np.arange(4000) / RATE
         sine = np.sin(2.0 * np.pi * BANDWIDTH * time)[:, None]
         inner = low_passed(time, sine, BANDWIDTH, shape)[1000:3000]
         gain = inner.std() / sine[1000:3000].std()
         assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
 
-    def test_uneven_times_are_interpolated(self) -> None:
+    def test_uneven_times_are_interpolated(self):
         time = np.arange(4000) / RATE
         uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
         shape = LowPassShape(order=2, causal=True)
@@ -108,7 +105,7 @@ class TestLowPassShape:
         expected = np.interp(uneven, time, smooth[:, 0])
         assert found[500:-10, 0] == pytest.approx(expected[500:-10], abs=2e-3)
 
-    def test_samples_filter_their_regressor_by_it(self) -> None:
+    def test_samples_filter_their_regressor_by_it(self):
         shape = LowPassShape(order=1, causal=True)
         how = Preprocessing(torque_bandwidth=BANDWIDTH, torque_shape=shape)
         samples = prepare(a_recording(None), MODEL, options=how)

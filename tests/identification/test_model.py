@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pickle
 from xml.etree import ElementTree
 
@@ -8,7 +6,6 @@ import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.export.urdf import write_urdf
@@ -32,16 +29,14 @@ from tests.identification.two_link import URDF as TWO_LINK
 TILTED = (2.0, -3.0, -9.0)
 
 
-def inverse_dynamics(
-    urdf: str, gravity: tuple[float, ...], q: np.ndarray, qd: np.ndarray, qdd: np.ndarray
-) -> np.ndarray:
+def inverse_dynamics(urdf, gravity, q, qd, qdd):
     """Return pinocchio's torques of the rigid bodies."""
     model = pin.buildModelFromXML(urdf)
     model.gravity.linear = np.array(gravity)
     data = model.createData()
     torque = np.empty(q.shape)
     for sample in range(len(q)):
-        configuration: list[float] = []
+        configuration = []
         for joint, angle in zip(list(model.joints)[1:], q[sample], strict=True):
             # pinocchio writes a continuous joint as a point on the circle
             configuration += [np.cos(angle), np.sin(angle)] if joint.nq == 2 else [angle]
@@ -59,7 +54,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_torque_is_pinocchios_plus_rotors_plus_friction(case: str) -> None:
+def test_torque_is_pinocchios_plus_rotors_plus_friction(case):
     make, gravity = CASES[case]
     urdf = make()
     law = FrictionLaw(third="cubic", offset="random" not in case)
@@ -81,7 +76,7 @@ def test_torque_is_pinocchios_plus_rotors_plus_friction(case: str) -> None:
     assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
 
 
-def test_the_ns16_has_40_base_and_18_friction_parameters() -> None:
+def test_the_ns16_has_40_base_and_18_friction_parameters():
     model = RobotModel.from_urdf(urdf_text())
     assert model.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
     assert model.n_parameters == len(model.units) == 58
@@ -96,14 +91,14 @@ def test_the_ns16_has_40_base_and_18_friction_parameters() -> None:
     assert unit["f1_6"] == "N·m·s/rad"
 
 
-def test_a_prismatic_joint_has_linear_units() -> None:
+def test_a_prismatic_joint_has_linear_units():
     model = RobotModel.from_urdf(slider("1 0 0"))
     assert model.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
     assert model.units == ("kg", "N", "N·s/m", "N·s²/m²")
     assert model.base.expressions() == ("m1 + I1m",)
 
 
-def test_a_pickled_model_gives_the_same_torque() -> None:
+def test_a_pickled_model_gives_the_same_torque():
     model = RobotModel.from_urdf(urdf_text())
     q, qd, qdd = np.random.default_rng(0).normal(size=(3, 10, 6))
     values = np.arange(58.0)
@@ -112,11 +107,11 @@ def test_a_pickled_model_gives_the_same_torque() -> None:
     assert np.array_equal(again.torque(values, q, qd, qdd), before)
 
 
-def slider(axis: str) -> str:
+def slider(axis):
     return one_joint("prismatic", axis)
 
 
-def followed(urdf: str) -> str:
+def followed(urdf):
     """Return a description with another joint after its last link."""
     return urdf.replace("</robot>", "") + (
         '<link name="c"/><joint name="turns" type="continuous"><parent link="b"/>'
@@ -142,13 +137,13 @@ BOTH = {"shoulder": 0.0, "elbow": 0.0}
         *((text, {"strange": 0.5}, "'strange' has an <axis> of length") for text in STILL.values()),
     ],
 )
-def test_invalid_descriptions_are_refused(text: str, locked: dict[str, float], words: str) -> None:
+def test_invalid_descriptions_are_refused(text, locked, words):
     with pytest.raises(ModelError, match=words) as caught:
         RobotModel.from_urdf(text, locked=locked)
     assert caught.value.joint == ("strange" if "'strange'" in words else caught.value.joint)
 
 
-def test_an_offset_equal_to_a_weight_is_refused() -> None:
+def test_an_offset_equal_to_a_weight_is_refused():
     law = FrictionLaw(offset=True)
     with pytest.raises(ModelError, match=r"'strange'.*offset"):
         RobotModel.from_urdf(slider("0 0 1"), friction=law)
@@ -159,7 +154,7 @@ def test_an_offset_equal_to_a_weight_is_refused() -> None:
     assert RobotModel.from_urdf(slider("1 0 0"), friction=law).n_parameters == 5
 
 
-def test_arrays_of_the_wrong_shape_are_refused_by_name() -> None:
+def test_arrays_of_the_wrong_shape_are_refused_by_name():
     model = RobotModel.from_urdf(urdf_text())
     good, short = np.zeros((5, 6)), np.zeros((4, 6))
     with pytest.raises(ShapeError, match=r"qd has shape \(4, 6\), expected \(5, 6\)"):
@@ -174,7 +169,7 @@ PAIRS = ((0, 1), (1, 3))
 LAYOUT = StandardLayout((True, False, True, False), rotor_inertia=True, pairs=PAIRS)
 
 
-def test_parameters_of_a_layout_have_indices_and_units() -> None:
+def test_parameters_of_a_layout_have_indices_and_units():
     """Joint by joint, couplings last; rotors of prismatic joints have mass."""
     assert LAYOUT.size == len(LAYOUT.names) == len(LAYOUT.units) == 46
     assert LAYOUT.names[22:33] == (
@@ -195,7 +190,7 @@ def test_parameters_of_a_layout_have_indices_and_units() -> None:
     assert len(set(many.names)) == many.size
 
 
-def test_the_rotors_make_a_symmetric_matrix() -> None:
+def test_the_rotors_make_a_symmetric_matrix():
     matrix = LAYOUT.rotor_matrix(np.arange(46.0))
     assert np.array_equal(matrix, matrix.T)
     assert np.array_equal(np.diag(matrix), [10.0, 21.0, 32.0, 43.0])
@@ -210,12 +205,12 @@ def test_the_rotors_make_a_symmetric_matrix() -> None:
 FINGERS = {"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.03}
 
 
-def panda() -> str:
+def panda():
     return robot_text("panda_description/urdf/panda.urdf")
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
+def test_a_locked_joint_equals_one_at_rest(seed):
     """Torques of the other joints agree with constant positions of the locked ones."""
     urdf = random_urdf(seed)
     whole = RobotModel.from_urdf(urdf)
@@ -224,7 +219,7 @@ def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
     model = RobotModel.from_urdf(urdf, locked=held)
     assert model.joint_names == tuple(n for n in whole.joint_names if n not in held)
 
-    def values(of: RobotModel) -> np.ndarray:
+    def values(of):
         return np.append(of.base.grouping @ of.nominal, np.zeros(len(of.friction.terms)))
 
     q, qd, qdd = random.uniform(-2.0, 2.0, (3, 20, model.n_joints))
@@ -237,17 +232,16 @@ def test_a_locked_joint_equals_one_at_rest(seed: int) -> None:
     np.testing.assert_allclose(model.torque(values(model), q, qd, qdd), expected, atol=1e-9)
 
 
-def text(element: ElementTree.Element | None) -> str:
-    assert element is not None
+def text(element):
     return ElementTree.tostring(element, encoding="unicode")
 
 
-def inertials(urdf: str) -> dict[str, ElementTree.Element | None]:
+def inertials(urdf):
     links = ElementTree.fromstring(urdf).findall("link")
     return {link.get("name", ""): link.find("inertial") for link in links}
 
 
-def test_written_urdf_keeps_locked_joints() -> None:
+def test_written_urdf_keeps_locked_joints():
     urdf = panda()
     model = RobotModel.from_urdf(urdf, locked=FINGERS)
     standard = model.nominal
@@ -266,7 +260,7 @@ def test_written_urdf_keeps_locked_joints() -> None:
     assert left == pin.buildModelFromXML(urdf).inertias[8].mass > 0.0
 
 
-def test_locked_links_are_merged_if_the_rest_is_inconsistent() -> None:
+def test_locked_links_are_merged_if_the_rest_is_inconsistent():
     urdf = panda()
     model = RobotModel.from_urdf(urdf, locked=FINGERS)
     standard = some_bodies(7)
@@ -277,7 +271,7 @@ def test_locked_links_are_merged_if_the_rest_is_inconsistent() -> None:
     np.testing.assert_allclose(again, standard[model.layout.links], atol=1e-8)
 
 
-def test_a_joint_may_have_the_name_of_a_link() -> None:
+def test_a_joint_may_have_the_name_of_a_link():
     """As in the gripper of the SO-100."""
     named = TWO_LINK.replace('joint name="elbow"', 'joint name="lower"')
     assert '<link name="lower"' in named
@@ -287,17 +281,15 @@ def test_a_joint_may_have_the_name_of_a_link() -> None:
     assert set(model.chain.frames) == set(same.chain.frames)
 
 
-Array = NDArray[np.float64]
-
 seeds = st.integers(0, 2**32 - 1)
 
 
-def point_masses(seed: int, count: int = 8) -> tuple[Array, Array]:
+def point_masses(seed, count=8):
     rng = np.random.default_rng(seed)
     return rng.uniform(0.1, 2.0, count), rng.normal(size=(count, 3))
 
 
-def of_points(masses: Array, places: Array) -> Array:
+def of_points(masses, places):
     """Return inertial parameters by definition: sums over point masses."""
     tensor = sum(
         m * ((p @ p) * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
@@ -307,7 +299,7 @@ def of_points(masses: Array, places: Array) -> Array:
 
 
 @given(seeds)
-def test_it_is_the_matrix_of_second_moments_of_the_mass(seed: int) -> None:
+def test_it_is_the_matrix_of_second_moments_of_the_mass(seed):
     masses, places = point_masses(seed)
     homogeneous = np.column_stack([places, np.ones(len(places))])
     expected = np.einsum("i,ij,ik->jk", masses, homogeneous, homogeneous)
@@ -315,7 +307,7 @@ def test_it_is_the_matrix_of_second_moments_of_the_mass(seed: int) -> None:
 
 
 @given(seeds)
-def test_consistent_bodies_satisfy_the_triangle_inequalities(seed: int) -> None:
+def test_consistent_bodies_satisfy_the_triangle_inequalities(seed):
     """Of the tensor about the centre of mass."""
     rng = np.random.default_rng(seed)
     moments = rng.uniform(0.05, 1.0, 3)
@@ -326,7 +318,7 @@ def test_consistent_bodies_satisfy_the_triangle_inequalities(seed: int) -> None:
 
 
 @given(seeds)
-def test_body_and_parameters_are_those_of_pinocchio(seed: int) -> None:
+def test_body_and_parameters_are_those_of_pinocchio(seed):
     inertial = of_points(*point_masses(seed))
     found = body(inertial)
     expected = pin.Inertia(found.mass, found.centre, found.inertia)
@@ -338,7 +330,7 @@ def test_body_and_parameters_are_those_of_pinocchio(seed: int) -> None:
 STEPS = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.4]])
 
 
-def a_link(moments: tuple[float, float, float], mass: float = 2.0) -> Array:
+def a_link(moments, mass=2.0):
     return inertial_parameters(Body(mass, np.array([0.1, 0.0, 0.2]), np.diag(moments)))
 
 
@@ -348,9 +340,7 @@ SOUND, FLAT, POINT = (0.1, 0.1, 0.02), (0.001, 0.002, 0.02), (0.0, 0.0, 0.0)
 @pytest.mark.parametrize(
     ("moments", "words"), [(SOUND, AS_GIVEN), (FLAT, MADE_POSSIBLE), (POINT, MADE_POSSIBLE)]
 )
-def test_reference_bodies_use_consistent_parts_of_a_link(
-    moments: tuple[float, float, float], words: str
-) -> None:
+def test_reference_bodies_use_consistent_parts_of_a_link(moments, words):
     """All of a consistent link, mass and centre of an inconsistent one."""
     links = np.array([a_link(moments), a_link(SOUND), np.zeros(10)])
     found = reference_bodies(links, STEPS)
@@ -363,7 +353,7 @@ def test_reference_bodies_use_consistent_parts_of_a_link(
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_reference_bodies_are_consistent(seed: int) -> None:
+def test_reference_bodies_are_consistent(seed):
     rng = np.random.default_rng(seed)
     links = rng.normal(size=(3, 10)) * 10.0 ** rng.uniform(-3, 3, (3, 1))
     links[rng.random(3) < 0.3] = 0.0

@@ -1,9 +1,6 @@
 """Criteria of motions, objective of a search, scale and Pareto front."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -38,22 +35,22 @@ P = MODEL.n_parameters
 seeds = st.integers(0, 999)
 
 
-def some_motion(seed: int, n_via: int = 5):
+def some_motion(seed, n_via=5):
     via = np.random.default_rng(seed).uniform(-2.4, 2.4, (n_via, 2))
     return plan(via, LIMITS, fly=0.5)
 
 
-def rows_of(motion, *, moving: bool = False) -> np.ndarray:
+def rows_of(motion, *, moving=False):
     """Phi of one motion: a row per sample and joint, of all or of those that move."""
     rows = MODEL.regressor(*motion[1:]).dense(P).reshape(-1, P)
     return rows[MODEL.moving(motion.velocity).ravel()] if moving else rows
 
 
-def share_of_period(motion) -> float:
+def share_of_period(motion):
     return float(motion.time[1] - motion.time[0]) / SAMPLE_PERIOD
 
 
-def assert_measures(found: Mapping[str, float], columns: np.ndarray, n_samples: int) -> None:
+def assert_measures(found, columns, n_samples):
     """Eqs. 9 and 5 from numpy's QR of Phi itself, which squares no condition number."""
     r = np.linalg.qr(columns, mode="r")
     determinant = 2.0 * np.log10(np.abs(np.diag(r))).sum() - r.shape[1] * math.log10(n_samples)
@@ -70,7 +67,7 @@ def assert_measures(found: Mapping[str, float], columns: np.ndarray, n_samples: 
 
 @given(seed=seeds, chosen=st.sets(st.integers(0, P - 1), min_size=1))
 @settings(max_examples=20, deadline=None)
-def test_measures_are_of_the_chosen_weighted_columns(seed: int, chosen: set[int]) -> None:
+def test_measures_are_of_the_chosen_weighted_columns(seed, chosen):
     motion, random = midpoints(some_motion(seed)), np.random.default_rng(seed)
     order, weights = random.permutation(sorted(chosen)), random.uniform(0.1, 4.0, 2)
     columns = rows_of(motion)
@@ -82,7 +79,7 @@ def test_measures_are_of_the_chosen_weighted_columns(seed: int, chosen: set[int]
     assert_measures(found, weighted, motion.n_samples)
 
 
-def test_criteria_are_the_measures_and_more() -> None:
+def test_criteria_are_the_measures_and_more():
     trajectory = some_motion(3)
     motion = midpoints(trajectory)
     criteria = Objective(MODEL).criteria(trajectory, SAMPLE_PERIOD)
@@ -97,7 +94,7 @@ def test_criteria_are_the_measures_and_more() -> None:
 # Sequential design.
 
 
-def earlier_of(trajectory) -> dict:
+def earlier_of(trajectory):
     """Information of a motion sampled every SAMPLE_PERIOD, to the last digit."""
     motion = midpoints(trajectory)
     columns = rows_of(motion, moving=True)
@@ -107,7 +104,7 @@ def earlier_of(trajectory) -> dict:
 
 @given(seed=seeds, repetitions=st.integers(1, 30))
 @settings(max_examples=20, deadline=None)
-def test_earlier_archives_and_repetitions_add_up(seed: int, repetitions: int) -> None:
+def test_earlier_archives_and_repetitions_add_up(seed, repetitions):
     earlier = earlier_of(some_motion(seed))
     before, after = midpoints(some_motion(seed)), midpoints(some_motion(seed + 1000))
     objective = Objective(MODEL, **earlier, repetitions=repetitions)
@@ -120,7 +117,7 @@ def test_earlier_archives_and_repetitions_add_up(seed: int, repetitions: int) ->
     assert_measures(objective.measures(after), stacked, earlier["earlier_samples"])
 
 
-def assert_more(gram: np.ndarray, other: np.ndarray) -> None:
+def assert_more(gram, other):
     """Check that no combination of parameters has less information."""
     scale = np.sqrt(np.diag(gram))
     assert np.linalg.eigvalsh((gram - other) / scale / scale[:, None])[0] >= -1e-12
@@ -128,9 +125,7 @@ def assert_more(gram: np.ndarray, other: np.ndarray) -> None:
 
 @given(seed=seeds, share=st.floats(0.05, 0.95), repetitions=st.integers(1, 30))
 @settings(max_examples=40, deadline=None)
-def test_additional_information_never_lowers_the_criterion(
-    seed: int, share: float, repetitions: int
-) -> None:
+def test_additional_information_never_lowers_the_criterion(seed, share, repetitions):
     """A motion and its beginning, which may have more information per second."""
     known = earlier_of(some_motion(seed))
     known = {name: 30 * value for name, value in known.items()}
@@ -146,7 +141,7 @@ def test_additional_information_never_lowers_the_criterion(
     assert often.measures(motion)["log10_det"] > more
 
 
-def test_rows_at_rest_are_left_out_in_sequential_design_only() -> None:
+def test_rows_at_rest_are_left_out_in_sequential_design_only():
     motion = midpoints(plan([[0.0, 0.5], [1.0, 0.5], [-1.0, 0.5]], LIMITS))  # the elbow rests
     alone = Objective(MODEL).information(motion)
     beside = Objective(MODEL, earlier=np.zeros((P, P)), earlier_samples=1).information(motion)
@@ -157,7 +152,7 @@ def test_rows_at_rest_are_left_out_in_sequential_design_only() -> None:
     assert np.trace(alone) > np.trace(beside) / share_of_period(motion)
 
 
-def test_the_sample_period_does_not_change_the_weight() -> None:
+def test_the_sample_period_does_not_change_the_weight():
     trajectory = some_motion(7, n_via=12)
     known = earlier_of(trajectory)
     n_earlier = known["earlier_samples"]
@@ -175,7 +170,7 @@ def test_the_sample_period_does_not_change_the_weight() -> None:
 
 @given(seed=seeds, period=st.floats(1e-3, 5e-2))
 @settings(max_examples=50, deadline=None)
-def test_samples_are_uniform_at_ends_or_in_the_middle(seed: int, period: float) -> None:
+def test_samples_are_uniform_at_ends_or_in_the_middle(seed, period):
     trajectory = some_motion(seed)
     ends, middles = sampled(trajectory, period), midpoints(trajectory, period)
     steps = np.diff(ends.time)
@@ -193,7 +188,7 @@ def test_samples_are_uniform_at_ends_or_in_the_middle(seed: int, period: float) 
 @pytest.mark.parametrize(
     ("length", "period", "steps"), [(16.0, 0.001, 16000), (16.0, 0.008, 2000), (8.008, 0.008, 1001)]
 )
-def test_whole_periods_get_no_further_sample(length: float, period: float, steps: int) -> None:
+def test_whole_periods_get_no_further_sample(length, period, steps):
     """The paper's N is 2000; 8.008 s over 8 ms is more than 1001 by rounding."""
     swing = FourierSeries(np.zeros(2), np.ones((2, 1)), np.ones((2, 1)), length)
     assert sampled(swing, period).n_samples == steps + 1
@@ -203,16 +198,16 @@ def test_whole_periods_get_no_further_sample(length: float, period: float, steps
 HAND = np.array([[2.0, 1.0], [1.0, 3.0]])  # det = 5, inverse [[3, -1], [-1, 2]] / 5
 
 
-def random_columns(seed: int, rows: int = 40, p: int = 5) -> np.ndarray:
+def random_columns(seed, rows=40, p=5):
     random = np.random.default_rng(seed)
     return random.normal(size=(rows, p)) @ random.normal(size=(p, p))
 
 
-def gram_of(columns: np.ndarray) -> np.ndarray:
+def gram_of(columns):
     return columns.T @ columns
 
 
-def test_a_small_case_by_hand() -> None:
+def test_a_small_case_by_hand():
     found = Criteria.of_gram(HAND, 10)
     assert found.log10_det == pytest.approx(math.log10(5.0 / 10.0**2), abs=1e-14)
     assert found.coupling_index == pytest.approx(1.0 / math.sqrt(6.0), abs=1e-14)
@@ -223,7 +218,7 @@ def test_a_small_case_by_hand() -> None:
     assert tuple(CRITERIA) == ("log10_det", "coupling_index")
 
 
-def test_a_determinant_beyond_floats_has_a_logarithm() -> None:
+def test_a_determinant_beyond_floats_has_a_logarithm():
     gram = np.diag(np.full(58, 1e9))
     with np.errstate(over="ignore"):
         assert np.linalg.det(gram) == np.inf
@@ -238,14 +233,14 @@ def test_a_determinant_beyond_floats_has_a_logarithm() -> None:
         np.full((3, 3), np.nan),
     ],
 )
-def test_a_singular_matrix_ranks_last(gram: np.ndarray) -> None:
+def test_a_singular_matrix_ranks_last(gram):
     expected = Criteria(-np.inf, np.inf, -np.inf, 10, np.inf, np.inf)
     assert Criteria.of_gram(gram, 10) == expected
     assert np.isnan(correlation(gram)).all()
 
 
 @pytest.mark.parametrize("p", [2, 5, 12])
-def test_fully_correlated_errors_reach_the_largest_coupling(p: int) -> None:
+def test_fully_correlated_errors_reach_the_largest_coupling(p):
     assert coupling_index_max(58) == 1653.0
     together = np.linspace(1.0, 2.0, p) * (-1.0) ** np.arange(p)
     apart = 1e-7
@@ -256,7 +251,7 @@ def test_fully_correlated_errors_reach_the_largest_coupling(p: int) -> None:
 
 
 @given(seed=st.integers(0, 99))
-def test_the_coupling_index_sums_the_correlations(seed: int) -> None:
+def test_the_coupling_index_sums_the_correlations(seed):
     gram = gram_of(random_columns(seed))
     matrix = correlation(gram)
     assert np.array_equal(matrix, matrix.T)
@@ -267,7 +262,7 @@ def test_the_coupling_index_sums_the_correlations(seed: int) -> None:
     assert index <= coupling_index_max(5)
 
 
-def test_criteria_agree_at_8_ms_and_1_ms() -> None:
+def test_criteria_agree_at_8_ms_and_1_ms():
     """Section 3.2 on a planned motion of six joints through eight points."""
     velocity, model = NS16_VELOCITY, RobotModel.from_urdf(urdf_text())
     limits = JointLimits([-2.8] * 6, [2.8] * 6, velocity, velocity / 0.3, velocity / 0.3 / 0.1)

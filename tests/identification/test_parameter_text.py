@@ -1,13 +1,9 @@
 """Files for other tools: every number comes back, and no name or gap in the data breaks them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +22,6 @@ from identification.export.friction import friction_source, friction_text
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.factor.factor import estimate
 from identification.model.coupling import Coupling
-from identification.model.friction import ThirdTerm
 from tests.identification.two_link import URDF
 
 PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}
@@ -35,7 +30,7 @@ Fit = tuple[RobotModel, Estimate, ConsistentEstimate]
 
 
 @pytest.fixture(scope="module")
-def fit() -> Fit:
+def fit():
     model = RobotModel.from_urdf(URDF, friction=DRY)
     rng = np.random.default_rng(0)
     q, qd, qdd = rng.normal(size=(3, 300, 2))
@@ -46,12 +41,12 @@ def fit() -> Fit:
     return model, found, consistent_estimate(model, factor, found)
 
 
-def table(text: str) -> list[dict[str, str]]:
+def table(text):
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 
 class TestParameters:
-    def test_json_restores_every_number(self, fit: Fit) -> None:
+    def test_json_restores_every_number(self, fit):
         model, found, consistent = fit
         text = parameters_json(model, found, consistent=consistent, provenance=PROVENANCE)
         read = json.loads(text)
@@ -66,7 +61,7 @@ class TestParameters:
         assert [link["rotor_inertia"] for link in links] == consistent.standard[[10, 21]].tolist()
         assert links[1]["friction"] == {"f0": consistent.friction[1], "f1": consistent.friction[3]}
 
-    def test_json_has_texts_for_undetermined_values(self, fit: Fit) -> None:
+    def test_json_has_texts_for_undetermined_values(self, fit):
         model, found, _ = fit
         covariance = found.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0
@@ -76,7 +71,7 @@ class TestParameters:
         assert read["parameters"][0]["std"] == read["condition"] == "Infinity"
         assert (read["undetermined"], read["standard"]) == (["I1yy"], None)
 
-    def test_csv_restores_values_and_covariance(self, fit: Fit) -> None:
+    def test_csv_restores_values_and_covariance(self, fit):
         model, found, _ = fit
         text = parameters_csv(model, found, provenance=PROVENANCE)
         assert "# recording: run_1.mcap sha256 0a1b" in text.splitlines()
@@ -87,7 +82,7 @@ class TestParameters:
         np.testing.assert_array_equal(covariance, found.covariance)
 
     @pytest.mark.parametrize("evil", ["=LINK('a')", "@SUM(1)", "-1+1", "+1", " =1", "a;#b"])
-    def test_no_name_is_a_formula_or_breaks_its_row(self, fit: Fit, evil: str) -> None:
+    def test_no_name_is_a_formula_or_breaks_its_row(self, fit, evil):
         _, _, consistent = fit
         model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=DRY)
         text = standard_csv(model, consistent, provenance={"archives": "a,=1+1.mcap;@b, -3"})
@@ -100,27 +95,25 @@ class TestParameters:
         assert "a,'=1+1.mcap;'@b, -3" in text
 
     @pytest.mark.parametrize("write", [parameters_json, parameters_csv])
-    def test_parameters_of_another_model_are_refused(
-        self, fit: Fit, write: Callable[..., str]
-    ) -> None:
+    def test_parameters_of_another_model_are_refused(self, fit, write):
         with pytest.raises(IdentificationError):
             write(RobotModel.from_urdf(URDF), fit[1])
 
 
-def in_source(model: RobotModel, coefficients: np.ndarray) -> dict[str, Any]:
+def in_source(model, coefficients):
     """Names that the source of a model's friction defines."""
-    namespace: dict[str, Any] = {}
+    namespace = {}
     exec(friction_source(model, coefficients), namespace)
     return namespace
 
 
-def with_law(law: FrictionLaw = DRY, **options: Any) -> RobotModel:
+def with_law(law=DRY, **options):
     return RobotModel.from_urdf(URDF, friction=law, **options)
 
 
 class TestFrictionSource:
     @pytest.mark.parametrize("tanh", [None, 0.02])
-    def test_it_has_every_term_and_coupled_motors(self, tanh: float | None) -> None:
+    def test_it_has_every_term_and_coupled_motors(self, tanh):
         model = with_law(
             FrictionLaw(asymmetric=True, stribeck=0.4, zone="linear", standstill=0.1),
             joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", tanh=tanh)},
@@ -135,7 +128,7 @@ class TestFrictionSource:
             assert torques([float(v) for v in speeds]) == pytest.approx(list(expected))
             assert torques(speeds) == pytest.approx(list(expected))  # an array will do
 
-    def test_smooth_friction_has_no_jump_at_zero_speed(self) -> None:
+    def test_smooth_friction_has_no_jump_at_zero_speed(self):
         friction = in_source(with_law(), np.array([4.0, 2.0, 1.5, 0.8]))["friction"]
         assert friction(0, 0.0) == 0.0
         assert friction(0, 0.005) == pytest.approx(4.0 + 0.0075)
@@ -144,7 +137,7 @@ class TestFrictionSource:
         standstill = in_source(with_law(FrictionLaw(standstill=0.0)), np.ones(6))["friction"]
         assert standstill(1, 0.0) == 0.0
 
-    def test_values_that_are_not_finite_are_valid_source(self) -> None:
+    def test_values_that_are_not_finite_are_valid_source(self):
         friction = in_source(with_law(), np.array([1.0, np.nan, 1.0, np.inf]))["friction"]
         assert friction(0, 1.0) == 2.0
         assert np.isnan(friction(1, 1.0))
@@ -154,19 +147,19 @@ class TestFrictionText:
     @pytest.mark.parametrize(
         ("third", "formula"), [("quadratic", "f2 sgn(v) v²"), ("cubic", "f2 v³")]
     )
-    def test_formula_and_values_of_each_joint(self, third: ThirdTerm, formula: str) -> None:
+    def test_formula_and_values_of_each_joint(self, third, formula):
         values = np.array([4.0, 2.0, 1.5, 0.8, -0.1, 0.2])
         words = friction_text(with_law(FrictionLaw(third=third)), values)
         assert f"f0 sgn(v) + f1 v + {formula}" in words
         assert "shoulder: f0 = 4 N·m, f1 = 1.5 N·m·s/rad, f2 = -0.1" in words
         assert "0.01 rad/s" in words
 
-    def test_without_friction_it_is_stated(self) -> None:
+    def test_without_friction_it_is_stated(self):
         model = with_law(FrictionLaw(coulomb=False, viscous=False, third=None))
         assert "no friction" in friction_text(model, np.empty(0))
         assert in_source(model, np.empty(0))["friction"](0, 1.0) == 0.0
 
-    def test_special_cases_of_joints_and_motors(self) -> None:
+    def test_special_cases_of_joints_and_motors(self):
         model = with_law(
             FrictionLaw(third=None, asymmetric=True, zone="linear", standstill=0.1),
             joint_friction={"elbow": FrictionLaw(third=None, stribeck=0.4)},
@@ -182,13 +175,11 @@ class TestFrictionText:
             assert words in text
 
     @pytest.mark.parametrize("write", [friction_text, friction_source])
-    def test_coefficients_of_another_law_are_refused(
-        self, write: Callable[[RobotModel, np.ndarray], str]
-    ) -> None:
+    def test_coefficients_of_another_law_are_refused(self, write):
         with pytest.raises(ShapeError):
             write(with_law(FrictionLaw()), np.ones(4))
 
-    def test_names_are_quoted_in_source_and_on_one_line_in_text(self) -> None:
+    def test_names_are_quoted_in_source_and_on_one_line_in_text(self):
         evil = "a'\\,); raise SystemExit #&quot;&quot;&quot;"
         model = RobotModel.from_urdf(URDF.replace("shoulder", evil), friction=DRY)
         values = np.array([1.0, 2.0, 3.0, 4.0])

@@ -1,14 +1,11 @@
 """Impossible parameters, by their signs and on held-out motion; jumps; nominal torque."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from numpy.typing import NDArray
 
 from identification import Recording
 from identification.estimators.covariance import with_block_covariance
@@ -17,9 +14,7 @@ from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
-from identification.validation.consistency import ConsistencyCheck, check_consistency
-from identification.validation.finding import Finding
+from identification.validation.consistency import check_consistency
 from identification.validation.nominal_scale import inertia_ratio, nominal_scale
 from identification.validation.plausibility import Implausible, implausibilities, inertia_matrices
 from identification.validation.position_jumps import position_jumps
@@ -29,10 +24,8 @@ from tests.identification.test_essential import NOISE, a_motion, samples_of
 from tests.identification.test_verdict import an_error, finding_of, judged
 from tests.identification.two_link import MODEL, URDF, as_samples, one_sine
 
-Array = NDArray[np.float64]
 
-
-def parameters(model: RobotModel = MODEL, **changes: float) -> Array:
+def parameters(model=MODEL, **changes):
     """Parameters of the URDF with rotors and friction, and with changes by name."""
     standard = dict(zip(model.layout.names, model.nominal, strict=True))
     standard |= {"I1m": 0.4, "I2m": 0.1}
@@ -43,7 +36,7 @@ def parameters(model: RobotModel = MODEL, **changes: float) -> Array:
     return np.concatenate([model.base.grouping @ list(standard.values()), list(friction.values())])
 
 
-def known(values: Array, model: RobotModel = MODEL, std: float = 0.01) -> Estimate:
+def known(values, model=MODEL, std=0.01):
     """Estimate with a relative standard deviation."""
     return Estimate(
         names=model.parameter_names, units=model.units, values=values,
@@ -52,14 +45,14 @@ def known(values: Array, model: RobotModel = MODEL, std: float = 0.01) -> Estima
     )  # fmt: skip
 
 
-def with_value(name: str, value: float, std: float = 0.01) -> Estimate:
+def with_value(name, value, std=0.01):
     """Estimate of the arm with another value of one parameter."""
     values = parameters()
     values[MODEL.parameter_names.index(name)] = value
     return replace(known(parameters(), std=std), values=values)
 
 
-def signs(found: Estimate, model: RobotModel = MODEL, *, error: float = 0.1) -> Implausible:
+def signs(found, model=MODEL, *, error=0.1):
     motion = one_sine(np.arange(2000) * 2e-3)
     return implausibilities(
         model,
@@ -82,10 +75,10 @@ class TestSigns:
             (with_value("I1yy", -3.0), "inertia seen by shoulder is negative"),
         ],
     )
-    def test_impossible_signs_are_named(self, found: Estimate, words: str) -> None:
+    def test_impossible_signs_are_named(self, found, words):
         assert any(words in one for one in signs(found).impossible)
 
-    def test_signs_within_the_uncertainty_are_possible(self) -> None:
+    def test_signs_within_the_uncertainty_are_possible(self):
         """So are undetermined parameters, and friction that falls from 2 to 1.3 N·m."""
         unknown = with_value("I2m", -0.1)
         index = unknown.names.index("I2m")
@@ -96,12 +89,12 @@ class TestSigns:
         assert signs(with_value("f1_2", -0.15)).impossible == ()
         assert signs(known(parameters())) == Implausible((), ())
 
-    def test_signs_of_a_torque_below_the_error_are_doubtful(self) -> None:
+    def test_signs_of_a_torque_below_the_error_are_doubtful(self):
         found = signs(with_value("I2m", -0.01), error=5.0)
         assert found.impossible == ()
         assert any("I2m is negative" in words for words in found.doubtful)
 
-    def test_negative_friction_of_a_coupled_motor_is_named(self) -> None:
+    def test_negative_friction_of_a_coupled_motor_is_named(self):
         coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False)
         coupled = RobotModel.from_urdf(URDF, friction=MODEL.friction.laws[0], coupling=coupling)
         arm = partial(parameters, coupled)
@@ -110,11 +103,11 @@ class TestSigns:
         assert signs(known(arm(), coupled), coupled) == Implausible((), ())
 
 
-def runs(**changes: float) -> list[Samples]:
+def runs(**changes):
     return [samples_of(MODEL, parameters(**changes), a_motion(k), NOISE, k) for k in (1, 2)]
 
 
-def checked(recordings: list[Samples]) -> ConsistencyCheck:
+def checked(recordings):
     training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in recordings)
     weights = joint_weights(training.total)
     free = with_block_covariance(estimate(MODEL, training.total, weights), training, weights)
@@ -124,14 +117,14 @@ def checked(recordings: list[Samples]) -> ConsistencyCheck:
 class TestConsistencyCheck:
     """Rise of the held-out error by physical consistency, and the active bounds."""
 
-    def test_consistent_data_cost_nothing(self) -> None:
+    def test_consistent_data_cost_nothing(self):
         found = checked(runs())
         assert abs(found.cost) < 0.001
         assert not found.costly and not found.impossible
         assert found.bounds == () and np.all(found.room > 0.5)
         assert "consistent parameters predict as well" in found.sentence
 
-    def test_the_cost_is_the_rise_of_the_error(self) -> None:
+    def test_the_cost_is_the_rise_of_the_error(self):
         recordings = runs(I2m=-0.1)
         found, run = checked(recordings), recordings[1]
         torque = np.where(run.usable, run.torque, 0.0)
@@ -153,26 +146,24 @@ class TestConsistencyCheck:
             ({"f1_1": -1.5}, "viscous friction of shoulder would be negative"),
         ],
     )
-    def test_active_bounds_are_named_with_their_joint(
-        self, change: dict[str, float], words: str
-    ) -> None:
+    def test_active_bounds_are_named_with_their_joint(self, change, words):
         found = checked(runs(**change))
         assert found.costly and words in found.sentence
         assert any(words in bound for bound in found.bounds)
 
-    def test_a_torque_of_the_wrong_sign_is_impossible(self) -> None:
+    def test_a_torque_of_the_wrong_sign_is_impossible(self):
         found = checked([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
         assert found.impossible and "shoulder" in found.sentence
         assert found.sentence.startswith("no physically consistent parameters fit")
 
-    def test_a_negative_second_moment_is_an_active_bound(self) -> None:
+    def test_a_negative_second_moment_is_an_active_bound(self):
         """That of the elbow's link about its own centre."""
         found = checked(runs(I2yy=0.05, I2m=0.0))
         assert found.room[1] < 0.01
         assert any("link of elbow" in bound for bound in found.bounds)
 
 
-def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:
+def recording(rate, *, jitter=0.0, seed=0):
     rng = np.random.default_rng(seed)
     time = np.cumsum((1.0 + jitter * rng.uniform(-1.0, 1.0, int(12 * rate))) / rate)
     q = np.column_stack([0.8 * np.sin(w * time + w) + 0.3 * np.sin(3.1 * w * time) for w in (2, 3)])
@@ -180,7 +171,7 @@ def recording(rate: float, *, jitter: float = 0.0, seed: int = 0) -> Recording:
     return Recording(time, q, ("hip", "knee"), torque=np.zeros_like(q))
 
 
-def with_jump(one: Recording, size: float, rows: slice) -> Recording:
+def with_jump(one, size, rows):
     position = one.position.copy()
     position[rows, 1] += size
     return replace(one, position=position)
@@ -188,7 +179,7 @@ def with_jump(one: Recording, size: float, rows: slice) -> Recording:
 
 @pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
 @pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
-def test_a_lasting_jump_is_found(rate: float, size: float) -> None:
+def test_a_lasting_jump_is_found(rate, size):
     one, at = recording(rate), int(5 * rate)
     (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
     assert (jump.recording, jump.joint) == ("log.mcap", "knee")
@@ -200,11 +191,11 @@ def test_a_lasting_jump_is_found(rate: float, size: float) -> None:
 
 @pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
-def test_motion_with_an_uneven_clock_has_no_jump(rate: float, jitter: float) -> None:
+def test_motion_with_an_uneven_clock_has_no_jump(rate, jitter):
     assert position_jumps(recording(rate, jitter=jitter, seed=3)) == []
 
 
-def sudden_stop() -> Recording:
+def sudden_stop():
     """From 1 rad/s to rest within one sample."""
     time = np.arange(0.0, 8.0, 0.002)
     q = np.column_stack([np.minimum(time, 4.0), np.sin(time)])
@@ -212,7 +203,7 @@ def sudden_stop() -> Recording:
     return Recording(time, q, ("a", "b"), torque=np.zeros_like(q))
 
 
-def jump_in_a_gap() -> Recording:
+def jump_in_a_gap():
     one = with_jump(recording(500.0), 0.3, slice(2500, None))
     return replace(one, gap_before=np.arange(len(one.time)) == 2500)
 
@@ -222,14 +213,14 @@ def jump_in_a_gap() -> Recording:
     [sudden_stop(), jump_in_a_gap(), with_jump(recording(500.0), 0.2, slice(2500, 2501))],
     ids=["sudden stop", "gap", "glitch of one sample"],
 )
-def test_other_steps_are_no_jumps(one: Recording) -> None:
+def test_other_steps_are_no_jumps(one):
     assert position_jumps(one) == []
 
 
 AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their friction
 
 
-def findings(model: RobotModel, **context: object) -> list[Finding]:
+def findings(model, **context):
     """Findings of a verdict with this context."""
     error = an_error(0.05, joints=model.n_joints)
     known = judged(model.joint_names, held_out=error, training=error).findings
@@ -238,11 +229,11 @@ def findings(model: RobotModel, **context: object) -> list[Finding]:
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return RobotModel.from_urdf(packaged_urdf("ur5_robot.urdf"), friction=FrictionLaw(offset=True))
 
 
-def standard(model: RobotModel, wrong: float, seed: int) -> Array:
+def standard(model, wrong, seed):
     """Nominal parameters with every link off by its own share, and rotors."""
     values = model.nominal.copy()
     rng = np.random.default_rng(seed)
@@ -253,7 +244,7 @@ def standard(model: RobotModel, wrong: float, seed: int) -> Array:
     return values
 
 
-def runs_of(model: RobotModel, values: Array, seed: int) -> list[Samples]:
+def runs_of(model, values, seed):
     friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
     truth = np.concatenate([model.base.grouping @ values, friction])
     found = []
@@ -267,13 +258,13 @@ def runs_of(model: RobotModel, values: Array, seed: int) -> list[Samples]:
     return found
 
 
-def nominal(model: RobotModel) -> Array:
+def nominal(model):
     friction = np.zeros(model.n_parameters - model.base.rank)
     return np.concatenate([model.base.grouping @ model.nominal, friction])
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_links_off_by_a_tenth_are_no_finding(model: RobotModel, seed: int) -> None:
+def test_links_off_by_a_tenth_are_no_finding(model, seed):
     found = nominal_scale(model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed))
     assert np.isfinite(found.scale[2])
     assert findings(model, nominal_scale=found) == []
@@ -281,7 +272,7 @@ def test_links_off_by_a_tenth_are_no_finding(model: RobotModel, seed: int) -> No
 
 @pytest.mark.parametrize("axis", AXES)
 @pytest.mark.parametrize("factor", [0.6, 1.5])
-def test_a_wrong_torque_constant_is_a_finding(model: RobotModel, axis: int, factor: float) -> None:
+def test_a_wrong_torque_constant_is_a_finding(model, axis, factor):
     scaled = []
     for run in runs_of(model, standard(model, 0.05, axis), axis):
         torque = run.torque.copy()
@@ -296,7 +287,7 @@ def test_a_wrong_torque_constant_is_a_finding(model: RobotModel, axis: int, fact
 
 
 @pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
-def test_torques_with_another_factor_are_wrong(model: RobotModel, factor: float) -> None:
+def test_torques_with_another_factor_are_wrong(model, factor):
     """Another unit, motor torques, or all of them negated; nothing is known without masses."""
     runs = runs_of(model, standard(model, 0.05, 1), 1)
     scaled = [replace(run, torque=factor * run.torque) for run in runs]
@@ -312,7 +303,7 @@ def test_torques_with_another_factor_are_wrong(model: RobotModel, factor: float)
 
 
 @cache
-def arm() -> tuple[RobotModel, Array, Array, Array]:
+def arm():
     """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
     urdf = packaged_urdf("ur5_robot.urdf")
     model = RobotModel.from_urdf(urdf)
@@ -327,18 +318,17 @@ def arm() -> tuple[RobotModel, Array, Array, Array]:
     return model, values, position, diagonal
 
 
-def test_inertia_matrices_are_those_of_pinocchio() -> None:
+def test_inertia_matrices_are_those_of_pinocchio():
     model, values, position, diagonal = arm()
     matrices = inertia_matrices(model, values, position)
     np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
 
 
-def test_another_inertia_of_the_controller_is_a_finding() -> None:
+def test_another_inertia_of_the_controller_is_a_finding():
     """A joint without one is not."""
     model, values, position, diagonal = arm()
     theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
     found = inertia_ratio(model, values, position, theirs)
-    assert found is not None
     np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
     np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
     (finding,) = findings(model, controller_inertia=found)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -147,7 +145,7 @@ def test_it_is_never_worse_than_its_start(seed, genes):
 def test_it_ends_on_request_and_when_steps_are_tiny():
     population = Bowl()
 
-    def enough() -> bool:
+    def enough():
         return len(population.scored) > 5
 
     _, scores = polished(population, START, evaluations=10_000, stop=enough)

@@ -1,17 +1,13 @@
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.signal import butter, sosfiltfilt
 
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import (
     EDGE,
@@ -28,20 +24,16 @@ from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, prepare
 from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
 
-Array = NDArray[np.float64]
-
 TRUTH = truth()
 
 RESOLUTION = 2e-6  # rad, of the encoders
 
 
-def motion(time: Array) -> tuple[Array, Array, Array]:
+def motion(time):
     return one_sine(time)[1:4]
 
 
-def a_recording(
-    model: RobotModel, truth: Array, *, noise: float = 0.0, delay: float = 0.0
-) -> Recording:
+def a_recording(model, truth, *, noise=0.0, delay=0.0):
     time = np.arange(6000) * 1e-3
     rng = np.random.default_rng(8)
     torque = model.torque(truth, *motion(time - delay))
@@ -56,7 +48,7 @@ def a_recording(
 QUANTISATION = np.full(2, RESOLUTION**2 / 12.0)
 
 
-def test_smoothed_motion_is_accurate_in_usable_rows() -> None:
+def test_smoothed_motion_is_accurate_in_usable_rows():
     recording = a_recording(MODEL, TRUTH)
     samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
     for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
@@ -64,15 +56,14 @@ def test_smoothed_motion_is_accurate_in_usable_rows() -> None:
         assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
 
 
-def test_the_torque_is_left_as_measured() -> None:
+def test_the_torque_is_left_as_measured():
     recording = a_recording(MODEL, TRUTH, noise=0.5)
     assert prepare(recording, MODEL).torque is recording.torque
 
 
-def test_derivatives_do_not_cross_a_gap() -> None:
+def test_derivatives_do_not_cross_a_gap():
     whole = a_recording(MODEL, TRUTH)
     keep = np.r_[0:2000, 2300:6000]
-    assert whole.torque is not None
     gap = np.zeros(len(keep), dtype=bool)
     gap[2000] = True
     # Time that continues through a gap: only the flag reports it.
@@ -93,10 +84,10 @@ def test_derivatives_do_not_cross_a_gap() -> None:
 
 
 @pytest.mark.parametrize("delay", [0.004, -0.0025])
-def test_a_known_torque_delay_is_compensated(delay: float) -> None:
+def test_a_known_torque_delay_is_compensated(delay):
     recording = a_recording(MODEL, TRUTH, delay=delay)
 
-    def worst(assumed: float) -> float:
+    def worst(assumed):
         options = Preprocessing(torque_delay=assumed)
         samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
         error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
@@ -109,14 +100,14 @@ def test_a_known_torque_delay_is_compensated(delay: float) -> None:
 
 @settings(max_examples=30)
 @given(sigma=st.floats(1e-6, 1e-2), seed=st.integers(0, 2**16))
-def test_differences_measure_noise(sigma: float, seed: int) -> None:
+def test_differences_measure_noise(sigma, seed):
     time = np.arange(3000) * 1e-3
     noise = sigma * np.random.default_rng(seed).standard_normal((3000, 2))
     found = difference_variance(time, motion(time)[0] + noise)
     np.testing.assert_allclose(np.sqrt(found), sigma, rtol=0.1)
 
 
-def test_clock_jitter_is_not_noise() -> None:
+def test_clock_jitter_is_not_noise():
     rng = np.random.default_rng(4)
     time = np.arange(5000) * 1e-3 + rng.uniform(-3e-4, 3e-4, 5000)
     found = difference_variance(time, motion(time)[0] + 1e-5 * rng.standard_normal((5000, 2)))
@@ -124,7 +115,7 @@ def test_clock_jitter_is_not_noise() -> None:
 
 
 @pytest.mark.parametrize("creeps", [False, True])
-def test_variance_at_standstill_is_that_of_the_noise(creeps: bool) -> None:
+def test_variance_at_standstill_is_that_of_the_noise(creeps):
     time, size = np.arange(5000) * 1e-3, np.array([1e-6, 1e-3])
     noise = size * np.random.default_rng(6).standard_normal((5000, 2))
     slip = 3e-4 * (time > 3.0) * (1.0 - np.exp(-(time - 3.0) / 0.2))
@@ -132,19 +123,18 @@ def test_variance_at_standstill_is_that_of_the_noise(creeps: bool) -> None:
     np.testing.assert_allclose(np.sqrt(standstill_variance(time, values)), size, rtol=0.1)
 
 
-def test_a_constant_reading_has_no_variance() -> None:
+def test_a_constant_reading_has_no_variance():
     assert standstill_variance(np.arange(500) * 1e-3, np.full((500, 1), 0.4))[0] < 1e-40
     with pytest.raises(RecordingError, match="20 samples"):
         standstill_variance(np.arange(19) * 1e-3, np.zeros((19, 2)))
 
 
-def test_a_torque_low_pass_cancels_with_the_regressor() -> None:
+def test_a_torque_low_pass_cancels_with_the_regressor():
     recording = a_recording(MODEL, TRUTH)
-    assert recording.torque is not None
     # Filtered by a zero-phase Butterworth filter, not by the smoother.
     logged = sosfiltfilt(butter(3, 4.0, fs=1000.0, output="sos"), recording.torque, axis=0)
 
-    def misfit(options: Preprocessing) -> float:
+    def misfit(options):
         samples = prepare(
             replace(recording, torque=logged), MODEL, noise_variance=QUANTISATION, options=options
         )
@@ -154,11 +144,10 @@ def test_a_torque_low_pass_cancels_with_the_regressor() -> None:
     assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
 
 
-def test_smooth_torque_filters_the_regressor_equally() -> None:
+def test_smooth_torque_filters_the_regressor_equally():
     recording = a_recording(MODEL, TRUTH, noise=0.5)
     known = {"noise_variance": QUANTISATION, "torque_variance": np.full(2, 0.25)}
     samples = prepare(recording, MODEL, **known, options=Preprocessing(smooth_torque=True))
-    assert recording.torque is not None
     removed = recording.torque - samples.torque
     np.testing.assert_allclose(np.mean(removed**2, axis=0), 0.25, rtol=0.1)
     # The residual contains the noise that the smoother passes.
@@ -166,7 +155,7 @@ def test_smooth_torque_filters_the_regressor_equally() -> None:
     assert np.sqrt(np.mean(error**2)) < 0.2
 
 
-def test_invalid_recordings_and_bandwidths_raise() -> None:
+def test_invalid_recordings_and_bandwidths_raise():
     valid = a_recording(MODEL, TRUTH)
     with pytest.raises(RecordingError, match="no joint torque"):
         prepare(replace(valid, torque=None), MODEL)
@@ -181,11 +170,11 @@ EVERYWHERE = np.ones((1, 1), dtype=np.bool_)
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
 
 
-def motion_and_recording(model: RobotModel, clip: float = np.inf) -> tuple[Motion, Recording]:
+def motion_and_recording(model, clip=np.inf):
     rate, rng = np.array([2.0, 3.1]), np.random.default_rng(2)
     angle, motion = rate * TIME[:, None] + 0.4, sine_motion(TIME, np.ones(2), rate, np.full(2, 0.4))
     torque = 20.0 * np.sin(angle * 1.7) + 0.2 * rng.standard_normal(angle.shape)
@@ -197,11 +186,9 @@ def motion_and_recording(model: RobotModel, clip: float = np.inf) -> tuple[Motio
     )
 
 
-def test_clipped_torque_is_found(model: RobotModel) -> None:
+def test_clipped_torque_is_found(model):
     _, whole = motion_and_recording(model)
     _, clipped = motion_and_recording(model, clip=15.0)
-    assert whole.torque is not None
-    assert clipped.torque is not None
     true = np.abs(whole.torque) > 15.0
     found = flat_topped(clipped.torque, EVERYWHERE)
     assert not np.any(found & ~true)
@@ -215,19 +202,19 @@ def test_clipped_torque_is_found(model: RobotModel) -> None:
     rate=st.floats(0.5, 20.0),
     phase=st.floats(0.0, 6.0),
 )
-def test_a_coarse_smooth_peak_is_not_clipped(resolution: float, rate: float, phase: float) -> None:
+def test_a_coarse_smooth_peak_is_not_clipped(resolution, rate, phase):
     smooth = np.round(20.0 * np.sin(rate * TIME + phase) / resolution) * resolution
     assert not flat_topped(smooth[:, None], EVERYWHERE).any()
 
 
-def test_a_constant_channel_at_rest_is_not_clipped() -> None:
+def test_a_constant_channel_at_rest_is_not_clipped():
     channel = np.concatenate([np.full(500, 12.0), 12.0 * np.cos(TIME[:2000] * 4.0)])[:, None]
     moving = np.arange(len(channel))[:, None] > 500
     assert not flat_topped(channel, moving).any()
     assert not flat_topped(np.full((100, 1), 3.0), EVERYWHERE).any()
 
 
-def test_every_excluded_row_has_a_reason(model: RobotModel) -> None:
+def test_every_excluded_row_has_a_reason(model):
     motion, recording = motion_and_recording(model, clip=15.0)
     mask = mask_rows(recording, model, motion, np.full(2, 40.0))
     reasons = np.any(list(mask.reasons.values()), axis=0)
@@ -238,7 +225,7 @@ def test_every_excluded_row_has_a_reason(model: RobotModel) -> None:
         assert np.all(mask.counts[reason] > 0)
 
 
-def test_rests_exclude_two_rows_at_a_reversal(model: RobotModel) -> None:
+def test_rests_exclude_two_rows_at_a_reversal(model):
     motion, recording = motion_and_recording(model)
     mask = mask_rows(recording, model, motion, np.full(2, 40.0), left_out="rests")
     for joint, speed in enumerate(motion.velocity.T):
@@ -250,7 +237,7 @@ def test_rests_exclude_two_rows_at_a_reversal(model: RobotModel) -> None:
 
 
 @pytest.mark.parametrize("friction", [True, False])
-def test_reversals_of_coupled_motors_are_excluded(friction: bool) -> None:
+def test_reversals_of_coupled_motors_are_excluded(friction):
     turns = np.array([[1.0, 0.0], [-0.8, 1.0]])
     model = RobotModel.from_urdf(
         URDF, friction=FrictionLaw(standstill=0.05), coupling=Coupling(turns, friction=friction)
@@ -260,7 +247,7 @@ def test_reversals_of_coupled_motors_are_excluded(friction: bool) -> None:
     motor = motion.velocity @ turns[1]
     assert model.friction.motors == ((1,) if friction else ())
 
-    def beside(speed: Array, reach: float) -> NDArray[np.bool_]:
+    def beside(speed, reach):
         at = TIME[:-1][speed[1:] * speed[:-1] < 0.0]
         assert len(at)
         return np.asarray(np.abs(TIME[:, None] - at).min(axis=1) <= reach)
@@ -277,11 +264,10 @@ def test_reversals_of_coupled_motors_are_excluded(friction: bool) -> None:
 
 
 @pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
-def test_delayed_rows_near_an_edge_are_excluded(model: RobotModel, delay: float) -> None:
+def test_delayed_rows_near_an_edge_are_excluded(model, delay):
     """The motion `delay` earlier must be known and away from an end."""
     _, recording = motion_and_recording(model)
     samples = prepare(recording, model, options=Preprocessing(torque_delay=delay))
-    assert samples.mask is not None
     end = min(LONGEST_END, END_PERIODS / float(samples.position_bandwidth.min()))
     read = recording.time - delay
     inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
@@ -289,7 +275,7 @@ def test_delayed_rows_near_an_edge_are_excluded(model: RobotModel, delay: float)
     assert not samples.usable[~inside].any()
 
 
-def test_edges_of_a_low_passed_torque_are_excluded(model: RobotModel) -> None:
+def test_edges_of_a_low_passed_torque_are_excluded(model):
     _, recording = motion_and_recording(model)
     samples = prepare(recording, model, options=Preprocessing(torque_bandwidth=10.0))
     beside = recording.time < recording.time[0] + END_PERIODS / 10.0
@@ -297,7 +283,7 @@ def test_edges_of_a_low_passed_torque_are_excluded(model: RobotModel) -> None:
     assert samples.usable[recording.time > recording.time[0] + LONGEST_END][:100].any()
 
 
-def test_edges_of_gaps_and_short_segments_are_excluded(model: RobotModel) -> None:
+def test_edges_of_gaps_and_short_segments_are_excluded(model):
     motion, recording = motion_and_recording(model)
     gap = np.zeros(len(TIME), dtype=np.bool_)
     gap[[2000, 2040]] = True
@@ -310,12 +296,11 @@ def test_edges_of_gaps_and_short_segments_are_excluded(model: RobotModel) -> Non
     assert not rows[2100:3900].any()
 
 
-def test_rows_at_the_current_limit_are_excluded(model: RobotModel) -> None:
+def test_rows_at_the_current_limit_are_excluded(model):
     motion, recording = motion_and_recording(model)
     driven = replace(recording, motor_current=recording.torque, torque=None)
     limit = np.array([18.0, 100.0])
     mask = mask_rows(driven, model, motion, np.full(2, 40.0), current_limit=limit)
-    assert driven.motor_current is not None
     saturated = mask.reasons[SATURATED]
     np.testing.assert_array_equal(saturated[:, 0], np.abs(driven.motor_current[:, 0]) >= 17.91)
     assert not saturated[:, 1].any()

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -7,57 +5,52 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.prior import GaussianPrior, fit_with_prior, nominal_prior, with_prior
 from identification.factor.factor import Factor, QRFactor, estimate
-from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
 from tests.identification import two_link
 from tests.identification.two_link import MODEL, NOISE, P, as_samples, one_sine, truth
-
-Array = NDArray[np.float64]
 
 ROTORS = {"I1m": (0.3, 0.2), "I2m": (0.1, 0.05)}
 FRICTION = {"f0_1": (4.0, 2.0), "f0_2": (2.0, 1.0), "f1_1": (1.5, 1.0), "f1_2": (0.8, 0.5)}
 KNOWN = ROTORS | FRICTION
 
 
-def a_motion(duration: float = 6.0, *, held_elbow: bool = False) -> Motion:
+def a_motion(duration=6.0, *, held_elbow=False):
     time = np.arange(0.0, duration, 5e-3)
     return one_sine(time, centre=np.array([0.0, 0.4]), held_elbow=held_elbow)
 
 
-def recording(values: Array, error: Array | float, motion: Motion) -> Samples:
+def recording(values, error, motion):
     return as_samples(MODEL, motion, MODEL.torque(values, *motion[1:]) + error)
 
 
 @cache
-def noisy(held_elbow: bool = False) -> Samples:
+def noisy(held_elbow=False):
     motion = a_motion(held_elbow=held_elbow)
     random = np.random.default_rng(0)
     return recording(truth(), NOISE * random.standard_normal((len(motion.time), 2)), motion)
 
 
-def some_covariance(seed: int, size: float = 1.0) -> Array:
+def some_covariance(seed, size=1.0):
     root = np.random.default_rng(seed).standard_normal((P, P))
     return size * (root @ root.T + 0.1 * np.eye(P))
 
 
-def prior_of(mean: Array, covariance: Array) -> GaussianPrior:
+def prior_of(mean, covariance):
     root = np.linalg.cholesky(covariance)
     return GaussianPrior.of_combinations(root, np.linalg.solve(root, mean), np.ones(len(mean)))
 
 
-def independent(mean: Array, std: Array) -> GaussianPrior:
+def independent(mean, std):
     return GaussianPrior.of_combinations(np.eye(len(mean)), mean, std)
 
 
 @given(seed=st.integers(0, 999), size=st.floats(1e-6, 1e6))
-def test_the_root_inverts_the_covariance(seed: int, size: float) -> None:
+def test_the_root_inverts_the_covariance(seed, size):
     covariance = some_covariance(seed, size)
     prior = prior_of(np.zeros(P), covariance)
     np.testing.assert_allclose(prior.root @ covariance @ prior.root.T, np.eye(P), atol=1e-8)
@@ -65,7 +58,7 @@ def test_the_root_inverts_the_covariance(seed: int, size: float) -> None:
 
 
 @given(seed=st.integers(0, 999), flat=st.integers(0, 3))
-def test_infinite_is_the_limit_of_large_deviations(seed: int, flat: int) -> None:
+def test_infinite_is_the_limit_of_large_deviations(seed, flat):
     random = np.random.default_rng(seed)
     combinations = np.hstack([np.eye(4), random.standard_normal((4, 3))])
     std = random.uniform(0.5, 2.0, 7)
@@ -82,7 +75,7 @@ def test_infinite_is_the_limit_of_large_deviations(seed: int, flat: int) -> None
 
 
 @given(seed=st.integers(0, 999), size=st.floats(1e-3, 1e3))
-def test_it_is_the_textbook_posterior(seed: int, size: float) -> None:
+def test_it_is_the_textbook_posterior(seed, size):
     mean = np.random.default_rng(seed).standard_normal(P)
     covariance, weights = some_covariance(seed, size), 1.0 / NOISE**2
     factor = Factor.of(MODEL, noisy())
@@ -99,7 +92,7 @@ def test_it_is_the_textbook_posterior(seed: int, size: float) -> None:
 
 
 @pytest.mark.parametrize("kind", [Factor, QRFactor])
-def test_an_infinite_prior_is_weighted_least_squares(kind: type[Factor]) -> None:
+def test_an_infinite_prior_is_weighted_least_squares(kind):
     factor = kind.of(MODEL, noisy())
     expected = estimate(MODEL, Factor.of(MODEL, noisy()))
     for std in (1e7, np.inf):
@@ -112,7 +105,7 @@ def test_an_infinite_prior_is_weighted_least_squares(kind: type[Factor]) -> None
 
 
 @pytest.mark.parametrize("kind", [Factor, QRFactor])
-def test_without_data_it_is_the_prior(kind: type[Factor]) -> None:
+def test_without_data_it_is_the_prior(kind):
     nothing = kind.zero(MODEL)
     prior = nominal_prior(MODEL, known=KNOWN)
     found = with_prior(MODEL, nothing, prior)
@@ -123,7 +116,7 @@ def test_without_data_it_is_the_prior(kind: type[Factor]) -> None:
     assert found.estimate.undetermined == ()
 
 
-def test_undetermined_parameters_keep_the_prior() -> None:
+def test_undetermined_parameters_keep_the_prior():
     prior = nominal_prior(MODEL, known=KNOWN)
     found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     at = {name: index for index, name in enumerate(found.estimate.names)}
@@ -139,7 +132,7 @@ def test_undetermined_parameters_keep_the_prior() -> None:
     assert (found.ratio <= 1.0 + 1e-9).all()
 
 
-def test_unknown_parameters_stay_at_the_prior_mean() -> None:
+def test_unknown_parameters_stay_at_the_prior_mean():
     prior = nominal_prior(MODEL, known=ROTORS)
     found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
     assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
@@ -151,7 +144,7 @@ def test_unknown_parameters_stay_at_the_prior_mean() -> None:
 
 @given(seed=st.integers(0, 999))
 @settings(max_examples=20)
-def test_two_updates_equal_one(seed: int) -> None:
+def test_two_updates_equal_one(seed):
     # The posterior is the prior of the next update.
     samples, weights = noisy(), 1.0 / NOISE**2
     half = len(samples.torque) // 2
@@ -166,7 +159,7 @@ def test_two_updates_equal_one(seed: int) -> None:
     np.testing.assert_allclose(second.std, once.std, rtol=1e-5)
 
 
-def test_few_rows_require_weights() -> None:
+def test_few_rows_require_weights():
     samples = noisy()
     few = replace(
         samples, usable=samples.usable & (np.arange(len(samples.torque)) % 200 == 7)[:, None]
@@ -179,7 +172,7 @@ def test_few_rows_require_weights() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(correlation):
     prior = nominal_prior(MODEL, known=KNOWN)
     spread = np.linalg.inv(prior.root)  # no flat direction
     motion = a_motion()
@@ -205,7 +198,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(correlation: float) -> None
         assert result.design_effect < 2.0
 
 
-def test_a_wrong_prior_is_detected() -> None:
+def test_a_wrong_prior_is_detected():
     wrong = KNOWN | {"f0_1": (20.0, 1.0)}
     result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=wrong))
     at = result.estimate.names.index("f0_1")
@@ -215,7 +208,7 @@ def test_a_wrong_prior_is_detected() -> None:
     assert np.nanmax(np.abs(others)) < 4.0
 
 
-def test_the_method_names_the_prior() -> None:
+def test_the_method_names_the_prior():
     result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=ROTORS))
     assert "Gaussian prior (nominal parameters to 10 %, 2 given)" in result.estimate.method
     empty = replace(noisy(), usable=np.zeros_like(noisy().usable))
@@ -223,7 +216,7 @@ def test_the_method_names_the_prior() -> None:
         fit_with_prior(MODEL, [empty], nominal_prior(MODEL))
 
 
-def test_the_nominal_prior_is_that_of_sampled_arms() -> None:
+def test_the_nominal_prior_is_that_of_sampled_arms():
     prior = nominal_prior(MODEL, 0.1, known=KNOWN)
     nominal = MODEL.nominal.reshape(2, 11)
     rng = np.random.default_rng(3)
@@ -247,7 +240,7 @@ def test_the_nominal_prior_is_that_of_sampled_arms() -> None:
     np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
 
 
-def test_rotors_and_friction_have_no_nominal_prior() -> None:
+def test_rotors_and_friction_have_no_nominal_prior():
     model = RobotModel.from_urdf(urdf_text())
     std = dict(zip(model.parameter_names, nominal_prior(model).std, strict=True))
     flat = {name for name, value in std.items() if np.isinf(value)}
@@ -262,13 +255,13 @@ def test_rotors_and_friction_have_no_nominal_prior() -> None:
     assert all(value > 0.0 for value in std.values())
 
 
-def test_a_urdf_without_inertia_has_no_prior() -> None:
+def test_a_urdf_without_inertia_has_no_prior():
     bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
     with pytest.raises(IdentificationError, match="no inertia"):
         nominal_prior(bare)
 
 
-def test_missing_moments_or_mass_are_scaled() -> None:
+def test_missing_moments_or_mass_are_scaled():
     inertial = MODEL.chain.inertial.copy()
     inertial[0, 6:9], inertial[1] = 0.0, 0.0
     model = replace(MODEL, chain=replace(MODEL.chain, inertial=inertial))

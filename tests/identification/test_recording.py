@@ -1,7 +1,5 @@
 """Recordings: checks, clock statistics, and repetitions recognised from positions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +19,7 @@ from identification.signals.recording import (
 NAMES = ("shoulder", "elbow", "wrist")
 
 
-def a_recording(samples: int = 200, *, commanded: bool = True) -> Recording:
+def a_recording(samples=200, *, commanded=True):
     time = np.arange(samples) * 1e-3
     phase = 8.0 * time[:, None] + np.arange(3)
     command = 0.5 * np.sin(phase)
@@ -34,7 +32,7 @@ def a_recording(samples: int = 200, *, commanded: bool = True) -> Recording:
     )
 
 
-def changed(name: str, rows: slice | int, joint: int, value: object) -> Recording:
+def changed(name, rows, joint, value):
     """Return a valid recording with other readings of a joint."""
     recording = a_recording()
     values = getattr(recording, name).copy()
@@ -42,7 +40,7 @@ def changed(name: str, rows: slice | int, joint: int, value: object) -> Recordin
     return replace(recording, **{name: values})
 
 
-def leaping(sample: int, step: float) -> Recording:
+def leaping(sample, step):
     """Return a recording with another time step at a sample [s]."""
     time = a_recording().time.copy()
     time[sample:] += time[sample - 1] + step - time[sample]
@@ -53,7 +51,7 @@ RESTING = changed("commanded_position", slice(None), 1, 0.3).commanded_position
 
 
 class TestChecks:
-    def test_a_valid_recording_is_unchanged(self) -> None:
+    def test_a_valid_recording_is_unchanged(self):
         recording = a_recording()
         assert recording.checked(NAMES) is recording
 
@@ -63,9 +61,7 @@ class TestChecks:
         joint=st.integers(0, 2),
         value=st.sampled_from([np.nan, np.inf, -np.inf]),
     )
-    def test_nan_and_infinity_raise(
-        self, channel: str, sample: int, joint: int, value: float
-    ) -> None:
+    def test_nan_and_infinity_raise(self, channel, sample, joint, value):
         where = f"{channel} of joint {NAMES[joint]} is {value} at sample {sample} "
         with pytest.raises(RecordingError, match=where):
             changed(channel, sample, joint, value).checked()
@@ -83,7 +79,7 @@ class TestChecks:
             (a_recording(1), "has 1 samples"),
         ],
     )
-    def test_invalid_recordings_raise(self, recording: Recording, words: str) -> None:
+    def test_invalid_recordings_raise(self, recording, words):
         with pytest.raises(RecordingError, match=words):
             recording.checked()
 
@@ -97,16 +93,16 @@ class TestChecks:
         ],
         ids=["cycles without a set-point", "commanded to rest", "a long pause", "standstill"],
     )
-    def test_valid_recordings_pass(self, recording: Recording) -> None:
+    def test_valid_recordings_pass(self, recording):
         assert recording.checked() is recording
 
-    def test_a_constant_reading_must_be_declared(self) -> None:
+    def test_a_constant_reading_must_be_declared(self):
         recording = replace(changed("position", slice(None), 0, 0.3), commanded_position=None)
         with pytest.raises(RecordingError, match=r"shoulder is stuck.*declare it as held"):
             recording.checked()
         replace(recording, held_joints=("shoulder",)).checked()
 
-    def test_quantised_readings_of_a_slow_joint_are_not_stuck(self) -> None:
+    def test_quantised_readings_of_a_slow_joint_are_not_stuck(self):
         slow = 0.01 * a_recording().time[:, None] + np.zeros(3)
         coarse = np.round(slow / 1e-3) * 1e-3
         replace(a_recording(), position=coarse, commanded_position=slow).checked()
@@ -115,12 +111,12 @@ class TestChecks:
         "expected",
         [("elbow", "shoulder", "wrist"), ("shoulder", "elbow", "hand"), ("shoulder", "elbow")],
     )
-    def test_other_joints_than_the_model_raise(self, expected: tuple[str, ...]) -> None:
+    def test_other_joints_than_the_model_raise(self, expected):
         with pytest.raises(RecordingError, match=f"the model's are {', '.join(expected)}"):
             a_recording().checked(expected)
 
 
-def test_gaps_split_a_recording_but_jitter_does_not() -> None:
+def test_gaps_split_a_recording_but_jitter_does_not():
     recording = a_recording()
     gap = np.zeros(200, dtype=bool)
     gap[30] = True
@@ -132,18 +128,16 @@ def test_gaps_split_a_recording_but_jitter_does_not() -> None:
     assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
 
 
-def test_arrays_of_other_shapes_raise() -> None:
+def test_arrays_of_other_shapes_raise():
     recording = a_recording()
-    assert recording.torque is not None
     with pytest.raises(ShapeError, match="torque"):
         replace(recording, torque=recording.torque[:-1])
     with pytest.raises(ShapeError, match="gap_before"):
         replace(recording, gap_before=np.zeros(3, dtype=bool))
 
 
-def test_a_motion_starts_with_its_command() -> None:
+def test_a_motion_starts_with_its_command():
     recording = a_recording()
-    assert recording.commanded_position is not None
     command = recording.commanded_position.copy()
     command[:40] = command[40]
     assert replace(recording, commanded_position=command).motion_start == recording.time[41]
@@ -155,9 +149,7 @@ def test_a_motion_starts_with_its_command() -> None:
 STEP = 2e-3
 
 
-def recorded(
-    seed: int, *, start: float = 0.0, clock: float = 0.0, pace: float = 1.0, noise: int = 0
-) -> Recording:
+def recorded(seed, *, start=0.0, clock=0.0, pace=1.0, noise=0):
     """Return eight seconds of a motion from `start`, with a clock offset [s]."""
     rng = np.random.default_rng(seed)
     amplitude, rate = rng.uniform(0.2, 1.0, (3, 2)), rng.uniform(0.5, 3.0, (3, 2))
@@ -175,10 +167,9 @@ class TestRepetitions:
         clock=st.floats(-1e3, 1e3),
         start=st.floats(-0.4, 0.4).map(lambda one: round(one / STEP) * STEP),
     )
-    def test_offsets_of_clocks_are_found(self, seed: int, clock: float, start: float) -> None:
+    def test_offsets_of_clocks_are_found(self, seed, clock, start):
         runs = [recorded(seed), recorded(seed, start=start, clock=clock, noise=1)]
         offsets = offsets_of_repetitions(runs)
-        assert offsets is not None
         np.testing.assert_allclose(offsets, [0.0, clock], atol=2e-3)
 
     @pytest.mark.parametrize(
@@ -191,12 +182,12 @@ class TestRepetitions:
             [recorded(1), recorded(1, noise=1), recorded(2)],
         ],
     )
-    def test_other_motions_are_no_repetitions(self, runs: list[Recording]) -> None:
+    def test_other_motions_are_no_repetitions(self, runs):
         assert offsets_of_repetitions(runs) is None
 
 
 @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
-def test_an_even_clock_is_uniform(rate: float) -> None:
+def test_an_even_clock_is_uniform(rate):
     base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
     assert base.uniform
     assert base.rate == pytest.approx(rate, rel=1e-4)
@@ -204,7 +195,7 @@ def test_an_even_clock_is_uniform(rate: float) -> None:
     assert len(base.describe()) == 1
 
 
-def test_jitter_is_measured_against_the_usual_step() -> None:
+def test_jitter_is_measured_against_the_usual_step():
     rng = np.random.default_rng(1)
     steps = 0.002 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, 20000))
     base = time_base(np.cumsum(steps))
@@ -215,7 +206,7 @@ def test_jitter_is_measured_against_the_usual_step() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_late_stamps_are_not_missing_samples(seed: int) -> None:
+def test_late_stamps_are_not_missing_samples(seed):
     random = np.random.default_rng(seed)
     late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
     lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
@@ -225,7 +216,7 @@ def test_late_stamps_are_not_missing_samples(seed: int) -> None:
         assert base.rate == pytest.approx(100.0, rel=1e-3)
 
 
-def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
+def test_repeats_falls_drops_and_gaps_are_distinguished():
     index = np.arange(1000.0)
     index[100] = index[99]  # repeats
     index[200] = index[199] - 0.5  # falls back
@@ -245,7 +236,7 @@ def test_repeats_falls_drops_and_gaps_are_distinguished() -> None:
         time_base(np.full(5, 3.0))
 
 
-def test_samples_of_one_stamp_are_averaged() -> None:
+def test_samples_of_one_stamp_are_averaged():
     time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
     torque = np.arange(14.0).reshape(7, 2)
     merged = without_repeats(

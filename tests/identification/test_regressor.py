@@ -1,10 +1,8 @@
 """The regressor, and estimators of one recording or its parts, equal to nine digits."""
 
-from __future__ import annotations
-
 import gc
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, RobotModel
 from identification.estimators.consistent import consistent_estimate
@@ -22,7 +19,6 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
-from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase
 from identification.model.motion import Motion
 from identification.model.regressor import CHUNK
@@ -33,16 +29,16 @@ from tests.identification.two_link import MODEL, a_motion, coloured, recording
 
 
 @pytest.fixture(scope="module")
-def model() -> RobotModel:
+def model():
     return RobotModel.from_urdf(urdf_text())
 
 
-def states(m: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def states(m, seed=3):
     q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6))
     return q, qd, qdd
 
 
-def test_blocks_have_only_columns_that_act_on_the_joint(model: RobotModel) -> None:
+def test_blocks_have_only_columns_that_act_on_the_joint(model):
     regressor = model.regressor(*states(50))
     for joint, (block, columns) in enumerate(
         zip(regressor.blocks, regressor.columns, strict=True), start=1
@@ -58,7 +54,7 @@ def test_blocks_have_only_columns_that_act_on_the_joint(model: RobotModel) -> No
     assert len(regressor.columns[5]) == 8 + 3
 
 
-def test_a_prismatic_joint_has_no_inertia_columns() -> None:
+def test_a_prismatic_joint_has_no_inertia_columns():
     urdf = (
         '<robot name="r"><link name="a"/><link name="b"/><link name="c"/>'
         '<joint name="s" type="prismatic"><parent link="a"/><child link="b"/>'
@@ -75,7 +71,7 @@ def test_a_prismatic_joint_has_no_inertia_columns() -> None:
 
 
 @pytest.mark.parametrize("m", [0, 1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
-def test_samples_are_independent(model: RobotModel, m: int) -> None:
+def test_samples_are_independent(model, m):
     q, qd, qdd = states(m)
     whole = model.regressor(q, qd, qdd)
     assert [len(block) for block in whole.blocks] == [m] * 6
@@ -85,7 +81,7 @@ def test_samples_are_independent(model: RobotModel, m: int) -> None:
             assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
 
 
-def test_threads_do_not_share_working_arrays(model: RobotModel) -> None:
+def test_threads_do_not_share_working_arrays(model):
     first, second = states(300, seed=1), states(300, seed=2)
     alone = [np.concatenate([b.copy() for b in rows]) for _, rows in model.plan.chunks(*first)]
     together = []
@@ -95,7 +91,7 @@ def test_threads_do_not_share_working_arrays(model: RobotModel) -> None:
 
 
 @pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi, 1e4])
-def test_all_angles_agree_with_pinocchio(model: RobotModel, angle: float) -> None:
+def test_all_angles_agree_with_pinocchio(model, angle):
     # tan(q / 2), from which the rotation is computed, has a pole at pi
     q, qd, qdd = states(3)
     q[:] = angle
@@ -105,14 +101,14 @@ def test_all_angles_agree_with_pinocchio(model: RobotModel, angle: float) -> Non
         assert np.allclose(at, near, atol=1e-6)
 
 
-def test_without_friction_and_rotors_all_columns_are_inertial() -> None:
+def test_without_friction_and_rotors_all_columns_are_inertial():
     law = FrictionLaw(coulomb=False, viscous=False, third=None)
     model = RobotModel.from_urdf(urdf_text(), rotor_inertia=False, friction=law)
     assert model.n_parameters == model.base.rank == 36
     assert [len(c) for c in model.regressor(*states(2)).columns] == [36, 35, 28, 21, 14, 7]
 
 
-def test_working_arrays_are_freed_with_the_model() -> None:
+def test_working_arrays_are_freed_with_the_model():
     """Without the cycle collector, which may run minutes later."""
     model = RobotModel.from_urdf(urdf_text())
     model.regressor(*states(CHUNK))
@@ -125,13 +121,12 @@ def test_working_arrays_are_freed_with_the_model() -> None:
         gc.enable()
 
 
-Array = NDArray[np.float64]
 Pieces = Sequence[tuple[Samples, Motion]]
 """Parts of a recording with the parts of the plan."""
 
 
 @cache
-def whole() -> tuple[Samples, Motion]:
+def whole():
     plan = a_motion(5.0)
     rng = np.random.default_rng(7)
     motion = plan._replace(acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
@@ -140,7 +135,7 @@ def whole() -> tuple[Samples, Motion]:
     return samples, plan
 
 
-def cut(places: Sequence[int]) -> Pieces:
+def cut(places):
     """Return the parts of a recording with a common time origin."""
     samples, plan = whole()
     edges = [0, *sorted(places), len(plan.time)]
@@ -160,11 +155,11 @@ def cut(places: Sequence[int]) -> Pieces:
     ]
 
 
-def recordings(pieces: Pieces) -> list[Samples]:
+def recordings(pieces):
     return [samples for samples, _ in pieces]
 
 
-def instruments(pieces: Pieces) -> PhaseFactor:
+def instruments(pieces):
     factors = [instrument_factor(MODEL, *piece) for piece in pieces]
     total = factors[0]
     for factor in factors[1:]:
@@ -172,13 +167,13 @@ def instruments(pieces: Pieces) -> PhaseFactor:
     return total
 
 
-def consistent(pieces: Pieces) -> Estimate:
+def consistent(pieces):
     factor = total_phase(MODEL, recordings(pieces)).total
     free = fit_least_squares(MODEL, recordings(pieces))
     return consistent_estimate(MODEL, factor, free).estimate
 
 
-ESTIMATORS: dict[str, Callable[[Pieces], Estimate]] = {
+ESTIMATORS = {
     "ordinary": lambda pieces: fit_least_squares(MODEL, recordings(pieces), "ordinary"),
     "weighted": lambda pieces: fit_least_squares(MODEL, recordings(pieces)),
     "prior": lambda pieces: (
@@ -191,20 +186,20 @@ ESTIMATORS: dict[str, Callable[[Pieces], Estimate]] = {
 }
 
 
-def deviations(one: Estimate, other: Estimate) -> Array:
+def deviations(one, other):
     """Return the difference of the values in standard deviations."""
     return np.asarray(np.abs(one.values - other.values) / one.std)
 
 
 @cache
-def from_one(name: str) -> Estimate:
+def from_one(name):
     return ESTIMATORS[name](cut([]))
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @given(places=st.lists(st.integers(1, 999), max_size=12))
 @settings(max_examples=6, deadline=None)
-def test_any_split_gives_the_same_values_and_covariance(name: str, places: list[int]) -> None:
+def test_any_split_gives_the_same_values_and_covariance(name, places):
     one, many = from_one(name), ESTIMATORS[name](cut(places))
     assert deviations(one, many).max() < 1e-9
     np.testing.assert_allclose(many.std, one.std, rtol=1e-9)
@@ -214,7 +209,7 @@ def test_any_split_gives_the_same_values_and_covariance(name: str, places: list[
 # Factors
 
 
-def test_blocks_can_be_selected_joined_merged_and_restricted() -> None:
+def test_blocks_can_be_selected_joined_merged_and_restricted():
     phase = total_phase(MODEL, recordings(cut([])))
     half = len(phase) // 2
     again = joined([phase.blocks(slice(0, half)), phase.blocks(slice(half, None))])
@@ -234,7 +229,7 @@ def test_blocks_can_be_selected_joined_merged_and_restricted() -> None:
     )
 
 
-def test_blocks_without_rows_change_nothing() -> None:
+def test_blocks_without_rows_change_nothing():
     samples, _ = whole()
     late = replace(samples, origin=samples.origin - 3.0)
     phase, same = (PhaseFactor.from_samples(MODEL, one) for one in (late, samples))

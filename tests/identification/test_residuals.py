@@ -1,26 +1,19 @@
 """Checks of the residual find injected patterns, and none in coloured noise."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from identification.model.motion import Motion
-from identification.signals.samples import Samples
-from identification.validation.finding import Finding, Thresholds
+from identification.validation.finding import Thresholds
 from identification.validation.residuals import (
     FEWEST_BLOCKS,
     HARMONICS,
     BlockMean,
     FrictionDrift,
-    ResidualChecks,
     Ripple,
     autocorrelation,
     block_mean,
@@ -30,33 +23,24 @@ from identification.validation.residuals import (
 from tests.identification.test_verdict import finding_of, judged
 from tests.identification.two_link import MODEL, as_samples, sine_motion
 
-Array = NDArray[np.float64]
-Disturbance = Callable[[Motion, int], Array]
-
 STEP = 4e-3
 GEAR = np.diag([100.0, -80.0])
 NOISE = 0.5
 MEMORY = 0.05  # s, of the coloured noise
 
 
-def values_of() -> Array:
+def values_of():
     return np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
 
 
-def coloured(rng: np.random.Generator, shape: tuple[int, ...], memory: float = MEMORY) -> Array:
+def coloured(rng, shape, memory=MEMORY):
     """Return first-order noise of unit variance, correlated over `memory` seconds."""
     decay = np.exp(-STEP / memory)
     white = np.sqrt(1.0 - decay**2) * rng.standard_normal(shape)
     return np.asarray(lfilter([1.0], [1.0, -decay], white, axis=0))
 
 
-def a_run(
-    seed: int,
-    disturbance: Disturbance | None = None,
-    *,
-    duration: float = 12.0,
-    noise: float = NOISE,
-) -> Samples:
+def a_run(seed, disturbance=None, *, duration=12.0, noise=NOISE):
     time = np.arange(round(duration / STEP)) * STEP
     rng = np.random.default_rng(seed)
     amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
@@ -68,14 +52,12 @@ def a_run(
     return as_samples(MODEL, motion, torque)
 
 
-def checked(
-    disturbance: Disturbance | None = None, *, first_seed: int = 0, noise: float = NOISE
-) -> ResidualChecks:
+def checked(disturbance=None, *, first_seed=0, noise=NOISE):
     runs = [a_run(first_seed + k, disturbance, noise=noise) for k in range(6)]
     return check_residuals(MODEL, values_of(), runs[:5], runs[5:], motor_from_joint=GEAR)
 
 
-def test_coloured_noise_is_not_reported() -> None:
+def test_coloured_noise_is_not_reported():
     alarms = np.zeros(4)
     campaigns = 25
     for campaign in range(campaigns):
@@ -87,8 +69,8 @@ def test_coloured_noise_is_not_reported() -> None:
     assert (alarms <= 1).all(), alarms
 
 
-def test_wrong_friction_shows_over_speed() -> None:
-    def stribeck(motion: Motion, _: int) -> Array:
+def test_wrong_friction_shows_over_speed():
+    def stribeck(motion, _):
         extra = 1.0 * np.sign(motion.velocity) * np.exp(-((motion.velocity / 0.5) ** 2))
         return np.asarray(extra * np.array([0.0, 1.0]))
 
@@ -98,7 +80,7 @@ def test_wrong_friction_shows_over_speed() -> None:
     assert abs(at) < 0.6 and np.sign(size) == np.sign(at)
 
 
-def test_a_position_dependent_torque_shows_over_position() -> None:
+def test_a_position_dependent_torque_shows_over_position():
     checks = checked(lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
     assert checks.position.significant.tolist() == [True, False]
     # RMS of the true wave, within binning and noise.
@@ -106,14 +88,13 @@ def test_a_position_dependent_torque_shows_over_position() -> None:
 
 
 @pytest.mark.parametrize("harmonic", HARMONICS)
-def test_ripple_is_found_with_its_harmonic_and_amplitude(harmonic: int) -> None:
+def test_ripple_is_found_with_its_harmonic_and_amplitude(harmonic):
     planted = np.array([0.0, 0.4])
 
-    def ripple(motion: Motion, _: int) -> Array:
+    def ripple(motion, _):
         return np.asarray(planted * np.sin(harmonic * motion.position @ GEAR.T + 0.7))
 
     found = checked(ripple).ripple
-    assert found is not None
     assert found.significant.tolist() == [False, True]
     assert found.strongest(1) == harmonic
     amplitude = found.amplitude[1, HARMONICS.index(harmonic)]
@@ -121,10 +102,10 @@ def test_ripple_is_found_with_its_harmonic_and_amplitude(harmonic: int) -> None:
     assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
 
 
-def test_friction_drift_is_measured() -> None:
+def test_friction_drift_is_measured():
     friction = np.where(MODEL.friction_columns, values_of(), 0.0)
 
-    def cooling(motion: Motion, seed: int) -> Array:
+    def cooling(motion, seed):
         # Five fitted recordings, seeds 0 to 4: from +4 % to -4 % of the second joint's friction.
         change = 0.04 - 0.02 * seed
         return np.asarray(change * MODEL.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
@@ -136,14 +117,14 @@ def test_friction_drift_is_measured() -> None:
     assert drift.change_std[1] < 0.02
 
 
-def test_drift_is_measured_within_one_recording() -> None:
+def test_drift_is_measured_within_one_recording():
     found = check_residuals(MODEL, values_of(), [a_run(1, duration=30.0)])
     assert found.drift is not None and len(found.drift.share) >= 4
     assert found.ripple is None  # without gear ratios
 
 
 @pytest.mark.parametrize("memory", [0.01, 0.05])
-def test_the_correlation_time_is_that_of_theory(memory: float) -> None:
+def test_the_correlation_time_is_that_of_theory(memory):
     rng = np.random.default_rng(2)
     residual = coloured(rng, (200_000, 2), memory)
     found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
@@ -157,7 +138,7 @@ def test_the_correlation_time_is_that_of_theory(memory: float) -> None:
 
 @given(st.integers(20, 60), st.integers(0, 2**32 - 1), st.integers(1, 3))
 @settings(max_examples=25, deadline=None)
-def test_the_autocorrelation_is_that_of_counting_pairs(rows: int, seed: int, runs: int) -> None:
+def test_the_autocorrelation_is_that_of_counting_pairs(rows, seed, runs):
     rng = np.random.default_rng(seed)
     parts = [(rng.standard_normal((rows, 1)), rng.random((rows, 1)) > 0.3) for _ in range(runs)]
     found = autocorrelation(parts, STEP, longest=10 * STEP)
@@ -172,7 +153,7 @@ def test_the_autocorrelation_is_that_of_counting_pairs(rows: int, seed: int, run
         )
 
 
-def test_block_means_cover_unlike_independent_samples() -> None:
+def test_block_means_cover_unlike_independent_samples():
     blocks, per_block, seeds = 60, 125, 400
     inside, naive = 0, 0
     for seed in range(seeds):
@@ -185,7 +166,7 @@ def test_block_means_cover_unlike_independent_samples() -> None:
     assert naive / seeds < 0.6
 
 
-def test_repeated_errors_are_not_more_certain() -> None:
+def test_repeated_errors_are_not_more_certain():
     rng = np.random.default_rng(3)
     motion = np.array([rng.standard_normal((40, 1)), np.ones((40, 1))])
     once, thrice = block_mean([motion]), block_mean([motion] * 3, repeated=3)
@@ -196,7 +177,7 @@ def test_repeated_errors_are_not_more_certain() -> None:
     assert np.isnan(block_mean([np.ones((2, FEWEST_BLOCKS - 1, 1))]).mean).all()
 
 
-def test_outliers_are_found_and_removed() -> None:
+def test_outliers_are_found_and_removed():
     random = np.random.default_rng(5)
     torque, residual = 10.0 * random.standard_normal((2, 5000, 2))
     residual *= 0.01
@@ -218,31 +199,31 @@ NAMES = ("shoulder", "elbow")
 LIMIT = Thresholds()
 
 
-def ripple(size: float) -> Ripple:
+def ripple(size):
     mean = np.zeros((2, len(HARMONICS), 2))
     mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
     std = np.full_like(mean, 1e-6)
     return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
 
 
-def drift(*change: float) -> FrictionDrift:
+def drift(*change):
     """Return a drift over ten parts with small scatter."""
     total = np.array(change)
     return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
 
 
 @pytest.fixture(scope="module")
-def valid() -> ResidualChecks:
+def valid():
     return replace(checked(), ripple=None, drift=None, rms=np.full(2, 0.01))
 
 
 class TestPatterns:
     """Findings of a verdict on patterns."""
 
-    def found(self, valid: ResidualChecks, check: str, **changes: object) -> Finding:
+    def found(self, valid, check, **changes):
         return finding_of(check, NAMES, residuals=replace(valid, **changes))
 
-    def test_untested_patterns_have_no_finding(self, valid: ResidualChecks) -> None:
+    def test_untested_patterns_have_no_finding(self, valid):
         checks = {one.check for one in judged(NAMES, residuals=valid).findings}
         assert "whiteness" in checks and not {"torque ripple", "friction over time"} & checks
 
@@ -250,9 +231,7 @@ class TestPatterns:
         ("share", "level"),
         [(0.0, "good"), (0.9 * LIMIT.ripple, "information"), (1.1 * LIMIT.ripple, "doubtful")],
     )
-    def test_large_ripple_is_doubtful(
-        self, valid: ResidualChecks, share: float, level: str
-    ) -> None:
+    def test_large_ripple_is_doubtful(self, valid, share, level):
         found = self.found(valid, "torque ripple", ripple=ripple(share * valid.torque_rms[1]))
         assert found.level == level and "shoulder" not in found.words
         expected = f"elbow (4 per motor turn, {share:.1%} of its torque)"
@@ -267,14 +246,7 @@ class TestPatterns:
             ((0.02, -0.2), 1.0, "doubtful", "during the recordings: elbow by -20.0%"),
         ],
     )
-    def test_drift_is_judged_by_its_torque(
-        self,
-        valid: ResidualChecks,
-        change: tuple[float, float],
-        share: float,
-        level: str,
-        words: str,
-    ) -> None:
+    def test_drift_is_judged_by_its_torque(self, valid, change, share, level, words):
         friction = np.array([share, 1.0])
         found = self.found(
             valid, "friction over time", drift=drift(*change), friction_share=friction

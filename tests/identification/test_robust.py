@@ -1,19 +1,15 @@
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
-from identification.signals.samples import Samples, prepare
+from identification.signals.samples import prepare
 from identification.validation.prediction import prediction_error
 from tests.identification.robots import ur10
 from tests.identification.two_link import (
@@ -27,17 +23,16 @@ from tests.identification.two_link import (
     truth,
 )
 
-Array = NDArray[np.float64]
 LOSSES = [Huber(), Tukey()]
 
 
-def with_outliers(rng: np.random.Generator, error: Array, share: float, size: float) -> Array:
+def with_outliers(rng, error, share, size):
     """Add errors of `size` standard deviations and one sign to a share of the rows."""
     bad = rng.random(error.shape) < share
     return np.where(bad, size * NOISE * rng.uniform(0.5, 1.5, error.shape), error)
 
 
-def distance(values: Array, samples: Samples) -> float:
+def distance(values, samples):
     """Return the rms error in standard deviations of a fit to good rows."""
     information = Factor.of(MODEL, samples).weighted(1.0 / NOISE**2).A
     off = values - truth()
@@ -46,7 +41,7 @@ def distance(values: Array, samples: Samples) -> float:
 
 @pytest.mark.parametrize("loss", [Loss(), *LOSSES, Huber(0.7), Tukey(3.0)])
 @given(x=st.floats(-1e6, 1e6))
-def test_weights_decrease_from_one_to_zero(loss: Loss, x: float) -> None:
+def test_weights_decrease_from_one_to_zero(loss, x):
     one, further = loss.weight(np.array([x])), loss.weight(np.array([1.1 * x]))
     assert 0.0 <= further[0] <= one[0] <= 1.0
     assert loss.weight(np.array([-x])) == one
@@ -55,7 +50,7 @@ def test_weights_decrease_from_one_to_zero(loss: Loss, x: float) -> None:
 
 
 @pytest.mark.parametrize("loss", [Loss(), *LOSSES])
-def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> None:
+def test_the_slope_is_the_derivative_of_weight_times_residual(loss):
     x = np.linspace(-7.0, 7.0, 1401)
     x = x[np.abs(np.abs(x) - 1.345) > 0.01]  # Huber's has a corner there
     h = 1e-6
@@ -66,7 +61,7 @@ def test_the_slope_is_the_derivative_of_weight_times_residual(loss: Loss) -> Non
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @given(seed=st.integers(0, 2**16))
 @settings(max_examples=8)
-def test_gaussian_noise_gives_nearly_least_squares(loss: Loss, seed: int) -> None:
+def test_gaussian_noise_gives_nearly_least_squares(loss, seed):
     motion = a_motion(5.0)
     samples = recording(gaussian(np.random.default_rng(seed), motion), motion)
     robust = robust_estimate(MODEL, [samples], loss)
@@ -81,7 +76,7 @@ def test_gaussian_noise_gives_nearly_least_squares(loss: Loss, seed: int) -> Non
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @given(seed=st.integers(0, 2**16), size=st.floats(20.0, 300.0))
 @settings(max_examples=8)
-def test_outliers_have_little_effect(loss: Loss, seed: int, size: float) -> None:
+def test_outliers_have_little_effect(loss, seed, size):
     motion, rng = a_motion(5.0), np.random.default_rng(seed)
     samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, size), motion)
     robust = robust_estimate(MODEL, [samples], loss)
@@ -93,7 +88,7 @@ def test_outliers_have_little_effect(loss: Loss, seed: int, size: float) -> None
     np.testing.assert_allclose(robust.outlying, 0.05, atol=0.025)
 
 
-def test_tukey_ignores_outliers_of_one_sign() -> None:
+def test_tukey_ignores_outliers_of_one_sign():
     motion, rng = a_motion(), np.random.default_rng(2)
     clean = gaussian(rng, motion)
     bad = recording(with_outliers(rng, clean, 0.10, 40.0), motion)
@@ -110,14 +105,14 @@ def test_tukey_ignores_outliers_of_one_sign() -> None:
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
-def test_it_minimises_the_loss(loss: Loss) -> None:
+def test_it_minimises_the_loss(loss):
     motion, rng = a_motion(2.0), np.random.default_rng(3)
     samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 15.0), motion)
     result = robust_estimate(MODEL, [samples], loss)
     rows = MODEL.regressor(*motion[1:]).dense(P)
     scale, usable = result.estimate.noise_std, samples.usable
 
-    def cost(values: Array) -> tuple[float, Array]:
+    def cost(values):
         x = (samples.torque - rows @ values) / scale
         if isinstance(loss, Huber):
             k = loss.tuning
@@ -142,7 +137,7 @@ def test_it_minimises_the_loss(loss: Loss) -> None:
 
 @pytest.mark.parametrize("loss", LOSSES, ids=["huber", "tukey"])
 @pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(loss: Loss, correlation: float) -> None:
+def test_95_percent_intervals_cover_90_to_99_percent(loss, correlation):
     motion = a_motion()
     inside = []
     for seed in range(40):
@@ -155,7 +150,7 @@ def test_95_percent_intervals_cover_90_to_99_percent(loss: Loss, correlation: fl
     assert 0.90 <= np.mean(inside) <= 0.99
 
 
-def test_exact_data_are_recovered() -> None:
+def test_exact_data_are_recovered():
     motion = a_motion(3.0)
     samples = recording(np.zeros((len(motion.time), 2)), motion)
     samples.torque[::40] += 500.0
@@ -163,7 +158,7 @@ def test_exact_data_are_recovered() -> None:
     np.testing.assert_allclose(result.estimate.values, truth(), rtol=1e-6)
 
 
-def test_a_resting_joint_has_no_scale() -> None:
+def test_a_resting_joint_has_no_scale():
     motion = a_motion(4.0)
     samples = recording(gaussian(np.random.default_rng(6), motion), motion)
     samples.usable[:, 1] = False
@@ -175,7 +170,7 @@ def test_a_resting_joint_has_no_scale() -> None:
     assert "f0_1" not in result.estimate.undetermined
 
 
-def test_missing_convergence_is_reported() -> None:
+def test_missing_convergence_is_reported():
     motion, rng = a_motion(3.0), np.random.default_rng(7)
     samples = recording(with_outliers(rng, gaussian(rng, motion), 0.05, 30.0), motion)
     result = robust_estimate(MODEL, [samples], most_iterations=1)
@@ -184,7 +179,7 @@ def test_missing_convergence_is_reported() -> None:
     assert "Huber" in result.estimate.method
 
 
-def test_many_outliers_mean_a_wrong_model() -> None:
+def test_many_outliers_mean_a_wrong_model():
     motion, rng = a_motion(5.0), np.random.default_rng(11)
     error = gaussian(rng, motion)
     # The elbow's friction in one direction of some poses is not in the model.
@@ -193,7 +188,7 @@ def test_many_outliers_mean_a_wrong_model() -> None:
     assert result.doubtful.tolist() == [False, True]
 
 
-def test_outliers_on_a_real_arm_have_little_effect(shared_data: Path) -> None:
+def test_outliers_on_a_real_arm_have_little_effect(shared_data):
     model, recorded = ur10(shared_data)
     cut = round(0.7 * recorded.n_samples)
     first = prepare(recorded.between(0, cut), model)
@@ -202,7 +197,7 @@ def test_outliers_on_a_real_arm_have_little_effect(shared_data: Path) -> None:
     gross = 3.0 * rms * rng.uniform(0.5, 1.5, first.torque.shape)
     bad = replace(first, torque=first.torque + gross * (rng.random(gross.shape) < 0.05))
 
-    def error(values: Array) -> float:
+    def error(values):
         (one,) = prediction_error(model, values, [last], all_rows=True)
         return one.overall
 

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import io
 import os
 import signal
@@ -46,7 +44,7 @@ class RecordingPopulation(Population):
         self._known = {}
         self.begin()
 
-    def begin(self, interrupted_after: int | None = None):
+    def begin(self, interrupted_after=None):
         self.genes, self.rows = [], []
         self.interrupted_after = interrupted_after
         return self
@@ -63,17 +61,17 @@ class RecordingPopulation(Population):
         return Scores.of_rows(self.rows[-1])
 
     @property
-    def everything(self) -> Scores:
+    def everything(self):
         return Scores.of_rows(np.concatenate(self.rows))
 
 
 class Stop:
     """Stop request after a number of calls."""
 
-    def __init__(self, after: int):
+    def __init__(self, after):
         self.left = after
 
-    def __call__(self) -> bool:
+    def __call__(self):
         self.left -= 1
         return self.left < 0
 
@@ -95,11 +93,11 @@ def population(shared):
     return shared.begin()
 
 
-def settings(method, **others) -> SearchSettings:
+def settings(method, **others):
     return replace(SETTINGS, method=method, **others)
 
 
-def fitness_of(settings, scores, scale=None) -> np.ndarray:
+def fitness_of(settings, scores, scale=None):
     """Return the fitness of the three methods with a single objective."""
     size, coupled = scores.measure("log10_det"), scores.measure("coupling_index")
     if settings.method == "a":
@@ -176,7 +174,7 @@ def test_a_search_is_better_than_random_motions(population):
     assert _room_under(design.front) > 1.03 * _room_under(by_chance)
 
 
-def _room_under(front: Front) -> float:
+def _room_under(front):
     """The area that a front beats, above log10 det = 0 and below I_c = 30."""
     size, coupled = front.measures.T
     assert size[0] > 0.0 and coupled[-1] < 30.0
@@ -246,7 +244,7 @@ def test_the_number_of_processes_changes_no_bit(population):
         assert bits(search(three, chosen)) == bits(search(population, chosen))
 
 
-def opened(file, chosen) -> Journal:
+def opened(file, chosen):
     return Journal(file, {"settings": asdict(chosen)})
 
 
@@ -331,7 +329,6 @@ def test_the_error_has_the_smallest_violations(shared):
     assert limit.bound == slow.velocity[1]
     assert limit.value > limit.bound
     assert limit.excess == scores.excess[scores.excess[:, 1] > 0.0, 1].min()
-    assert limit.time is not None
     for part in (f"none of {error.tried}", "joint limit", "velocity", f"at {limit.time:.3f} s"):
         assert part in str(error)
 
@@ -378,11 +375,11 @@ def test_a_search_without_new_motions_ends_as_exhausted(population):
 PLANNING = KINDS.index("planning")
 
 
-def genes(count: int, n_genes: int = 8, seed: int = 0) -> np.ndarray:
+def genes(count, n_genes=8, seed=0):
     return np.random.default_rng(seed).random((count, n_genes))
 
 
-def same(scores: Scores, others: Scores) -> bool:
+def same(scores, others):
     return scores.rows.tobytes() == others.rows.tobytes()
 
 
@@ -446,7 +443,7 @@ def test_a_killed_process_changes_nothing(scorers):
     assert scorers.violations(rows[0]) == ()
 
 
-def currents(limit: float) -> CurrentModel:
+def currents(limit):
     model = problem().objective.model
     values = np.random.default_rng(2).uniform(0.1, 1.0, model.n_parameters)
     return CurrentModel(model, values, np.eye(2), np.ones(2), np.full(2, limit), uncertainty=0.2)
@@ -480,7 +477,7 @@ def test_excess_is_that_of_the_violations_by_kind(scorers):
     np.testing.assert_array_equal(scores.measures, scorers.score(rows).measures)
 
 
-def scored(log10_det: float, coupling_index: float, excess: float) -> np.ndarray:
+def scored(log10_det, coupling_index, excess):
     row = np.zeros(ROW)
     row[:3] = log10_det, coupling_index, 10.0
     row[3 + 1] = excess
@@ -503,11 +500,9 @@ def test_unexciting_and_unplannable_motions_rank_last(method, n_objectives):
     settings = SearchSettings(method=method, population=len(rows), generations=2)
     evolution = Evolution(settings, first, n_objectives)
     asked = evolution.ask()
-    assert asked is not None
     scores = Scores.of_rows(rows)
     evolution.tell(scores, scores.measures[:, :n_objectives] * [-1.0, 1.0][:n_objectives])
     children = evolution.ask()
-    assert children is not None
     without_motion = np.tile(unplanned(), (len(children), 1))
     evolution.tell(Scores.of_rows(without_motion), np.zeros((len(children), n_objectives)))
     ranked = evolution._algorithm.pop.get("X")

@@ -1,13 +1,10 @@
 """Files for simulators, parts of torque, noise, and replays of motions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification import FrictionLaw, Motion, RobotModel
 from identification.export.simulators import (
@@ -27,7 +24,6 @@ from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.payload import Payload
 from identification.signals.noise import noiseless_above, spectrum
-from identification.signals.samples import Samples
 from identification.signals.smoothing import LowPassShape, low_passed
 from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
@@ -39,9 +35,9 @@ WRIST = np.eye(6)
 WRIST[5, 4] = 0.5
 
 
-def an_arm(urdf: str, **options: object) -> Arm:
+def an_arm(urdf, **options):
     """Random consistent bodies, and friction of all kinds."""
-    model = RobotModel.from_urdf(urdf, **options)  # type: ignore[arg-type]
+    model = RobotModel.from_urdf(urdf, **options)
     n = model.n_joints
     standard = np.zeros(model.layout.size)
     standard[: 11 * n] = some_bodies(n)
@@ -54,7 +50,7 @@ def an_arm(urdf: str, **options: object) -> Arm:
     return Arm(urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite))
 
 
-def readable(form: str) -> None:
+def readable(form):
     if form == "mjcf":
         pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
 
@@ -67,14 +63,14 @@ class TestReadBack:
 
     @FORMS
     @pytest.mark.parametrize("seed", [1, 2])
-    def test_trees_of_any_joints(self, form: str, seed: int) -> None:
+    def test_trees_of_any_joints(self, form, seed):
         readable(form)
         arm = an_arm(random_urdf(seed), friction=FrictionLaw(third="cubic"))
         text = FORMATS[form].write(arm, "random", [])
         assert compare(text, FORMATS[form], arm, random_states(arm, 20)).difference < AGREES
 
     @FORMS
-    def test_a_published_description(self, form: str) -> None:
+    def test_a_published_description(self, form):
         """With rounded angles and locked joints."""
         readable(form)
         arm = an_arm(robot_text("panda_description/urdf/panda.urdf"),
@@ -83,7 +79,7 @@ class TestReadBack:
         assert compare(text, FORMATS[form], arm, random_states(arm, 20)).difference < AGREES
 
     @FORMS
-    def test_everything_that_an_arm_can_have(self, form: str) -> None:
+    def test_everything_that_an_arm_can_have(self, form):
         readable(form)
         arm = an_arm(
             urdf_text(),
@@ -112,7 +108,7 @@ class TestReadBack:
         assert ("a term f2 with the speed squared" in left) == (form != "mjcf")
 
     @FORMS
-    def test_parts_left_out_have_their_own_torque(self, form: str) -> None:
+    def test_parts_left_out_have_their_own_torque(self, form):
         readable(form)
         arm = an_arm(urdf_text(), friction=FrictionLaw(offset=True), coupling=Coupling(WRIST))
         motion = random_states(arm, 50)
@@ -124,7 +120,7 @@ class TestReadBack:
             np.testing.assert_allclose(found.left_out["rotor inertias"], rms)
 
     @FORMS
-    def test_a_changed_text_is_refused(self, form: str) -> None:
+    def test_a_changed_text_is_refused(self, form):
         readable(form)
         arm = an_arm(urdf_text())
         other = replace(arm, standard=1.01 * arm.standard)
@@ -136,26 +132,24 @@ class TestReadBack:
 class TestTexts:
     """Content of the files beside the inertia."""
 
-    def test_limits_springs_and_names(self) -> None:
+    def test_limits_springs_and_names(self):
         arm = an_arm(urdf_text(), elements=[TorsionSpring("joint_2", 0.3, 50.0)])
         n = arm.model.n_joints
         ranges = Ranges(-np.ones(n), np.full(n, 2.0), np.full(n, 3.0), np.full(n, 40.0))
         arm = replace(arm, ranges=ranges)
         model = ElementTree.fromstring(mjcf(arm, "arm"))
         joint = model.find(".//joint[@name='joint_2']")
-        assert joint is not None
         assert joint.get("range") == "-1.0 2.0"
         assert joint.get("actuatorfrcrange") == "-40.0 40.0"
         assert (joint.get("stiffness"), joint.get("springref")) == ("50.0", "0.3")
         assert [one.get("ctrlrange") for one in model.iter("motor")] == ["-40.0 40.0"] * n
         assert "gravcomp" not in mjcf(arm, "arm")
         limit = ElementTree.fromstring(sdf(arm, "arm")).find(".//joint[@name='joint_2']/axis/limit")
-        assert limit is not None
         assert {one.tag: one.text for one in limit} == {
             "lower": "-1.0", "upper": "2.0", "velocity": "3.0", "effort": "40.0"}  # fmt: skip
 
     @FORMS
-    def test_dry_friction_is_written_as_it_was_identified(self, form: str) -> None:
+    def test_dry_friction_is_written_as_it_was_identified(self, form):
         arm = an_arm(urdf_text())
         f0 = [row["f0"] for row in arm.friction]
         root = ElementTree.fromstring(FORMATS[form].write(arm, "arm", []))
@@ -166,30 +160,28 @@ class TestTexts:
             found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
         assert found == f0
 
-    def test_a_link_does_not_share_its_name_with_a_joint(self) -> None:
+    def test_a_link_does_not_share_its_name_with_a_joint(self):
         urdf = urdf_text().replace('"link_2"', '"joint_2"')
         root = ElementTree.fromstring(sdf(an_arm(urdf), "arm"))
         names = [one.get("name") for tag in ("link", "joint", "frame") for one in root.iter(tag)]
         assert len(names) == len(set(names))
 
 
-Array = NDArray[np.float64]
-
 F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
 PRESLIDING = 1e-3
 
 
-def model_with(**law: float | bool) -> RobotModel:
+def model_with(**law):
     return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, offset=True, **law))
 
 
-def values_of(model: RobotModel) -> Array:
+def values_of(model):
     standard = model.nominal.copy()
     standard[[10, 21]] = 0.4, 0.1  # rotors
     return np.concatenate([model.base.grouping @ standard, F0, F1, FO])
 
 
-def samples_of(model: RobotModel, bandwidth: float | None = None) -> Samples:
+def samples_of(model, bandwidth=None):
     motion = one_sine(np.arange(3000) * 2e-3, phase=(0.0, 0.0))
     samples = as_samples(
         model,
@@ -207,20 +199,20 @@ class TestParts:
 
     @pytest.mark.parametrize("bandwidth", [None, 20.0])
     @pytest.mark.parametrize("presliding", [0.0, PRESLIDING])
-    def test_add_up_to_it(self, bandwidth: float | None, presliding: float) -> None:
+    def test_add_up_to_it(self, bandwidth, presliding):
         model = model_with(presliding=presliding)
         samples = samples_of(model, bandwidth)
         parts = torque_parts(model, values_of(model), samples)
         np.testing.assert_allclose(sum(parts), samples.torque, atol=1e-9)
 
-    def test_are_those_of_the_whole_where_samples_are_a_part(self) -> None:
+    def test_are_those_of_the_whole_where_samples_are_a_part(self):
         model = model_with()
         whole = samples_of(model, 20.0)
         some = torque_parts(model, values_of(model), whole.between(500, 900))
         for part, all_rows in zip(some, torque_parts(model, values_of(model), whole), strict=True):
             np.testing.assert_array_equal(part, all_rows[500:900])
 
-    def test_follow_what_they_are_named_after(self) -> None:
+    def test_follow_what_they_are_named_after(self):
         """Doubled speed: Coriolis torque grows fourfold; inertia and gravity stay."""
         model, values = model_with(), values_of(model_with())
         samples = samples_of(model)
@@ -239,7 +231,7 @@ class TestParts:
 class TestFrictionCurve:
     """Friction of a joint over speed and after a reversal."""
 
-    def test_jumps_at_zero_and_has_the_offset(self) -> None:
+    def test_jumps_at_zero_and_has_the_offset(self):
         model = model_with()
         curve = friction_curve(model, values_of(model), 1, -2.0, 3.0)
         assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
@@ -250,7 +242,7 @@ class TestFrictionCurve:
         assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
         assert np.isnan(curve.travel).all() and np.isnan(curve.turning).all()
 
-    def test_reverses_over_the_presliding_displacement(self) -> None:
+    def test_reverses_over_the_presliding_displacement(self):
         model = model_with(presliding=PRESLIDING)
         curve = friction_curve(model, values_of(model), 0, -1.0, 1.0)
         assert curve.turning[0] == pytest.approx(FO[0] - F0[0])
@@ -258,7 +250,7 @@ class TestFrictionCurve:
         zero = np.interp(0.0, curve.turning - FO[0], curve.travel)
         assert zero == pytest.approx(PRESLIDING * np.log(2.0), rel=0.02)
 
-    def test_of_an_arm_with_an_identified_spring(self) -> None:
+    def test_of_an_arm_with_an_identified_spring(self):
         """Parameters after those of friction are ignored."""
         law = FrictionLaw(third=None, offset=True)
         spring = TorsionSpring("shoulder", 0.2, identified=True)
@@ -266,7 +258,7 @@ class TestFrictionCurve:
         curve = friction_curve(model, np.append(values_of(model_with()), 25.0), 0, -1.0, 1.0)
         assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
 
-    def test_agrees_with_the_data(self) -> None:
+    def test_agrees_with_the_data(self):
         """Torque minus the other parts is on the curve for a perfect model."""
         model = model_with()
         values, samples = values_of(model), samples_of(model)
@@ -281,7 +273,7 @@ class TestFrictionCurve:
 class TestSpectrum:
     """Amplitude spectral density of torques."""
 
-    def test_of_white_noise_is_flat_at_its_density(self) -> None:
+    def test_of_white_noise_is_flat_at_its_density(self):
         rate, std = 500.0, 0.3
         time = np.arange(20_000) / rate
         noise = std * np.random.default_rng(1).standard_normal((20_000, 1))
@@ -290,7 +282,7 @@ class TestSpectrum:
         level = np.sqrt(np.mean(density[frequency > 5.0] ** 2))
         assert level == pytest.approx(expected, rel=0.05)
 
-    def test_has_its_peak_at_the_sine(self) -> None:
+    def test_has_its_peak_at_the_sine(self):
         """Uneven time stamps are used as times."""
         rng = np.random.default_rng(2)
         time = np.sort(np.arange(4000) * 0.01 + rng.uniform(0.0, 0.003, 4000))
@@ -299,7 +291,7 @@ class TestSpectrum:
         )
         assert frequency[np.argmax(density)] == pytest.approx(7.0, rel=0.03)
 
-    def test_reads_the_longest_segment_and_none_that_is_short(self) -> None:
+    def test_reads_the_longest_segment_and_none_that_is_short(self):
         time = np.arange(300) * 0.01
         signals = np.where(np.arange(300) < 40, 9.0, np.sin(time))[:, None]
         both = spectrum(time, signals, [slice(0, 40), slice(40, 300)])
@@ -314,34 +306,33 @@ class TestNoise:
     TIME = np.arange(4000) * 0.005
     SHAPE = LowPassShape(order=4)
 
-    def torque(self, noise: float) -> Array:
+    def torque(self, noise):
         slow = 20.0 * np.sin(2.0 * np.pi * np.array([0.3, 0.9]) * self.TIME[:, None])
         return np.asarray(slow + noise * np.random.default_rng(3).standard_normal(slow.shape))
 
-    def above(self, torque: Array) -> float | None:
+    def above(self, torque):
         return noiseless_above(self.TIME, torque, [slice(0, len(torque))])
 
-    def test_of_half_a_per_cent_is_seen(self) -> None:
+    def test_of_half_a_per_cent_is_seen(self):
         assert self.above(self.torque(0.1)) is None
 
     @pytest.mark.parametrize("bandwidth", [2.0, 5.0, 10.0])
-    def test_ends_above_a_low_pass(self, bandwidth: float) -> None:
+    def test_ends_above_a_low_pass(self, bandwidth):
         found = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
-        assert found is not None
         assert bandwidth < found < 2.5 * bandwidth
 
-    def test_of_one_joint_is_enough_for_the_channel(self) -> None:
+    def test_of_one_joint_is_enough_for_the_channel(self):
         torque = self.torque(0.1)
         torque[:, 1] = low_passed(self.TIME, torque[:, 1:], 5.0, self.SHAPE)[:, 0]
         assert self.above(torque) is None
 
-    def test_of_a_constant_or_a_few_samples_is_not_judged(self) -> None:
+    def test_of_a_constant_or_a_few_samples_is_not_judged(self):
         assert self.above(np.ones((4000, 2))) is None
         assert self.above(self.torque(0.0)[:20]) is None
 
 
-def an_ns16(**options: object) -> Simulated:
-    model = RobotModel.from_urdf(urdf_text(), **options)  # type: ignore[arg-type]
+def an_ns16(**options):
+    model = RobotModel.from_urdf(urdf_text(), **options)
     standard = np.zeros(model.layout.size)
     standard[:66] = some_bodies(6)
     standard[model.layout.rotors] += 1.0
@@ -350,7 +341,7 @@ def an_ns16(**options: object) -> Simulated:
     return Simulated(model, standard[None], values[None])
 
 
-def recorded(arm: Simulated, step: float = 2e-3) -> Samples:
+def recorded(arm, step=0.002):
     """A motion of three seconds of sines with its torque."""
     time = np.arange(0.0, 3.0, step)
     rng = np.random.default_rng(2)
@@ -359,7 +350,7 @@ def recorded(arm: Simulated, step: float = 2e-3) -> Samples:
     return samples(arm.model, motion, arm.model.torque(arm.values[0], *motion[1:]))
 
 
-def samples(model: RobotModel, motion: Motion, torque: Array) -> Samples:
+def samples(model, motion, torque):
     return as_samples(model, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
 
 
@@ -375,13 +366,13 @@ class TestReplay:
     """The true model reproduces the motion; another one does not."""
 
     @pytest.mark.parametrize("name", OPTIONS)
-    def test_the_true_arm_makes_the_motion(self, name: str) -> None:
+    def test_the_true_arm_makes_the_motion(self, name):
         arm = an_ns16(**OPTIONS[name])
         error = replay(arm, recorded(arm))
         assert np.abs(error).max() < 2e-3  # rad, of a motion of about 0.7
 
     @pytest.mark.parametrize("name", OPTIONS)
-    def test_arms_side_by_side_move_as_each_by_itself(self, name: str) -> None:
+    def test_arms_side_by_side_move_as_each_by_itself(self, name):
         arm = an_ns16(**OPTIONS[name])
         given = recorded(arm)
         short = samples(arm.model, given.motion.rows(slice(0, 300)), given.torque[:300])
@@ -391,12 +382,12 @@ class TestReplay:
         np.testing.assert_allclose(found[0], alone[0], atol=1e-12)
         assert not np.allclose(found[1], heavy[0], atol=1e-6)  # another inertia's feedback
 
-    def test_an_arm_of_another_weight_drifts(self) -> None:
+    def test_an_arm_of_another_weight_drifts(self):
         arm = an_ns16()
         good, bad = replay(together(arm, changed_weight(arm, 1.2)), recorded(arm))
         assert np.all(np.sqrt(np.mean(bad**2, axis=0)) > 3.0 * np.sqrt(np.mean(good**2, axis=0)))
 
-    def test_dry_friction_holds_an_arm_at_rest(self) -> None:
+    def test_dry_friction_holds_an_arm_at_rest(self):
         """Without friction every joint would fall."""
         arm = an_ns16(friction=FrictionLaw(viscous=False, third=None))
         values = arm.values.copy()
@@ -406,7 +397,7 @@ class TestReplay:
         error = replay(arm._replace(values=values), samples(arm.model, motion, 0.0 * still))
         assert np.abs(error).max() < 1e-9
 
-    def test_a_gap_starts_a_new_simulation(self) -> None:
+    def test_a_gap_starts_a_new_simulation(self):
         arm = an_ns16()
         given = recorded(arm)
         parts = replace(given, segments=(slice(0, 600), slice(800, 1500)))
@@ -414,7 +405,7 @@ class TestReplay:
         assert np.isnan(error[:, 600:800]).all()
         assert not error[:, [0, 800]].any()
 
-    def test_mujoco_makes_the_same_motion(self) -> None:
+    def test_mujoco_makes_the_same_motion(self):
         """With half of the true mass, from the same description with the same feedback."""
         pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
         truth = an_ns16(coupling=Coupling(WRIST))
@@ -423,18 +414,18 @@ class TestReplay:
         np.testing.assert_allclose(found, by_mujoco(arm, given), atol=5e-3)
 
 
-def changed_weight(arm: Simulated, factor: float) -> Simulated:
+def changed_weight(arm, factor):
     values = arm.values.copy()
     values[:, : arm.model.base.rank] *= factor
     return arm._replace(standard=factor * arm.standard, values=values)
 
 
-def together(*arms: Simulated) -> Simulated:
+def together(*arms):
     standard, values = (np.concatenate([one[k] for one in arms]) for k in (1, 2))
     return Simulated(arms[0].model, standard, values)
 
 
-def by_mujoco(arm: Simulated, given: Samples) -> Array:
+def by_mujoco(arm, given):
     mujoco = load_mujoco()
     infinite = np.full(6, np.inf)
     ranges = Ranges(-infinite, infinite, infinite, infinite)
@@ -461,7 +452,7 @@ class TestSlowResidual:
     """Causes of drift are separated by their dependence on the motion."""
 
     @pytest.mark.parametrize("joint", [0, 3])
-    def test_an_offset_and_friction_are_separated(self, joint: int) -> None:
+    def test_an_offset_and_friction_are_separated(self, joint):
         arm = an_ns16()
         right = recorded(arm)
         velocity = right.motion.velocity[:, joint]

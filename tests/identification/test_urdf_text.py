@@ -1,14 +1,11 @@
 """Untrusted robot descriptions: refused with a message; writing of URDFs."""
 
-from __future__ import annotations
-
 import difflib
 import gc
 import itertools
 import math
 import struct
 import time
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -44,13 +41,13 @@ ARM = (
 )
 
 
-def arm(old: str, new: str) -> str:
+def arm(old, new):
     """Return the arm with replaced text."""
     assert old in ARM
     return ARM.replace(old, new)
 
 
-def chain(n: int, kind: str) -> str:
+def chain(n, kind):
     """Return the arm with a chain of `n` more links."""
     links = ["upper", *(f"l{i}" for i in range(n))]
     more = "".join(
@@ -60,17 +57,17 @@ def chain(n: int, kind: str) -> str:
     return arm("</robot>", f"{more}</robot>")
 
 
-def declaring(entity: str, used: str = "") -> str:
+def declaring(entity, used=""):
     return f"<!DOCTYPE robot [{entity}]>" + arm('name="r"', f'name="r{used}"')
 
 
-def expanding() -> str:
+def expanding():
     """Ten nested entities ("billion laughs")."""
     lines = [f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10)]
     return declaring('<!ENTITY e0 "ha">' + "".join(lines), "&e9;")
 
 
-def without(old: str) -> str:
+def without(old):
     return arm(old, "")
 
 
@@ -78,18 +75,18 @@ LINKS = '<link name="a"/><link name="b"/>'
 LIMIT = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
 
 
-def joint(kind: str, child: str = "b", limit: str = "", name: str = "j") -> str:
+def joint(kind, child="b", limit="", name="j"):
     return (
         f'<joint name="{name}" type="{kind}"><parent link="a"/><child link="{child}"/>'
         f'<axis xyz="0 0 1"/>{limit}</joint>'
     )
 
 
-def robot(inside: str, head: str = ' name="r"') -> str:
+def robot(inside, head=' name="r"'):
     return f"<robot{head}>{inside}</robot>"
 
 
-def xacro(text: str) -> str:
+def xacro(text):
     return text.replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1)
 
 
@@ -169,7 +166,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_invalid_texts_are_refused_quickly(case: str) -> None:
+def test_invalid_texts_are_refused_quickly(case):
     text, why = REFUSED[case]
     began = time.process_time()
     with pytest.raises(ModelError) as caught:
@@ -192,7 +189,7 @@ LOST = {
 
 
 @pytest.mark.parametrize("left_out", LOST)
-def test_an_incomplete_inertia_is_refused(left_out: str) -> None:
+def test_an_incomplete_inertia_is_refused(left_out):
     """The reader drops the tensor, sometimes the mass, and the shapes of the link."""
     text = without(left_out)
     whole, read = (pin.buildModelFromXML(urdf) for urdf in (ARM, text))
@@ -203,12 +200,12 @@ def test_an_incomplete_inertia_is_refused(left_out: str) -> None:
 
 
 @pytest.mark.parametrize("left_out", [INERTIAL, '<origin xyz="0.2 0 0"/>', ' xyz="0.2 0 0"'])
-def test_optional_parts_may_be_missing(left_out: str) -> None:
+def test_optional_parts_may_be_missing(left_out):
     assert RobotModel.from_urdf(without(left_out)).n_joints == 1
 
 
 @pytest.mark.parametrize("encoding", ["UTF-32", "ISO-8859-1", "nonsense"])
-def test_the_declared_encoding_is_ignored(encoding: str) -> None:
+def test_the_declared_encoding_is_ignored(encoding):
     joint = "\N{GREEK CAPITAL LETTER ALPHA}"  # its bytes cannot be printed in ISO-8859-1
     text = f'<?xml version="1.0" encoding="{encoding}"?>{arm("shoulder", joint)}'
     model = RobotModel.from_urdf(text)
@@ -218,18 +215,18 @@ def test_the_declared_encoding_is_ignored(encoding: str) -> None:
 
 
 @pytest.mark.parametrize("number", [" 6", "+6", "6.", "0.6E+1", "006"])
-def test_accepted_numbers_are_read_correctly(number: str) -> None:
+def test_accepted_numbers_are_read_correctly(number):
     model = RobotModel.from_urdf(arm('value="6"', f'value="{number}"'))
     mass = model.chain.inertial[0, list(model.layout.names).index("m1")]
     assert math.isclose(mass, 6.0)
 
 
-def test_attributes_may_be_on_separate_lines() -> None:
+def test_attributes_may_be_on_separate_lines():
     assert refusal(ARM.replace('" i', '"\n\ti').replace('" value', '"\n value')) is None
     assert refusal("<!-- a > b -->\n" + arm("<mass ", "<mass\n\t")) is None
 
 
-def checker(urdf: str) -> CollisionChecker:
+def checker(urdf):
     return CollisionChecker(urdf, Workspace(floor=-1.0))
 
 
@@ -242,7 +239,7 @@ def checker(urdf: str) -> CollisionChecker:
         ("0.3 1e308 0.1", r"a collision shape of link 'upper' is larger than 1e\+06 m"),
     ],
 )
-def test_unreadable_collision_shapes_are_refused(size: str, why: str) -> None:
+def test_unreadable_collision_shapes_are_refused(size, why):
     """A second, valid shape must not hide an invalid one."""
     urdf = arm(SHAPE, SHAPE.replace("0.3 0.1 0.1", size))
     both = chain(1, "revolute").replace(SHAPE, SHAPE.replace("0.3 0.1 0.1", size))
@@ -258,7 +255,7 @@ FAR = '<origin xyz="1e300 0 0"/>'
 
 
 @pytest.mark.parametrize("kind", ["revolute", "fixed"])
-def test_too_distant_parts_are_refused(kind: str) -> None:
+def test_too_distant_parts_are_refused(kind):
     sound = chain(1, kind)
     joint = '<joint name="j_l0" type="' + kind + '">'
     assert joint in sound
@@ -274,7 +271,7 @@ def test_too_distant_parts_are_refused(kind: str) -> None:
 
 
 @pytest.mark.parametrize("corner", [math.nan, 0.0])
-def test_a_mesh_without_volume_is_named(corner: float, tmp_path: Path) -> None:
+def test_a_mesh_without_volume_is_named(corner, tmp_path):
     """Four triangles in one point, or with invalid corners."""
     triangle = b"\0" * 12 + struct.pack("<9f", *[corner] * 9) + b"\0\0"
     mesh = tmp_path / "mesh.stl"
@@ -285,7 +282,7 @@ def test_a_mesh_without_volume_is_named(corner: float, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [ARM, ARM[:-1]])
-def test_a_description_is_freed_after_reading(text: str) -> None:
+def test_a_description_is_freed_after_reading(text):
     """It may have 20 MB; the cycle collector may run minutes later."""
     refusal(text)
     gc.collect()
@@ -300,11 +297,11 @@ def test_a_description_is_freed_after_reading(text: str) -> None:
 DRAKE = 'xmlns="http://drake.mit.edu"'
 
 
-def drakes(text: str) -> str:
+def drakes(text):
     return text.replace("<robot ", f"<robot {DRAKE} ")
 
 
-def test_elements_have_the_names_that_are_written() -> None:
+def test_elements_have_the_names_that_are_written():
     text = (
         f'<robot {DRAKE} xmlns:gazebo="x" name="r"><!-- first --><link name="a&amp;b" />'
         '<gazebo:link gazebo:name="c">1 &lt; 2</gazebo:link></robot>'
@@ -315,7 +312,7 @@ def test_elements_have_the_names_that_are_written() -> None:
     assert [child.tag for child in urdf_tree(text)] == ["link", "gazebo:link"]
 
 
-def test_faults_are_found_in_a_namespace_too() -> None:
+def test_faults_are_found_in_a_namespace_too():
     checker(drakes(ARM))
     second = arm("</robot>", f'<link name="l"/>{HINGE.format("j", "revolute", "upper", "l")}')
     second = second.replace('<link name="l"/>', f'<link name="l">{SHAPE}</link>') + "</robot>"
@@ -339,7 +336,7 @@ ROBOTS = {
 
 
 @pytest.mark.parametrize("name", ["ur10", "panda"])
-def test_pinocchio_reads_the_parameters_back(name: str) -> None:
+def test_pinocchio_reads_the_parameters_back(name):
     urdf = ROBOTS[name]()
     model = RobotModel.from_urdf(urdf, friction=FrictionLaw(offset=True))
     n = model.n_joints
@@ -366,13 +363,13 @@ def test_pinocchio_reads_the_parameters_back(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ns16", "panda"])
-def test_only_inertia_and_friction_change(name: str) -> None:
+def test_only_inertia_and_friction_change(name):
     urdf = ROBOTS[name]()
     model = RobotModel.from_urdf(urdf)
     friction = np.ones(3 * model.n_joints)
     written = write_urdf(urdf, model, some_bodies(model.n_joints), friction)
 
-    def without(text: str) -> list[str]:
+    def without(text):
         root = ElementTree.fromstring(text)
         for link in root.findall("link"):
             for inertial in link.findall("inertial"):
@@ -389,7 +386,7 @@ def test_only_inertia_and_friction_change(name: str) -> None:
         assert line[0] in " ?" or any(word in line for word in words), line
 
 
-def test_friction_not_given_and_other_attributes_stay() -> None:
+def test_friction_not_given_and_other_attributes_stay():
     urdf = ROBOTS["panda"]()
     model = RobotModel.from_urdf(urdf)
     n = model.n_joints
@@ -416,7 +413,7 @@ WITH_TOOL = TWO_LINK.replace(
 )
 
 
-def test_fixed_links_are_included_once() -> None:
+def test_fixed_links_are_included_once():
     model = RobotModel.from_urdf(WITH_TOOL)
     assert model.nominal[20] == pytest.approx(4.0)  # 3 kg and 1 kg
     written = write_urdf(WITH_TOOL, model, model.nominal)
@@ -432,7 +429,7 @@ def test_fixed_links_are_included_once() -> None:
     assert "inertia is contained in lower" in written
 
 
-def test_the_base_keeps_its_inertia() -> None:
+def test_the_base_keeps_its_inertia():
     urdf = TWO_LINK.replace(
         '<link name="base"/>',
         '<link name="base"><inertial><mass value="50"/>'
@@ -456,7 +453,7 @@ ROTATED = 'rpy="0.3 -1 2"'
     ],
     ids=["rotated frame", "no inertia", "no origin"],
 )  # fmt: skip
-def test_inertia_is_written_in_its_frame(urdf: str) -> None:
+def test_inertia_is_written_in_its_frame(urdf):
     """A rotated inertial frame stays; a link without inertia gets one."""
     model, standard = RobotModel.from_urdf(urdf), some_bodies(2)
     written = write_urdf(urdf, model, standard)
@@ -482,7 +479,7 @@ FIXED = TWO_LINK.replace('name="elbow" type="revolute"', 'name="elbow" type="fix
         ({}, np.ones(3), ShapeError, "coefficients"),
     ],
 )
-def test_inconsistent_parameters_are_refused(standard, friction, error, words) -> None:
+def test_inconsistent_parameters_are_refused(standard, friction, error, words):
     model = RobotModel.from_urdf(TWO_LINK)
     values = model.nominal.copy()
     values[[*standard]] = [*standard.values()]
@@ -490,7 +487,7 @@ def test_inconsistent_parameters_are_refused(standard, friction, error, words) -
         write_urdf(TWO_LINK, model, values, *([friction] if len(friction) else []))
 
 
-def test_the_description_of_another_robot_is_refused() -> None:
+def test_the_description_of_another_robot_is_refused():
     model = RobotModel.from_urdf(TWO_LINK)
     longer = TWO_LINK.replace('<origin xyz="0 0 0.5" rpy="0 0 0"/>\n    <axis', "<axis")
     assert longer != TWO_LINK
@@ -518,7 +515,7 @@ REST = """<?xml version="1.0"?>
 """
 
 
-def test_other_elements_and_comments_are_unchanged() -> None:
+def test_other_elements_and_comments_are_unchanged():
     """White space and quotes inside tags may change."""
     urdf = REST.format("\n  " + HINGE.format("shoulder", "revolute", "base", "upper"))
     model = RobotModel.from_urdf(urdf)

@@ -1,7 +1,5 @@
 """Prediction errors, and coverage of intervals of held-out torque."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.least_squares import estimate_repetitions
@@ -17,7 +14,7 @@ from identification.factor.factor import Factor, joint_weights, solve
 from identification.factor.phases import PhaseFactor
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.samples import Samples
-from identification.validation.calibration import Calibration, TorqueMeans, calibrate, inner_errors
+from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repetition_noise
 from identification.validation.prediction import (
     PredictionError,
@@ -36,13 +33,10 @@ from tests.identification.two_link import (
     truth,
 )
 
-Array = NDArray[np.float64]
-
-
 torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
 
 
-def samples_with(error: Array, *, origin: float = 0.0) -> Samples:
+def samples_with(error, *, origin=0.0):
     """Return a motion with the torque of unit parameters plus an error (m, 2)."""
     time = np.arange(len(error)) * 2e-3
     motion = one_sine(time)._replace(time=time + origin)
@@ -50,7 +44,7 @@ def samples_with(error: Array, *, origin: float = 0.0) -> Samples:
     return as_samples(MODEL, motion, torque, origin=origin)
 
 
-def test_error_measures_are_correct() -> None:
+def test_error_measures_are_correct():
     measured = np.array([[3.0, 1.0], [-4.0, 2.0]])
     error = PredictionError.between(measured, np.array([[2.0, 1.0], [-2.0, 2.0]]))
     np.testing.assert_allclose(error.mean_absolute, [1.5, 0.0])
@@ -61,9 +55,7 @@ def test_error_measures_are_correct() -> None:
 
 
 @given(torques, torques, arrays(np.bool_, (20, 2)))
-def test_unusable_rows_have_no_effect(
-    measured: Array, predicted: Array, usable: NDArray[np.bool_]
-) -> None:
+def test_unusable_rows_have_no_effect(measured, predicted, usable):
     spoilt = np.where(usable, measured, np.nan)
     one = PredictionError.between(measured, predicted, usable)
     two = PredictionError.between(spoilt, predicted, usable)
@@ -73,14 +65,14 @@ def test_unusable_rows_have_no_effect(
 
 
 @given(torques, torques, torques, torques)
-def test_errors_of_two_recordings_add(m1: Array, p1: Array, m2: Array, p2: Array) -> None:
+def test_errors_of_two_recordings_add(m1, p1, m2, p2):
     both = pooled_error([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
     joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
     np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
     assert both.overall == pytest.approx(joined.overall, rel=1e-12, nan_ok=True)
 
 
-def test_prediction_error_of_usable_or_all_rows() -> None:
+def test_prediction_error_of_usable_or_all_rows():
     values = np.ones(MODEL.n_parameters)
     samples = samples_with(np.zeros((2000, 2)))
     torque = samples.torque.copy()
@@ -92,7 +84,7 @@ def test_prediction_error_of_usable_or_all_rows() -> None:
     assert error.overall > 0.05
 
 
-def test_friction_change_is_separated() -> None:
+def test_friction_change_is_separated():
     """Measured without limit, compensated up to a tenth."""
     values = np.ones(MODEL.n_parameters)
     motion = samples_with(np.zeros((5000, 2))).motion
@@ -109,7 +101,7 @@ def test_friction_change_is_separated() -> None:
     assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
 
 
-def test_noise_is_measured_between_repetitions() -> None:
+def test_noise_is_measured_between_repetitions():
     """With different clock offsets."""
     rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
     common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
@@ -122,7 +114,7 @@ def test_noise_is_measured_between_repetitions() -> None:
     assert np.isnan(repetition_noise(MODEL, values, [runs[0], later])).all()
 
 
-def test_a_joint_without_torque_has_no_relative_error() -> None:
+def test_a_joint_without_torque_has_no_relative_error():
     measured = np.column_stack([np.ones(5), np.zeros(5)])
     error = PredictionError.between(measured, measured + 0.1)
     np.testing.assert_allclose(error.relative, [0.1, np.nan])
@@ -136,23 +128,23 @@ LENGTH = len(MOTION.time)
 CUT = 2800  # of 4000 rows: what is fitted
 
 
-def least_squares(factor: Factor) -> Array:
+def least_squares(factor):
     return solve(factor.weighted(joint_weights(factor))).values
 
 
-def calibrated(fitted: Samples, held_out: Samples) -> Calibration:
+def calibrated(fitted, held_out):
     result = estimate_repetitions(MODEL, [fitted])
     means = [TorqueMeans.of(MODEL, [one]) for one in (fitted, held_out)]
     return calibrate(result.pooled, result.phase, means[0], means[1], least_squares)
 
 
-def split(error: Array) -> Calibration:
+def split(error):
     """Fit the beginning of a motion, hold out the rest."""
     samples = recording(error, MOTION)
     return calibrated(samples.between(0, CUT), samples.between(CUT, LENGTH))
 
 
-def shares(correlation: float, model_error: float = 0.0, seeds: int = 50) -> tuple[float, ...]:
+def shares(correlation, model_error=0.0, seeds=50):
     """Return share inside, with white residuals, and half width over noise."""
     systematic = model_error * NOISE * np.sin(6.0 * MOTION.position)
     found = []
@@ -167,13 +159,13 @@ class TestIntervals:
     """Held-out mean torques are inside their 95 % intervals."""
 
     @pytest.mark.parametrize("correlation", [0.0, 0.02, 0.05, 0.1, 0.2])
-    def test_they_cover_for_white_and_coloured_noise(self, correlation: float) -> None:
+    def test_they_cover_for_white_and_coloured_noise(self, correlation):
         """93 to 98 % inside; intervals of white residuals fail for coloured noise."""
         inside, white, _ = shares(correlation)
         assert 0.93 <= inside <= 0.98
         assert (white < 0.7) == (correlation > 0.0)
 
-    def test_they_cover_with_a_model_error(self) -> None:
+    def test_they_cover_with_a_model_error(self):
         """Unmodelled torque as large as the noise: 93 to 98 % inside."""
         _, _, without = shares(0.02)
         inside, white, half_width = shares(0.02, model_error=1.0)
@@ -181,7 +173,7 @@ class TestIntervals:
         assert half_width > 1.3 * without
         assert white < 0.7
 
-    def test_repeated_errors_do_not_shrink_them(self) -> None:
+    def test_repeated_errors_do_not_shrink_them(self):
         """An error equal in all repetitions counts once."""
         noise = coloured(np.random.default_rng(1), LENGTH, 5e-3, 0.05)
         one = recording(noise, MOTION).between(0, CUT)
@@ -197,7 +189,7 @@ class TestIntervals:
 
 
 class TestHeldOutTorque:
-    def test_it_does_not_change_the_intervals(self) -> None:
+    def test_it_does_not_change_the_intervals(self):
         noise = coloured(np.random.default_rng(2), LENGTH, 5e-3, 0.05)
         spoiled = noise.copy()
         spoiled[CUT:] += 20.0 * NOISE
@@ -205,7 +197,7 @@ class TestHeldOutTorque:
         np.testing.assert_array_equal(off.half_width, sound.half_width)
         assert off.overall == 0.0 < 0.8 < sound.overall
 
-    def test_without_means_the_share_is_nan(self) -> None:
+    def test_without_means_the_share_is_nan(self):
         samples = recording(coloured(np.random.default_rng(3), LENGTH, 5e-3, 0.05), MOTION)
         found = calibrated(samples, samples.between(0, 0))
         assert np.isnan(found.overall)
@@ -213,7 +205,7 @@ class TestHeldOutTorque:
 
 
 class TestInnerFolds:
-    def test_each_fold_is_predicted_from_the_others(self) -> None:
+    def test_each_fold_is_predicted_from_the_others(self):
         """Equal to leaving out the first fold by hand."""
         noise = coloured(np.random.default_rng(4), LENGTH, 5e-3, 0.05)
         samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
@@ -223,7 +215,7 @@ class TestInnerFolds:
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
         np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
 
-    def test_a_joint_moving_in_one_fold_has_no_interval(self) -> None:
+    def test_a_joint_moving_in_one_fold_has_no_interval(self):
         samples = recording(coloured(np.random.default_rng(5), LENGTH, 5e-3, 0.05), MOTION)
         usable = samples.usable.copy()
         usable[200:, 1] = False
@@ -233,12 +225,12 @@ class TestInnerFolds:
         assert found.blocks.tolist() == [12, 0]
         assert found.overall == found.inside[0]
 
-    def test_two_seconds_are_too_short(self) -> None:
+    def test_two_seconds_are_too_short(self):
         samples = recording(np.zeros((LENGTH, 2)), MOTION)
         with pytest.raises(IdentificationError, match="too short"):
             calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
 
-    def test_final_rest_belongs_to_the_last_fold(self) -> None:
+    def test_final_rest_belongs_to_the_last_fold(self):
         """Unfitted rows are predicted."""
         samples = recording(coloured(np.random.default_rng(6), LENGTH, 5e-3, 0.05), MOTION)
         usable = samples.usable.copy()
@@ -249,14 +241,14 @@ class TestInnerFolds:
 
 
 class TestTorqueMeans:
-    def test_a_half_empty_block_has_no_mean(self) -> None:
+    def test_a_half_empty_block_has_no_mean(self):
         samples = recording(np.zeros((LENGTH, 2)), MOTION)
         for length, known in ((1040, 10), (1060, 11)):
             errors = TorqueMeans.of(MODEL, [samples.between(0, length)]).errors(truth())
             assert len(errors) == 11
             np.testing.assert_array_equal(np.isfinite(errors).sum(axis=0), known)
 
-    def test_edges_are_excluded_and_rest_included(self) -> None:
+    def test_edges_are_excluded_and_rest_included(self):
         """Motion or torque are unknown at edges."""
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
         ends[:20], slow[40:60] = True, True

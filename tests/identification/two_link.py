@@ -1,12 +1,8 @@
 """A planted arm of two links, a motion of it, and recordings with noise whose truth is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from identification.model.friction import FrictionLaw
@@ -14,12 +10,8 @@ from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-Array = NDArray[np.float64]
 
-
-def sine_motion(
-    time: Array, size: Array, pace: Array, phase: Array, centre: Array | float = 0.0
-) -> Motion:
+def sine_motion(time, size, pace, phase, centre=0.0):
     """Sums of sines about a centre, of sizes, paces and phases (k, n) or (n,)."""
     a, w, own = np.broadcast_arrays(*map(np.atleast_2d, (size, pace, phase)))
     angle = w * time[:, None, None] + own
@@ -31,7 +23,7 @@ def sine_motion(
     )
 
 
-def as_samples(model: RobotModel, motion: Motion, torque: Array, **changes: Any) -> Samples:
+def as_samples(model, motion, torque, **changes):
     """Samples of a motion without gaps, smoothed by nothing; where a joint moves its row counts."""
     fields = {
         "usable": model.moving(motion.velocity),
@@ -49,46 +41,44 @@ NOISE = np.array([3.0, 0.2])
 """Standard deviation of the torque noise of each joint [N·m]."""
 
 
-def truth() -> Array:
+def truth():
     """The planted parameters (p,)."""
     standard = MODEL.nominal.copy()
     standard[[10, 21]] = 0.4, 0.1  # rotors
     return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
 
 
-def one_sine(time: Array, size: Any = (0.9, 1.2), phase: Any = (0.3, 1.1), **named: Any) -> Motion:
+def one_sine(time, size=(0.9, 1.2), phase=(0.3, 1.1), **named):
     """One sine for each joint, with reversals at other times; `held_elbow` lets the second rest."""
     if named.pop("held_elbow", False):
         size = (size[0], 0.0)
     return sine_motion(time, np.array(size), np.array([2.1, 3.7]), np.array(phase), **named)
 
 
-def four_sines(
-    time: Array, speed: float = 1.0, *, n: int = 2, seed: int = 12, size: float = 1.0
-) -> Motion:
+def four_sines(time, speed=1.0, *, n=2, seed=12, size=1.0):
     """Four sines for each of n joints."""
     rng = np.random.default_rng(seed)
     a, w, phase = rng.uniform([[[0.2]], [[2.0]], [[0.0]]], [[[0.5]], [[9.0]], [[6.0]]], (3, 4, n))
     return sine_motion(time, size * a, w * speed, phase)
 
 
-def a_motion(duration: float = 10.0, step: float = 5e-3) -> Motion:
+def a_motion(duration=10.0, step=0.005):
     """Four sines for each joint, from time zero."""
     return four_sines(np.arange(0.0, duration, step))
 
 
-def recording(error: Array, motion: Motion) -> Samples:
+def recording(error, motion):
     """What the planted arm's torques were in a motion, with an error (m, 2) [N·m]."""
     torque = MODEL.torque(truth(), *motion[1:]) + error
     return as_samples(MODEL, motion, torque, origin=float(motion.time[0]))
 
 
-def gaussian(rng: np.random.Generator, motion: Motion) -> Array:
+def gaussian(rng, motion):
     """White noise of standard deviation NOISE."""
     return NOISE * rng.standard_normal((len(motion.time), 2))
 
 
-def coloured(rng: np.random.Generator, length: int, step: float, correlation: float) -> Array:
+def coloured(rng, length, step, correlation):
     """First-order noise of standard deviation NOISE, correlated over a time [s]; 0 for white."""
     r = np.exp(-step / correlation) if correlation else 0.0
     start = rng.standard_normal((1, 2)) * r

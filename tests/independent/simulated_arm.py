@@ -37,17 +37,17 @@ class SimulatedArm:
     viscous: Array  # (n,) [N·m·s/rad]
 
     @property
-    def joint_names(self) -> tuple[str, ...]:
+    def joint_names(self):
         return tuple(self.model.names[1:])
 
-    def torque(self, q: Array, qd: Array, qdd: Array) -> Array:
+    def torque(self, q, qd, qdd):
         """Joint torque (m, n) [N·m]."""
         data = self.model.createData()
         rigid = np.array([pin.rnea(self.model, data, *row) for row in zip(q, qd, qdd, strict=True)])
         return rigid + self.coulomb * np.tanh(qd / 1e-3) + self.viscous * qd
 
 
-def ns16() -> SimulatedArm:
+def ns16():
     """Return a COMAU NS 16, with more friction than inertia in the wrist."""
     urdf = (ROOT / "sim_fixtures" / "ns16" / "ns16.urdf").read_text(encoding="utf-8")
     model = pin.buildModelFromXML(urdf)
@@ -64,7 +64,7 @@ def ns16() -> SimulatedArm:
     )
 
 
-def panda() -> SimulatedArm:
+def panda():
     """Return a Franka Emika Panda without fingers; skips without its description."""
     try:
         package = distribution("example-robot-data")
@@ -98,7 +98,7 @@ class Sines:
     rate: Array  # (k, n), rad/s
     phase: Array  # (k, n)
 
-    def __call__(self, time: Array) -> tuple[Array, Array, Array]:
+    def __call__(self, time):
         """Position, velocity and acceleration (m, n)."""
         angle = self.rate * time[:, None, None] + self.phase
         wave = self.size * np.sin(angle)
@@ -106,7 +106,7 @@ class Sines:
         return self.centre + wave.sum(axis=1), slope, -(wave * self.rate**2).sum(axis=1)
 
 
-def motion(arm: SimulatedArm, seed: int, pace: float) -> Sines:
+def motion(arm, seed, pace):
     """Return five sines per joint, 0.1 to 1 Hz at pace 1, up to 60 % of the largest speeds."""
     rng = np.random.default_rng([seed, 1])
     shape = (5, len(arm.centre))
@@ -129,17 +129,17 @@ class Log:
 
 
 def record(
-    arm: SimulatedArm,
-    seed: int,
+    arm,
+    seed,
     *,
-    delay: float = 0.0,
-    pace: float = 1.0,
-    noise: Noise = "white",
-    level: float = 0.014,
-    duration: float = 20.0,
-    rate: float = 250.0,
-    moves: Sines | None = None,
-) -> Log:
+    delay=0.0,
+    pace=1.0,
+    noise="white",
+    level=0.014,
+    duration=20.0,
+    rate=250.0,
+    moves=None,
+):
     """Return a recording whose torque is logged a delay [s] after its position.
 
     The noise of the torque has a standard deviation of `level` times that of the torque; it is

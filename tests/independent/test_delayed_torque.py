@@ -1,15 +1,9 @@
 """Delayed torque, on recordings made without code of the project."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from identification.estimators.delay import (
-    DelayEstimate,
     estimate_delays,
     rate_products,
     with_uncertain_delay,
@@ -20,30 +14,26 @@ from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Settings, choose_settings
 from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, Samples, prepare
-from tests.independent.simulated_arm import Noise, SimulatedArm, ns16, panda, record
+from identification.signals.samples import Preprocessing, prepare
+from tests.independent.simulated_arm import ns16, panda, record
 
-Array = NDArray[np.float64]
-
-ARMS: dict[str, Callable[[], SimulatedArm]] = {"NS 16": ns16, "Panda": panda}
+ARMS = {"NS 16": ns16, "Panda": panda}
 DELAYS = [0.0, 0.0013, 0.004, 0.01]  # s
 NEAR = 0.3e-3  # s
 BRISK, SLOW = 1.3, 0.05  # pace; at 1.3 the NS 16 is at its acceleration limits
 SEEDS = 20
 
 
-def model_of(arm: SimulatedArm) -> RobotModel:
+def model_of(arm):
     return RobotModel.from_urdf(arm.urdf, locked=arm.locked, friction=FrictionLaw(third=None))
 
 
-def recorded(arm: SimulatedArm, seed: int, noise: Noise, delay: float, pace: float) -> Recording:
+def recorded(arm, seed, noise, delay, pace):
     log = record(arm, seed, delay=delay, pace=pace, noise=noise, duration=30.0)
     return Recording(log.time, log.position, arm.joint_names, torque=log.torque)
 
 
-def coverage(
-    arm: SimulatedArm, model: RobotModel, recording: Recording, found: DelayEstimate
-) -> float:
+def coverage(arm, model, recording, found):
     """Return the share of parameters in their 95 % intervals, with the delay compensated."""
     standard = model.nominal
     standard[10::11] = arm.model.armature
@@ -70,7 +60,7 @@ class TestDelayOfABriskMotion:
             ("NS 16", "coloured", 0.01),
         ],
     )
-    def test_it_is_found(self, name: str, noise: Noise, delay: float) -> None:
+    def test_it_is_found(self, name, noise, delay):
         arm = ARMS[name]()
         found = estimate_delays(recorded(arm, 0, noise, delay, BRISK), model_of(arm))
         assert found.determined and found.agree
@@ -81,7 +71,7 @@ class TestDelayOfABriskMotion:
     @pytest.mark.parametrize("name", ARMS)
     @pytest.mark.parametrize("noise", ["white", "coloured"])
     @pytest.mark.parametrize("delay", DELAYS)
-    def test_it_is_found_and_intervals_cover(self, name: str, noise: Noise, delay: float) -> None:
+    def test_it_is_found_and_intervals_cover(self, name, noise, delay):
         """Within 0.3 ms in 19 of 20 runs; 95 % intervals of parameters cover 93 to 98 %."""
         arm = ARMS[name]()
         model = model_of(arm)
@@ -100,13 +90,13 @@ class TestDelayOfABriskMotion:
 class TestDelayBesideOtherSettings:
     @pytest.mark.slow
     @pytest.mark.parametrize("seed", [2, 3, 4])
-    def test_a_presliding_displacement_does_not_replace_it(self, seed: int) -> None:
+    def test_a_presliding_displacement_does_not_replace_it(self, seed):
         """On all rows 1e-5 rad without delay predicts better than 1e-6 rad with the true one."""
         arm = ns16()
         model, recording = model_of(arm), recorded(arm, seed, "coloured", 0.0013, BRISK)
         found = estimate_delays(recording, model)
 
-        def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        def ready(model, how):
             return [prepare(recording, model, options=how)]
 
         best, _ = choose_settings(
@@ -121,7 +111,7 @@ class TestDelayBesideOtherSettings:
 
 class TestDelayOfASlowMotion:
     @pytest.mark.parametrize("name", ARMS)
-    def test_it_is_not_determined(self, name: str) -> None:
+    def test_it_is_not_determined(self, name):
         arm = ARMS[name]()
         found = estimate_delays(recorded(arm, 0, "coloured", 0.0, SLOW), model_of(arm))
         assert not found.determined
@@ -130,7 +120,7 @@ class TestDelayOfASlowMotion:
     @pytest.mark.slow
     @pytest.mark.parametrize("name", ARMS)
     @pytest.mark.parametrize("noise", ["white", "coloured"])
-    def test_it_is_not_determined_in_any_run(self, name: str, noise: Noise) -> None:
+    def test_it_is_not_determined_in_any_run(self, name, noise):
         arm = ARMS[name]()
         model = model_of(arm)
         for seed in range(SEEDS):
