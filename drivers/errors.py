@@ -198,9 +198,7 @@ class TargetNotFinite(NotFinite):
         self.arm = arm
 
 
-_BEYOND = (
-    "the motion exceeds the limits and would be refused again: rehearse it, or design another one"
-)
+_BEYOND = "the motion exceeds the limits and would be refused again: design another one"
 
 
 class PositionLimit(GuardError, check="position", unit="rad", remedy=_BEYOND):

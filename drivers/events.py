@@ -20,7 +20,7 @@ class Counters:
     """Packets since the session was created.
 
     `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...);
-    `unanswered` are replies that the controller did not accept, see `AnswersLost`.
+    `not_accepted` are replies that the controller did not accept, see `AnswersLost`.
     """
 
     answered: int = 0
@@ -30,7 +30,7 @@ class Counters:
     ended: int = 0
     missed: int = 0
     refused: int = 0
-    unanswered: int = 0
+    not_accepted: int = 0
     discarded: dict[str, int] = field(default_factory=dict)
 
 

@@ -44,26 +44,6 @@ class InitCheck:
     adopted: bool
 
 
-@dataclass(frozen=True, eq=False)
-class ControllerLimits:
-    """Limits (n,) of an arm's motors in an init packet; NaN where it has none.
-
-    `current` in A, thresholds `following_error` in motor revolutions.
-    """
-
-    current: Array
-    following_error: Array
-
-    @classmethod
-    def of(cls, init: InitPacket, arm: int, n_joints: int) -> ControllerLimits:
-        """Return the limits of the first axes of an arm, from 1."""
-        row, axes = arm - 1, slice(0, n_joints)
-        return cls(
-            init.current_limit[row, axes].astype(np.float64),
-            init.following_error[row, axes].astype(np.float64),
-        )
-
-
 def is_narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
     """Return where a limit (n,) of the controller is below the cell's by more than rounding."""
     return np.asarray(theirs < ours * (1.0 - _WRITTEN))

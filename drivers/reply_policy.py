@@ -274,12 +274,12 @@ class ReplyPolicy:
         self._wire.read(words.view(np.float32), ring.measured[row], ages)
 
     def check_gap(
-        self, unanswered: int, paused: bool, machine: StateMachine, reading: Reading
+        self, without_reply: int, paused: bool, machine: StateMachine, reading: Reading
     ) -> None:
         """Check in open mode that a gap or a pause before this packet allows to continue.
 
         Args:
-            unanswered: packets before this one without a reply.
+            without_reply: packets before this one without a reply.
             paused: this packet arrived late by the clock.
             machine: in the state that the packet leads to.
             reading: status and modes of the packet.
@@ -290,11 +290,11 @@ class ReplyPolicy:
         open_mode = self._open_mode
         if open_mode is None:
             return
-        open_mode.missed = unanswered
+        open_mode.missed = without_reply
         in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
         if not in_open or machine.entering:
             return
-        if unanswered > self._max_gap:
+        if without_reply > self._max_gap:
             open_mode.check_after_gap(machine.execution, reading, machine.cycle)
         elif paused:
             open_mode.check_after_pause(reading, machine.cycle)

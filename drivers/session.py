@@ -230,7 +230,7 @@ class Session:
         self._arrived_at = -math.inf
         self._last_packet = b""
         self._last_reply = b""
-        self._unanswered = 0
+        self._without_reply = 0
         # Number and last reason of packets without a reply, by kind, since the last drain.
         self._unreported: dict[str, tuple[int, str]] = {}
 
@@ -341,11 +341,11 @@ class Session:
             return
         assert self._silent_since is not None
         silence = now - self._silent_since
-        self._machine.events.append(LinkLost(silence, self.state, self._unanswered))
+        self._machine.events.append(LinkLost(silence, self.state, self._without_reply))
         self.deadline = math.inf
         self._sequence.broken = True
-        stale = f"only packets that do not follow the last one came ({self._unanswered})"
-        self._machine.apply(Input.SILENCE, stale if self._unanswered else "")
+        stale = f"only packets that do not follow the last one came ({self._without_reply})"
+        self._machine.apply(Input.SILENCE, stale if self._without_reply else "")
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """Return the reply to a packet, or None if it gets none.
@@ -426,7 +426,7 @@ class Session:
             self.counters.duplicates += 1
             return self._last_reply
         if self._sequence.is_stale(number):
-            self._unanswered += 1
+            self._without_reply += 1
             self.counters.stale += 1
             self._report("stale", 1, f"number {number} does not follow {self._sequence.last}")
             return None
@@ -435,24 +435,24 @@ class Session:
         late = (now - self._arrived_at) / self._guard.period - max(missed, self._max_gap)
         words = words_of(decoded)
         # After a corrupted number the controller's own numbers are stale for a while.
-        unanswered, self._unanswered = missed + self._unanswered, 0
+        without_reply, self._without_reply = missed + self._without_reply, 0
         reading = policy.reader.read(decoded.status, words[:, MODE])
         row = ring.slot
         ring.arrival[row] = now
         ring.number[row] = number
         ring.gap[row] = missed
         ring.cycle[row] = machine.cycle
-        policy.record(ring, row, reading, words, ages)
         refusal: RefusalError | None = None
         try:
-            machine.record_gap(missed, unanswered, self._max_gap)
+            policy.record(ring, row, reading, words, ages)
+            machine.record_gap(missed, without_reply, self._max_gap)
             machine.require_axes(reading, self._mode)
             before = machine.state
             machine.apply(reading.input)
             if machine.state is State.FAULTED and before is not State.FAULTED:
                 refusal = ModeRefused(*reading.faulty, machine.cycle)
             measured, commanded = ring.measured[row], ring.commanded[row]
-            policy.check_gap(unanswered, late > PAUSE_CYCLES, machine, reading)
+            policy.check_gap(without_reply, late > PAUSE_CYCLES, machine, reading)
             status = policy.fill(machine, reading, words, measured, commanded)
         except BaseException as error:
             # Any error becomes a reply in this cycle that asks the controller to stop.

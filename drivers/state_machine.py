@@ -146,7 +146,7 @@ class StateMachine:
         """
         if not lost:
             return
-        self._counters.unanswered += lost
+        self._counters.not_accepted += lost
         self.events.append(AnswersLost(lost, self.cycle))
         self._losses.append((self.cycle, lost))
         while self._losses[0][0] <= self.cycle - LOSS_WINDOW:
@@ -155,13 +155,13 @@ class StateMachine:
         if count > max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
 
-    def record_gap(self, missed: int, unanswered: int, max_gap: int) -> None:
-        """Count `missed` packets; more than `max_gap` `unanswered` ones stop a motion."""
+    def record_gap(self, missed: int, without_reply: int, max_gap: int) -> None:
+        """Count `missed` packets; more than `max_gap` `without_reply` ones stop a motion."""
         if missed:
             self._counters.missed += missed
             self.events.append(GapSeen(missed, self.cycle))
-        if unanswered > max_gap and self.state is State.OPEN and self.execution:
-            self.stop(f"{unanswered} packets were missed in a row")
+        if without_reply > max_gap and self.state is State.OPEN and self.execution:
+            self.stop(f"{without_reply} packets were missed in a row")
 
     def require_axes(self, reading: Reading, mode: int) -> None:
         """Require every wanted axis in its mode during a motion; raises AxisNotInMode."""

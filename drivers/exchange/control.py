@@ -108,7 +108,7 @@ class ControlBlock(ctypes.Structure):
         overflow: records overwritten before they were archived.
         late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
             answered late; `answered_late` of them were answered.
-        unanswered: replies not accepted by the controller.
+        not_accepted: replies not accepted by the controller.
         worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
             to the departure of the reply, µs.
         finished: 1 when the exchange has ended properly.
@@ -150,7 +150,7 @@ class ControlBlock(ctypes.Structure):
     foreign: int
     late: int
     answered_late: int
-    unanswered: int
+    not_accepted: int
     refused: int
     worst_turnaround_us: float
     finished: int

@@ -6,9 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from drivers.drive_train import Ages
 from drivers.errors import TransportClosed
 from drivers.packets import (
     AXIS_LENGTH,
@@ -50,7 +48,6 @@ have been full when newer ones arrived."""
 _NUMBER_WINDOW: Final = 1000
 """Largest difference of two packet numbers that is one of age."""
 
-Ages = NDArray[np.uint16]
 _Kind = tuple[int, int, bytes]
 """Session within the backlog, length, status and modes."""
 

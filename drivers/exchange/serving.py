@@ -53,7 +53,8 @@ assumed to have closed."""
 MAX_LINGER: Final = 10.0
 """Time after the axes closed first from which on axes that open again do not delay the end, s."""
 ARM_MOVED: Final = 5e-4
-"""Change of a joint position that counts as motion of the arm, rad."""
+"""Change of a joint position that counts as motion of the arm, rad: more than an encoder's noise,
+less than any motion moves in a second."""
 ARM_RESTS: Final = 1.0
 """Time without motion after which the arm is at rest, s."""
 _SLOW_EVERY: Final = 32
@@ -62,9 +63,9 @@ _POSITION: Final = MEASURED.index("position")
 _MAY_BE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
-_COUNTERS: Final = ("answered", "missed", "duplicates", "stale", "unanswered", "refused")
+_COUNTERS: Final = ("answered", "missed", "duplicates", "stale", "not_accepted", "refused")
 """Counters of a session with their own field in the control block."""
-STOPPED: Final = "the supervisor requested a stop"
+STOPPED: Final = "a stop was requested"
 _Mergeable = PacketRejected | GapSeen | AnswersLost
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
+from drivers.errors import GuardError
 from drivers.events import (
     AnswersLost,
     GapSeen,
@@ -277,6 +278,8 @@ class Recorder:
 
     def _archive(self, event: ExchangeEvent) -> None:
         data = {name: getattr(event, name) for name in _DATA.get(type(event), ())}
+        if isinstance(event, Refused) and isinstance(event.error, GuardError):
+            data = {name: getattr(event.error, name) for name in _REFUSAL_DATA}
         cycle, name = getattr(event, "cycle", None), type(event).__name__
         self.writer.event(cycle, name, describe(event), level=level_of(event), data=data)
 
@@ -313,6 +316,7 @@ _DATA: Final[Mapping[type, Sequence[str]]] = {
     HoldChanged: ("held",),
 }
 """Data of an event beside its cycle."""
+_REFUSAL_DATA: Final = ("check", "joint", "value", "bound", "unit")
 
 
 def _at_rest(ended: MotionEnded) -> bool:

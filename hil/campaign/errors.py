@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from drivers.events import Refused
 from hil.errors import ControllerFault, HilError, InputError, UnsafeError
 from hil.terminal_text import plural
 
@@ -33,7 +31,7 @@ class MotionFailedError(ControllerFault):
     Attributes:
         outcome: "stopped", "refused" or "lost".
         sentence: motion, archive, outcome and reason.
-        flight_recorder: (k,) of `drivers.cycle_dtype`, the last records up to a refusal, or None.
+        refused: the refusal, with its error and the last records before it; else None.
     """
 
     def __init__(
@@ -41,17 +39,15 @@ class MotionFailedError(ControllerFault):
         motion: str,
         outcome: str,
         reason: str,
-        flight_recorder: NDArray[np.void] | None = None,
         archive: str | None = None,
+        refused: Refused | None = None,
     ) -> None:
-        self.outcome, self.reason = outcome, reason
-        self.flight_recorder = flight_recorder
+        self.outcome, self.reason, self.refused = outcome, reason, refused
         which = motion if archive is None else f"{motion} ({archive})"
         how = reason if reason.startswith(outcome) else f"{outcome}: {reason}"
         self.sentence = f"{which} was {how}"
-        super().__init__(
-            f"{self.sentence}; everything recorded is archived, run the campaign again to continue."
-        )
+        remedy = "run the campaign again to continue" if refused is None else refused.error.remedy
+        super().__init__(f"{self.sentence}; everything recorded is archived; {remedy}.")
 
 
 class NotRehearsedError(UnsafeError):

@@ -256,7 +256,7 @@ class Link(MotionLink):
     def _counts(self) -> PacketCounts:
         counters = self.session.counters
         late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
-        return PacketCounts(counters.answered, counters.missed, late, counters.unanswered)
+        return PacketCounts(counters.answered, counters.missed, late, counters.not_accepted)
 
 
 class _Archiving:

@@ -41,6 +41,7 @@ from drivers.exchange.event_log import (
 )
 from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
+from drivers.exchange.serving import ARM_MOVED
 from drivers.motion_source import MotionSource
 from drivers.record import CAPACITY, RingReader
 from drivers.states import State
@@ -398,7 +399,8 @@ class LiveLink(MotionLink):
             return
         if self.exchange.alive:
             self.exchange.stop()
-        self._shut()
+        if (problem := self._shut()) is not None:
+            error.add_note(problem)
 
     # --- archives
 
@@ -535,7 +537,7 @@ class LiveLink(MotionLink):
             status.answered,
             status.missed,
             status.late,
-            status.unanswered,
+            status.not_accepted,
             tuple(status.latencies),
             1e-6 * status.worst_turnaround_us,
         )
@@ -767,7 +769,7 @@ class LiveLink(MotionLink):
                 State(status.state),
                 self._position,
                 late=status.late,
-                not_accepted=status.unanswered,
+                not_accepted=status.not_accepted,
                 waiting="" if status.answered else self._waiting(),
                 over=over,
             )
@@ -777,7 +779,6 @@ class LiveLink(MotionLink):
 SILENCE: Final = 1.0  # s without a packet after which the controller is assumed to have gone
 NO_SESSION: Final = frozenset((State.SYNC, State.INIT, State.ENDED))  # States without a session
 TARGET_MOVED: Final = 1e-5  # rad; a target at rest does not change, but its rounding may
-ARM_MOVED: Final = 5e-4  # rad; more than an encoder's noise, less than any motion moves in a second
 REST: Final = 1.0  # s of the controller's time without motion after which the arm is at rest
 OFF: Final = 1.0
 """s with the drive off after which replies end; a session that is being ended has ended by then."""

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.events import MotionStarted
+from drivers.exchange.serving import ARM_MOVED
 from hil.archive import Archive, ArchiveHeader, ArchiveName, open_archive
 from hil.archive.header import REJECTED
 from hil.archive.repair import amend_outcome
@@ -37,8 +38,6 @@ FIELDS: Final = ("cycle", "gap", "position", "target_current", *_SENT)
 MISSED_SHARE: Final = 0.01  # Largest share of missed packets
 OFF_PATH: Final = 1e-4
 """Largest distance of set-point and plan, rad; float32 targets are exact to 2e-6."""
-_ARM_MOVED: Final = 5e-4
-"""rad; more than an encoder's noise, less than any motion makes in a second."""
 SATURATED: Final = 0.98  # Share of the current limit from which a current is saturated
 SATURATED_CYCLES: Final = 3  # Saturated cycles in a row that are more than noise
 COMPARED: Final = 9  # Earlier repetitions that a new one is compared with
@@ -167,7 +166,7 @@ def moving_arm(executed: Executed, _trajectory: Motion, cell: Cell) -> Problem |
     rows = min(round(STANDSTILL_WINDOW / cell.period), len(executed.position) - 1)
     moved = np.abs(executed.position[rows:] - executed.position[:-rows]).max(axis=0)
     speed = moved / (rows * cell.period)
-    allowed = np.maximum(cell.model.friction.standstill, _ARM_MOVED / STANDSTILL_WINDOW)
+    allowed = np.maximum(cell.model.friction.standstill, ARM_MOVED / STANDSTILL_WINDOW)
     joint = int(np.argmax(speed / allowed))
     if speed[joint] <= allowed[joint]:
         return None

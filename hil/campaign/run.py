@@ -431,8 +431,7 @@ class Runner:
             if archived is not None:
                 run.folder.add(archived, ended.outcome, ended.reason)
             refused = self._link.connection.refused if ended.outcome == "refused" else None
-            recorder = None if refused is None else refused.flight_recorder
-            raise MotionFailedError(str(interval), ended.outcome, ended.reason, recorder, archived)
+            raise MotionFailedError(str(interval), ended.outcome, ended.reason, archived, refused)
         self.task.advance(duration / most, str(interval))
         return spec.path.name
 

@@ -252,7 +252,7 @@ def _notes(folder: CampaignFolder) -> tuple[str, ...]:
     entries = folder.manifest()
     there = {path.name for path in folder.archives.glob("*.mcap")}
     left = [
-        f"{name} was left by a run that was killed; the next run uses it if it is complete and "
+        f"{name} was left by a run that ended abruptly; the next run uses it if it is complete and "
         "needed"
         for name in sorted(there - {one.name for one in entries})
     ]

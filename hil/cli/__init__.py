@@ -251,7 +251,8 @@ def main() -> None:
     except Exception as error:
         if not isinstance(error, HilError) and not _comes_from_below(error):
             raise
-        _fail(str(error), exit_code_of(error), stopped=isinstance(error, OperatorStopError))
+        text = "; ".join([str(error), *getattr(error, "__notes__", ())])
+        _fail(text, exit_code_of(error), stopped=isinstance(error, OperatorStopError))
 
 
 def _fail(text: str, status: int, *, stopped: bool = False) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
-from hil.campaign import Campaign, Link, stop_on_interrupt
+from hil.campaign import Campaign, Link, MotionFailedError, stop_on_interrupt
 from hil.campaign.run import RunResult
 from hil.cell_link import require_real_time
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
@@ -144,7 +144,8 @@ def _run(
                 stop=stop, reporter=operator, operator=operator, live=view, **choices
             )
         except (ControllerFault, OSError) as fault:
-            if stop.requested:  # an OSError: of a terminal that was closed
+            failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
+            if stop.requested and not failed:  # an OSError: of a terminal that was closed
                 again = f"Resume with `hil run {campaign.folder.root}`."
                 raise OperatorStopError(f"{fault} {again}") from fault
             raise

@@ -29,6 +29,8 @@ from tests.drivers.rig import Table, limits, train_of
 PERIOD = 0.002
 OPEN, CLOSED = 4, 0
 ON = 5
+FOLLOWING_ERROR = np.linspace(1.0, 1.9, 40).reshape(4, 10)  # of each arm and axis
+CURRENT_LIMIT = 10.0 * FOLLOWING_ERROR
 
 
 @dataclass
@@ -100,8 +102,8 @@ class Bench:
             {},
             open_axes_map=table if self.open_axes_map is None else self.open_axes_map,
             kinematic_influence=influence,
-            following_error=np.full((4, 10), 2.0),
-            current_limit=np.full((4, 10), 20.0),
+            following_error=FOLLOWING_ERROR,
+            current_limit=CURRENT_LIMIT,
             **rows,
         )
         init.record["n_axes"] = len(self.slots)
@@ -164,6 +166,15 @@ def opened(slots, arm, n, **options) -> Bench:
 
 
 TWO_ARMS = tuple((arm, axis) for axis in range(3) for arm in (2, 1))
+
+
+@pytest.mark.parametrize("arm", [1, 2])
+def test_guard_has_the_narrower_limits_of_its_arm(arm):
+    bench = Bench(TWO_ARMS, arm, 3)
+    bench.start()
+    guard = bench.session._guard
+    np.testing.assert_array_equal(guard.following_error, np.float32(FOLLOWING_ERROR[arm - 1, :3]))
+    np.testing.assert_array_equal(guard.current, np.float32(CURRENT_LIMIT[arm - 1, :3]))
 
 
 def test_drive_of_another_arm_off():

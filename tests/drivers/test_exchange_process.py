@@ -513,7 +513,7 @@ class TestStops:
     @pytest.mark.parametrize(
         ("ask", "reason", "ends"),
         [
-            (ExchangeProcess.stop, "the supervisor requested a stop", False),
+            (ExchangeProcess.stop, "a stop was requested", False),
             (ExchangeProcess.terminate, "asked to terminate", True),
             (ExchangeProcess.finish, "the supervisor requested the end", True),
         ],

@@ -213,7 +213,7 @@ class TestNextStep:
             assert -1e-5 <= step <= 1.001 * share * STEP
             assert last == 0.0 or abs(step - last) <= PULL
             last = step
-        assert rig.session.counters.unanswered == lost
+        assert rig.session.counters.not_accepted == lost
         rig.session.stop()
         rig.run_to("stopped")
         assert (rig.ended.reason == "a stop was requested") is continues
@@ -281,7 +281,7 @@ def test_earlier_losses_do_not_count():
     for _ in range(6):
         lose(rig, 1)
         rig.cycle(49)
-    assert rig.session.counters.unanswered == 6
+    assert rig.session.counters.not_accepted == 6
     assert rig.session._machine.stop_reason is None
     assert rig.state is State.OPEN
 
@@ -313,7 +313,7 @@ class TestExtrapolation:
         rig = self.extrapolated(missed)
         rig.cycle(10)
         assert rig.state is State.OPEN
-        assert rig.session.counters.unanswered == 0
+        assert rig.session.counters.not_accepted == 0
         rig.session.stop()
         rig.run_to("stopped")
 
@@ -329,7 +329,7 @@ def test_late_target_is_reported_once():
     report_late(rig)
     rig.cycle(600)
     assert rig.state is State.OPEN
-    assert rig.session.counters.unanswered == 1
+    assert rig.session.counters.not_accepted == 1
 
 
 class TestGapWithoutMotion:

@@ -546,13 +546,17 @@ class TestSourcesThatRaise:
             Rig().session.request(failing(error=SystemExit(), feed_forward=property(no)))
 
 
-def test_internal_error_requests_drive_off(monkeypatch):
+@pytest.mark.parametrize("where", ["guard", "record of the packet"])
+def test_internal_error_requests_drive_off(where, monkeypatch):
     rig, _ = moving()
 
     def fails(*_, **__):
         raise MemoryError("no room")
 
-    monkeypatch.setattr(rig.guard, "check_set_point", fails)
+    owner, name = rig.guard, "check_set_point"
+    if where != "guard":
+        owner, name = rig.session._policy, "record"
+    monkeypatch.setattr(owner, name, fails)
     assert all_drive_off(rig.cycle())
     assert "the session failed: MemoryError: no room" in str(rig.refusal)
     assert rig.ended.outcome == "refused"

@@ -457,7 +457,7 @@ def test_lost_reply_is_counted_in_its_interval_only():
     rig.cycle()
     rig.axes[:] = before
     rig.cycle()
-    assert rig.session.counters.unanswered == 1
+    assert rig.session.counters.not_accepted == 1
     rig.axes["d"][:, 1] = rig.axes["d"][:, 3] = 0.0
     rig.cycle(2, mode=Mode.CLOSED)
     rig.modes[:3] = rig.mode
@@ -465,7 +465,7 @@ def test_lost_reply_is_counted_in_its_interval_only():
     rig.session.stop()
     rig.cycle(5)
     assert rig.state is State.EXITING
-    assert rig.session.counters.unanswered == 1
+    assert rig.session.counters.not_accepted == 1
     assert len(rig.seen(AnswersLost)) == 1
 
 
@@ -644,7 +644,7 @@ class TestAges:
         rig.axes[:] = before
         rig.ages[0, self.TARGET] = age
         rig.cycle()
-        assert rig.session.counters.unanswered == lost
+        assert rig.session.counters.not_accepted == lost
 
     @pytest.mark.parametrize(("axis", "refused"), [(2, False), (3, True)])
     @pytest.mark.parametrize("column", [TARGET, TARGET_VELOCITY, VELOCITY])

@@ -20,7 +20,7 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import ControllerLimits, InitCheck, compare, is_narrower
+from drivers.init_check import InitCheck, compare, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
@@ -648,14 +648,3 @@ def test_values_far_off_are_not_accepted(changes, words):
     theirs = adopted(arm(6), **changes)
     assert theirs.adopted == (not words)
     assert words in (theirs.unusable or "")
-
-
-def test_limits_are_those_of_the_arm_and_of_its_joints():
-    fields = {"current_limit": np.arange(1.0, 7.0), "following_error": np.arange(11.0, 17.0)}
-    init = InitPacket.build(6, 2, fields)
-    found = ControllerLimits.of(init, 1, 4)
-    np.testing.assert_array_equal(found.current, [1.0, 2.0, 3.0, 4.0])
-    np.testing.assert_array_equal(found.following_error, [11.0, 12.0, 13.0, 14.0])
-    assert found.current.dtype == found.following_error.dtype == np.float64
-    other = ControllerLimits.of(init, 2, 4)
-    assert not np.array_equal(other.current, found.current)

@@ -37,7 +37,7 @@ SAMPLED_EVERY: Final = 5.0  # s between two looks at everything
 PRIORITY: Final = 60
 """Real-time priority of the controller: its clock has to be better than what is measured by it."""
 COUNTERS: Final = (
-    "answered", "missed", "late", "answered_late", "unanswered", "refused", "duplicates", "stale",
+    "answered", "missed", "late", "answered_late", "not_accepted", "refused", "duplicates", "stale",
     "malformed", "foreign", "overflow", "ended_count", "worst_turnaround_us",
 )  # fmt: skip
 

@@ -129,8 +129,8 @@ def test_status_names_incomplete_and_rejected_archives(
         notes = campaign.status().notes
     assert notes == (
         "it is in use by a run or a rehearsal",
-        "excitation_001_a1.mcap was left by a run that was killed; the next run uses it if it is "
-        "complete and needed",
+        "excitation_001_a1.mcap was left by a run that ended abruptly; the next run uses it if it "
+        "is complete and needed",
         "excitation_000_a1.mcap is rejected: a jam",
     )
 

@@ -164,12 +164,28 @@ def test_a_refusal_comes_with_its_flight_recorder(
     ):
         campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
     assert failed.value.outcome == "refused"
-    recorder = failed.value.flight_recorder
+    recorder = failed.value.refused.flight_recorder
     assert 1 < len(recorder) <= 50
     archive = open_archive(campaign.folder.archives / campaign.folder.manifest()[-1].name)
     assert archive.outcome.entries["outcome"] == "refused"
-    assert any(event.name == "Refused" for event in archive.events)
+    (refusal,) = (event for event in archive.events if event.name == "Refused")
+    assert refusal.data["check"] == "following error"
+    assert refusal.data["joint"] == 1
+    assert refusal.data["value"] > refusal.data["bound"]
+    assert str(failed.value).endswith(f"; {failed.value.refused.error.remedy}.")
     assert recorder["cycle"][-1] in archive.columns["cycle"]
+
+
+def test_an_arm_that_stays_open_is_named_beside_the_error(cell: Cell, monkeypatch) -> None:
+    problem = "the exchange process still replies"
+    with (
+        pytest.raises(RuntimeError, match="first") as failed,
+        loopback_link(on_loopback(cell), options=PATIENT) as link,
+    ):
+        end = link._shut
+        monkeypatch.setattr(link, "_shut", lambda: end() or problem)
+        raise RuntimeError("the first error")
+    assert failed.value.__notes__ == [problem]
 
 
 class Operator:

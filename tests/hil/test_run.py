@@ -1133,6 +1133,19 @@ def hil_run(campaign: Campaign, *options: str) -> Result:
     return CliRunner().invoke(app, ["run", str(campaign.folder.root), *options])
 
 
+@pytest.mark.parametrize(
+    ("outcome", "error"),
+    [("stopped", OperatorStopError), ("refused", MotionFailedError), ("lost", MotionFailedError)],
+)
+def test_a_motion_that_fails_after_a_stop_is_a_fault(campaign, monkeypatch, outcome, error):
+    def run(self, *, stop, **_):
+        stop.requested = True
+        raise MotionFailedError("repetition 1", outcome, "why")
+
+    monkeypatch.setattr(Campaign, "run", run)
+    assert type(hil_run(campaign, "--quiet").exception) is error
+
+
 def exit_code(result: Result) -> int:
     """Exit status of the program."""
     error = result.exception

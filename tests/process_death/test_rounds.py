@@ -169,7 +169,7 @@ def round_in_which(victim: Victim) -> int:
 @pytest.mark.parametrize(
     ("victim", "how", "status", "words"),
     [
-        ("supervisor", "SIGINT", 4, "was stopped: the supervisor requested a stop"),
+        ("supervisor", "SIGINT", 4, "was stopped: a stop was requested"),
         pytest.param("supervisor", "SIGHUP", 4, "was stopped", marks=pytest.mark.slow),
         (
             "archive",

@@ -24,6 +24,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.drive_train import Ages
 from drivers.errors import PacketError
 from drivers.packets import (
     AXIS_DTYPE,
@@ -62,7 +63,6 @@ from drivers.transports.can.layout import (
 )
 
 Words = NDArray[np.int32]
-Ages = NDArray[np.uint16]
 Array = NDArray[np.float64]
 
 WORDS_PER_AXIS: Final = 9

@@ -16,6 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.drive_train import Ages
 from drivers.errors import PacketError
 from drivers.packets import (
     AXIS_DTYPE,
@@ -28,7 +29,6 @@ from drivers.packets import (
 )
 from drivers.transports.can.codecs import (
     NEVER,
-    Ages,
     ClassicCodec,
     Codec,
     FdCodec,
