@@ -12,6 +12,8 @@ from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body, inertial_parameters
 from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
+from sim_fixtures.ns16 import load_truth
+from tests.identification.two_link import values_of
 
 
 def robot_text(path):
@@ -55,13 +57,41 @@ def random_urdf(seed, n_joints=7):
     return "".join(parts) + "</robot>"
 
 
-def one_joint(kind, axis="0 0 1"):
+def link(name, shape="", at="0 0 0", *, rpy="0 0 0", mass=1, inertia=(1, 1, 1), centre="0 0 0"):
+    """A link with a diagonal inertia, and with a collision shape if one is given."""
+    xx, yy, zz = inertia
+    place = f'<collision><origin xyz="{at}" rpy="{rpy}"/><geometry>{shape}</geometry></collision>'
     return (
-        '<robot name="r"><link name="a"/><link name="b"><inertial><mass value="2"/>'
-        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
-        f'<joint name="strange" type="{kind}"><parent link="a"/><child link="b"/>'
-        f'<axis xyz="{axis}"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+        f'<link name="{name}"><inertial><origin xyz="{centre}"/><mass value="{mass}"/>'
+        f'<inertia ixx="{xx}" ixy="0" ixz="0" iyy="{yy}" iyz="0" izz="{zz}"/></inertial>'
+        f"{place if shape else ''}</link>"
     )
+
+
+def joint(name, parent, child, axis="0 0 1", kind="revolute", at="0 0 0", rpy="0 0 0", ends=2):
+    """A joint from `-ends` to `ends`."""
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{at}" rpy="{rpy}"/><axis xyz="{axis}"/>'
+        f'<limit lower="{-ends}" upper="{ends}" effort="1" velocity="1"/></joint>'
+    )
+
+
+def robot(*parts):
+    return f'<robot name="r">{"".join(parts)}</robot>'
+
+
+def one_joint(kind, axis="0 0 1"):
+    return robot('<link name="a"/>', link("b", mass=2), joint("strange", "a", "b", axis, kind))
+
+
+def ns16_values(model, coulomb=None, viscous=None):
+    """Parameters of the simulated NS 16, zero in the third term; `model` is of its description."""
+    truth = load_truth()
+    friction = [truth.coulomb if coulomb is None else coulomb]
+    friction.append(truth.viscous if viscous is None else viscous)
+    friction += [np.zeros(len(model.friction.terms) - 12)]
+    return values_of(model, np.concatenate(friction), truth.rotor_inertia)
 
 
 def some_bodies(n, seed=0):
@@ -76,6 +106,11 @@ def some_bodies(n, seed=0):
         row[10] = rng.uniform(0.0, 1.0)
     return standard.reshape(-1)
 
+
+NS16_TURNS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0]) @ (
+    np.eye(6) + np.array([[0.0] * 6] * 4 + [[0, 0, 0, -0.2, 0, 0], [0, 0, 0, 0.16, -0.3, 0]])
+)
+"""Turns of the motors per turn of the joints; motors 5 and 6 turn with the joints before them."""
 
 ALL_TERMS = FrictionLaw(offset=True)
 

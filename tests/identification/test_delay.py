@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hil.cell import Cell
-from hil.simulation import planted_truth, simulated_drive
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
@@ -25,61 +24,31 @@ from identification.signals.smoothing import low_pass
 from sim_fixtures import ControllerSettings, SimulatedController, ns16
 from tests.identification.robots import ur10
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
-from tests.sim_fixtures.bench import MinimalPC
-
-PERIOD = 0.001
+from tests.sim_fixtures.bench import DRIVE, MinimalPC
+from tests.sim_fixtures.bench import TRUTH as PLANT
 
 
 def ns16_model():
     return RobotModel.from_urdf(ns16.urdf_text(), friction=FrictionLaw(third=None, standstill=0.1))
 
 
-def smooth_motion(duration):
-    """Positions and velocities (m, 6), DH angles: sines in and out of rest."""
-    t = np.arange(round(duration / PERIOD) + 1) * PERIOD
+def smooth_positions(duration):
+    """Positions (m, 6), DH angles: sines in and out of rest."""
+    t = np.arange(round(duration / STEP) + 1) * STEP
     window = np.clip(np.minimum(t, duration - t), 0.0, 1.0)
     soft = window**3 * (10.0 - 15.0 * window + 6.0 * window**2)
-    slope = np.where(t < 1.0, 1.0, -1.0) * 30.0 * window**2 * (1.0 - window) ** 2
-    slope[(t >= 1.0) & (t <= duration - 1.0)] = 0.0
     swing = np.radians([12.0, 8.0, 10.0, 22.0, 20.0, 25.0])
-    rate = np.array([4.1, 4.7, 5.5, 7.3, 8.1, 9.0])
     centre = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
-    angle = rate * t[:, None] + np.arange(6)
-    wave = np.sin(angle) + 0.4 * np.sin(2.3 * angle)
-    wave_slope = rate * (np.cos(angle) + 0.92 * np.cos(2.3 * angle))
-    position = centre + swing * soft[:, None] * wave
-    return position, swing * (soft[:, None] * wave_slope + slope[:, None] * wave)
-
-
-def simulated_recording(duration, *, seed):
-    """Recording of a run on the simulated cell, and the delay of its currents [cycles]."""
-    cell = Cell.load(ns16.CELL_PATH)
-    train, noise = cell.drive_train, cell.simulation
-    position, velocity = smooth_motion(duration)
-    controller = SimulatedController(
-        ns16.urdf_text(),
-        simulated_drive(cell),
-        planted_truth(cell),
-        ControllerSettings(
-            current_noise=noise.current_noise, current_resolution=noise.current_resolution
-        ),
-        seed=seed,
-        initial_position=position[0],
-    )
-    deltas = train.motor_revolutions_per_cycle(velocity, PERIOD)
-    pc = MinimalPC(controller, train.motor_revolutions(position), deltas)
-    axes = pc.run(settle=50).axes
-    recording = Recording(
-        time=np.arange(len(axes)) * PERIOD,
-        position=train.joint_position(axes["d"][:, :, 2].astype(float)),
-        joint_names=ns16_model().joint_names,
-        torque=train.joint_torque(axes["d"][:, :, 4].astype(float)),
-    )
-    return recording, controller.current_delay_cycles
+    angle = np.array([4.1, 4.7, 5.5, 7.3, 8.1, 9.0]) * t[:, None] + np.arange(6)
+    return centre + swing * soft[:, None] * (np.sin(angle) + 0.4 * np.sin(2.3 * angle))
 
 
 TRUTH = truth()
 STEP = 1e-3
+UNEVEN = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))
+CARRYING = RobotModel.from_urdf(
+    URDF, friction=FrictionLaw(third=None), payload=Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
+)
 
 
 def motion(time, speed=1.0):
@@ -88,7 +57,7 @@ def motion(time, speed=1.0):
 
 
 def a_recording(
-    model, truth, delays, *, seed=0, speed=1.0, torque_noise=1.0, position_noise=2e-5, time=None
+    delays, *, model=MODEL, seed=0, speed=1.0, torque_noise=1.0, position_noise=2e-5, time=None
 ):
     """Simulate two links whose torque is logged `delays` [s] after the position."""
     if time is None:
@@ -96,7 +65,7 @@ def a_recording(
     rng = np.random.default_rng(seed)
     late = [motion(time - delay, speed) for delay in np.broadcast_to(delays, 2)]
     torque = np.column_stack(
-        [(model.torque(truth, *one) + model.load_torque(*one))[:, j] for j, one in enumerate(late)]
+        [(model.torque(TRUTH, *one) + model.load_torque(*one))[:, j] for j, one in enumerate(late)]
     )
     shape = torque.shape
     return Recording(
@@ -110,24 +79,53 @@ def a_recording(
 @pytest.fixture(scope="module")
 def simulated():
     """A recording of the simulated cell, and the delay of its currents [s]."""
-    recording, cycles = simulated_recording(6.0, seed=3)
-    return recording, cycles * STEP
+    cell, position = Cell.load(ns16.CELL_PATH), smooth_positions(6.0)
+    train, noise = cell.drive_train, cell.simulation
+    settings = ControllerSettings(
+        current_noise=noise.current_noise, current_resolution=noise.current_resolution
+    )
+    controller = SimulatedController(
+        ns16.urdf_text(), DRIVE, PLANT, settings, seed=3, initial_position=position[0]
+    )
+    deltas = train.motor_revolutions_per_cycle(np.gradient(position, STEP, axis=0), STEP)
+    axes = MinimalPC(controller, train.motor_revolutions(position), deltas).run(settle=50).axes
+    recording = Recording(
+        time=np.arange(len(axes)) * STEP,
+        position=train.joint_position(axes["d"][:, :, 2].astype(float)),
+        joint_names=ns16_model().joint_names,
+        torque=train.joint_torque(axes["d"][:, :, 4].astype(float)),
+    )
+    return recording, controller.current_delay_cycles * STEP
 
 
 class TestCommonDelay:
-    def test_it_is_exact_without_noise(self):
-        recording = a_recording(MODEL, TRUTH, 3.7e-4, torque_noise=0.0, position_noise=1e-8)
-        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=5e-6)
-        time = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))  # uneven
-        recording = a_recording(MODEL, TRUTH, 3.7e-4, time=time, torque_noise=0.3)
-        assert estimate_delays(recording, MODEL).common == pytest.approx(3.7e-4, abs=1e-4)
+    @pytest.mark.parametrize(
+        ("planted", "near", "options"),
+        [
+            (3.7e-4, 5e-6, {"torque_noise": 0.0, "position_noise": 1e-8}),
+            (3.7e-4, 1e-4, {"time": UNEVEN, "torque_noise": 0.3}),
+            # Of many cycles.
+            *((planted, 3e-4, {}) for planted in (-0.043, 0.01, 0.048)),
+            # The known torque of a payload, subtracted with another delay.
+            (0.01, 1e-4, {"model": CARRYING, "torque_noise": 0.1}),
+        ],
+    )
+    def test_it_is_found(self, planted, near, options):
+        options = {"model": MODEL} | options
+        found = estimate_delays(a_recording(delays=planted, **options), options["model"])
+        assert found.common == pytest.approx(planted, abs=near)
+        np.testing.assert_array_equal(found.applied, found.common)
+
+    def test_it_is_found_in_a_filtered_torque(self):
+        time = np.arange(0.0, 8.0, 0.004)
+        recording = a_recording(delays=0.003, time=time, torque_noise=0.3)
+        filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
+        found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
+        assert found.common == pytest.approx(0.003, abs=4e-4)
 
     def test_noise_does_not_bias_it_and_the_interval_covers(self):
         """Mean within its standard error, scatter over seeds as estimated."""
-        found = [
-            estimate_delays(a_recording(MODEL, TRUTH, 1.6e-3, seed=seed), MODEL)
-            for seed in range(12)
-        ]
+        found = [estimate_delays(a_recording(1.6e-3, seed=seed), MODEL) for seed in range(12)]
         error = np.array([one.common - 1.6e-3 for one in found])
         claimed = np.sqrt(np.mean([one.common_std**2 for one in found]))
         scatter = error.std(ddof=1)
@@ -136,33 +134,13 @@ class TestCommonDelay:
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
         assert all(one.agree and one.significant for one in found)
 
-    @pytest.mark.parametrize("planted", [-0.043, 0.01, 0.048])
-    def test_a_delay_of_many_cycles_is_found(self, planted):
-        found = estimate_delays(a_recording(MODEL, TRUTH, planted), MODEL)
-        assert found.common == pytest.approx(planted, abs=3e-4)
-        np.testing.assert_array_equal(found.applied, found.common)
-
     def test_a_delay_beyond_the_range_is_undetermined(self):
-        found = estimate_delays(a_recording(MODEL, TRUTH, 0.06), MODEL)
+        found = estimate_delays(a_recording(0.06), MODEL)
         assert found.reason == "the residual decreases up to the longest delay tested"
         np.testing.assert_array_equal(found.applied, 0.0)
 
-    def test_it_is_found_in_a_filtered_torque(self):
-        time = np.arange(0.0, 8.0, 0.004)
-        recording = a_recording(MODEL, TRUTH, 0.003, time=time, torque_noise=0.3)
-        filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
-        found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
-        assert found.common == pytest.approx(0.003, abs=4e-4)
-
-    def test_known_payload_torque_is_delayed_equally(self):
-        """It was subtracted with another delay."""
-        load = Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
-        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None), payload=load)
-        found = estimate_delays(a_recording(model, TRUTH, 0.01, torque_noise=0.1), model)
-        assert found.common == pytest.approx(0.01, abs=1e-4)
-
     def test_it_is_found_beside_an_assumed_delay(self):
-        recording = a_recording(MODEL, TRUTH, 0.004)
+        recording = a_recording(0.004)
         found = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.003))
         assert found.common == pytest.approx(0.004, abs=3e-4)
         assert found.significant
@@ -177,7 +155,7 @@ class TestCommonDelay:
         late = motion(time - 0.005)
         direction = model.friction.direction(time, late[0], late[1])
         recording = replace(
-            a_recording(model, TRUTH, 0.0), torque=model.torque(TRUTH, *late, direction)
+            a_recording(0.0, model=model), torque=model.torque(TRUTH, *late, direction)
         )
         assert estimate_delays(recording, model).common == pytest.approx(0.005, abs=5e-5)
 
@@ -191,7 +169,7 @@ class TestCommonDelay:
 
 class TestUndeterminedDelay:
     def test_a_slow_motion_does_not_determine_it(self):
-        slow = estimate_delays(a_recording(MODEL, TRUTH, 0.0, speed=0.05), MODEL)
+        slow = estimate_delays(a_recording(0.0, speed=0.05), MODEL)
         assert not slow.determined
         assert np.isnan(slow.delays).all()
         assert np.isinf(slow.std).all()
@@ -204,14 +182,14 @@ class TestUndeterminedDelay:
         assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
 
     def test_an_uncertain_significant_delay_is_applied(self):
-        found = estimate_delays(a_recording(MODEL, TRUTH, 0.045, speed=0.2, seed=2), MODEL)
+        found = estimate_delays(a_recording(0.045, speed=0.2, seed=2), MODEL)
         assert found.reason is not None and found.significant
         np.testing.assert_array_equal(found.applied, found.common)
         (line,) = found.describe()
         assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
     def test_a_recording_without_motion_raises(self):
-        still = a_recording(MODEL, TRUTH, 0.0, speed=0.0)
+        still = a_recording(0.0, speed=0.0)
         with pytest.raises(IdentificationError, match="not one usable sample"):
             estimate_delays(still, MODEL)
 
@@ -227,7 +205,7 @@ class TestUndeterminedDelay:
 class TestDeviatingAxes:
     @pytest.mark.parametrize("planted", [[3.7e-4, -1.3e-3], [0.004, 0.0], [-0.045, 0.045]])
     def test_an_axis_with_another_delay_is_found(self, planted):
-        found = estimate_delays(a_recording(MODEL, TRUTH, np.array(planted)), MODEL)
+        found = estimate_delays(a_recording(np.array(planted)), MODEL)
         assert not found.agree and found.significant
         assert found.applied == pytest.approx(planted, abs=3e-4)
         assert any("predicts better than the common delay" in s for s in found.describe())
@@ -261,7 +239,7 @@ PLANTED = np.array([0.37e-3, -1.3e-3])  # s
 
 class TestCompensation:
     def test_torques_are_shifted_to_their_positions(self):
-        late = a_recording(MODEL, TRUTH, PLANTED, torque_noise=0.0, position_noise=0.0)
+        late = a_recording(PLANTED, torque_noise=0.0, position_noise=0.0)
         time = late.time
         gap = np.zeros(len(time), dtype=np.bool_)
         gap[2500] = True
@@ -275,7 +253,7 @@ class TestCompensation:
         assert there.n_samples == gapped.n_samples - 2 * 3
 
     def test_zero_delays_change_nothing_and_long_ones_raise(self):
-        recording = a_recording(MODEL, TRUTH, 0.0)
+        recording = a_recording(0.0)
         same = compensate(recording, [0.0, 0.0])
         np.testing.assert_array_equal(same.torque, recording.torque)
         np.testing.assert_array_equal(same.time, recording.time)
@@ -289,7 +267,7 @@ class TestDelayUncertainty:
 
     def test_the_sensitivity_is_the_derivative_of_the_estimate(self):
         """Compared with fits at delays half a millisecond shorter and longer."""
-        recording = a_recording(MODEL, TRUTH, 0.004, torque_noise=0.0, position_noise=1e-8)
+        recording = a_recording(0.004, torque_noise=0.0, position_noise=1e-8)
 
         def samples(delay):
             options = Preprocessing(torque_delay=delay, left_out="slow", rigid_bandwidth=40.0)
@@ -306,7 +284,7 @@ class TestDelayUncertainty:
         np.testing.assert_array_equal(wider.values, fitted.values)
 
     def test_undetermined_parameters_stay_undetermined(self):
-        samples = prepare(a_recording(MODEL, TRUTH, 0.0), MODEL)
+        samples = prepare(a_recording(0.0), MODEL)
         fitted, products = self.fit(MODEL, samples), rate_products(MODEL, samples)
         covariance = fitted.covariance.copy()
         covariance[0, :] = covariance[:, 0] = 0.0

@@ -205,32 +205,24 @@ class TestElementModel:
 
 
 @pytest.fixture(scope="module")
-def model():
-    return with_elements(SPRING, GAS)
-
-
-@pytest.fixture(scope="module")
-def values():
-    return np.concatenate([two_link.truth(), [-35.0, 0.8]])
-
-
-@pytest.fixture(scope="module")
-def factor(model, values):
-    motion = two_link.a_motion()
-    noise = two_link.gaussian(np.random.default_rng(3), motion)
-    torque = model.torque(values, *motion[1:]) + noise
-    return Factor.from_samples(model, motion, torque, model.moving(motion.velocity))
+def identified():
+    """A model with two elements, its true values, and the factor of a recording."""
+    model, motion = with_elements(SPRING, GAS), two_link.a_motion()
+    values = np.concatenate([two_link.truth(), [-35.0, 0.8]])
+    samples = two_link.simulated(model, values, motion, two_link.NOISE, 3)
+    return model, values, Factor.of(model, samples)
 
 
 class TestIdentifiedElements:
-    def test_least_squares_finds_them(self, model, values, factor):
+    def test_least_squares_finds_them(self, identified):
+        model, values, factor = identified
         found = estimate(model, factor)
         assert np.all(np.abs(found.values - values) <= 4.5 * found.std)
 
-    def test_the_consistent_solution_leaves_them_free(self, model, values, factor):
+    def test_the_consistent_solution_leaves_them_free(self, identified):
         """A stiffness may be negative and has no prior."""
-        free = estimate(model, factor)
+        model, values, factor = identified
+        free, own = estimate(model, factor), model.element_part
         found = consistent_estimate(model, factor, free)
         assert len(found.friction) == len(model.friction.terms)
-        own = model.element_part
         assert np.all(np.abs(found.estimate.values - values)[own] <= 4.5 * free.std[own])

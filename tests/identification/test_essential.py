@@ -17,8 +17,8 @@ from identification.selection.essential import CutRule, choose_essential, elimin
 from identification.signals.samples import prepare
 from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures.ns16 import urdf_text
-from tests.identification.robots import ur10
-from tests.identification.two_link import URDF, as_samples, sine_motion, truth
+from tests.identification.robots import ns16_values, ur10
+from tests.identification.two_link import URDF, simulated, sine_motion, truth
 
 NOISE = np.array([3.0, 0.6])
 
@@ -36,243 +36,230 @@ def a_motion(seed, n=2, duration=12.0, step=0.005):
     return sine_motion(time, a, w, phase)
 
 
-def samples_of(model, values, motion, noise, seed):
-    torque = model.torque(values, *motion[1:])
-    torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
-    return as_samples(model, motion, torque)
-
-
 def factors(model, values, seed=0):
     """Return factors of a fitted and of another motion."""
-    runs = (samples_of(model, values, a_motion(k), NOISE, seed + k) for k in (1, 2))
+    runs = (simulated(model, values, a_motion(k), NOISE, seed + k) for k in (1, 2))
     return tuple(PhaseFactor.from_samples(model, run) for run in runs)
 
 
-def test_zero_parameters_are_removed():
-    nothing = {"f2_1", "f2_2", "fo_1", "fo_2"}
-    gone = []
-    for seed in range(0, 40, 2):
-        result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
-        gone += result.removed
-        assert not {"f0_1", "f0_2", "f1_1", "f1_2", "mc2z", "I2yy"} & set(result.removed)
-    counts = {name: gone.count(name) for name in nothing}
-    assert min(counts.values()) >= 17, counts  # of 20
-    assert set(gone) <= nothing | {"mc2x", "mc1x"}  # small in the URDF: 0.12 and 0.03 kg m
+class TestElimination:
+    """Parameters are removed while unseen motion is predicted as well."""
 
+    def test_zero_parameters_are_removed(self):
+        nothing = {"f2_1", "f2_2", "fo_1", "fo_2"}
+        gone = []
+        for seed in range(0, 40, 2):
+            result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
+            gone += result.removed
+            assert not {"f0_1", "f0_2", "f1_1", "f1_2", "mc2z", "I2yy"} & set(result.removed)
+        counts = {name: gone.count(name) for name in nothing}
+        assert min(counts.values()) >= 17, counts  # of 20
+        assert set(gone) <= nothing | {"mc2x", "mc1x"}  # small in the URDF: 0.12 and 0.03 kg m
 
-def test_a_step_is_the_least_squares_fit_of_the_columns_left():
-    runs = [samples_of(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
-    training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in runs)
-    weights = np.array([0.2, 3.0])
-    result = eliminate(MODEL, training, unseen, weights=weights)
-    left = [MODEL.parameter_names.index(name) for name in result.estimate.names]
-    rows, torque = [], []
-    for run in runs:
-        dense = MODEL.regressor(*run.motion[1:]).dense(MODEL.n_parameters)
-        rows.append(np.where(run.usable[..., None], dense, 0.0))
-        torque.append(np.where(run.usable, run.torque, 0.0))
-    scale = np.sqrt(weights)
-    fitted = (rows[0] * scale[:, None])[:, :, left].reshape(-1, len(left))
-    expected = np.linalg.lstsq(fitted, (torque[0] * scale).ravel(), rcond=None)[0]
-    np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-6, atol=1e-8)
-    np.testing.assert_allclose(result.values[left], expected, rtol=1e-6, atol=1e-8)
-    assert np.count_nonzero(result.values) == len(left)
-    for step_error, part in ((result.chosen.in_sample, 0), (result.chosen.held_out, 1)):
-        error = torque[part] - rows[part][:, :, left] @ expected
-        assert step_error == pytest.approx(
-            np.linalg.norm(error) / np.linalg.norm(torque[part]), rel=1e-6
+    def test_a_step_is_the_least_squares_fit_of_the_columns_left(self):
+        runs = [simulated(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
+        training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in runs)
+        weights = np.array([0.2, 3.0])
+        result = eliminate(MODEL, training, unseen, weights=weights)
+        left = [MODEL.parameter_names.index(name) for name in result.estimate.names]
+        rows, torque = [], []
+        for run in runs:
+            dense = MODEL.regressor(*run.motion[1:]).dense(MODEL.n_parameters)
+            rows.append(np.where(run.usable[..., None], dense, 0.0))
+            torque.append(np.where(run.usable, run.torque, 0.0))
+        scale = np.sqrt(weights)
+        fitted = (rows[0] * scale[:, None])[:, :, left].reshape(-1, len(left))
+        expected = np.linalg.lstsq(fitted, (torque[0] * scale).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(result.values[left], expected, rtol=1e-6, atol=1e-8)
+        assert np.count_nonzero(result.values) == len(left)
+        for step_error, part in ((result.chosen.in_sample, 0), (result.chosen.held_out, 1)):
+            error = torque[part] - rows[part][:, :, left] @ expected
+            assert step_error == pytest.approx(
+                np.linalg.norm(error) / np.linalg.norm(torque[part]), rel=1e-6
+            )
+        length = np.linalg.norm(fitted, axis=0)
+        assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
+
+    def test_the_path_removes_the_most_uncertain_parameter(self):
+        training, unseen = factors(MODEL, TRUTH)
+        result = eliminate(MODEL, training, unseen)
+        full = estimate(MODEL, training.total)
+        relative = full.std / np.abs(full.values)
+        assert result.steps[0].removed is None
+        assert result.steps[0].spread == pytest.approx(relative.max() / relative.min(), rel=1e-9)
+        assert result.steps[1].removed == full.names[int(relative.argmax())]
+        assert result.steps[0].largest_relative_std == pytest.approx(relative.max(), rel=1e-9)
+        assert [step.left for step in result.steps] == list(range(MODEL.n_parameters, 0, -1))
+        errors = [step.in_sample for step in result.steps]
+        # Monotonic with weights; nearly so without.
+        assert errors[-1] > 5.0 * errors[0]
+        removed = [step.removed for step in result.steps[1:]]
+        assert len(set(removed)) == len(removed)
+
+    def test_a_parameter_needed_by_unseen_motion_stays(self):
+        values = TRUTH.copy()
+        values[MODEL.parameter_names.index("fo_2")] = 1.0
+        training, unseen = factors(MODEL, values)
+        blind = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0, overall=9.0, axis=9.0))
+        result = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0))
+        assert "f1_1" in blind.removed  # a friction of 1.5 N·m·s/rad, among a noise of 3 N·m
+        assert "f1_1" in result.refused
+        assert "f1_1" in result.reason
+        assert result.chosen.held_out < blind.chosen.held_out - 0.001
+
+    @settings(max_examples=15)
+    @given(st.integers(0, 2**16))
+    def test_removals_up_to_the_cut_satisfy_the_rule(self, seed):
+        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
+        values = np.random.default_rng(seed).normal(0.0, 2.0, model.n_parameters)
+        result = eliminate(model, *factors(model, values, seed))
+        rule = CutRule()
+        best = min(step.held_out for step in result.steps[: result.cut + 1])
+        assert result.chosen.held_out <= best + 2.0 * rule.overall
+        assert set(result.refused).isdisjoint(result.removed)
+        assert set(result.removed) | set(result.estimate.names) == set(model.parameter_names)
+        if not result.refused:
+            assert result.chosen.spread < rule.spread
+
+    def test_undetermined_parameters_are_removed_first(self):
+        motion = a_motion(1)
+        held = Motion(motion.time, *(part * [1.0, 0.0] for part in motion[1:4]))
+        training = PhaseFactor.from_samples(MODEL, simulated(MODEL, TRUTH, held, NOISE, 3))
+        result = eliminate(MODEL, training, training)
+        full = estimate(MODEL, training.total)
+        lost = [
+            after
+            for before, after in pairwise(result.steps)
+            if np.isinf(before.largest_relative_std)
+        ]
+        assert {"f0_2", "f1_2", "f2_2", "fo_2"} <= {step.removed for step in lost}
+        assert len(lost) < len(full.undetermined)  # one parameter of a combination can stay
+        assert result.estimate.undetermined == ()
+        assert np.all(np.isfinite(result.estimate.std))
+
+    def test_95_percent_intervals_cover_88_to_99_percent(self):
+        covered = []
+        for seed in range(0, 60, 2):
+            result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
+            one = result.estimate
+            true = TRUTH[[MODEL.parameter_names.index(name) for name in one.names]]
+            covered.append(np.abs(one.values - true) < one.interval_factor * one.std)
+        assert 0.88 <= np.mean(np.concatenate(covered)) <= 0.995
+        assert one.units == tuple(
+            MODEL.units[MODEL.parameter_names.index(name)] for name in one.names
         )
-    length = np.linalg.norm(fitted, axis=0)
-    assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
+        assert "essential" in one.method
+        assert "cluster-robust" in one.method
 
-
-def test_the_path_removes_the_most_uncertain_parameter():
-    training, unseen = factors(MODEL, TRUTH)
-    result = eliminate(MODEL, training, unseen)
-    full = estimate(MODEL, training.total)
-    relative = full.std / np.abs(full.values)
-    assert result.steps[0].removed is None
-    assert result.steps[0].spread == pytest.approx(relative.max() / relative.min(), rel=1e-9)
-    assert result.steps[1].removed == full.names[int(relative.argmax())]
-    assert result.steps[0].largest_relative_std == pytest.approx(relative.max(), rel=1e-9)
-    assert [step.left for step in result.steps] == list(range(MODEL.n_parameters, 0, -1))
-    errors = [step.in_sample for step in result.steps]
-    # Monotonic with weights; nearly so without.
-    assert errors[-1] > 5.0 * errors[0]
-    removed = [step.removed for step in result.steps[1:]]
-    assert len(set(removed)) == len(removed)
-
-
-def test_a_parameter_needed_by_unseen_motion_stays():
-    values = TRUTH.copy()
-    values[MODEL.parameter_names.index("fo_2")] = 1.0
-    training, unseen = factors(MODEL, values)
-    blind = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0, overall=9.0, axis=9.0))
-    result = eliminate(MODEL, training, unseen, rule=CutRule(spread=4.0))
-    assert "f1_1" in blind.removed  # a friction of 1.5 N·m·s/rad, among a noise of 3 N·m
-    assert "f1_1" in result.refused
-    assert "f1_1" in result.reason
-    assert result.chosen.held_out < blind.chosen.held_out - 0.001
-
-
-@settings(max_examples=15)
-@given(st.integers(0, 2**16))
-def test_removals_up_to_the_cut_satisfy_the_rule(seed):
-    model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
-    values = np.random.default_rng(seed).normal(0.0, 2.0, model.n_parameters)
-    result = eliminate(model, *factors(model, values, seed))
-    rule = CutRule()
-    best = min(step.held_out for step in result.steps[: result.cut + 1])
-    assert result.chosen.held_out <= best + 2.0 * rule.overall
-    assert set(result.refused).isdisjoint(result.removed)
-    assert set(result.removed) | set(result.estimate.names) == set(model.parameter_names)
-    if not result.refused:
-        assert result.chosen.spread < rule.spread
-
-
-def test_undetermined_parameters_are_removed_first():
-    motion = a_motion(1)
-    held = Motion(motion.time, *(part * [1.0, 0.0] for part in motion[1:4]))
-    training = PhaseFactor.from_samples(MODEL, samples_of(MODEL, TRUTH, held, NOISE, 3))
-    result = eliminate(MODEL, training, training)
-    full = estimate(MODEL, training.total)
-    lost = [
-        after for before, after in pairwise(result.steps) if np.isinf(before.largest_relative_std)
-    ]
-    assert {"f0_2", "f1_2", "f2_2", "fo_2"} <= {step.removed for step in lost}
-    assert len(lost) < len(full.undetermined)  # one parameter of a combination can stay
-    assert result.estimate.undetermined == ()
-    assert np.all(np.isfinite(result.estimate.std))
-
-
-def test_95_percent_intervals_cover_88_to_99_percent():
-    covered = []
-    for seed in range(0, 60, 2):
-        result = eliminate(MODEL, *factors(MODEL, TRUTH, seed))
-        one = result.estimate
-        true = TRUTH[[MODEL.parameter_names.index(name) for name in one.names]]
-        covered.append(np.abs(one.values - true) < one.interval_factor * one.std)
-    assert 0.88 <= np.mean(np.concatenate(covered)) <= 0.995
-    assert one.units == tuple(MODEL.units[MODEL.parameter_names.index(name)] for name in one.names)
-    assert "essential" in one.method
-    assert "cluster-robust" in one.method
-
-
-def test_the_ns16_predicts_equally_with_fewer_parameters():
-    model = RobotModel.from_urdf(urdf_text())
-    standard = model.nominal.reshape(6, -1).copy()
-    standard[:, -1] = [7.6465, 24.5955, 10.48, 0.253, 0.298, 0.12]
-    coulomb = [68.035, 108.777, 50.446, 9.248, 8.904, 5.148]
-    viscous = [41.196, 63.255, 39.248, 3.2659, 16.4439, 8.8808]
-    values = np.concatenate([model.base.grouping @ standard.ravel(), coulomb, viscous, np.zeros(6)])
-    noise = np.array([20.0, 20.0, 12.0, 2.0, 2.0, 1.5])
-    training, unseen = (
-        PhaseFactor.from_samples(
-            model, samples_of(model, values, a_motion(k, 6, step=0.01), noise, k)
+    def test_the_ns16_predicts_equally_with_fewer_parameters(self):
+        model = RobotModel.from_urdf(urdf_text())
+        values = ns16_values(model)
+        noise = np.array([20.0, 20.0, 12.0, 2.0, 2.0, 1.5])
+        training, unseen = (
+            PhaseFactor.from_samples(
+                model, simulated(model, values, a_motion(k, 6, step=0.01), noise, k)
+            )
+            for k in (1, 2)
         )
-        for k in (1, 2)
-    )
-    result = eliminate(model, training, unseen)
-    assert {f"f2_{joint}" for joint in range(1, 7)} <= set(result.removed)
-    assert {f"f{k}_{joint}" for joint in range(1, 7) for k in (0, 1)} <= set(result.estimate.names)
-    assert result.chosen.left < 45
-    assert result.chosen.held_out < result.steps[0].held_out + 0.001
-    took = []
-    for _ in range(3):
-        begin = time.process_time()
-        eliminate(model, training, unseen)
-        took.append(time.process_time() - begin)
-    assert min(took) < 0.3  # 0.07 s on a quiet machine
+        result = eliminate(model, training, unseen)
+        assert {f"f2_{joint}" for joint in range(1, 7)} <= set(result.removed)
+        assert {f"f{k}_{joint}" for joint in range(1, 7) for k in (0, 1)} <= set(
+            result.estimate.names
+        )
+        assert result.chosen.left < 45
+        assert result.chosen.held_out < result.steps[0].held_out + 0.001
+        took = []
+        for _ in range(3):
+            begin = time.process_time()
+            eliminate(model, training, unseen)
+            took.append(time.process_time() - begin)
+        assert min(took) < 0.3  # 0.07 s on a quiet machine
 
-
-def test_a_real_ur10_needs_20_to_30_of_58_parameters(shared_data):
-    model, recording = ur10(shared_data, FrictionLaw(third=None, offset=True))
-    cut = round(0.7 * recording.n_samples)
-    fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
-    options = possible_low_passes(fitted, model)[0]
-    training, unseen = (
-        PhaseFactor.from_samples(model, prepare(part, model, options=options))
-        for part in (fitted, rest)
-    )
-    result = eliminate(model, training, unseen)
-    assert model.n_parameters == 58
-    assert 20 <= result.chosen.left <= 30
-    assert result.chosen.held_out < result.steps[0].held_out + 0.001
-    # The error of each axis stays, unlike by relative standard deviations, which remove the offset
-    # of joint 6.
-    error = unseen.total.relative_errors
-    assert np.all(error(result.values) < error(estimate(model, training.total).values) + 0.005)
-    blind = eliminate(model, training, unseen, rule=CutRule(overall=9.0, axis=9.0))
-    assert blind.chosen.left < result.chosen.left
-    assert error(blind.values)[5] > 2.0 * error(result.values)[5]
+    def test_a_real_ur10_needs_20_to_30_of_58_parameters(self, shared_data):
+        model, recording = ur10(shared_data, FrictionLaw(third=None, offset=True))
+        cut = round(0.7 * recording.n_samples)
+        fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
+        options = possible_low_passes(fitted, model)[0]
+        training, unseen = (
+            PhaseFactor.from_samples(model, prepare(part, model, options=options))
+            for part in (fitted, rest)
+        )
+        result = eliminate(model, training, unseen)
+        assert model.n_parameters == 58
+        assert 20 <= result.chosen.left <= 30
+        assert result.chosen.held_out < result.steps[0].held_out + 0.001
+        # The error of each axis stays; relative standard deviations remove the offset of joint 6.
+        error = unseen.total.relative_errors
+        assert np.all(error(result.values) < error(estimate(model, training.total).values) + 0.005)
+        blind = eliminate(model, training, unseen, rule=CutRule(overall=9.0, axis=9.0))
+        assert blind.chosen.left < result.chosen.left
+        assert error(blind.values)[5] > 2.0 * error(result.values)[5]
 
 
 def runs_of(model, truth, seed, count):
     seeds = range(seed, seed + count)
-    return [samples_of(model, truth, a_motion(k), NOISE, k) for k in seeds]
+    return [simulated(model, truth, a_motion(k), NOISE, k) for k in seeds]
 
 
 def factors_of(model, runs):
     return [PhaseFactor.from_samples(model, run) for run in runs]
 
 
-@settings(max_examples=8)
-@given(st.integers(0, 1000))
-def test_a_blind_choice_ignores_the_held_out_motion(seed):
-    """Recomputed from rows: chosen on the end of the fitted part, fitted to all of it."""
-    arm = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
-    values = np.random.default_rng(seed).normal(1.0, 1.0, arm.n_parameters)
-    fitted, *unseen = runs_of(arm, values, seed, 3)
-    training, *held_out = factors_of(arm, [fitted, *unseen])
-    found = choose_essential(arm, training, held_out)
-    weights = joint_weights(training.total)
-    edge = round(0.7 * len(training)) * 25  # rows in a block of 0.125 s
-    first, last = (
-        PhaseFactor.from_samples(arm, fitted.between(*rows))
-        for rows in ((0, edge), (edge, len(fitted.torque)))
-    )
-    names = eliminate(arm, first, last, weights=weights).estimate.names
-    left = [arm.parameter_names.index(name) for name in names]
-    dense = arm.regressor(*fitted.motion[1:]).dense(arm.n_parameters)[:, :, left]
-    scale = np.sqrt(weights) * fitted.usable
-    values = np.zeros(arm.n_parameters)
-    values[left] = np.linalg.lstsq(
-        (dense * scale[..., None]).reshape(-1, len(left)),
-        (fitted.torque * scale).ravel(),
-        rcond=None,
-    )[0]
-    expected = pooled_error(prediction_error(arm, values, unseen)).overall
-    assert found.blind.left == len(left)
-    assert found.blind.essential == pytest.approx(expected, rel=1e-6)
+class TestChoice:
+    @settings(max_examples=8)
+    @given(st.integers(0, 1000))
+    def test_a_blind_choice_ignores_the_held_out_motion(self, seed):
+        """Recomputed from rows: chosen on the end of the fitted part, fitted to all of it."""
+        arm = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
+        values = np.random.default_rng(seed).normal(1.0, 1.0, arm.n_parameters)
+        fitted, *unseen = runs_of(arm, values, seed, 3)
+        training, *held_out = factors_of(arm, [fitted, *unseen])
+        found = choose_essential(arm, training, held_out)
+        weights = joint_weights(training.total)
+        edge = round(0.7 * len(training)) * 25  # rows in a block of 0.125 s
+        first, last = (
+            PhaseFactor.from_samples(arm, fitted.between(*rows))
+            for rows in ((0, edge), (edge, len(fitted.torque)))
+        )
+        names = eliminate(arm, first, last, weights=weights).estimate.names
+        left = [arm.parameter_names.index(name) for name in names]
+        dense = arm.regressor(*fitted.motion[1:]).dense(arm.n_parameters)[:, :, left]
+        scale = np.sqrt(weights) * fitted.usable
+        values = np.zeros(arm.n_parameters)
+        values[left] = np.linalg.lstsq(
+            (dense * scale[..., None]).reshape(-1, len(left)),
+            (fitted.torque * scale).ravel(),
+            rcond=None,
+        )[0]
+        expected = pooled_error(prediction_error(arm, values, unseen)).overall
+        assert found.blind.left == len(left)
+        assert found.blind.essential == pytest.approx(expected, rel=1e-6)
 
+    def test_a_short_motion_has_no_blind_choice(self):
+        training, unseen = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 2))
+        assert choose_essential(MODEL, training, [unseen]).blind is not None
+        assert choose_essential(MODEL, training.blocks(slice(0, 20)), [unseen]).blind is None
 
-def test_a_short_motion_has_no_blind_choice():
-    training, unseen = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 2))
-    assert choose_essential(MODEL, training, [unseen]).blind is not None
-    assert choose_essential(MODEL, training.blocks(slice(0, 20)), [unseen]).blind is None
+    def test_the_choice_by_spread_ignores_held_out_errors(self):
+        training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 3))
+        found = choose_essential(MODEL, training, held_out)
+        assert found.by_spread.spread < CutRule().spread
+        assert found.by_spread.left <= found.elimination.chosen.left
+        assert found.elimination.chosen.held_out <= found.by_spread.held_out + 2 * CutRule().overall
 
+    def test_many_recordings_are_merged(self):
+        """The error over merged blocks is the same sum."""
+        training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
+        found = choose_essential(MODEL, training, held_out)
+        total = sum(held_out, PhaseFactor.zero(MODEL)).total
+        assert found.elimination.chosen.held_out == pytest.approx(
+            total.relative_error(found.elimination.values), rel=1e-9
+        )
 
-def test_the_choice_by_spread_ignores_held_out_errors():
-    training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 3))
-    found = choose_essential(MODEL, training, held_out)
-    assert found.by_spread.spread < CutRule().spread
-    assert found.by_spread.left <= found.elimination.chosen.left
-    assert found.elimination.chosen.held_out <= found.by_spread.held_out + 2 * CutRule().overall
-
-
-def test_many_recordings_are_merged():
-    """The error over merged blocks is the same sum."""
-    training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
-    found = choose_essential(MODEL, training, held_out)
-    total = sum(held_out, PhaseFactor.zero(MODEL)).total
-    assert found.elimination.chosen.held_out == pytest.approx(
-        total.relative_error(found.elimination.values), rel=1e-9
-    )
-
-
-def test_empty_factors_raise():
-    (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
-    with pytest.raises(IdentificationError, match="no usable held-out sample"):
-        choose_essential(MODEL, training, [PhaseFactor.zero(MODEL)])
-    with pytest.raises(IdentificationError, match="no usable fitted"):
-        eliminate(MODEL, PhaseFactor.zero(MODEL), training)
+    def test_empty_factors_raise(self):
+        (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
+        with pytest.raises(IdentificationError, match="no usable held-out sample"):
+            choose_essential(MODEL, training, [PhaseFactor.zero(MODEL)])
+        with pytest.raises(IdentificationError, match="no usable fitted"):
+            eliminate(MODEL, PhaseFactor.zero(MODEL), training)

@@ -28,31 +28,10 @@ from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.simulated_logs import urdf_path
+from tests.identification.robots import joint, link, random_urdf, robot
 
+TILTED = "0.1 -0.3 0.7"
 NOWHERE = Workspace(floor=None, margin=0.0)
-
-
-def link(name, shape="", at="0 0 0"):
-    collision = (
-        f'<collision><origin xyz="{at}"/><geometry>{shape}</geometry></collision>' if shape else ""
-    )
-    return (
-        f'<link name="{name}"><inertial><mass value="1"/>'
-        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-        f"{collision}</link>"
-    )
-
-
-def joint(number, parent, child, axis, kind="revolute", at="0 0 0"):
-    return (
-        f'<joint name="joint_{number}" type="{kind}"><parent link="{parent}"/>'
-        f'<child link="{child}"/><origin xyz="{at}" rpy="0.1 -0.3 0.7"/><axis xyz="{axis}"/>'
-        '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
-    )
-
-
-def robot(*parts):
-    return f'<robot name="r">{"".join(parts)}</robot>'
 
 
 def ball_chain(*radii):
@@ -61,7 +40,8 @@ def ball_chain(*radii):
     for k, radius in enumerate(radii):
         shape = f'<sphere radius="{radius}"/>' if radius else ""
         parts.append(link(f"link_{k}", shape))
-        parts.append(joint(k, f"link_{k - 1}" if k else "base", f"link_{k}", "0 0 1", at="0.1 0 0"))
+        parent = f"link_{k - 1}" if k else "base"
+        parts.append(joint(f"joint_{k}", parent, f"link_{k}", at="0.1 0 0", rpy=TILTED))
     return robot(*parts)
 
 
@@ -73,38 +53,6 @@ def arm():
 def postures(model, seed, count):
     random = np.random.default_rng(seed)
     return random.uniform(model.lowerPositionLimit, model.upperPositionLimit, (count, model.nq))
-
-
-def test_joint_frames_are_those_of_pinocchio():
-    urdf = robot(
-        link("base"),
-        link("a"),
-        link("b"),
-        link("c"),
-        joint(1, "base", "a", "0.6 0 0.8", at="0.1 0.2 0.3"),
-        joint(2, "a", "b", "0 0.6 -0.8", kind="prismatic", at="0 0.2 0"),
-        joint(3, "b", "c", "0 1 0", at="0 0 0.5"),
-    )
-    model = pin.buildModelFromXML(urdf)
-    data = model.createData()
-    q = postures(model, 1, 20)
-    rotations, translations = joint_poses(chain_from_urdf(urdf), q)
-    for k, row in enumerate(q):
-        pin.forwardKinematics(model, data, row)
-        for i in range(4):
-            np.testing.assert_allclose(rotations[i, k], data.oMi[i].rotation, atol=1e-12)
-            np.testing.assert_allclose(translations[i, k], data.oMi[i].translation, atol=1e-12)
-
-
-def test_shapes_are_freed(arm):
-    def living():
-        gc.collect()
-        return sum(isinstance(thing, pin.GeometryModel) for thing in gc.get_objects())
-
-    before = living()
-    for _ in range(5):
-        assert link_bodies(arm, urdf_text(), [])
-    assert living() == before
 
 
 @pytest.fixture(scope="module")
@@ -131,47 +79,10 @@ def brute(arm):
     return least
 
 
-@given(seed=st.integers(0, 10**6), margin=st.sampled_from([0.0, 0.05, 0.15]))
-@settings(max_examples=20)
-def test_the_deepest_contact_agrees_with_brute_force(arm, brute, seed, margin):
-    ends = np.concatenate((np.zeros((1, 6)), postures(arm, seed, 3)))
-    q = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(ends)])
-    distances = brute(q)
-    contact = checkers(margin).deepest_contact(q)
-    certain = np.abs(distances - margin) > 1e-5
-    clear = checkers(margin).clear(q)
-    np.testing.assert_array_equal(clear[certain], (distances >= margin)[certain])
-    if distances.min() >= margin:
-        assert contact is None
-    else:
-        assert contact.distance == pytest.approx(distances[contact.sample], abs=1e-5)
-        assert contact.distance <= min(distances.min() + 0.00501, margin)
-
-
 def checkers(margin, made={}):  # noqa: B006 - the cache is the point
     if margin not in made:
         made[margin] = CollisionChecker(urdf_text(), Workspace(margin=margin))
     return made[margin]
-
-
-@given(st.integers(0, 10**6))
-@settings(max_examples=10)
-def test_bounds_do_not_exceed_distances(arm, seed):
-    scene = mixed_shapes()
-    path = scene.path(np.random.default_rng(seed).uniform(-2.0, 2.0, (30, 3)))
-    count = len(scene.separation.first)
-    pair, sample = np.indices((count, 30)).reshape(2, -1)
-    lower, normal = scene.separation.bound(path.bodies, pair, sample)
-    distance = np.array(
-        [scene.distance(p, path, k) for p, k in zip(pair.tolist(), sample.tolist(), strict=True)]
-    )
-    np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1.0, atol=1e-12)
-    assert np.all(lower <= distance + 1e-5)
-    exact = scene.separation.exact[pair]
-    np.testing.assert_allclose(lower[exact], distance[exact], atol=1e-9)
-    assert np.any(exact)
-    quick = scene.separation.coarse(path.bodies, np.arange(30)).ravel()
-    assert np.all(quick <= distance + 1e-5)
 
 
 def mixed_shapes():
@@ -182,16 +93,12 @@ def mixed_shapes():
         link("b", '<cylinder radius="0.04" length="0.2"/>', at="0 0.1 0.1"),
         link("c", '<box size="0.1 0.2 0.3"/>', at="0.2 0 0"),
         link("tool", '<sphere radius="0.05"/>', at="0 0 0.3"),
-        joint(1, "base", "a", "0 0 1", at="0 0 0.3"),
-        joint(2, "a", "b", "0 0.6 0.8", kind="prismatic", at="0.2 0.3 0.1"),
-        joint(3, "b", "c", "1 0 0", at="0.1 0 0.2"),
-        '<joint name="fixed" type="fixed"><parent link="c"/><child link="tool"/></joint>',
+        joint("joint_1", "base", "a", "0 0 1", at="0 0 0.3", rpy=TILTED),
+        joint("joint_2", "a", "b", "0 0.6 0.8", kind="prismatic", at="0.2 0.3 0.1", rpy=TILTED),
+        joint("joint_3", "b", "c", "1 0 0", at="0.1 0 0.2", rpy=TILTED),
+        joint("fixed", "c", "tool", kind="fixed"),
     )
-    workspace = Workspace(
-        floor=-0.4,
-        boxes=(Box((0.4, 0.4, -0.2), (0.9, 0.7, 0.5)),),
-        margin=0.02,
-    )
+    workspace = Workspace(floor=-0.4, boxes=(Box((0.4, 0.4, -0.2), (0.9, 0.7, 0.5)),), margin=0.02)
     return CollisionChecker(urdf, workspace)
 
 
@@ -225,208 +132,13 @@ FAST = JointLimits(
 )
 
 
-@given(
-    seed=st.integers(0, 10**6),
-    kind=st.sampled_from([short_motion, short_sines]),
-    beyond=st.sampled_from([-3e-3, -1e-4, 1e-4, 3e-3]),
-)
-@settings(max_examples=20, deadline=None)
-def test_a_motion_is_clear_if_and_only_if_every_instant_of_it_is(brute, seed, kind, beyond):
-    # The margin is close to the smallest distance.
-    motion = kind(seed)
-    time = np.linspace(0.0, motion.duration, int(motion.duration / 0.008) + 2)
-    coarse = brute(motion.sample(time)[0])
-    around = time[np.argmin(coarse)] + np.linspace(-0.008, 0.008, 161)
-    least = min(coarse.min(), brute(motion.sample(around)[0]).min())
-    checker = CollisionChecker(urdf_text(), Workspace(margin=max(least + beyond, 0.0)))
-    for period in (0.008, 0.03):
-        contact = checker.deepest_along(motion, sampled(motion, period))
-        if least + beyond <= 0.0 and least > 0.0:
-            continue  # the margin was cut off at zero
-        assert (contact is not None) == (beyond > 0.0 or least < 0.0)
-        if contact is not None:
-            assert contact.distance < checker.workspace.margin
-            np.testing.assert_allclose(
-                contact.posture, motion.sample_one(contact.time)[0], atol=1e-12
-            )
-            there = brute(np.array([contact.posture]))[0]
-            assert contact.distance == pytest.approx(there, abs=1e-5)
-            assert contact.distance <= least + 0.025
-
-
-@pytest.mark.parametrize("steps", [7, 40])
-def test_contacts_between_samples_are_found(steps):
-    # A ball on an arm of 1 m sweeps past a post of 2 cm in a hundredth of a second.
-    urdf = ball_on_a_turntable(0.01)
-    limits = JointLimits([-4.0], [4.0], [4.0], [20.0], [200.0])
-    motion = plan([[-1.5], [1.63]], limits)
-    samples = sampled(motion, motion.duration / steps)
-    post = Box((0.99, -0.001, -1.0), (1.01, 0.001, 1.0))
-    tip = np.abs(np.sin(samples.position[:, 0]))
-    assert np.all(tip > 0.02)  # no sample touches
-    aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the path
-    contact, none = (
-        CollisionChecker(urdf, replace(NOWHERE, boxes=(box,))).deepest_along(motion, samples)
-        for box in (post, aside)
-    )
-    assert (contact.first, contact.second) == ("arm", "box 0")
-    assert abs(np.sin(contact.posture[0])) < 0.011
-    assert none is None
-
-
-@pytest.mark.parametrize("touches", [True, False])
-def test_a_reversal_between_samples_is_found(touches):
-    """The ball is in the same place at both samples, and 2 cm nearer to the wall between them."""
-    motion = FourierSeries([0.0], [[0.5]], [[2.0 * np.pi]], length=3.0, ramp=0.5)
-    time = np.linspace(0.0, 3.0, 31)
-    nearest = np.sin(0.5) + 0.01  # y at 1.25 s
-    wall = Box((0.8, nearest + (-0.01 if touches else 0.001), -1.0), (1.2, 1.0, 1.0))
-    checker = CollisionChecker(ball_on_a_turntable(0.01), replace(NOWHERE, boxes=(wall,)))
-    contact = checker.deepest_along(motion, Motion(time, *motion.sample(time)))
-    assert (contact is not None) == touches
-
-
-@given(st.integers(0, 10**6))
-@settings(max_examples=20)
-def test_bulges_bound_the_deviation_from_straight_lines(seed):
-    scene = mixed_shapes()
-    random = np.random.default_rng(seed)
-    q0, rate, bend = random.uniform(-1.0, 1.0, (3, 3)) * [[1.0], [3.0], [8.0]]
-    step = 0.1
-    t = np.linspace(0.0, step, 21)[:, None]
-    path = scene.path(q0 + rate * t + bend * t**2 / 2.0)
-    speed = np.abs(rate + bend * t).max(axis=0)
-    both_ends = path.q[[0, -1]]
-    bulges = scene.from_base.bulge(speed[:, None], np.abs(bend)[:, None], both_ends, step)[:, 0]
-    share = t[:, 0] / step
-    for pair, bulge in enumerate(bulges.tolist()):
-        left = 0.0
-        for body in map(int, scene.indices(pair)):
-            hull = scene._bodies[body].hull
-            for side in (-1.0, 0.0, 1.0):
-                end = path.bodies.centre[:, body] + side * (
-                    hull.half_length * path.bodies.axis[:, body]
-                )
-                chord = np.outer(end[:, 0], 1.0 - share) + np.outer(end[:, -1], share)
-                left = max(left, float(np.linalg.norm(end - chord, axis=0).max()))
-        assert left <= bulge + 1e-12
-
-
 def ball_on_a_turntable(radius):
     """A ball at 1 m from a vertical axis."""
     return robot(
         link("base"),
         link("arm", f'<sphere radius="{radius}"/>', at="1 0 0"),
-        '<joint name="turn" type="continuous"><parent link="base"/><child link="arm"/>'
-        '<axis xyz="0 0 1"/></joint>',
+        joint("turn", "base", "arm", kind="continuous"),
     )
-
-
-def test_contacts_with_boxes():
-    urdf = ball_on_a_turntable(0.1)
-    q = np.linspace(0.0, np.pi, 1801)[:, None]  # 0.1 degrees each
-    box = Workspace(floor=None, boxes=(Box((-2.0, -1.0, -1.0), (-0.5, 1.0, 1.0)),), margin=0.05)
-    checker = CollisionChecker(urdf, box)
-    contact = checker.deepest_contact(q)
-    assert (contact.first, contact.second) == ("arm", "box 0")
-    np.testing.assert_array_equal(checker.clear(q), np.cos(q[:, 0]) >= -0.5 + 0.15)
-    shallow = q[np.cos(q[:, 0]) >= -0.42]
-    contact = checker.deepest_contact(shallow)
-    assert contact.distance == pytest.approx(np.cos(shallow[-1, 0]) + 0.5 - 0.1, abs=0.005)
-
-
-def test_all_pairs_that_can_touch_are_checked():
-    pairs = {frozenset(pair) for pair in checkers(0.05).pairs}
-    links = ["base_link", *(f"link_{k}" for k in range(1, 7))]
-    for (i, a), (k, b) in combinations(enumerate(links), 2):
-        assert (frozenset((a, b)) in pairs) == (k - i > 1), (a, b)
-    for name in links[1:]:
-        assert frozenset((name, "floor")) in pairs
-    assert frozenset(("base_link", "floor")) not in pairs
-    for wider in (0.2, 0.5):
-        assert checkers(wider).pairs == checkers(0.05).pairs
-
-
-def test_only_close_pairs_of_a_wrist_are_unchecked():
-    wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
-    assert ("link_0", "link_2") not in wrist.pairs
-    (pair,) = wrist.unchecked
-    assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
-    assert pair.nearest <= pair.farthest < 0.0
-    assert "link_0_0 and link_2_0" in str(wrist.exceptions)
-    assert checkers(0.05).unchecked == ()
-    assert checkers(0.05).exceptions is None
-    # Four joints between base and tip: permanent contact is reported.
-    far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
-    contact = far.deepest_contact(np.zeros((1, 4)))
-    assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
-    assert contact.distance < 0.0
-
-
-def test_missing_limits_leave_no_pair_unchecked():
-    # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
-    rod = '<cylinder radius="0.05" length="0.5"/>'
-    parts = [link("base")]
-    for k in range(3):
-        parent, at = ("base", "0 0 0.42") if k == 0 else (f"l{k - 1}", "0.6 0 0")
-        parts += [
-            link(f"l{k}", rod, at="0.3 0 0"),
-            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
-            f'<origin xyz="{at}"/><axis xyz="0 {int(k > 0)} {int(k == 0)}"/>'
-            '<limit effort="1" velocity="1"/></joint>',
-        ]
-    urdf = robot(*parts)
-    limits = JointLimits([-3.0] * 3, [3.0] * 3, [2.0] * 3, [10.0] * 3, [100.0] * 3)
-    crate = Box((0.8, -0.2, 0.0), (0.95, 0.2, 0.33))
-    workspace = Workspace(floor=None, boxes=(crate,))
-    for in_use in (limits, None):
-        checker = CollisionChecker(urdf, workspace, limits=in_use)
-        assert ("l1", "box 0") in checker.pairs
-        contact = checker.deepest_contact(np.array([[0.0, 0.3, -0.6]]))
-        assert contact is not None and "box 0" in (contact.first, contact.second)
-
-
-@pytest.mark.parametrize(
-    "workspace",
-    [
-        Workspace(floor=0.6),
-        Workspace(floor=1e6),
-        Workspace(floor=None, boxes=(Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0)),)),
-    ],
-    ids=["floor above the foot", "floor above all", "box around all"],
-)
-def test_misplaced_obstacles_leave_no_moving_link_unchecked(arm, workspace):
-    checker = CollisionChecker(urdf_text(), workspace, limits=FAST)
-    with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
-    assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
-    # The first link turns in it in all motions: reported, not checked.
-    assert {pair.first[:6] for pair in checker.unchecked} == {"link_1"}
-    home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
-    contact = checker.deepest_contact(home)
-    assert contact is not None and contact.first == "link_2"
-    assert not np.any(checker.clear(postures(arm, 3, 200)))
-
-
-def test_a_first_link_that_swings_towards_the_floor_is_checked():
-    rod = '<cylinder radius="0.05" length="0.6"/>'
-    urdf = robot(link("base"), link("arm", rod), joint(1, "base", "arm", "1 0 0"))
-    for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
-        checker = CollisionChecker(urdf, Workspace(floor=floor))
-        assert checker.pairs == (("arm", "floor"),)
-        assert checker.unchecked == ()
-
-
-def test_limits_and_postures_of_another_arm_are_refused():
-    with pytest.raises(ShapeError):
-        checkers(0.05).deepest_contact(np.zeros((3, 5)))
-    with pytest.raises(ShapeError, match="limits"):
-        CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
-
-    q = np.zeros((3, 6))
-    q[1, 4] = np.nan
-    for check in (checkers(0.05).clear, checkers(0.05).deepest_contact):
-        with pytest.raises(ValueError, match="finite"):
-            check(q)
 
 
 def violent_sines(size, pace, ramp):
@@ -446,76 +158,324 @@ def violent_pieces(jerk):
     return PiecewiseCubic(tuple(np.linspace(0.0, 5.0, 501) for _ in range(6)), tuple(table))
 
 
-@pytest.mark.parametrize(
-    "motion",
-    [
-        *(violent_sines(0.2, 3.0, ramp) for ramp in (0.0, 1e-9, 1e-3)),
-        violent_sines(3.0, 50.0, 2.5),
-        violent_pieces(1e9),
-    ],
-)
-def test_violent_motions_are_checked_quickly(motion):
-    began = time.process_time()
-    checkers(0.05).deepest_along(motion, sampled(motion))
-    assert time.process_time() - began < 3.0
-
-
-def test_long_motions_are_checked_in_parts(monkeypatch):
-    motion = short_sines(7)
-    whole = [checkers(m).deepest_along(motion, sampled(motion)) for m in (0.0, 0.05, 0.3)]
-    monkeypatch.setattr(checker_module, "_PART", 50)
-    for margin, contact in zip((0.0, 0.05, 0.3), whole, strict=True):
-        again = checkers(margin).deepest_along(motion, sampled(motion))
-        assert (again is None) == (contact is None)
-        if contact is not None:
-            assert again.distance == pytest.approx(contact.distance, abs=0.006)
-
-
-def test_a_mesh_counts_as_its_convex_hull(tmp_path):
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.2 - 0.1
-    triangles = corners[ConvexHull(corners).simplices].astype("<f4")
-    facets = [b"\0" * 12 + triangle.tobytes() + b"\0\0" for triangle in triangles]
-    folder = tmp_path / "cell" / "meshes"
-    folder.mkdir(parents=True)
-    binary = b"\0" * 80 + struct.pack("<I", len(facets)) + b"".join(facets)
-    (folder / "cube.stl").write_bytes(binary)
-
-    def cell(shape):
-        return robot(link("base"), link("tip", shape), joint(1, "base", "tip", "0 0 1"))
-
-    workspace = Workspace(floor=-0.15, margin=0.0)
-    meshed = CollisionChecker(
-        cell('<mesh filename="package://cell/meshes/cube.stl"/>'),
-        workspace,
-        mesh_folders=[str(tmp_path)],
+class TestMotions:
+    @given(
+        seed=st.integers(0, 10**6),
+        kind=st.sampled_from([short_motion, short_sines]),
+        beyond=st.sampled_from([-3e-3, -1e-4, 1e-4, 3e-3]),
     )
-    boxed = CollisionChecker(cell('<box size="0.2 0.2 0.2"/>'), workspace)
-    q = np.linspace(-2.0, 2.0, 9)[:, None]
-    for k in range(len(q)):
-        distances = [checker.distance(0, checker.path(q), k) for checker in (meshed, boxed)]
-        assert distances[0] == pytest.approx(distances[1], abs=1e-6)
+    @settings(max_examples=20, deadline=None)
+    def test_they_are_clear_if_and_only_if_every_instant_is(self, brute, seed, kind, beyond):
+        # The margin is close to the smallest distance.
+        motion = kind(seed)
+        time = np.linspace(0.0, motion.duration, int(motion.duration / 0.008) + 2)
+        coarse = brute(motion.sample(time)[0])
+        around = time[np.argmin(coarse)] + np.linspace(-0.008, 0.008, 161)
+        least = min(coarse.min(), brute(motion.sample(around)[0]).min())
+        checker = CollisionChecker(urdf_text(), Workspace(margin=max(least + beyond, 0.0)))
+        for period in (0.008, 0.03):
+            contact = checker.deepest_along(motion, sampled(motion, period))
+            if least + beyond <= 0.0 and least > 0.0:
+                continue  # the margin was cut off at zero
+            assert (contact is not None) == (beyond > 0.0 or least < 0.0)
+            if contact is not None:
+                assert contact.distance < checker.workspace.margin
+                np.testing.assert_allclose(
+                    contact.posture, motion.sample_one(contact.time)[0], atol=1e-12
+                )
+                there = brute(np.array([contact.posture]))[0]
+                assert contact.distance == pytest.approx(there, abs=1e-5)
+                assert contact.distance <= least + 0.025
 
+    @pytest.mark.parametrize("steps", [7, 40])
+    def test_contacts_between_samples_are_found(self, steps):
+        # A ball on an arm of 1 m sweeps past a post of 2 cm in a hundredth of a second.
+        urdf = ball_on_a_turntable(0.01)
+        limits = JointLimits([-4.0], [4.0], [4.0], [20.0], [200.0])
+        motion = plan([[-1.5], [1.63]], limits)
+        samples = sampled(motion, motion.duration / steps)
+        post = Box((0.99, -0.001, -1.0), (1.01, 0.001, 1.0))
+        tip = np.abs(np.sin(samples.position[:, 0]))
+        assert np.all(tip > 0.02)  # no sample touches
+        aside = Box((1.0102, -0.001, -1.0), (1.02, 0.001, 1.0))  # 0.2 mm beside the path
+        contact, none = (
+            CollisionChecker(urdf, replace(NOWHERE, boxes=(box,))).deepest_along(motion, samples)
+            for box in (post, aside)
+        )
+        assert (contact.first, contact.second) == ("arm", "box 0")
+        assert abs(np.sin(contact.posture[0])) < 0.011
+        assert none is None
 
-def test_unusable_shapes_and_boxes_are_refused():
-    for shape in ('<mesh filename="package://nowhere/part.stl"/>', ""):
-        urdf = robot(link("base"), link("tip", shape), joint(1, "base", "tip", "0 0 1"))
-        with pytest.raises(CollisionModelError):
-            CollisionChecker(urdf, Workspace())
-    with pytest.raises(WorkspaceError):
-        Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
+    @pytest.mark.parametrize("touches", [True, False])
+    def test_a_reversal_between_samples_is_found(self, touches):
+        """The ball is in one place at both samples, and 2 cm nearer to the wall between them."""
+        motion = FourierSeries([0.0], [[0.5]], [[2.0 * np.pi]], length=3.0, ramp=0.5)
+        time = np.linspace(0.0, 3.0, 31)
+        nearest = np.sin(0.5) + 0.01  # y at 1.25 s
+        wall = Box((0.8, nearest + (-0.01 if touches else 0.001), -1.0), (1.2, 1.0, 1.0))
+        checker = CollisionChecker(ball_on_a_turntable(0.01), replace(NOWHERE, boxes=(wall,)))
+        contact = checker.deepest_along(motion, Motion(time, *motion.sample(time)))
+        assert (contact is not None) == touches
 
-
-def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting():
-    """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
-    path = urdf_path("ur5_robot.urdf")
-    checker = CollisionChecker(
-        path.read_text(), Workspace(floor=0.0), mesh_folders=(str(path.parents[4]),)
+    @pytest.mark.parametrize(
+        "motion",
+        [
+            *(violent_sines(0.2, 3.0, ramp) for ramp in (0.0, 1e-9, 1e-3)),
+            violent_sines(3.0, 50.0, 2.5),
+            violent_pieces(1e9),
+        ],
     )
-    near = {first for first, second in checker.pairs if second == "floor"}
-    assert not near & {"base_link", "shoulder_link"}
-    assert {"upper_arm_link", "forearm_link", "wrist_3_link"} <= near
-    upright = np.array([0.0, -1.57, 0.0, -1.57, 0.0, 0.0])
-    level = np.array([0.0, -0.05, 0.0, -1.57, 0.0, 0.0])
-    bowed = np.array([0.0, 0.1, -0.6, -1.57, 0.0, 0.0])
-    assert checker.clear(np.array([upright, level, bowed])).tolist() == [True, True, False]
-    assert "upper_arm_link_0 and floor" in str(checker.exceptions)
+    def test_violent_ones_are_checked_quickly(self, motion):
+        began = time.process_time()
+        checkers(0.05).deepest_along(motion, sampled(motion))
+        assert time.process_time() - began < 3.0
+
+    def test_long_ones_are_checked_in_parts(self, monkeypatch):
+        motion = short_sines(7)
+        whole = [checkers(m).deepest_along(motion, sampled(motion)) for m in (0.0, 0.05, 0.3)]
+        monkeypatch.setattr(checker_module, "_PART", 50)
+        for margin, contact in zip((0.0, 0.05, 0.3), whole, strict=True):
+            again = checkers(margin).deepest_along(motion, sampled(motion))
+            assert (again is None) == (contact is None)
+            if contact is not None:
+                assert again.distance == pytest.approx(contact.distance, abs=0.006)
+
+
+class TestDistances:
+    def test_joint_frames_are_those_of_pinocchio(self):
+        urdf = random_urdf(1)
+        model, chain = pin.buildModelFromXML(urdf), chain_from_urdf(urdf)
+        data, q = (
+            model.createData(),
+            np.random.default_rng(1).uniform(-2.0, 2.0, (20, chain.n_joints)),
+        )
+        rotations, translations = joint_poses(chain, q)
+        for k, row in enumerate(q):
+            pin.forwardKinematics(model, data, pin.integrate(model, pin.neutral(model), row))
+            for i, pose in enumerate(data.oMi):
+                np.testing.assert_allclose(rotations[i, k], pose.rotation, atol=1e-12)
+                np.testing.assert_allclose(translations[i, k], pose.translation, atol=1e-12)
+
+    def test_shapes_are_freed(self, arm):
+        def living():
+            gc.collect()
+            return sum(isinstance(thing, pin.GeometryModel) for thing in gc.get_objects())
+
+        before = living()
+        for _ in range(5):
+            assert link_bodies(arm, urdf_text(), [])
+        assert living() == before
+
+    @given(seed=st.integers(0, 10**6), margin=st.sampled_from([0.0, 0.05, 0.15]))
+    @settings(max_examples=20)
+    def test_the_deepest_contact_agrees_with_brute_force(self, arm, brute, seed, margin):
+        ends = np.concatenate((np.zeros((1, 6)), postures(arm, seed, 3)))
+        q = np.concatenate([np.linspace(a, b, 60) for a, b in pairwise(ends)])
+        distances = brute(q)
+        contact = checkers(margin).deepest_contact(q)
+        certain = np.abs(distances - margin) > 1e-5
+        clear = checkers(margin).clear(q)
+        np.testing.assert_array_equal(clear[certain], (distances >= margin)[certain])
+        if distances.min() >= margin:
+            assert contact is None
+        else:
+            assert contact.distance == pytest.approx(distances[contact.sample], abs=1e-5)
+            assert contact.distance <= min(distances.min() + 0.00501, margin)
+
+    @given(st.integers(0, 10**6))
+    @settings(max_examples=10)
+    def test_bounds_do_not_exceed_distances(self, arm, seed):
+        scene = mixed_shapes()
+        path = scene.path(np.random.default_rng(seed).uniform(-2.0, 2.0, (30, 3)))
+        count = len(scene.separation.first)
+        pair, sample = np.indices((count, 30)).reshape(2, -1)
+        lower, normal = scene.separation.bound(path.bodies, pair, sample)
+        distance = np.array(
+            [
+                scene.distance(p, path, k)
+                for p, k in zip(pair.tolist(), sample.tolist(), strict=True)
+            ]
+        )
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=0), 1.0, atol=1e-12)
+        assert np.all(lower <= distance + 1e-5)
+        exact = scene.separation.exact[pair]
+        np.testing.assert_allclose(lower[exact], distance[exact], atol=1e-9)
+        assert np.any(exact)
+        quick = scene.separation.coarse(path.bodies, np.arange(30)).ravel()
+        assert np.all(quick <= distance + 1e-5)
+
+    @given(st.integers(0, 10**6))
+    @settings(max_examples=20)
+    def test_bulges_bound_the_deviation_from_straight_lines(self, seed):
+        scene = mixed_shapes()
+        random = np.random.default_rng(seed)
+        q0, rate, bend = random.uniform(-1.0, 1.0, (3, 3)) * [[1.0], [3.0], [8.0]]
+        step = 0.1
+        t = np.linspace(0.0, step, 21)[:, None]
+        path = scene.path(q0 + rate * t + bend * t**2 / 2.0)
+        speed = np.abs(rate + bend * t).max(axis=0)
+        both_ends = path.q[[0, -1]]
+        bulges = scene.from_base.bulge(speed[:, None], np.abs(bend)[:, None], both_ends, step)[:, 0]
+        share = t[:, 0] / step
+        for pair, bulge in enumerate(bulges.tolist()):
+            left = 0.0
+            for body in map(int, scene.indices(pair)):
+                hull = scene._bodies[body].hull
+                for side in (-1.0, 0.0, 1.0):
+                    end = path.bodies.centre[:, body] + side * (
+                        hull.half_length * path.bodies.axis[:, body]
+                    )
+                    chord = np.outer(end[:, 0], 1.0 - share) + np.outer(end[:, -1], share)
+                    left = max(left, float(np.linalg.norm(end - chord, axis=0).max()))
+            assert left <= bulge + 1e-12
+
+    def test_a_mesh_counts_as_its_convex_hull(self, tmp_path):
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * 0.2 - 0.1
+        triangles = corners[ConvexHull(corners).simplices].astype("<f4")
+        facets = [b"\0" * 12 + triangle.tobytes() + b"\0\0" for triangle in triangles]
+        folder = tmp_path / "cell" / "meshes"
+        folder.mkdir(parents=True)
+        binary = b"\0" * 80 + struct.pack("<I", len(facets)) + b"".join(facets)
+        (folder / "cube.stl").write_bytes(binary)
+
+        def cell(shape):
+            return robot(
+                link("base"),
+                link("tip", shape),
+                joint("joint_1", "base", "tip", "0 0 1", rpy=TILTED),
+            )
+
+        workspace = Workspace(floor=-0.15, margin=0.0)
+        meshed = CollisionChecker(
+            cell('<mesh filename="package://cell/meshes/cube.stl"/>'),
+            workspace,
+            mesh_folders=[str(tmp_path)],
+        )
+        boxed = CollisionChecker(cell('<box size="0.2 0.2 0.2"/>'), workspace)
+        q = np.linspace(-2.0, 2.0, 9)[:, None]
+        for k in range(len(q)):
+            distances = [checker.distance(0, checker.path(q), k) for checker in (meshed, boxed)]
+            assert distances[0] == pytest.approx(distances[1], abs=1e-6)
+
+
+class TestInvalidInput:
+    def test_limits_and_postures_of_another_arm_are_refused(self):
+        with pytest.raises(ShapeError):
+            checkers(0.05).deepest_contact(np.zeros((3, 5)))
+        with pytest.raises(ShapeError, match="limits"):
+            CollisionChecker(ball_chain(0.05, 0.05), NOWHERE, limits=FAST)
+
+        q = np.zeros((3, 6))
+        q[1, 4] = np.nan
+        for check in (checkers(0.05).clear, checkers(0.05).deepest_contact):
+            with pytest.raises(ValueError, match="finite"):
+                check(q)
+
+    def test_unusable_shapes_and_boxes_are_refused(self):
+        for shape in ('<mesh filename="package://nowhere/part.stl"/>', ""):
+            urdf = robot(
+                link("base"),
+                link("tip", shape),
+                joint("joint_1", "base", "tip", "0 0 1", rpy=TILTED),
+            )
+            with pytest.raises(CollisionModelError):
+                CollisionChecker(urdf, Workspace())
+        with pytest.raises(WorkspaceError):
+            Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
+
+
+class TestPairs:
+    """Pairs that can touch are checked; those that touch in every posture are named."""
+
+    def test_all_pairs_that_can_touch_are_checked(self):
+        pairs = {frozenset(pair) for pair in checkers(0.05).pairs}
+        links = ["base_link", *(f"link_{k}" for k in range(1, 7))]
+        for (i, a), (k, b) in combinations(enumerate(links), 2):
+            assert (frozenset((a, b)) in pairs) == (k - i > 1), (a, b)
+        for name in links[1:]:
+            assert frozenset((name, "floor")) in pairs
+        assert frozenset(("base_link", "floor")) not in pairs
+        for wider in (0.2, 0.5):
+            assert checkers(wider).pairs == checkers(0.05).pairs
+
+    def test_only_close_pairs_of_a_wrist_are_unchecked(self):
+        wrist = CollisionChecker(ball_chain(0.08, 0.01, 0.2), NOWHERE)
+        assert ("link_0", "link_2") not in wrist.pairs
+        (pair,) = wrist.unchecked
+        assert (pair.first, pair.second) == ("link_0_0", "link_2_0")
+        assert pair.nearest <= pair.farthest < 0.0
+        assert "link_0_0 and link_2_0" in str(wrist.exceptions)
+        assert checkers(0.05).unchecked == ()
+        assert checkers(0.05).exceptions is None
+        # Four joints between base and tip: permanent contact is reported.
+        far = CollisionChecker(ball_chain(0.3, 0.0, 0.0, 0.4), NOWHERE)
+        contact = far.deepest_contact(np.zeros((1, 4)))
+        assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
+        assert contact.distance < 0.0
+
+    def test_missing_limits_leave_no_pair_unchecked(self):
+        # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
+        rod = '<cylinder radius="0.05" length="0.5"/>'
+        parts = [link("base")]
+        for k in range(3):
+            parent, at = ("base", "0 0 0.42") if k == 0 else (f"l{k - 1}", "0.6 0 0")
+            parts += [
+                link(f"l{k}", rod, at="0.3 0 0"),
+                f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+                f'<origin xyz="{at}"/><axis xyz="0 {int(k > 0)} {int(k == 0)}"/>'
+                '<limit effort="1" velocity="1"/></joint>',
+            ]
+        urdf = robot(*parts)
+        limits = JointLimits([-3.0] * 3, [3.0] * 3, [2.0] * 3, [10.0] * 3, [100.0] * 3)
+        crate = Box((0.8, -0.2, 0.0), (0.95, 0.2, 0.33))
+        workspace = Workspace(floor=None, boxes=(crate,))
+        for in_use in (limits, None):
+            checker = CollisionChecker(urdf, workspace, limits=in_use)
+            assert ("l1", "box 0") in checker.pairs
+            contact = checker.deepest_contact(np.array([[0.0, 0.3, -0.6]]))
+            assert contact is not None and "box 0" in (contact.first, contact.second)
+
+    @pytest.mark.parametrize(
+        "workspace",
+        [
+            Workspace(floor=0.6),
+            Workspace(floor=1e6),
+            Workspace(floor=None, boxes=(Box((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0)),)),
+        ],
+        ids=["floor above the foot", "floor above all", "box around all"],
+    )
+    def test_misplaced_obstacles_leave_no_moving_link_unchecked(self, arm, workspace):
+        checker = CollisionChecker(urdf_text(), workspace, limits=FAST)
+        with_obstacle = {first for first, second in checker.pairs if not second.startswith("link")}
+        assert with_obstacle >= {f"link_{k}" for k in range(2, 7)}
+        # The first link turns in it in all motions: reported, not checked.
+        assert {pair.first[:6] for pair in checker.unchecked} == {"link_1"}
+        home = np.array([[0.0, -np.pi / 2, np.pi / 2, 0.0, np.pi / 2, 0.0]])
+        contact = checker.deepest_contact(home)
+        assert contact is not None and contact.first == "link_2"
+        assert not np.any(checker.clear(postures(arm, 3, 200)))
+
+    def test_a_first_link_that_swings_towards_the_floor_is_checked(self):
+        rod = '<cylinder radius="0.05" length="0.6"/>'
+        urdf = robot(
+            link("base"), link("arm", rod), joint("joint_1", "base", "arm", "1 0 0", rpy=TILTED)
+        )
+        for floor in (0.0, 0.4):  # in it in every posture: the ends of the rod now more, now less
+            checker = CollisionChecker(urdf, Workspace(floor=floor))
+            assert checker.pairs == (("arm", "floor"),)
+            assert checker.unchecked == ()
+
+    def test_a_ur5_on_the_floor_is_checked_but_for_its_mounting(self):
+        """Base and shoulder turn 3 cm above it, less than the margin, in every posture."""
+        path = urdf_path("ur5_robot.urdf")
+        checker = CollisionChecker(
+            path.read_text(), Workspace(floor=0.0), mesh_folders=(str(path.parents[4]),)
+        )
+        near = {first for first, second in checker.pairs if second == "floor"}
+        assert not near & {"base_link", "shoulder_link"}
+        assert {"upper_arm_link", "forearm_link", "wrist_3_link"} <= near
+        upright = np.array([0.0, -1.57, 0.0, -1.57, 0.0, 0.0])
+        level = np.array([0.0, -0.05, 0.0, -1.57, 0.0, 0.0])
+        bowed = np.array([0.0, 0.1, -0.6, -1.57, 0.0, 0.0])
+        assert checker.clear(np.array([upright, level, bowed])).tolist() == [True, True, False]
+        assert "upper_arm_link_0 and floor" in str(checker.exceptions)

@@ -8,58 +8,41 @@ from hypothesis import strategies as st
 from identification import FrictionLaw, RobotModel
 from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.constraints import (
-    Constraints,
-    CurrentModel,
-    check_motion,
-    sampled,
-)
+from identification.excitation.constraints import Constraints, CurrentModel, check_motion, sampled
 from identification.excitation.joint_limits import limit_violations
 from identification.excitation.violation import KINDS, excess_by_kind
 from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
+from tests.identification.robots import joint, link, robot
+from tests.identification.two_link import values_of
 
 # Two links of 1 m that swing in a vertical plane: known to every textbook.
-URDF = """<robot name="pendulum">
-<link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-<link name="upper"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
-  <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
-  <collision><origin xyz="0.5 0 0" rpy="0 1.5707963 0"/><geometry>
-    <cylinder radius="0.05" length="0.8"/></geometry></collision></link>
-<link name="lower"><inertial><origin xyz="0.5 0 0"/><mass value="1"/>
-  <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial>
-  <collision><origin xyz="0.5 0 0" rpy="0 1.5707963 0"/><geometry>
-    <cylinder radius="0.05" length="0.8"/></geometry></collision></link>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
-  <axis xyz="0 -1 0"/><limit lower="-3" upper="3" effort="100" velocity="3"/></joint>
-<joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/>
-  <origin xyz="1 0 0"/><axis xyz="0 -1 0"/><limit lower="-3" upper="3" effort="100" velocity="3"/>
-</joint></robot>"""
+ROD = {
+    "shape": '<cylinder radius="0.05" length="0.8"/>',
+    "at": "0.5 0 0",
+    "rpy": "0 1.5707963 0",
+    "centre": "0.5 0 0",
+    "inertia": (0.1, 0.1, 0.1),
+}
+URDF = robot(
+    link("base", '<box size="0.1 0.1 0.1"/>'),
+    link("upper", mass=2, **ROD),
+    link("lower", mass=1, **ROD),
+    joint("shoulder", "base", "upper", "0 -1 0", ends=3),
+    joint("elbow", "upper", "lower", "0 -1 0", at="1 0 0", ends=3),
+)
 
 LIMITS = JointLimits([-3.0] * 2, [3.0] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 MOTOR_FROM_JOINT = np.array([[100.0, 0.0], [5.0, -80.0]])
 TORQUE_CONSTANT = np.array([0.5, 0.25])
 
 
-@pytest.fixture(scope="module")
-def model():
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+MODEL = RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None))
+VALUES = values_of(MODEL, [3.0, 1.0, 0.0, 0.0])
 
 
-@pytest.fixture(scope="module")
-def values(model):
-    friction = {"f0_1": 3.0, "f0_2": 1.0, "f1_1": 0.0, "f1_2": 0.0}
-    inertial = model.base.grouping @ model.nominal
-    return np.array([*inertial, *(friction[n] for n in model.parameter_names[len(inertial) :])])
-
-
-@pytest.fixture(scope="module")
-def make_currents(model, values):
-    def make(current_limit, **more):
-        return CurrentModel(
-            model, values, MOTOR_FROM_JOINT, TORQUE_CONSTANT, np.array(current_limit), **more
-        )
-
-    return make
+def make_currents(current_limit, values=VALUES, **more):
+    limit = np.array(current_limit)
+    return CurrentModel(MODEL, values, MOTOR_FROM_JOINT, TORQUE_CONSTANT, limit, **more)
 
 
 @pytest.fixture(scope="module")
@@ -67,85 +50,42 @@ def swing():
     return plan([[0.0, 0.0], [1.5, -1.0], [0.0, 0.0]], LIMITS, fly=0.0)
 
 
-def test_static_currents_agree_with_the_textbook(make_currents, swing):
-    motion = sampled(swing, 0.008)
-    currents, unsure = make_currents([1.0, 1.0]), make_currents([1.0, 1.0], uncertainty=0.2)
-    torque = currents.torque(motion)
-    # At rest and level at the very start: elbow 1 kg at 0.5 m, shoulder 2 kg at 0.5 m more.
-    np.testing.assert_allclose(torque[0], 9.81 * np.array([2 * 0.5 + 1 * 1.5, 1 * 0.5]), rtol=1e-9)
-    joint_speed = np.array([0.7, -0.3])  # the same power on both sides of the gears
-    power = (currents.current(torque) * TORQUE_CONSTANT) @ (MOTOR_FROM_JOINT @ joint_speed)
-    np.testing.assert_allclose(power, torque @ joint_speed, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(unsure.torque(motion), 1.2 * torque)
+class TestCurrents:
+    def test_static_currents_agree_with_the_textbook(self, swing):
+        motion = sampled(swing, 0.008)
+        currents, unsure = make_currents([1.0, 1.0]), make_currents([1.0, 1.0], uncertainty=0.2)
+        torque = currents.torque(motion)
+        # At rest and level at the very start: elbow 1 kg at 0.5 m, shoulder 2 kg at 0.5 m more.
+        np.testing.assert_allclose(
+            torque[0], 9.81 * np.array([2 * 0.5 + 1 * 1.5, 1 * 0.5]), rtol=1e-9
+        )
+        joint_speed = np.array([0.7, -0.3])  # the same power on both sides of the gears
+        power = (currents.current(torque) * TORQUE_CONSTANT) @ (MOTOR_FROM_JOINT @ joint_speed)
+        np.testing.assert_allclose(power, torque @ joint_speed, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(unsure.torque(motion), 1.2 * torque)
 
+    def test_a_current_beyond_its_limit_is_named(self, swing):
+        """With value, bound, instant, and the share of the limit that may be used."""
+        motion = sampled(swing, 0.008)
+        generous = make_currents([100.0, 100.0])
+        assert check_motion(swing, LIMITS, currents=generous) == ()
+        current = np.abs(generous.current(generous.torque(motion)))[:, 1]
+        for share, remedy in ((1.0, ""), (0.8, "a motion may use 80% of the motor's limit")):
+            tight = make_currents([100.0, 0.9 / share * current.max()], usable=share)
+            (violation,) = check_motion(swing, LIMITS, currents=tight)
+            assert (violation.kind, violation.subject) == ("current", "motor of elbow")
+            assert violation.value == pytest.approx(current.max())
+            assert violation.bound == pytest.approx(0.9 * current.max())
+            assert violation.excess == pytest.approx(1 / 0.9 - 1)
+            assert violation.time == motion.time[current.argmax()]
+            assert violation.remedy == remedy
+            for word in ("current", "motor of elbow", "A", f"{violation.time:.3f} s", remedy):
+                assert word in str(violation)
 
-def test_a_current_beyond_its_limit_is_named(make_currents, swing):
-    """With value, bound, instant, and the share of the limit that may be used."""
-    motion = sampled(swing, 0.008)
-    generous = make_currents([100.0, 100.0])
-    assert check_motion(swing, LIMITS, currents=generous) == ()
-    current = np.abs(generous.current(generous.torque(motion)))[:, 1]
-    for share, remedy in ((1.0, ""), (0.8, "a motion may use 80% of the motor's limit")):
-        tight = make_currents([100.0, 0.9 / share * current.max()], usable=share)
-        (violation,) = check_motion(swing, LIMITS, currents=tight)
-        assert (violation.kind, violation.subject) == ("current", "motor of elbow")
-        assert violation.value == pytest.approx(current.max())
-        assert violation.bound == pytest.approx(0.9 * current.max())
-        assert violation.excess == pytest.approx(1 / 0.9 - 1)
-        assert violation.time == motion.time[current.argmax()]
-        assert violation.remedy == remedy
-        for word in ("current", "motor of elbow", "A", f"{violation.time:.3f} s", remedy):
-            assert word in str(violation)
-
-
-def test_every_joint_and_quantity_beyond_is_named(swing):
-    slow = JointLimits([-3.0, -0.5], [1.0, 3.0], [1.0, 3.0], [10.0, 4.0], [100.0, 30.0])
-    violations = {v.subject: v for v in check_motion(swing, slow)}
-    assert set(violations) == {
-        "position of joint 0",
-        "position of joint 1",
-        "velocity of joint 0",
-        "acceleration of joint 1",
-        "jerk of joint 1",
-    }
-    lowest = violations["position of joint 1"]
-    assert (lowest.value, lowest.bound) == (pytest.approx(-1.0), -0.5)
-    assert "at least -0.5" in str(lowest)
-    assert lowest.excess == pytest.approx(0.5 / 3.5)  # of the range
-    assert lowest.posture == pytest.approx([1.5, -1.0], abs=1e-3)
-    fastest = violations["velocity of joint 0"]
-    assert abs(swing.sample_one(fastest.time)[1][0]) == pytest.approx(fastest.value, rel=1e-3)
-    assert fastest.excess == pytest.approx(fastest.value - 1.0)
-
-
-def test_the_deepest_contact_is_reported_with_pair_and_instant():
-    checker = CollisionChecker(URDF, Workspace(floor=-0.5, margin=0.1))
-    down = plan([[0.0, 0.0], [-0.6, 0.0], [0.3, 0.0]], LIMITS, fly=0.0)
-    (violation,) = check_motion(down, LIMITS, checker=checker)
-    assert (violation.kind, violation.subject) == ("collision", "lower and floor")
-    assert violation.bound == 0.1
-    q = down.sample_one(violation.time)[0]
-    np.testing.assert_allclose(q, [-0.6, 0.0], atol=2e-3)
-    # the end of the lower link, 1.9 m out, its edge 0.05 m below the centre line
-    height = 1.9 * np.sin(q[0]) - 0.05 * np.cos(q[0])
-    assert height == pytest.approx(-0.5 + violation.value, abs=1e-6)
-    np.testing.assert_allclose(violation.posture, q, atol=1e-9)
-    # 1 m from shoulder to elbow: that much too close would be an excess of 1
-    assert violation.excess == pytest.approx(0.1 - violation.value)
-    text = str(violation)
-    assert text.startswith(
-        f"collision of lower and floor: {violation.value:.4g} m, must be at least 0.1 m"
-    )
-    assert f"at {violation.time:.3f} s" in text
-    assert "joints at (-0." in text
-
-
-def test_a_prediction_that_is_not_finite_violates_every_limit(model, values, swing):
-    broken = CurrentModel(
-        model, values * np.nan, MOTOR_FROM_JOINT, TORQUE_CONSTANT, np.array([1e9, 1e9])
-    )
-    violations = check_motion(swing, LIMITS, currents=broken)
-    assert [violation.excess for violation in violations] == [np.inf, np.inf]
+    def test_a_prediction_that_is_not_finite_violates_every_limit(self, swing):
+        broken = make_currents([1e9, 1e9], VALUES * np.nan)
+        violations = check_motion(swing, LIMITS, currents=broken)
+        assert [violation.excess for violation in violations] == [np.inf, np.inf]
 
 
 def series(seed, *, ramp, scale=1.0):
@@ -159,82 +99,127 @@ def series(seed, *, ramp, scale=1.0):
     )
 
 
-@given(
-    seed=st.integers(0, 10**6),
-    ramp=st.sampled_from([0.0, 0.01, 1.0, 3.0]),
-    quantity=st.sampled_from(["position", "velocity", "acceleration", "jerk"]),
-    joint=st.integers(0, 1),
-    share=st.sampled_from([0.9, 1 - 1e-5, 1 - 1e-8, 1 + 1e-8, 1 + 1e-5, 1.1]),
-)
-@example(seed=0, ramp=1.0, quantity="jerk", joint=1, share=0.9)
-@example(seed=120, ramp=0.0, quantity="position", joint=1, share=1 + 1e-8)
-@settings(max_examples=60, deadline=None)
-def test_limits_of_sines_agree_with_exact_extrema(seed, ramp, quantity, joint, share):
-    motion = series(seed, ramp=ramp)
-    exact = motion.extrema()
-    bounds = {
-        "lower": np.full(2, -50.0),
-        "upper": np.full(2, 50.0),
-        "velocity": np.full(2, 1e9),
-        "acceleration": np.full(2, 1e9),
-        "jerk": np.full(2, 1e9),
-    }
-    name = "upper" if quantity == "position" else quantity
-    bounds[name][joint] = getattr(exact, name)[joint] * share
-    limits = JointLimits(**bounds)
-    violations = limit_violations(motion, limits, sampled(motion))
-    try:
-        check_limits(motion, limits)
-        assert violations == []
-    except LimitExceeded:
-        (violation,) = violations
-        assert violation.subject == f"{quantity} of joint {joint}"
-        # a sampled value, up to 10 % below a short extremum
-        assert violation.bound < violation.value <= getattr(exact, name)[joint]
+class TestJointLimits:
+    def test_every_joint_and_quantity_beyond_is_named(self, swing):
+        slow = JointLimits([-3.0, -0.5], [1.0, 3.0], [1.0, 3.0], [10.0, 4.0], [100.0, 30.0])
+        violations = {v.subject: v for v in check_motion(swing, slow)}
+        assert set(violations) == {
+            "position of joint 0",
+            "position of joint 1",
+            "velocity of joint 0",
+            "acceleration of joint 1",
+            "jerk of joint 1",
+        }
+        lowest = violations["position of joint 1"]
+        assert (lowest.value, lowest.bound) == (pytest.approx(-1.0), -0.5)
+        assert "at least -0.5" in str(lowest)
+        assert lowest.excess == pytest.approx(0.5 / 3.5)  # of the range
+        assert lowest.posture == pytest.approx([1.5, -1.0], abs=1e-3)
+        fastest = violations["velocity of joint 0"]
+        assert abs(swing.sample_one(fastest.time)[1][0]) == pytest.approx(fastest.value, rel=1e-3)
+        assert fastest.excess == pytest.approx(fastest.value - 1.0)
 
-
-def test_sines_far_from_limits_need_no_exact_extrema(monkeypatch):
-    motion = series(3, ramp=2.0, scale=0.1)
-    monkeypatch.setattr(FourierSeries, "extrema", lambda self: pytest.fail("looked at exactly"))
-    assert not check_motion(motion, LIMITS)
-
-
-def test_sines_without_a_ramp_are_refused_with_a_remedy():
-    bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
-    (violation,) = check_motion(bare, LIMITS)
-    assert violation.kind == "joint limit"
-    assert "velocity of joint" in violation.subject
-    assert "start" in violation.subject or "end" in violation.subject
-    assert violation.excess > 0.0
-    assert "ramp" in str(violation)
-    assert not check_motion(gentle, LIMITS)
-    # A design may look at one all the same.
-    lenient = Constraints(LIMITS, at_rest=False)
-    assert lenient.violations(bare, sampled(bare)) == ()
-
-
-@pytest.mark.parametrize(("shortest", "longest", "side"), [(5.0, 9.0, "least"), (0.0, 1.0, "most")])
-def test_a_motion_too_short_or_too_long_is_named(swing, shortest, longest, side):
-    constraints = Constraints(LIMITS, min_duration=shortest, max_duration=longest)
-    (violation,) = constraints.violations(swing, sampled(swing))
-    bound = shortest or longest
-    assert (violation.kind, violation.value, violation.bound) == ("duration", swing.duration, bound)
-    assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
-    assert f"at {side} {bound:g} s" in str(violation)
-
-
-def test_excess_by_kind_is_the_largest(make_currents, swing):
-    constraints = Constraints(
-        LIMITS.scaled(velocity=0.5),
-        max_duration=1.0,
-        checker=CollisionChecker(URDF, Workspace(floor=0.01, margin=0.06)),
-        currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
+    @given(
+        seed=st.integers(0, 10**6),
+        ramp=st.sampled_from([0.0, 0.01, 1.0, 3.0]),
+        quantity=st.sampled_from(["position", "velocity", "acceleration", "jerk"]),
+        joint=st.integers(0, 1),
+        share=st.sampled_from([0.9, 1 - 1e-5, 1 - 1e-8, 1 + 1e-8, 1 + 1e-5, 1.1]),
     )
-    motion = sampled(swing)
-    violations = constraints.violations(swing, motion)
-    assert pickle.loads(pickle.dumps(constraints)).violations(swing, motion) == violations
-    excess = excess_by_kind(violations)
-    assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
-    for kind, worst in zip(KINDS, excess, strict=True):
-        assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
-    assert not excess_by_kind(()).any()
+    @example(seed=0, ramp=1.0, quantity="jerk", joint=1, share=0.9)
+    @example(seed=120, ramp=0.0, quantity="position", joint=1, share=1 + 1e-8)
+    @settings(max_examples=60, deadline=None)
+    def test_limits_of_sines_agree_with_exact_extrema(self, seed, ramp, quantity, joint, share):
+        motion = series(seed, ramp=ramp)
+        exact = motion.extrema()
+        bounds = {
+            "lower": np.full(2, -50.0),
+            "upper": np.full(2, 50.0),
+            "velocity": np.full(2, 1e9),
+            "acceleration": np.full(2, 1e9),
+            "jerk": np.full(2, 1e9),
+        }
+        name = "upper" if quantity == "position" else quantity
+        bounds[name][joint] = getattr(exact, name)[joint] * share
+        limits = JointLimits(**bounds)
+        violations = limit_violations(motion, limits, sampled(motion))
+        try:
+            check_limits(motion, limits)
+            assert violations == []
+        except LimitExceeded:
+            (violation,) = violations
+            assert violation.subject == f"{quantity} of joint {joint}"
+            # a sampled value, up to 10 % below a short extremum
+            assert violation.bound < violation.value <= getattr(exact, name)[joint]
+
+    def test_sines_far_from_limits_need_no_exact_extrema(self, monkeypatch):
+        motion = series(3, ramp=2.0, scale=0.1)
+        monkeypatch.setattr(FourierSeries, "extrema", lambda self: pytest.fail("looked at exactly"))
+        assert not check_motion(motion, LIMITS)
+
+    def test_sines_without_a_ramp_are_refused_with_a_remedy(self):
+        bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
+        (violation,) = check_motion(bare, LIMITS)
+        assert violation.kind == "joint limit"
+        assert "velocity of joint" in violation.subject
+        assert "start" in violation.subject or "end" in violation.subject
+        assert violation.excess > 0.0
+        assert "ramp" in str(violation)
+        assert not check_motion(gentle, LIMITS)
+        # A design may look at one all the same.
+        lenient = Constraints(LIMITS, at_rest=False)
+        assert lenient.violations(bare, sampled(bare)) == ()
+
+
+class TestViolations:
+    def test_the_deepest_contact_is_reported_with_pair_and_instant(self):
+        checker = CollisionChecker(URDF, Workspace(floor=-0.5, margin=0.1))
+        down = plan([[0.0, 0.0], [-0.6, 0.0], [0.3, 0.0]], LIMITS, fly=0.0)
+        (violation,) = check_motion(down, LIMITS, checker=checker)
+        assert (violation.kind, violation.subject) == ("collision", "lower and floor")
+        assert violation.bound == 0.1
+        q = down.sample_one(violation.time)[0]
+        np.testing.assert_allclose(q, [-0.6, 0.0], atol=2e-3)
+        # the end of the lower link, 1.9 m out, its edge 0.05 m below the centre line
+        height = 1.9 * np.sin(q[0]) - 0.05 * np.cos(q[0])
+        assert height == pytest.approx(-0.5 + violation.value, abs=1e-6)
+        np.testing.assert_allclose(violation.posture, q, atol=1e-9)
+        # 1 m from shoulder to elbow: that much too close would be an excess of 1
+        assert violation.excess == pytest.approx(0.1 - violation.value)
+        text = str(violation)
+        assert text.startswith(
+            f"collision of lower and floor: {violation.value:.4g} m, must be at least 0.1 m"
+        )
+        assert f"at {violation.time:.3f} s" in text
+        assert "joints at (-0." in text
+
+    @pytest.mark.parametrize(
+        ("shortest", "longest", "side"), [(5.0, 9.0, "least"), (0.0, 1.0, "most")]
+    )
+    def test_a_motion_too_short_or_too_long_is_named(self, swing, shortest, longest, side):
+        constraints = Constraints(LIMITS, min_duration=shortest, max_duration=longest)
+        (violation,) = constraints.violations(swing, sampled(swing))
+        bound = shortest or longest
+        assert (violation.kind, violation.value, violation.bound) == (
+            "duration",
+            swing.duration,
+            bound,
+        )
+        assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
+        assert f"at {side} {bound:g} s" in str(violation)
+
+    def test_excess_by_kind_is_the_largest(self, swing):
+        constraints = Constraints(
+            LIMITS.scaled(velocity=0.5),
+            max_duration=1.0,
+            checker=CollisionChecker(URDF, Workspace(floor=0.01, margin=0.06)),
+            currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
+        )
+        motion = sampled(swing)
+        violations = constraints.violations(swing, motion)
+        assert pickle.loads(pickle.dumps(constraints)).violations(swing, motion) == violations
+        excess = excess_by_kind(violations)
+        assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
+        for kind, worst in zip(KINDS, excess, strict=True):
+            assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
+        assert not excess_by_kind(()).any()

@@ -122,29 +122,24 @@ class TestFactor:
     @both
     @given(pieces=st.integers(1, 300), seed=st.integers(0, 2**16))
     @settings(max_examples=6)
-    def test_the_factor_of_a_union_is_the_sum_of_factors(self, kind, pieces, seed):
+    def test_that_of_a_union_is_the_sum(self, kind, pieces, seed):
+        """Gram matrices and triangles agree to nine digits, with any weights of joints."""
         samples = noisy(a_motion(1500), NOISE, seed)
-        inner = np.random.default_rng(seed).integers(0, 1501, pieces - 1)
+        random = np.random.default_rng(seed)
+        inner, weights = random.integers(0, 1501, pieces - 1), random.uniform(0.1, 20.0, 2)
         many = summed(kind, parts_of(samples, np.concatenate([[0], inner, [1500]])))
         whole = QRFactor.of(MODEL, samples)
         size = np.abs(whole.gram).max(axis=(1, 2), keepdims=True)
         assert np.abs((many.gram - whole.gram) / size).max() < 1e-13
         np.testing.assert_array_equal(many.samples, whole.samples)
-        one, other = estimate(MODEL, many), estimate(MODEL, whole)
-        np.testing.assert_allclose(one.values, other.values, rtol=1e-9)
-        np.testing.assert_allclose(one.std, other.std, rtol=1e-9)
-
-    def test_weights_are_applied_joint_by_joint_afterwards(self):
-        model, (motion, torque) = ns16(), some_samples(150)
-        weights = np.array([1.0, 0.5, 2.0, 10.0, 0.0, 3.0])
-        equations = Factor.from_samples(model, motion, torque).weighted(weights)
-        dense = model.regressor(*motion[1:]).dense(58)
-        rows = (dense * np.sqrt(weights)[None, :, None]).reshape(-1, 58)
-        right = (torque * np.sqrt(weights)).reshape(-1)
-        np.testing.assert_allclose(equations.A, rows.T @ rows, rtol=1e-11, atol=1e-8)
-        np.testing.assert_allclose(equations.b, rows.T @ right, rtol=1e-11, atol=1e-7)
-        assert equations.yy == pytest.approx(right @ right, rel=1e-13)
-        assert equations.n == 900
+        np.testing.assert_allclose(joint_weights(many), joint_weights(whole), rtol=1e-9)
+        for own in (None, weights):
+            one, other = estimate(MODEL, many, own), estimate(MODEL, whole, own)
+            for name in ("values", "std", "noise_std", "condition"):
+                np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-9)
+            scale = np.outer(one.std, one.std)
+            assert np.abs((one.covariance - other.covariance) / scale).max() < 1e-9
+            assert ("QR" in one.method) == (kind is QRFactor)
 
     def test_the_dense_regressor_is_not_allocated(self):
         model, (motion, torque) = ns16(), some_samples(30_000)
@@ -175,19 +170,6 @@ class TestFactor:
             np.testing.assert_allclose(table, expected, rtol=1e-12, atol=1e-12)
             np.testing.assert_array_equal(MODEL.plan.columns[joint], columns[joint])
         assert (chunks[0][0].start, chunks[-1][0].stop) == (0, 3000)
-
-    @pytest.mark.parametrize("weights", [None, np.array([0.3, 20.0])])
-    def test_gram_and_qr_agree_to_nine_digits(self, weights):
-        samples = noisy(a_motion(), NOISE)
-        gram, factor = Factor.of(MODEL, samples), QRFactor.of(MODEL, samples)
-        expected, found = estimate(MODEL, gram, weights), estimate(MODEL, factor, weights)
-        np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
-        scale = np.outer(expected.std, expected.std)
-        assert np.abs((found.covariance - expected.covariance) / scale).max() < 1e-9
-        np.testing.assert_allclose(found.noise_std, expected.noise_std, rtol=1e-9)
-        assert found.condition == pytest.approx(expected.condition, rel=1e-9)
-        assert "QR" in found.method
-        np.testing.assert_allclose(joint_weights(factor), joint_weights(gram), rtol=1e-9)
 
 
 class TestConditioning:

@@ -9,13 +9,9 @@ from hypothesis import strategies as st
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.model.coupling import Coupling
-from identification.model.friction import (
-    TERMS,
-    JointFriction,
-    dissipation,
-    presliding_state,
-)
-from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
+from identification.model.friction import TERMS, JointFriction, dissipation, presliding_state
+from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import NS16_TURNS
 from tests.identification.two_link import MODEL, a_motion, truth
 from tests.identification.two_link import URDF as TWO_LINK
 
@@ -90,91 +86,92 @@ def torque_of(law, coefficients, v):
     return float(sum(value * terms[symbol] for symbol, value in coefficients.items()))
 
 
-@given(st.lists(LAWS, min_size=6, max_size=6), st.integers(0, 2**16))
-@settings(max_examples=25, deadline=None)
-def test_joints_can_have_different_laws(laws, seed):
-    names = [f"joint_{j}" for j in range(1, 7)]
-    model = RobotModel.from_urdf(
-        urdf_text(), friction=laws[0], joint_friction=dict(zip(names[1:], laws[1:], strict=True))
-    )
-    random = np.random.default_rng(seed)
-    friction = random.normal(size=len(model.friction.terms))
-    values = np.concatenate([np.zeros(model.base.rank), friction])
-    qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
-    torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
-    own = [{} for _ in names]
-    for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
-        symbol, joint = name.split("_")
-        own[int(joint) - 1][symbol] = value
-    expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
-    np.testing.assert_allclose(torque, expected, atol=1e-11)
+class TestLawsOfJoints:
+    @given(st.lists(LAWS, min_size=6, max_size=6), st.integers(0, 2**16))
+    @settings(max_examples=25, deadline=None)
+    def test_they_can_differ(self, laws, seed):
+        names = [f"joint_{j}" for j in range(1, 7)]
+        model = RobotModel.from_urdf(
+            urdf_text(),
+            friction=laws[0],
+            joint_friction=dict(zip(names[1:], laws[1:], strict=True)),
+        )
+        random = np.random.default_rng(seed)
+        friction = random.normal(size=len(model.friction.terms))
+        values = np.concatenate([np.zeros(model.base.rank), friction])
+        qd = random.choice([-2.0, -0.5, -0.1, -1e-3, 0.0, 1e-3, 0.1, 0.5, 2.0], (30, 6))
+        torque = model.torque(values, random.normal(size=(30, 6)), qd, random.normal(size=(30, 6)))
+        own = [{} for _ in names]
+        for name, value in zip(model.parameter_names[model.base.rank :], friction, strict=True):
+            symbol, joint = name.split("_")
+            own[int(joint) - 1][symbol] = value
+        expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
+        np.testing.assert_allclose(torque, expected, atol=1e-11)
+
+    def test_parameters_are_ordered_by_term(self):
+        model = RobotModel.from_urdf(
+            TWO_LINK,
+            friction=FrictionLaw(third=None),
+            joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", stribeck=0.1)},
+        )
+        assert model.friction.names == ("f0_1", "f0_2", "f1_1", "f2_2", "fs_2")
+        assert model.friction.units == ("N·m", "N·m", "N·m·s/rad", "N·m·s³/rad³", "N·m")
+        table = model.friction.table(np.arange(5.0))
+        assert table == ({"f0": 0.0, "f1": 2.0}, {"f0": 1.0, "f2": 3.0, "fs": 4.0})
+        with pytest.raises(ShapeError):
+            model.friction.table(np.arange(4.0))
+
+    def test_rows_at_rest_are_excluded_only_with_that_zone(self):
+        model = RobotModel.from_urdf(
+            TWO_LINK,
+            friction=FrictionLaw(standstill=0.1),
+            joint_friction={"elbow": FrictionLaw(standstill=0.1, zone="linear")},
+        )
+        speeds = np.array([[0.0, 0.0], [0.1, 0.1], [-0.11, 0.0]])
+        assert model.moving(speeds).tolist() == [[False, True], [False, True], [True, True]]
+        np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
+
+    def test_offsets_do_not_count_as_friction(self):
+        model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
+        friction = [
+            n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f
+        ]
+        assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
+
+    def test_invalid_ones_are_refused(self):
+        with pytest.raises(ModelError, match="standstill"):
+            FrictionLaw(zone="linear", standstill=0.0)
+        with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
+            RobotModel.from_urdf(TWO_LINK, joint_friction={"wrist": FrictionLaw()})
 
 
-def test_parameters_are_ordered_by_term():
-    model = RobotModel.from_urdf(
-        TWO_LINK,
-        friction=FrictionLaw(third=None),
-        joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", stribeck=0.1)},
-    )
-    assert model.friction.names == ("f0_1", "f0_2", "f1_1", "f2_2", "fs_2")
-    assert model.friction.units == ("N·m", "N·m", "N·m·s/rad", "N·m·s³/rad³", "N·m")
-    table = model.friction.table(np.arange(5.0))
-    assert table == ({"f0": 0.0, "f1": 2.0}, {"f0": 1.0, "f2": 3.0, "fs": 4.0})
-    with pytest.raises(ShapeError):
-        model.friction.table(np.arange(4.0))
+class TestDissipation:
+    @given(st.lists(LAWS, min_size=2, max_size=2), st.booleans(), st.integers(0, 2**16))
+    @settings(max_examples=30, deadline=None)
+    def test_dissipative_combinations_dissipate_energy(self, laws, coupled, seed):
+        coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]])) if coupled else None
+        friction = JointFriction(tuple(laws), (True, True), coupling)
+        combine, not_negative = dissipation(friction)
+        assert np.linalg.matrix_rank(combine) == len(friction.terms)
+        g = np.random.default_rng(seed).exponential(size=len(friction.terms))
+        g[~not_negative] = 0.0
+        values = dict(zip(friction.names, combine @ g, strict=True))
+        for joint, law in enumerate(laws, start=1):
+            own = {s: values[f"{s}_{joint}"] for s in law.symbols}
+            for v in (-3.0, -0.01, 0.01, 3.0):
+                assert torque_of(law, own, v) * v >= -1e-12
 
-
-def test_rows_at_rest_are_excluded_only_with_that_zone():
-    model = RobotModel.from_urdf(
-        TWO_LINK,
-        friction=FrictionLaw(standstill=0.1),
-        joint_friction={"elbow": FrictionLaw(standstill=0.1, zone="linear")},
-    )
-    speeds = np.array([[0.0, 0.0], [0.1, 0.1], [-0.11, 0.0]])
-    assert model.moving(speeds).tolist() == [[False, True], [False, True], [True, True]]
-    np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
-
-
-def test_offsets_do_not_count_as_friction():
-    model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
-    friction = [n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f]
-    assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
-
-
-def test_invalid_laws_are_refused():
-    with pytest.raises(ModelError, match="standstill"):
-        FrictionLaw(zone="linear", standstill=0.0)
-    with pytest.raises(ModelError, match=r"no joint 'wrist'.*shoulder, elbow"):
-        RobotModel.from_urdf(TWO_LINK, joint_friction={"wrist": FrictionLaw()})
-
-
-@given(st.lists(LAWS, min_size=2, max_size=2), st.booleans(), st.integers(0, 2**16))
-@settings(max_examples=30, deadline=None)
-def test_dissipative_combinations_dissipate_energy(laws, coupled, seed):
-    coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]])) if coupled else None
-    friction = JointFriction(tuple(laws), (True, True), coupling)
-    combine, not_negative = dissipation(friction)
-    assert np.linalg.matrix_rank(combine) == len(friction.terms)
-    g = np.random.default_rng(seed).exponential(size=len(friction.terms))
-    g[~not_negative] = 0.0
-    values = dict(zip(friction.names, combine @ g, strict=True))
-    for joint, law in enumerate(laws, start=1):
-        own = {s: values[f"{s}_{joint}"] for s in law.symbols}
-        for v in (-3.0, -0.01, 0.01, 3.0):
-            assert torque_of(law, own, v) * v >= -1e-12
-
-
-def test_all_dissipative_friction_is_allowed():
-    law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
-    friction = JointFriction((law,), (True,))
-    combine, not_negative = dissipation(friction)
-    possible = {"f0": 2.0, "f1": 1.0, "fd": -0.9, "fs": -1.8, "fo": -5.0}
-    g = np.linalg.solve(combine, [possible[term.symbol] for term in friction.terms])
-    assert np.all(g[not_negative] >= 0.0)
-    for beyond in ({"fd": -1.1}, {"fs": -2.1}, {"f0": -0.1}, {"fd": 1.1}):
-        values = possible | beyond
-        g = np.linalg.solve(combine, [values[term.symbol] for term in friction.terms])
-        assert np.any(g[not_negative] < 0.0), beyond
+    def test_all_dissipative_friction_is_allowed(self):
+        law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
+        friction = JointFriction((law,), (True,))
+        combine, not_negative = dissipation(friction)
+        possible = {"f0": 2.0, "f1": 1.0, "fd": -0.9, "fs": -1.8, "fo": -5.0}
+        g = np.linalg.solve(combine, [possible[term.symbol] for term in friction.terms])
+        assert np.all(g[not_negative] >= 0.0)
+        for beyond in ({"fd": -1.1}, {"fs": -2.1}, {"f0": -0.1}, {"fd": 1.1}):
+            values = possible | beyond
+            g = np.linalg.solve(combine, [values[term.symbol] for term in friction.terms])
+            assert np.any(g[not_negative] < 0.0), beyond
 
 
 steps = st.lists(st.sampled_from([-3e-4, -1e-5, 0.0, 1e-5, 2e-3]), min_size=2, max_size=60)
@@ -224,104 +221,76 @@ class TestDirectionOfFriction:
         )
 
 
-GEARS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0])
-
-
-def wrist(k54=0.2, k64=-0.1, k65=0.3):
-    """Motors 5 and 6 are coupled to the axes before them, as in the COMAU wrist."""
-    turns = np.eye(6)
-    turns[4, 3], turns[5, 4], turns[5, 3] = -k54, -k65, k65 * k54 - k64
-    return GEARS @ turns
-
-
 @pytest.fixture(scope="module")
 def model():
-    return RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist()))
+    return RobotModel.from_urdf(urdf_text(), coupling=Coupling(NS16_TURNS))
 
 
 def states(m=40):
     return np.random.default_rng(4).uniform(-3.0, 3.0, (3, m, 6))
 
 
-def test_the_ns16_has_three_coupling_inertias(model):
-    assert model.base.rank == 43
-    assert set(model.base.names) == {row.pivot for row in TABLE2[:N_ESSENTIAL]} | {
-        "I45", "I46", "I56",
-    }  # fmt: skip
-    assert model.base.largest_dropped < 1e-10 * model.base.smallest_pivot
-    rows = {row.pivot: row for row in TABLE2[:N_ESSENTIAL]}
-    for name, group in zip(model.base.names, model.base.grouping, strict=True):
-        expected = np.zeros(len(model.layout.names))
-        terms = rows[name].terms if name in rows else {name: 1.0}
-        sign = rows[name].sign if name in rows else 1
-        for standard, factor in terms.items():
-            expected[model.layout.names.index(standard)] = sign * factor
-        assert np.abs(group - expected).max() < 1e-10, name
+class TestCoupling:
+    """Motors that turn with several joints."""
 
+    def test_names_and_units_of_coupling_parameters(self, model):
+        assert model.parameter_names[40:43] == ("I45", "I46", "I56")
+        assert model.parameter_names[-4:] == ("f0_m5", "f0_m6", "f1_m5", "f1_m6")
+        assert model.units[40:43] == ("kg m²",) * 3
+        assert model.units[-4:] == ("N·m", "N·m", "N·m·s/rad", "N·m·s/rad")
+        assert model.friction_columns.tolist() == [False] * 43 + [True] * 22
 
-def test_names_and_units_of_coupling_parameters(model):
-    assert model.parameter_names[40:43] == ("I45", "I46", "I56")
-    assert model.parameter_names[-4:] == ("f0_m5", "f0_m6", "f1_m5", "f1_m6")
-    assert model.units[40:43] == ("kg m²",) * 3
-    assert model.units[-4:] == ("N·m", "N·m", "N·m·s/rad", "N·m·s/rad")
-    assert model.friction_columns.tolist() == [False] * 43 + [True] * 22
+    def test_rotors_and_motor_friction_act_through_it(self, model):
+        """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
+        q, qd, qdd = states()
+        inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
+        rotors = NS16_TURNS.T @ np.diag(inertia) @ NS16_TURNS
+        standard = np.zeros(len(model.layout.names))
+        standard[model.layout.rotors] = np.diag(rotors)
+        standard[model.layout.couplings] = rotors[3, 4], rotors[3, 5], rotors[4, 5]
+        np.testing.assert_allclose(model.layout.rotor_matrix(standard), rotors, atol=1e-12)
 
+        friction = np.zeros(len(model.friction.terms))
+        friction[-4:] = 2.0, 3.0, 0.5, 0.7
+        values = np.concatenate([model.base.grouping @ standard, friction])
+        expected = qdd @ rotors
+        for motor, coulomb, viscous in ((4, 2.0, 0.5), (5, 3.0, 0.7)):
+            c = NS16_TURNS[motor] / NS16_TURNS[motor, motor]
+            speed = qd @ c
+            expected += np.outer(coulomb * np.sign(speed) + viscous * speed, c)
+        np.testing.assert_allclose(model.torque(values, q, qd, qdd), expected, atol=1e-9)
 
-def test_rotors_and_motor_friction_act_through_the_coupling(model):
-    """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
-    q, qd, qdd = states()
-    inertia = np.random.default_rng(1).uniform(1e-4, 1e-3, 6)
-    rotors = wrist().T @ np.diag(inertia) @ wrist()
-    standard = np.zeros(len(model.layout.names))
-    standard[model.layout.rotors] = np.diag(rotors)
-    standard[model.layout.couplings] = rotors[3, 4], rotors[3, 5], rotors[4, 5]
-    np.testing.assert_allclose(model.layout.rotor_matrix(standard), rotors, atol=1e-12)
+    def test_rows_need_moving_motors(self, model):
+        qd = np.ones((1, 6))
+        # Joint speeds at which motor 5 is at rest: c_5 qd = 0.
+        qd[0, 4] = 0.2
+        assert model.moving(qd).tolist() == [[True, True, True, False, False, True]]
 
-    friction = np.zeros(len(model.friction.terms))
-    friction[-4:] = 2.0, 3.0, 0.5, 0.7
-    values = np.concatenate([model.base.grouping @ standard, friction])
-    expected = qdd @ rotors
-    for motor, coulomb, viscous in ((4, 2.0, 0.5), (5, 3.0, 0.7)):
-        c = wrist()[motor] / wrist()[motor, motor]
-        speed = qd @ c
-        expected += np.outer(coulomb * np.sign(speed) + viscous * speed, c)
-    np.testing.assert_allclose(model.torque(values, q, qd, qdd), expected, atol=1e-9)
+    def test_either_part_can_be_left_out(self):
+        for part, count in (("friction", 43 + 18), ("inertia", 40 + 22)):
+            coupling = Coupling(NS16_TURNS, **{part: False})
+            assert RobotModel.from_urdf(urdf_text(), coupling=coupling).n_parameters == count
+        law = FrictionLaw(coulomb=False)
+        viscous = RobotModel.from_urdf(urdf_text(), friction=law, coupling=Coupling(NS16_TURNS))
+        assert viscous.parameter_names[-2:] == ("f1_m5", "f1_m6")
 
+    def test_uncoupled_motors_add_nothing(self):
+        uncoupled = RobotModel.from_urdf(urdf_text())
+        with_gears = RobotModel.from_urdf(
+            urdf_text(), coupling=Coupling(np.diag(np.diag(NS16_TURNS)))
+        )
+        assert with_gears.parameter_names == uncoupled.parameter_names
+        blocks = [one.regressor(*states()).blocks for one in (with_gears, uncoupled)]
+        assert all(map(np.array_equal, *blocks))
 
-def test_rows_need_moving_motors(model):
-    qd = np.ones((1, 6))
-    # Joint speeds at which motor 5 is at rest: c_5 qd = 0.
-    qd[0, 4] = 0.2
-    assert model.moving(qd).tolist() == [[True, True, True, False, False, True]]
-
-
-def test_either_part_can_be_left_out():
-    inertia = RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist(), friction=False))
-    assert inertia.n_parameters == 43 + 18
-    friction = RobotModel.from_urdf(urdf_text(), coupling=Coupling(wrist(), inertia=False))
-    assert friction.n_parameters == 40 + 22
-    law = FrictionLaw(coulomb=False)
-    viscous = RobotModel.from_urdf(urdf_text(), friction=law, coupling=Coupling(wrist()))
-    assert viscous.parameter_names[-2:] == ("f1_m5", "f1_m6")
-
-
-def test_uncoupled_motors_add_nothing():
-    uncoupled = RobotModel.from_urdf(urdf_text())
-    with_gears = RobotModel.from_urdf(urdf_text(), coupling=Coupling(GEARS))
-    assert with_gears.parameter_names == uncoupled.parameter_names
-    for a, b in zip(with_gears.regressor(*states()).blocks, uncoupled.regressor(*states()).blocks,
-                    strict=True):  # fmt: skip
-        assert np.array_equal(a, b)
-
-
-@pytest.mark.parametrize(
-    ("matrix", "words"),
-    [
-        (np.array([[0.0, 1.0], [1.0, 0.0]]), "motor 1 .* does not turn with joint 1"),
-        (np.array([[1.0, 0.0], [16.0, 1e-308]]), "motor 2 .* does not turn with joint 2"),
-        (np.ones((2, 2)), "singular"),
-    ],
-)
-def test_an_invalid_coupling_is_refused(matrix, words):
-    with pytest.raises(ModelError, match=words):
-        Coupling(matrix)
+    @pytest.mark.parametrize(
+        ("matrix", "words"),
+        [
+            (np.array([[0.0, 1.0], [1.0, 0.0]]), "motor 1 .* does not turn with joint 1"),
+            (np.array([[1.0, 0.0], [16.0, 1e-308]]), "motor 2 .* does not turn with joint 2"),
+            (np.ones((2, 2)), "singular"),
+        ],
+    )
+    def test_an_invalid_one_is_refused(self, matrix, words):
+        with pytest.raises(ModelError, match=words):
+            Coupling(matrix)

@@ -10,8 +10,17 @@ from identification.factor.phases import gain_factor, joined
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel
-from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
-from tests.identification.two_link import MODEL, a_motion, as_samples, coloured, four_sines, truth
+from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import joint, link, ns16_values, robot
+from tests.identification.two_link import (
+    MODEL,
+    a_motion,
+    as_samples,
+    coloured,
+    four_sines,
+    truth,
+    values_of,
+)
 
 LOAD = Payload(2.0, (0.03, 0.0, 0.45))
 PLANTED = np.array([12.0, 5.0])  # N m / A
@@ -20,46 +29,32 @@ SEEDS = 100
 TIME = np.arange(2000) * 5e-3
 
 # Lifts along gravity, then turns about it: no payload loads the second axis.
-LIFT_AND_TURN = """<robot name="lift"><link name="base"/>
-<joint name="lift" type="prismatic"><parent link="base"/><child link="column"/>
-<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="500" velocity="3"/></joint>
-<link name="column"><inertial><mass value="8"/>
-<inertia ixx="0.2" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.05"/></inertial></link>
-<joint name="turn" type="revolute"><parent link="column"/><child link="hand"/>
-<axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="50" velocity="6"/></joint>
-<link name="hand"><inertial><mass value="3"/>
-<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.03"/></inertial></link></robot>"""
+LIFT_AND_TURN = robot(
+    '<link name="base"/>',
+    joint("lift", "base", "column", kind="prismatic"),
+    link("column", mass=8, inertia=(0.2, 0.2, 0.05)),
+    joint("turn", "column", "hand", ends=3),
+    link("hand", mass=3, inertia=(0.02, 0.02, 0.03)),
+)
 
 
 def load_torque(model, payload, motion):
     return Load(model.chain, model.gravity, payload).torque(*motion[1:4])
 
 
-def factor_of(
-    noise=NOISE,
-    *,
-    seed=0,
-    model=MODEL,
-    values=None,
-    gains=PLANTED,
-    load=LOAD,
-    motion=None,
-    transmission=None,
-):
+def factor_of(noise=NOISE, *, seed=0, model=MODEL, values=None, gains=PLANTED, load=LOAD, **more):
     """Reduce a recording without payload and one with it; noise is on the currents."""
+    motion, turns = more.get("motion"), more.get("turns")
     motion = four_sines(TIME, n=model.n_joints) if motion is None else motion
     samples = as_samples(model, motion, np.zeros_like(motion.position))
     rng = np.random.default_rng(seed)
     torque = model.torque(truth() if values is None else values, *motion[1:])
-    turns = np.eye(model.n_joints) if transmission is None else transmission
     factors = []
     for payload in (None, load):
         joint = torque if payload is None else torque + load_torque(model, payload, motion)
-        current = np.linalg.solve(turns.T, joint.T).T / gains
-        current = current + noise * rng.standard_normal(current.shape)
-        factors.append(
-            gain_factor(model, samples, current, payload=payload, transmission=transmission)
-        )
+        motor = joint if turns is None else np.linalg.solve(turns.T, joint.T).T
+        current = motor / gains + noise * rng.standard_normal(joint.shape)
+        factors.append(gain_factor(model, samples, current, payload=payload, transmission=turns))
     return joined(factors)
 
 
@@ -70,9 +65,7 @@ def gains_of(factor, model=MODEL):
 def lifted(payload):
     """Return gains of an arm that lifts along gravity and turns about it."""
     model = RobotModel.from_urdf(LIFT_AND_TURN, friction=FrictionLaw(third=None))
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 2.0, 0.05
-    values = np.concatenate([model.base.grouping @ standard, [20.0, 3.0, 15.0, 1.0]])
+    values = values_of(model, [20.0, 3.0, 15.0, 1.0], (2.0, 0.05))
     return gains_of(factor_of(model=model, values=values, load=payload), model)
 
 
@@ -87,19 +80,14 @@ NS16_LOAD = Payload(16.0, (0.10, 0.05, 0.25), (0.1, 0.0, 0.0, 0.1, 0.0, 0.05))
 def ns16(motion=None):
     """Return gains of the coupled NS 16."""
     model = RobotModel.from_urdf(urdf_text(), friction=FrictionLaw(third=None))
-    planted, named = load_truth(), standard_parameters()
-    # The named figures are of the DH frames; the URDF holds the same bodies.
-    standard = model.nominal.copy().reshape(6, -1)
-    standard[:, -1] = [named[f"I{j}m"] for j in range(1, 7)]
-    base = model.base.grouping @ standard.reshape(-1)
     factor = factor_of(
         np.full(6, 0.05),
         model=model,
-        values=np.concatenate([base, planted.coulomb, planted.viscous]),
+        values=ns16_values(model),
         gains=CONSTANTS,
         load=NS16_LOAD,
         motion=motion,
-        transmission=TURNS,
+        turns=TURNS,
     )
     return gains_of(factor, model)
 
@@ -110,7 +98,7 @@ GAINS = np.array([12.0, 3.0])  # N·m/A
 def scale(signs):
     """Return gains from currents of the nominal arm with rotors and friction, times signs."""
     motion = a_motion()
-    values = np.concatenate([MODEL.base.grouping @ MODEL.nominal, [4.0, 2.0, 1.5, 0.8]])
+    values = values_of(MODEL, [4.0, 2.0, 1.5, 0.8])
     noise = 0.1 * coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
     torque = MODEL.torque(values, *motion[1:]) + noise
     return scale_from_nominal(MODEL, [motion], [torque / (GAINS * np.array(signs))])

@@ -19,14 +19,7 @@ from identification.excitation import (
 )
 from identification.excitation.criteria import Criteria
 from identification.excitation.genomes import SineGenome, ViaPointGenome
-from planner import (
-    FourierSeries,
-    JointLimits,
-    WorkerProcess,
-    check_limits,
-    plan,
-    plan_moves,
-)
+from planner import FourierSeries, JointLimits, WorkerProcess, check_limits, plan, plan_moves
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.searching import NS16_HOME as HOME
 from tests.identification.searching import NS16_LIMITS as LIMITS
@@ -58,72 +51,69 @@ def bits(motion):
     return b"".join(array.tobytes() for array in motion.knots + motion.coefficients)
 
 
-# Both kinds
+class TestGenomes:
+    @GENOMES
+    def test_motions_do_not_depend_on_batch_and_process(self, genome):
+        genes = some_genes(genome, 5)
+        together = [bits(motion) for motion in genome.motions(genes)]
+        assert [bits(genome.motions(genes[[k]])[0]) for k in range(5)] == together
+        with WorkerProcess(timeout=60.0) as child:
+            assert [bits(motion) for motion in child.call(genome.motions, genes)] == together
+
+    @GENOMES
+    def test_a_first_population_is_uniform_and_its_seed_decides_it(self, genome):
+        assert (OPEN.n_genes, CLOSED.n_genes) == (
+            6 * 6 + 6,
+            4 * 6 + 6,
+        )  # points and speeds; no home
+        assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
+        genes = genome.sample(np.random.default_rng(7), 50)
+        assert genes.shape == (50, genome.n_genes)
+        assert kstest(genes.ravel(), "uniform").pvalue > 0.001
+        np.testing.assert_array_equal(genome.sample(np.random.default_rng(7), 50), genes)
+        assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
 
 
-@GENOMES
-def test_motions_do_not_depend_on_batch_and_process(genome):
-    genes = some_genes(genome, 5)
-    together = [bits(motion) for motion in genome.motions(genes)]
-    assert [bits(genome.motions(genes[[k]])[0]) for k in range(5)] == together
-    with WorkerProcess(timeout=60.0) as child:
-        assert [bits(motion) for motion in child.call(genome.motions, genes)] == together
+class TestViaPoints:
+    @pytest.mark.parametrize("genome", [OPEN, CLOSED])
+    def test_genes_reach_the_ends_of_range_and_speed(self, genome):
+        lower, upper = LIMITS.lower, LIMITS.upper
+        spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
+        own = slice(None) if genome.home is None else slice(1, -1)
+        for gene, end, share in ((0.0, lower + spare, genome.slowest), (1.0, upper - spare, 1.0)):
+            points, speed = genome.decode(np.full((1, genome.n_genes), gene))
+            np.testing.assert_array_equal(points[0, own], np.tile(end, (genome.n_via, 1)))
+            np.testing.assert_array_equal(speed, np.full((1, 6), share))
 
+    @pytest.mark.parametrize("genome", [OPEN, CLOSED])
+    @given(data=st.data())
+    @settings(max_examples=50, deadline=None)
+    def test_points_and_speeds_are_within_their_range(self, genome, data):
+        points, speed = genome.decode(data.draw(genes_of(genome, rows=2)))
+        assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
+        assert np.all((speed >= genome.slowest) & (speed <= 1.0))
 
-@GENOMES
-def test_a_first_population_is_uniform_and_its_seed_decides_it(genome):
-    assert (OPEN.n_genes, CLOSED.n_genes) == (6 * 6 + 6, 4 * 6 + 6)  # points and speeds; no home
-    assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
-    genes = genome.sample(np.random.default_rng(7), 50)
-    assert genes.shape == (50, genome.n_genes)
-    assert kstest(genes.ravel(), "uniform").pvalue > 0.001
-    np.testing.assert_array_equal(genome.sample(np.random.default_rng(7), 50), genes)
-    assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
+    def test_each_gene_moves_one_coordinate_or_one_speed(self):
+        genes = some_genes(OPEN, 1)
+        points, speed = OPEN.decode(genes)
+        for index in range(OPEN.n_genes):
+            moved = genes.copy()
+            moved[0, index] = 1.0 - moved[0, index]
+            other_points, other_speed = OPEN.decode(moved)
+            changed = np.concatenate(
+                ((other_points != points).ravel(), (other_speed != speed).ravel())
+            )
+            assert np.flatnonzero(changed).tolist() == [index]
 
-
-# Via points
-
-
-@pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_genes_reach_the_ends_of_range_and_speed(genome):
-    lower, upper = LIMITS.lower, LIMITS.upper
-    spare = (1.0 - genome.range_share) / 2.0 * (upper - lower)
-    own = slice(None) if genome.home is None else slice(1, -1)
-    for gene, end, share in ((0.0, lower + spare, genome.slowest), (1.0, upper - spare, 1.0)):
-        points, speed = genome.decode(np.full((1, genome.n_genes), gene))
-        np.testing.assert_array_equal(points[0, own], np.tile(end, (genome.n_via, 1)))
-        np.testing.assert_array_equal(speed, np.full((1, 6), share))
-
-
-@pytest.mark.parametrize("genome", [OPEN, CLOSED])
-@given(data=st.data())
-@settings(max_examples=50, deadline=None)
-def test_via_points_and_speeds_are_within_their_range(genome, data):
-    points, speed = genome.decode(data.draw(genes_of(genome, rows=2)))
-    assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
-    assert np.all((speed >= genome.slowest) & (speed <= 1.0))
-
-
-def test_each_gene_moves_one_coordinate_or_one_speed():
-    genes = some_genes(OPEN, 1)
-    points, speed = OPEN.decode(genes)
-    for index in range(OPEN.n_genes):
-        moved = genes.copy()
-        moved[0, index] = 1.0 - moved[0, index]
-        other_points, other_speed = OPEN.decode(moved)
-        changed = np.concatenate(((other_points != points).ravel(), (other_speed != speed).ravel()))
-        assert np.flatnonzero(changed).tolist() == [index]
-
-
-@pytest.mark.parametrize("genome", [OPEN, CLOSED])
-def test_motions_are_those_of_the_planner(genome):
-    genes = some_genes(genome, 6)
-    for motion, points, speed in zip(genome.motions(genes), *genome.decode(genes), strict=True):
-        check_limits(motion, LIMITS.scaled(velocity=speed))
-        alone = plan(points, LIMITS, speed=speed, fly=genome.fly)
-        times = np.linspace(0.0, alone.duration, 300)
-        for ours, theirs in zip(motion.sample(times), alone.sample(times), strict=True):
-            np.testing.assert_array_equal(ours, theirs)
+    @pytest.mark.parametrize("genome", [OPEN, CLOSED])
+    def test_motions_are_those_of_the_planner(self, genome):
+        genes = some_genes(genome, 6)
+        for motion, points, speed in zip(genome.motions(genes), *genome.decode(genes), strict=True):
+            check_limits(motion, LIMITS.scaled(velocity=speed))
+            alone = plan(points, LIMITS, speed=speed, fly=genome.fly)
+            times = np.linspace(0.0, alone.duration, 300)
+            for ours, theirs in zip(motion.sample(times), alone.sample(times), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
 
 
 # Via points among obstacles
@@ -134,80 +124,78 @@ def checker():
     return CollisionChecker(urdf_text(), Workspace(margin=0.05))
 
 
-@pytest.mark.parametrize("home", [HOME, None], ids=["closed", "open"])
-def test_paths_of_a_first_population_are_free(checker, home):
-    genome = ViaPointGenome(LIMITS, n_via=5, home=home, checker=checker)
-    points, _ = genome.decode(genome.sample(np.random.default_rng(2), 12))
-    for path in points:
-        for start, end in pairwise(path):
-            steps = int(np.ceil(np.max(np.abs(end - start)) / 0.1)) + 1
-            assert checker.clear(np.linspace(start, end, steps + 1)).all()
+class TestObstacles:
+    @pytest.mark.parametrize("home", [HOME, None], ids=["closed", "open"])
+    def test_paths_of_a_first_population_are_free(self, checker, home):
+        genome = ViaPointGenome(LIMITS, n_via=5, home=home, checker=checker)
+        points, _ = genome.decode(genome.sample(np.random.default_rng(2), 12))
+        for path in points:
+            for start, end in pairwise(path):
+                steps = int(np.ceil(np.max(np.abs(end - start)) / 0.1)) + 1
+                assert checker.clear(np.linspace(start, end, steps + 1)).all()
+
+    def test_a_population_covers_the_free_range(self, checker):
+        genome = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
+        genes = genome.sample(np.random.default_rng(4), 30)
+        np.testing.assert_array_equal(genome.sample(np.random.default_rng(4), 30), genes)
+        coordinates = genes[:, :36].reshape(-1, 6)
+        assert kstest(coordinates[:, 5], "uniform").pvalue > 0.001  # the flange turns in place
+        postures = np.random.default_rng(5).random((500, 6))
+        clear = checker.clear(LIMITS.lower + postures * (LIMITS.upper - LIMITS.lower))
+        assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
+
+    def test_a_population_without_free_space(self, checker):
+        everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
+        blocked = CollisionChecker(urdf_text(), everywhere)
+        genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=blocked)
+        genes = genome.sample(np.random.default_rng(1), 2)
+        assert genes.shape == (2, 12)
+        assert all(check_motion(m, LIMITS, checker=blocked) for m in genome.motions(genes))
 
 
-def test_a_population_among_obstacles_covers_the_free_range(checker):
-    genome = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
-    genes = genome.sample(np.random.default_rng(4), 30)
-    np.testing.assert_array_equal(genome.sample(np.random.default_rng(4), 30), genes)
-    coordinates = genes[:, :36].reshape(-1, 6)
-    assert kstest(coordinates[:, 5], "uniform").pvalue > 0.001  # the flange turns in place
-    postures = np.random.default_rng(5).random((500, 6))
-    clear = checker.clear(LIMITS.lower + postures * (LIMITS.upper - LIMITS.lower))
-    assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
+class TestSines:
+    def test_genes_at_their_ends_reach_the_papers_bounds(self):
+        room = np.minimum(LIMITS.upper - HOME, HOME - LIMITS.lower)
+        for gene, side, rates in (
+            (0.0, -1.0, np.full(6, 2 * np.pi / 15.0)),
+            (1.0, 1.0, np.full(6, 2)),
+        ):
+            amplitude, frequency = RAMPED.decode(np.full((1, RAMPED.n_genes), gene))
+            for sine in range(2):
+                np.testing.assert_array_equal(amplitude[0, :, sine], side * room / 2)
+                np.testing.assert_array_equal(frequency[0, :, sine], rates)
+        amplitude, frequency = BARE.decode(np.ones(BARE.n_genes))
+        half = (LIMITS.upper - LIMITS.lower) / 2.0
+        np.testing.assert_allclose(amplitude[0], np.tile(half[:, None] / 3.0, 3), rtol=1e-15)
+        largest = np.sqrt(LIMITS.acceleration / half)
+        np.testing.assert_allclose(frequency[0], np.tile(largest[:, None], 3), rtol=1e-15)
+        np.testing.assert_allclose(BARE.frequency_range[0], 0.314, atol=5e-4)  # Table 1, for 20 s
+        assert not np.any(RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))[0].amplitude)
 
+    @given(genes=genes_of(BARE))
+    @settings(max_examples=25, deadline=None)
+    def test_bare_sines_keep_the_limits_of_position_and_acceleration(self, genes):
+        (motion,) = BARE.motions(genes)
+        q, _, qdd = motion.sample(np.linspace(0.0, 20.0, 4001))
+        assert np.all((q >= LIMITS.lower - 1e-12) & (q <= LIMITS.upper + 1e-12))
+        assert np.all(np.abs(qdd) <= LIMITS.acceleration * (1.0 + 1e-12))
 
-def test_a_population_without_free_space(checker):
-    everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
-    blocked = CollisionChecker(urdf_text(), everywhere)
-    genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=blocked)
-    genes = genome.sample(np.random.default_rng(1), 2)
-    assert genes.shape == (2, 12)
-    assert all(check_motion(m, LIMITS, checker=blocked) for m in genome.motions(genes))
-
-
-# Sines
-
-
-def test_genes_at_their_ends_reach_the_papers_bounds():
-    room = np.minimum(LIMITS.upper - HOME, HOME - LIMITS.lower)
-    for gene, side, rates in ((0.0, -1.0, np.full(6, 2 * np.pi / 15.0)), (1.0, 1.0, np.full(6, 2))):
-        amplitude, frequency = RAMPED.decode(np.full((1, RAMPED.n_genes), gene))
-        for sine in range(2):
-            np.testing.assert_array_equal(amplitude[0, :, sine], side * room / 2)
-            np.testing.assert_array_equal(frequency[0, :, sine], rates)
-    amplitude, frequency = BARE.decode(np.ones(BARE.n_genes))
-    half = (LIMITS.upper - LIMITS.lower) / 2.0
-    np.testing.assert_allclose(amplitude[0], np.tile(half[:, None] / 3.0, 3), rtol=1e-15)
-    largest = np.sqrt(LIMITS.acceleration / half)
-    np.testing.assert_allclose(frequency[0], np.tile(largest[:, None], 3), rtol=1e-15)
-    np.testing.assert_allclose(BARE.frequency_range[0], 0.314, atol=5e-4)  # Table 1, for 20 s
-    assert not np.any(RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))[0].amplitude)
-
-
-@given(genes=genes_of(BARE))
-@settings(max_examples=25, deadline=None)
-def test_bare_sines_keep_the_limits_of_position_and_acceleration(genes):
-    (motion,) = BARE.motions(genes)
-    q, _, qdd = motion.sample(np.linspace(0.0, 20.0, 4001))
-    assert np.all((q >= LIMITS.lower - 1e-12) & (q <= LIMITS.upper + 1e-12))
-    assert np.all(np.abs(qdd) <= LIMITS.acceleration * (1.0 + 1e-12))
-
-
-@pytest.mark.parametrize(
-    ("name", "setting"),
-    [
-        ("harmonics", {"harmonics": 0}),
-        ("offset", {"offset": LIMITS.lower}),
-        ("offset", {"offset": HOME[:5]}),
-        ("slowest", {"slowest": np.zeros(6)}),
-        ("slowest", {"slowest": np.full(6, 5.0)}),
-        ("slowest", {"slowest": np.full(6, np.nan)}),
-        ("slowest", {"length": 1.0}),  # one period is faster than the limits allow
-    ],
-)
-def test_settings_of_sines_outside_their_range_are_refused(name, setting):
-    with pytest.raises(DesignError) as refusal:
-        SineGenome(LIMITS, **{"length": 20.0, **setting})
-    assert refusal.value.name == name
+    @pytest.mark.parametrize(
+        ("name", "setting"),
+        [
+            ("harmonics", {"harmonics": 0}),
+            ("offset", {"offset": LIMITS.lower}),
+            ("offset", {"offset": HOME[:5]}),
+            ("slowest", {"slowest": np.zeros(6)}),
+            ("slowest", {"slowest": np.full(6, 5.0)}),
+            ("slowest", {"slowest": np.full(6, np.nan)}),
+            ("slowest", {"length": 1.0}),  # one period is faster than the limits allow
+        ],
+    )
+    def test_settings_outside_their_range_are_refused(self, name, setting):
+        with pytest.raises(DesignError) as refusal:
+            SineGenome(LIMITS, **{"length": 20.0, **setting})
+        assert refusal.value.name == name
 
 
 ROOMY = JointLimits(
@@ -253,48 +241,47 @@ def through_json(excitation):
     return Excitation.from_dict(json.loads(json.dumps(excitation.to_dict())))
 
 
-@given(
-    make=st.sampled_from([planned, lambda seed: planned(seed, 0.0), sines]),
-    seed=st.integers(0, 2**32 - 1),
-)
-@settings(max_examples=30, deadline=None)
-def test_an_excitation_is_restored_bit_for_bit(make, seed):
-    excitation = make(seed)
-    restored = through_json(excitation)
-    assert restored.to_dict() == excitation.to_dict()
-    assert restored.criteria == excitation.criteria
-    assert type(restored.trajectory) is type(excitation.trajectory)
-    assert bits(restored.trajectory) == bits(excitation.trajectory)
-    if restored.via_points is not None:  # its moves plan to the motion bit for bit
-        again = plan_moves(restored.via_points[0], restored.moves, ROOMY)
-        assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
+class TestExcitation:
+    @given(
+        make=st.sampled_from([planned, lambda seed: planned(seed, 0.0), sines]),
+        seed=st.integers(0, 2**32 - 1),
+    )
+    @settings(max_examples=30, deadline=None)
+    def test_it_is_restored_bit_for_bit(self, make, seed):
+        excitation = make(seed)
+        restored = through_json(excitation)
+        assert restored.to_dict() == excitation.to_dict()
+        assert restored.criteria == excitation.criteria
+        assert type(restored.trajectory) is type(excitation.trajectory)
+        assert bits(restored.trajectory) == bits(excitation.trajectory)
+        if restored.via_points is not None:  # its moves plan to the motion bit for bit
+            again = plan_moves(restored.via_points[0], restored.moves, ROOMY)
+            assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
 
+    def test_data_without_method_are_restored(self):
+        excitation = planned(5)
+        old = excitation.to_dict()
+        del old["method"]
+        for name in ("condition", "scaled_condition"):
+            del old["criteria"][name]
+        restored = Excitation.from_dict(old)
+        assert restored.method == "random"
+        assert (restored.criteria.condition, restored.criteria.scaled_condition) == (None, None)
+        assert restored.criteria.log10_det == excitation.criteria.log10_det
+        np.testing.assert_array_equal(restored.via_points, excitation.via_points)
 
-def test_data_without_method_are_restored():
-    excitation = planned(5)
-    old = excitation.to_dict()
-    del old["method"]
-    for name in ("condition", "scaled_condition"):
-        del old["criteria"][name]
-    restored = Excitation.from_dict(old)
-    assert restored.method == "random"
-    assert (restored.criteria.condition, restored.criteria.scaled_condition) == (None, None)
-    assert restored.criteria.log10_det == excitation.criteria.log10_det
-    np.testing.assert_array_equal(restored.via_points, excitation.via_points)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"trajectory": {"type": "fourier_series"}},
-        {"trajectory": sines(1).trajectory.to_dict() | {"amplitude": [[10**400], [1]]}},
-        {"criteria": {**sines(1).to_dict()["criteria"], "beauty": 1.0}},
-        {"criteria": asdict(sines(1).criteria) | {"log10_det": "x"}},
-        {"seed": "first"},
-        {"rejected": {"limits": "many"}},
-        {"via_points": None},
-    ],
-)
-def test_invalid_data_are_refused(damage):
-    with pytest.raises(ValueError, match="not an excitation"):
-        Excitation.from_dict({**planned(1).to_dict(), **damage})
+    @pytest.mark.parametrize(
+        "damage",
+        [
+            {"trajectory": {"type": "fourier_series"}},
+            {"trajectory": sines(1).trajectory.to_dict() | {"amplitude": [[10**400], [1]]}},
+            {"criteria": {**sines(1).to_dict()["criteria"], "beauty": 1.0}},
+            {"criteria": asdict(sines(1).criteria) | {"log10_det": "x"}},
+            {"seed": "first"},
+            {"rejected": {"limits": "many"}},
+            {"via_points": None},
+        ],
+    )
+    def test_invalid_data_are_refused(self, damage):
+        with pytest.raises(ValueError, match="not an excitation"):
+            Excitation.from_dict({**planned(1).to_dict(), **damage})

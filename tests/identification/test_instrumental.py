@@ -83,216 +83,203 @@ def dense(samples, plan=PLAN):
     )
 
 
-def test_without_noise_the_true_values_are_found():
-    _, result = fit(executed(0, noise=0.0))
-    np.testing.assert_allclose(result.estimate.values, TRUTH, rtol=1e-6, atol=1e-7)
-    assert result.estimate.undetermined == ()
-    assert result.weak == ()
+class TestStrength:
+    def test_it_is_sheas_partial_r2(self):
+        samples = executed(1, position_noise=LARGE)
+        z, w, y = dense(samples)
+        rows = [part.reshape(-1, MODEL.n_parameters) for part in (z, w)]
+        table = np.column_stack([*rows, y.ravel()])
+        strength = partial_r2(table.T @ table)
+        fitted = rows[0] @ np.linalg.lstsq(rows[0], rows[1], rcond=None)[0]
+        for k in range(MODEL.n_parameters):
+            others = np.arange(MODEL.n_parameters) != k
+            apart = [
+                part[:, k]
+                - part[:, others] @ np.linalg.lstsq(part[:, others], part[:, k], rcond=None)[0]
+                for part in (rows[1], fitted)
+            ]
+            assert strength[k] == pytest.approx(
+                (apart[1] @ apart[1]) / (apart[0] @ apart[0]), rel=1e-5
+            )
+
+    def test_unrelated_instruments_are_weak(self):
+        samples = executed(1)
+        factor, result = fit(samples, four_sines(TIME, seed=99))
+        assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
+        assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
 
-def test_it_solves_the_weighted_instrumental_equations():
-    samples = executed(1, position_noise=LARGE)
-    z, w, y = dense(samples)
-    weights = np.array([0.3, 20.0])
-    z = z * weights[:, None]
-    expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
-    factor = instrument_factor(MODEL, samples, PLAN)
-    result = estimate_instrumental(MODEL, factor, weights)
-    np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
+class TestInstrumentalEstimate:
+    def test_it_solves_the_weighted_instrumental_equations(self):
+        samples = executed(1, position_noise=LARGE)
+        z, w, y = dense(samples)
+        weights = np.array([0.3, 20.0])
+        z = z * weights[:, None]
+        expected = np.linalg.solve(np.einsum("tji,tjk->ik", z, w), np.einsum("tji,tj->i", z, y))
+        factor = instrument_factor(MODEL, samples, PLAN)
+        result = estimate_instrumental(MODEL, factor, weights)
+        np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-8, atol=1e-9)
 
+    def test_with_large_position_noise_it_beats_least_squares(self):
+        runs = [fit(executed(s, position_noise=LARGE))[1] for s in range(30)]
+        instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
+        least = np.array([run.least_squares.values for run in runs]) - TRUTH
+        inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
+        # Least squares shrinks the coefficients of the acceleration, instruments do not, and their
+        # total error is far smaller.
+        assert np.all(np.abs(least.mean(axis=0))[inertias] > 0.2 * TRUTH[inertias])
+        assert np.all(np.abs(instrumental.mean(axis=0))[inertias] < 0.02 * TRUTH[inertias])
+        errors = [np.sqrt((e**2).mean(axis=0)) for e in (instrumental, least)]
+        assert np.median(errors[0] / errors[1]) < 0.3
 
-def test_with_large_position_noise_it_beats_least_squares():
-    runs = [fit(executed(s, position_noise=LARGE))[1] for s in range(30)]
-    instrumental = np.array([run.estimate.values for run in runs]) - TRUTH
-    least = np.array([run.least_squares.values for run in runs]) - TRUTH
-    inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
-    # Least squares shrinks the coefficients of the acceleration, instruments do not, and their
-    # total error is far smaller.
-    assert np.all(np.abs(least.mean(axis=0))[inertias] > 0.2 * TRUTH[inertias])
-    assert np.all(np.abs(instrumental.mean(axis=0))[inertias] < 0.02 * TRUTH[inertias])
-    errors = [np.sqrt((e**2).mean(axis=0)) for e in (instrumental, least)]
-    assert np.median(errors[0] / errors[1]) < 0.3
+    @pytest.mark.parametrize("correlation", [0.0, 0.05])
+    def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):
+        covered = []
+        for seed in range(60):
+            samples = executed(seed, position_noise=1e-4, correlation=correlation)
+            one = fit(samples)[1].estimate
+            covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
+        assert 0.90 <= np.mean(covered) <= 0.99
 
-
-@pytest.mark.parametrize("correlation", [0.0, 0.05])
-def test_95_percent_intervals_cover_90_to_99_percent(correlation):
-    covered = []
-    for seed in range(60):
-        samples = executed(seed, position_noise=1e-4, correlation=correlation)
-        one = fit(samples)[1].estimate
-        covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
-    assert 0.90 <= np.mean(covered) <= 0.99
-
-
-def test_the_measured_part_is_the_least_squares_factor():
-    samples = executed(1)
-    factor = instrument_factor(MODEL, samples, PLAN)
-    same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
-    expected = Factor.of(MODEL, same_rows)
-    np.testing.assert_allclose(
-        measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
-    )
-    np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
-
-
-def test_strength_is_sheas_partial_r2():
-    samples = executed(1, position_noise=LARGE)
-    z, w, y = dense(samples)
-    rows = [part.reshape(-1, MODEL.n_parameters) for part in (z, w)]
-    table = np.column_stack([*rows, y.ravel()])
-    strength = partial_r2(table.T @ table)
-    fitted = rows[0] @ np.linalg.lstsq(rows[0], rows[1], rcond=None)[0]
-    for k in range(MODEL.n_parameters):
-        others = np.arange(MODEL.n_parameters) != k
-        apart = [
-            part[:, k]
-            - part[:, others] @ np.linalg.lstsq(part[:, others], part[:, k], rcond=None)[0]
-            for part in (rows[1], fitted)
-        ]
-        assert strength[k] == pytest.approx((apart[1] @ apart[1]) / (apart[0] @ apart[0]), rel=1e-5)
-
-
-def test_unrelated_instruments_are_weak():
-    samples = executed(1)
-    factor, result = fit(samples, four_sines(TIME, seed=99))
-    assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
-    assert "too weak for" in endogeneity_test(MODEL, factor, result).words
-
-
-def test_a_resting_instrument_determines_nothing():
-    still = PLAN._replace(
-        velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
-    )
-    _, result = fit(executed(1), still)
-    assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)
-    assert np.isinf(result.estimate.std[MODEL.parameter_names.index("f0_2")])
-    assert {"f0_2", "f1_2"} <= set(result.weak)
-
-
-def test_without_noise_a_5_percent_test_rejects_3_to_8():
-    runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
-    assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
-    assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
-
-
-def test_large_noise_is_reported_as_bias():
-    for seed in range(5):
-        test = examine(executed(seed, position_noise=LARGE))
-        assert test.biased
-        assert {"I1yy", "I2yy"} <= set(test.shifted)
-        assert "Least squares is biased by noise in the regressor" in test.words
-        assert "I1yy" in test.words
-        assert test.predicted.max() > 0.05
-
-
-@pytest.mark.parametrize(
-    ("noise", "biased", "matters", "words"),
-    [
-        (0.0, False, False, "does not bias least squares significantly"),
-        (2e-5, True, False, "negligible"),
-        (LARGE, True, True, "Use the instrumental variables"),
-    ],
-)
-def test_the_size_of_the_bias_is_reported(noise, biased, matters, words):
-    test = examine(executed(0, position_noise=noise))
-    assert (test.biased, test.matters) == (biased, matters)
-    assert (test.predicted.max() < 0.005) == (not matters)
-    assert words in test.words
-
-
-def test_instruments_equal_to_the_motion_are_untested():
-    samples = executed(0, position_noise=SMALL)
-    factor, result = fit(samples, samples.motion)
-    test = endogeneity_test(MODEL, factor, result)
-    assert np.isnan(test.p_value)
-    assert not test.biased
-    assert "was not tested" in test.words
-    np.testing.assert_allclose(
-        result.estimate.values, result.least_squares.values, rtol=1e-7, atol=1e-8
-    )
-
-
-def test_the_statistic_is_that_of_the_refitted_regression():
-    samples = executed(3, position_noise=1e-4)
-    factor, result = fit(samples)
-    test = endogeneity_test(MODEL, factor, result)
-    scale = np.sqrt(result.weights)
-    z, w, y = (part * (scale[:, None] if part.ndim == 3 else scale) for part in dense(samples))
-    p = MODEL.n_parameters
-    explained = np.linalg.lstsq(
-        z.reshape(-1, p), w.reshape(-1, p) @ result.estimate.values, rcond=None
-    )[0]
-    error = w @ result.estimate.values - z @ explained  # (m, n)
-    own = error[:, :, None] * np.eye(2)  # one column per joint, on its own rows
-    table = np.concatenate([w, own], axis=2)
-    gamma = np.linalg.lstsq(table.reshape(-1, p + 2), y.ravel(), rcond=None)[0][-2:]
-    blocks = test.freedom[0] + test.freedom[1]
-    fine = np.floor(TIME / 0.125 + 1e-9).astype(int)
-    used = np.unique(fine[np.abs(table).sum(axis=(1, 2)) > 0.0])
-    length = -(-len(used) // blocks)
-    block = np.full(len(TIME), -1)
-    for k, one in enumerate(used):
-        block[fine == one] = k // length
-    moved = []
-    for b in range(blocks):
-        left = block != b
-        refit = np.linalg.lstsq(table[left].reshape(-1, p + 2), y[left].ravel(), rcond=None)[0]
-        moved.append(gamma - refit[-2:])
-    covariance = np.array(moved).T @ np.array(moved)
-    squared = gamma @ np.linalg.solve(covariance, gamma)
-    expected = squared * (blocks - 2) / (2 * (blocks - 1))
-    assert test.statistic == pytest.approx(expected, rel=1e-5)
-
-
-@settings(max_examples=10)
-@given(st.floats(0.002, 0.2), st.floats(0.002, 0.2))
-def test_the_plan_is_shifted_by_the_lag_of_each_axis(shoulder, elbow):
-    spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
-    late = [
-        np.column_stack(
-            [spline(TIME - lag, order)[:, j] for j, lag in enumerate((shoulder, elbow))]
+    def test_the_measured_part_is_the_least_squares_factor(self):
+        samples = executed(1)
+        factor = instrument_factor(MODEL, samples, PLAN)
+        same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
+        expected = Factor.of(MODEL, same_rows)
+        np.testing.assert_allclose(
+            measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
         )
-        for order in range(3)
-    ]
-    noise = 1e-4 * np.random.default_rng(0).standard_normal(late[0].shape)
-    drooped = Motion(TIME, late[0] + noise + [0.01, -0.02], *late[1:])
-    instruments = planned_motion(samples_of(drooped, 0.0 * noise), PLAN.position)
-    np.testing.assert_allclose(instruments.lag, [shoulder, elbow], atol=1e-4)
-    inside = (TIME > 0.5) & (TIME < 9.5)
-    np.testing.assert_allclose(
-        instruments.motion.acceleration[inside], late[2][inside], atol=0.01 * late[2].max()
+        np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
+
+    def test_a_resting_instrument_determines_nothing(self):
+        still = PLAN._replace(
+            velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
+        )
+        _, result = fit(executed(1), still)
+        assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)
+        assert np.isinf(result.estimate.std[MODEL.parameter_names.index("f0_2")])
+        assert {"f0_2", "f1_2"} <= set(result.weak)
+
+
+class TestEndogeneity:
+    def test_without_noise_a_5_percent_test_rejects_3_to_8(self):
+        runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
+        assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
+        assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
+
+    @pytest.mark.parametrize(
+        ("noise", "seed", "words"),
+        [
+            (0.0, 0, "does not bias least squares significantly"),
+            (2e-5, 0, "negligible"),
+            *((LARGE, seed, "Use the instrumental variables") for seed in range(5)),
+        ],
     )
-    assert not instruments.usable[TIME - min(shoulder, elbow) < -STEP].any()
-    assert instruments.usable[inside].all()
+    def test_the_size_of_the_bias_is_reported(self, noise, seed, words):
+        test, large = examine(executed(seed, position_noise=noise)), noise == LARGE
+        assert (test.biased, test.matters) == (noise > 0.0, large)
+        assert words in test.words
+        assert test.predicted.max() > 0.05 if large else test.predicted.max() < 0.005
+        if large:
+            assert {"I1yy", "I2yy"} <= set(test.shifted)
+            assert "Least squares is biased by noise in the regressor" in test.words
+            assert "I1yy" in test.words
+
+    def test_instruments_equal_to_the_motion_are_untested(self):
+        samples = executed(0, position_noise=SMALL)
+        factor, result = fit(samples, samples.motion)
+        test = endogeneity_test(MODEL, factor, result)
+        assert np.isnan(test.p_value)
+        assert not test.biased
+        assert "was not tested" in test.words
+        np.testing.assert_allclose(
+            result.estimate.values, result.least_squares.values, rtol=1e-7, atol=1e-8
+        )
+
+    def test_the_statistic_is_that_of_the_refitted_regression(self):
+        samples = executed(3, position_noise=1e-4)
+        factor, result = fit(samples)
+        test = endogeneity_test(MODEL, factor, result)
+        scale = np.sqrt(result.weights)
+        z, w, y = (part * (scale[:, None] if part.ndim == 3 else scale) for part in dense(samples))
+        p = MODEL.n_parameters
+        explained = np.linalg.lstsq(
+            z.reshape(-1, p), w.reshape(-1, p) @ result.estimate.values, rcond=None
+        )[0]
+        error = w @ result.estimate.values - z @ explained  # (m, n)
+        own = error[:, :, None] * np.eye(2)  # one column per joint, on its own rows
+        table = np.concatenate([w, own], axis=2)
+        gamma = np.linalg.lstsq(table.reshape(-1, p + 2), y.ravel(), rcond=None)[0][-2:]
+        blocks = test.freedom[0] + test.freedom[1]
+        fine = np.floor(TIME / 0.125 + 1e-9).astype(int)
+        used = np.unique(fine[np.abs(table).sum(axis=(1, 2)) > 0.0])
+        length = -(-len(used) // blocks)
+        block = np.full(len(TIME), -1)
+        for k, one in enumerate(used):
+            block[fine == one] = k // length
+        moved = []
+        for b in range(blocks):
+            left = block != b
+            refit = np.linalg.lstsq(table[left].reshape(-1, p + 2), y[left].ravel(), rcond=None)[0]
+            moved.append(gamma - refit[-2:])
+        covariance = np.array(moved).T @ np.array(moved)
+        squared = gamma @ np.linalg.solve(covariance, gamma)
+        expected = squared * (blocks - 2) / (2 * (blocks - 1))
+        assert test.statistic == pytest.approx(expected, rel=1e-5)
 
 
-def test_a_known_lag_is_used(monkeypatch):
-    samples = executed(0)
-    found = planned_motion(samples, PLAN.position)
-    monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
-    again = planned_motion(samples, PLAN.position, lag=found.lag)
-    np.testing.assert_array_equal(again.motion.position, found.motion.position)
-    np.testing.assert_array_equal(again.usable, found.usable)
+class TestPlannedMotion:
+    @settings(max_examples=10)
+    @given(st.floats(0.002, 0.2), st.floats(0.002, 0.2))
+    def test_the_plan_is_shifted_by_the_lag_of_each_axis(self, shoulder, elbow):
+        spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
+        late = [
+            np.column_stack(
+                [spline(TIME - lag, order)[:, j] for j, lag in enumerate((shoulder, elbow))]
+            )
+            for order in range(3)
+        ]
+        noise = 1e-4 * np.random.default_rng(0).standard_normal(late[0].shape)
+        drooped = Motion(TIME, late[0] + noise + [0.01, -0.02], *late[1:])
+        instruments = planned_motion(samples_of(drooped, 0.0 * noise), PLAN.position)
+        np.testing.assert_allclose(instruments.lag, [shoulder, elbow], atol=1e-4)
+        inside = (TIME > 0.5) & (TIME < 9.5)
+        np.testing.assert_allclose(
+            instruments.motion.acceleration[inside], late[2][inside], atol=0.01 * late[2].max()
+        )
+        assert not instruments.usable[TIME - min(shoulder, elbow) < -STEP].any()
+        assert instruments.usable[inside].all()
 
+    def test_a_known_lag_is_used(self, monkeypatch):
+        samples = executed(0)
+        found = planned_motion(samples, PLAN.position)
+        monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
+        again = planned_motion(samples, PLAN.position, lag=found.lag)
+        np.testing.assert_array_equal(again.motion.position, found.motion.position)
+        np.testing.assert_array_equal(again.usable, found.usable)
 
-def test_repetitions_share_a_plan_for_any_clock():
-    plan = TIME, PLAN.position
-    spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
-    later, half = TIME[20:-20] + 0.3 * STEP, len(TIME) // 2
-    gapped = spline(later)
-    gapped[100:120] = np.nan
-    assert same_plan(plan, (later, gapped))
-    assert not same_plan(plan, (TIME[:half], PLAN.position[:half]))
-    others = 0.9 * PLAN.position, PLAN.position[::-1], PLAN.position[:, :1], np.nan * PLAN.position
-    assert not any(same_plan(plan, (TIME, other)) for other in others)
+    def test_repetitions_share_a_plan_for_any_clock(self):
+        plan = TIME, PLAN.position
+        spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
+        later, half = TIME[20:-20] + 0.3 * STEP, len(TIME) // 2
+        gapped = spline(later)
+        gapped[100:120] = np.nan
+        assert same_plan(plan, (later, gapped))
+        assert not same_plan(plan, (TIME[:half], PLAN.position[:half]))
+        others = (
+            0.9 * PLAN.position,
+            PLAN.position[::-1],
+            PLAN.position[:, :1],
+            np.nan * PLAN.position,
+        )
+        assert not any(same_plan(plan, (TIME, other)) for other in others)
 
-
-def test_missing_commands():
-    samples, command = executed(0), PLAN.position.copy()
-    command[300:340, 1] = np.nan
-    instruments = planned_motion(samples, command)
-    assert not instruments.usable[300:340].any()
-    assert instruments.usable[400:-400].all()
-    for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
-        with pytest.raises(IdentificationError, match=words):
-            planned_motion(samples, np.full_like(command, value))
+    def test_missing_commands_are_not_used(self):
+        samples, command = executed(0), PLAN.position.copy()
+        command[300:340, 1] = np.nan
+        instruments = planned_motion(samples, command)
+        assert not instruments.usable[300:340].any()
+        assert instruments.usable[400:-400].all()
+        for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
+            with pytest.raises(IdentificationError, match=words):
+                planned_motion(samples, np.full_like(command, value))

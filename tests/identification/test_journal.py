@@ -44,45 +44,44 @@ def known(file):
     return count
 
 
-def test_a_truncated_journal_loses_one_generation():
-    file, lengths = written(3)
-    content = file.getvalue()
-    assert known(io.BytesIO(content)) == 3
-    for length in {*range(0, lengths[0], 7), *range(lengths[2], len(content), 31), *lengths}:
-        truncated = io.BytesIO(content[:length])
-        count = known(truncated)
-        assert count == sum(length >= end for end in lengths[1:])
-        opened(truncated).record(*generation(count))
-        assert known(truncated) == count + 1
+class TestRecall:
+    def test_a_truncated_journal_loses_one_generation(self):
+        file, lengths = written(3)
+        content = file.getvalue()
+        assert known(io.BytesIO(content)) == 3
+        for length in {*range(0, lengths[0], 7), *range(lengths[2], len(content), 31), *lengths}:
+            truncated = io.BytesIO(content[:length])
+            count = known(truncated)
+            assert count == sum(length >= end for end in lengths[1:])
+            opened(truncated).record(*generation(count))
+            assert known(truncated) == count + 1
 
+    def test_records_after_a_damaged_one_are_dropped(self):
+        file, lengths = written(4)
+        for offset in range(lengths[1], lengths[2], 97):
+            damaged = bytearray(file.getvalue())
+            damaged[offset] ^= 0x10
+            again = io.BytesIO(bytes(damaged))
+            journal = opened(again)
+            found = [journal.recall(generation(seed)[0]) is not None for seed in range(4)]
+            assert found == [True, False, False, False]
+            assert journal.damaged == lengths[4] - lengths[1]
+            journal.record(*generation(1))
+            assert known(again) == 2
 
-def test_records_after_a_damaged_one_are_dropped():
-    file, lengths = written(4)
-    for offset in range(lengths[1], lengths[2], 97):
-        damaged = bytearray(file.getvalue())
-        damaged[offset] ^= 0x10
-        again = io.BytesIO(bytes(damaged))
-        journal = opened(again)
-        found = [journal.recall(generation(seed)[0]) is not None for seed in range(4)]
-        assert found == [True, False, False, False]
-        assert journal.damaged == lengths[4] - lengths[1]
-        journal.record(*generation(1))
-        assert known(again) == 2
-
-
-def test_other_genes_are_not_recalled():
-    file, _ = written(3)
-    journal = opened(file)
-    others, scores = generation(7)
-    moved, _ = generation(1)
-    moved[2, 3] = np.nextafter(moved[2, 3], 2.0)
-    for genes in (others, moved, moved[:3]):
-        assert journal.recall(genes) is None
-    journal.record(others, scores)
-    again = opened(file)
-    for genes in (others, generation(2)[0], generation(0)[0]):
-        assert again.recall(genes) is not None
-    assert (again.recalled, again.damaged) == (12, 0)
+    def test_other_genes_are_not_recalled(self):
+        file, _ = written(3)
+        journal = opened(file)
+        others, scores = generation(7)
+        moved, _ = generation(1)
+        moved[2, 3] = np.nextafter(moved[2, 3], 2.0)
+        for genes in (others, moved, moved[:3]):
+            assert journal.recall(genes) is None
+        journal.record(others, scores)
+        again = opened(file)
+        for genes in (others, generation(2)[0], generation(0)[0]):
+            assert again.recall(genes) is not None
+        assert (again.recalled, again.damaged) == (12, 0)
 
 
 class FullDisk(io.BytesIO):
@@ -97,71 +96,70 @@ class FullDisk(io.BytesIO):
         return super().write(bytes(content)[:1000])
 
 
-def test_pending_records_are_written_later():
-    file = FullDisk()
-    journal = opened(file)
-    journal.record(*generation(0))
-    file.room = False
-    for seed in (1, 2):
-        journal.record(*generation(seed))
-        assert journal.error is not None and journal.error.errno == errno.ENOSPC
-    assert known(io.BytesIO(file.getvalue())) == 1
-    journal.close()
-    assert journal.error is not None
-    file.room = True
-    journal.record(*generation(3))
-    assert journal.error is None
-    assert known(io.BytesIO(file.getvalue())) == 4
-    file.room = False
-    journal.record(*generation(4))
-    file.room = True
-    journal.close()
-    assert known(io.BytesIO(file.getvalue())) == 5
-
-
-def test_the_file_is_synced_at_intervals_and_at_the_end(tmp_path, monkeypatch):
-    synced = []
-    monkeypatch.setattr(os, "fsync", synced.append)
-    with (tmp_path / "journal").open("x+b", buffering=0) as file:
-        journal = Journal(file, SEARCH)
-        for seed in range(20):
+class TestWriting:
+    def test_pending_records_are_written_later(self):
+        file = FullDisk()
+        journal = opened(file)
+        journal.record(*generation(0))
+        file.room = False
+        for seed in (1, 2):
             journal.record(*generation(seed))
-        assert len(synced) <= 1
+            assert journal.error is not None and journal.error.errno == errno.ENOSPC
+        assert known(io.BytesIO(file.getvalue())) == 1
         journal.close()
-        assert len(synced) >= 1
+        assert journal.error is not None
+        file.room = True
+        journal.record(*generation(3))
+        assert journal.error is None
+        assert known(io.BytesIO(file.getvalue())) == 4
+        file.room = False
+        journal.record(*generation(4))
+        file.room = True
+        journal.close()
+        assert known(io.BytesIO(file.getvalue())) == 5
 
-
-@pytest.mark.parametrize(
-    ("other", "words"),
-    [
-        ({"settings": {"seed": 2, "population": 4}}, "settings seed was 1, is 2"),
-        ({"cell": {"urdf": "b"}}, "cell urdf was 'a', is 'b'"),
-        ({"earlier": {"x.mcap": "00"}}, "earlier x.mcap was None, is '00'"),
-    ],
-)
-def test_the_journal_of_another_search_is_refused(other, words):
-    file, _ = written(1)
-    before = file.getvalue()
-    with pytest.raises(JournalError, match=words):
-        Journal(file, SEARCH | other)
-    assert file.getvalue() == before
-
-
-def test_the_journal_of_another_release_is_refused(monkeypatch):
-    file, _ = written(1)
-    journal = identification.excitation.searches.journal
-    ours = journal.versions()
-    monkeypatch.setattr(journal, "versions", lambda: {**ours, "pymoo": "0.5.0"})
-    with pytest.raises(JournalError, match=f"pymoo was '{ours['pymoo']}', is '0.5.0'"):
-        opened(file)
+    def test_the_file_is_synced_at_intervals_and_at_the_end(self, tmp_path, monkeypatch):
+        synced = []
+        monkeypatch.setattr(os, "fsync", synced.append)
+        with (tmp_path / "journal").open("x+b", buffering=0) as file:
+            journal = Journal(file, SEARCH)
+            for seed in range(20):
+                journal.record(*generation(seed))
+            assert len(synced) <= 1
+            journal.close()
+            assert len(synced) >= 1
 
 
 FIRST_LINE = b"hil search journal 2\n"
 
 
-@pytest.mark.parametrize("content", [b"x", FIRST_LINE + b"{}" * 50, FIRST_LINE])
-def test_another_file_is_refused_and_unchanged(content):
-    file = io.BytesIO(content + b" ")
-    with pytest.raises(JournalError):
-        opened(file)
-    assert file.getvalue() == content + b" "
+class TestOtherFiles:
+    @pytest.mark.parametrize(
+        ("other", "words"),
+        [
+            ({"settings": {"seed": 2, "population": 4}}, "settings seed was 1, is 2"),
+            ({"cell": {"urdf": "b"}}, "cell urdf was 'a', is 'b'"),
+            ({"earlier": {"x.mcap": "00"}}, "earlier x.mcap was None, is '00'"),
+        ],
+    )
+    def test_the_journal_of_another_search_is_refused(self, other, words):
+        file, _ = written(1)
+        before = file.getvalue()
+        with pytest.raises(JournalError, match=words):
+            Journal(file, SEARCH | other)
+        assert file.getvalue() == before
+
+    def test_the_journal_of_another_release_is_refused(self, monkeypatch):
+        file, _ = written(1)
+        journal = identification.excitation.searches.journal
+        ours = journal.versions()
+        monkeypatch.setattr(journal, "versions", lambda: {**ours, "pymoo": "0.5.0"})
+        with pytest.raises(JournalError, match=f"pymoo was '{ours['pymoo']}', is '0.5.0'"):
+            opened(file)
+
+    @pytest.mark.parametrize("content", [b"x", FIRST_LINE + b"{}" * 50, FIRST_LINE])
+    def test_another_file_is_refused_and_unchanged(self, content):
+        file = io.BytesIO(content + b" ")
+        with pytest.raises(JournalError):
+            opened(file)
+        assert file.getvalue() == content + b" "

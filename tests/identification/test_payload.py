@@ -26,8 +26,8 @@ from tests.identification.two_link import (
     a_motion,
     as_samples,
     four_sines,
-    sine_motion,
     truth,
+    values_of,
 )
 
 TILTED = (2.0, -3.0, -9.0)
@@ -57,76 +57,69 @@ def states(n):
     return np.random.default_rng(6).uniform(-2.0, 2.0, (3, 20, n))
 
 
-@pytest.mark.parametrize("case", ["ns16", "ur10 at its tool", *range(6)])
-def test_the_load_torque_is_the_difference_in_pinocchio(case):
-    frame, where = None, pin.SE3.Identity()
-    urdf = urdf_text()
-    if isinstance(case, int):
-        urdf = random_urdf(case)
-    elif case.startswith("ur10"):
-        urdf, frame = robot_text("ur_description/urdf/ur10_robot.urdf"), "tool0"
-        reader = pin.buildModelFromXML(urdf)
-        where = reader.frames[reader.getFrameId("tool0", pin.FrameType.BODY)].placement
-    payload = Payload(7.0, (0.05, -0.02, 0.11), INERTIA, frame)
-    model = RobotModel.from_urdf(urdf, gravity=TILTED, payload=payload)
-    expected = pinocchio_torque(urdf, payload, model.n_joints, where)
-    expected -= pinocchio_torque(urdf, None, model.n_joints, where)
-    np.testing.assert_allclose(model.load_torque(*states(model.n_joints)), expected, atol=1e-9)
+class TestPayload:
+    @pytest.mark.parametrize("case", ["ns16", "ur10 at its tool", *range(6)])
+    def test_its_torque_is_the_difference_in_pinocchio(self, case):
+        frame, where = None, pin.SE3.Identity()
+        urdf = urdf_text()
+        if isinstance(case, int):
+            urdf = random_urdf(case)
+        elif case.startswith("ur10"):
+            urdf, frame = robot_text("ur_description/urdf/ur10_robot.urdf"), "tool0"
+            reader = pin.buildModelFromXML(urdf)
+            where = reader.frames[reader.getFrameId("tool0", pin.FrameType.BODY)].placement
+        payload = Payload(7.0, (0.05, -0.02, 0.11), INERTIA, frame)
+        model = RobotModel.from_urdf(urdf, gravity=TILTED, payload=payload)
+        expected = pinocchio_torque(urdf, payload, model.n_joints, where)
+        expected -= pinocchio_torque(urdf, None, model.n_joints, where)
+        np.testing.assert_allclose(model.load_torque(*states(model.n_joints)), expected, atol=1e-9)
 
+    def test_it_does_not_change_the_parameters(self):
+        bare = RobotModel.from_urdf(urdf_text())
+        loaded = RobotModel.from_urdf(urdf_text(), payload=Payload(16.0, (0.1, 0.0, 0.2)))
+        assert loaded.parameter_names == bare.parameter_names
+        values = np.arange(1.0, bare.n_parameters + 1)
+        np.testing.assert_array_equal(
+            loaded.torque(values, *states(6)), bare.torque(values, *states(6))
+        )
+        assert not bare.load_torque(*states(6)).any()
 
-def test_a_payload_does_not_change_the_parameters():
-    bare = RobotModel.from_urdf(urdf_text())
-    loaded = RobotModel.from_urdf(urdf_text(), payload=Payload(16.0, (0.1, 0.0, 0.2)))
-    assert loaded.parameter_names == bare.parameter_names
-    values = np.arange(1.0, bare.n_parameters + 1)
-    np.testing.assert_array_equal(
-        loaded.torque(values, *states(6)), bare.torque(values, *states(6))
-    )
-    assert not bare.load_torque(*states(6)).any()
+    def test_an_unknown_frame_is_refused_with_the_known_ones(self):
+        with pytest.raises(ModelError, match=r"'tool9' is not a link .* link_6"):
+            RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="tool9"))
+        with pytest.raises(ModelError, match="fixed to the base"):
+            RobotModel.from_urdf(
+                urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="base_link")
+            )
 
+    def test_invalid_masses_and_inertias_are_reported(self):
+        at = (0.0, 0.0, 0.0)
+        for mass in (-1.0, np.nan):
+            with pytest.raises(ModelError, match="weighs"):
+                Payload(mass, at)
+        assert Payload(1.0, at).possible
+        assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
+        assert not Payload(1.0, at, (0.1, 0.0, 0.0, 0.1, 0.0, 0.3)).possible
+        assert not Payload(1.0, at, (-0.1, 0.0, 0.0, 0.1, 0.0, 0.1)).possible
 
-def test_an_unknown_frame_is_refused_with_the_known_ones():
-    with pytest.raises(ModelError, match=r"'tool9' is not a link .* link_6"):
-        RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="tool9"))
-    with pytest.raises(ModelError, match="fixed to the base"):
-        RobotModel.from_urdf(urdf_text(), payload=Payload(1.0, (0.0, 0.0, 0.0), frame="base_link"))
-
-
-def test_invalid_masses_and_inertias_are_reported():
-    at = (0.0, 0.0, 0.0)
-    for mass in (-1.0, np.nan):
-        with pytest.raises(ModelError, match="weighs"):
-            Payload(mass, at)
-    assert Payload(1.0, at).possible
-    assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
-    assert not Payload(1.0, at, (0.1, 0.0, 0.0, 0.1, 0.0, 0.3)).possible
-    assert not Payload(1.0, at, (-0.1, 0.0, 0.0, 0.1, 0.0, 0.1)).possible
-
-
-def test_a_recording_of_the_loaded_arm_gives_the_parameters_of_the_bare_one():
-    payload = Payload(16.0, (0.1, 0.0, 0.2), INERTIA, "link_6")
-    law = FrictionLaw(third=None)
-    model = RobotModel.from_urdf(urdf_text(), friction=law, payload=payload)
-    bare = RobotModel.from_urdf(urdf_text(), friction=law)
-    random = np.random.default_rng(8)
-    time = np.arange(8000, dtype=np.float64) * 1e-3
-    pace, phase = random.uniform(2.0, 9.0, (4, 6)), random.uniform(0.0, 6.0, (4, 6))
-    motion = sine_motion(time, np.full((4, 6), 0.4), pace, phase)[1:4]
-    truth = np.append(bare.base.grouping @ bare.nominal, np.full(12, 5.0))
-    recording = Recording(
-        time=time,
-        position=motion[0],
-        joint_names=model.joint_names,
-        torque=bare.torque(truth, *motion) + model.load_torque(*motion),
-    )
-
-    def largest_error(of):
-        samples = prepare(recording, of, noise_variance=np.full(6, 1e-14))
-        (error,) = prediction_error(of, truth, [samples])
-        return float(error.overall)
-
-    assert largest_error(model) < 0.01
-    assert largest_error(bare) > 0.1
+    def test_a_loaded_arm_has_the_parameters_of_the_bare_one(self):
+        payload, law = Payload(16.0, (0.1, 0.0, 0.2), INERTIA, "link_6"), FrictionLaw(third=None)
+        model = RobotModel.from_urdf(urdf_text(), friction=law, payload=payload)
+        bare = RobotModel.from_urdf(urdf_text(), friction=law)
+        motion = four_sines(np.arange(8000) * 1e-3, n=6, seed=8)
+        truth = values_of(bare, np.full(12, 5.0))
+        recording = Recording(
+            motion.time,
+            motion.position,
+            model.joint_names,
+            torque=bare.torque(truth, *motion[1:]) + model.load_torque(*motion[1:4]),
+        )
+        errors = []
+        for arm in (model, bare):
+            samples = prepare(recording, arm, noise_variance=np.full(6, 1e-14))
+            (error,) = prediction_error(arm, truth, [samples])
+            errors.append(error.overall)
+        assert errors[0] < 0.01 and errors[1] > 0.1
 
 
 LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))
@@ -152,21 +145,21 @@ def recordings(loads, *, noise=NOISE, drift=0.0, pace=1.0, seed=0):
     return MODEL, runs
 
 
-def estimate(loads, **options):
+def identified(loads, **options):
     return identify_payload(*recordings(loads, **options))
 
 
 class TestMass:
     def test_without_noise_the_body_comes_back(self):
-        found = identify_payload(*recordings([None, LOAD], noise=np.zeros(2)))
+        found = identified([None, LOAD], noise=np.zeros(2))
         assert found.body.mass == pytest.approx(4.0, rel=1e-6)
         assert found.body.centre[[0, 2]] == pytest.approx([0.2, 0.1], abs=1e-6)
         assert found.body.inertia[1, 1] == pytest.approx(0.03, rel=1e-4)
 
     def test_order_and_number_of_recordings_do_not_matter(self):
-        found = estimate([LOAD, None, None, LOAD, LOAD])
+        found = identified([LOAD, None, None, LOAD, LOAD])
         assert found.intervals[0, 0] < 4.0 < found.intervals[0, 1]
-        once = estimate([LOAD, None])
+        once = identified([LOAD, None])
         assert np.diff(found.intervals[0]) < np.diff(once.intervals[0])
 
     def test_no_load_is_no_body(self):
@@ -185,7 +178,7 @@ class TestMass:
 
 @pytest.fixture(scope="module")
 def many():
-    return [estimate([None, LOAD], drift=0.04, seed=seed) for seed in range(SEEDS)]
+    return [identified([None, LOAD], drift=0.04, seed=seed) for seed in range(SEEDS)]
 
 
 class TestIntervals:
@@ -206,7 +199,7 @@ class TestIntervals:
         """Drift of 30 % of the friction, three times that of the prior."""
         model, runs = recordings([None, LOAD])
         low, high = identify_payload(model, runs).intervals[0]
-        drifting = estimate([None, LOAD], drift=0.3, seed=3)
+        drifting = identified([None, LOAD], drift=0.3, seed=3)
         assert drifting.intervals[0, 0] < 4.0 < drifting.intervals[0, 1]
         assert np.diff(drifting.intervals[0])[0] < 3.0 * (high - low)
 
@@ -219,20 +212,20 @@ class TestIntervals:
 class TestPossibleBody:
     @pytest.mark.parametrize("seed", range(5))
     def test_a_poor_motion_gives_a_consistent_body(self, seed):
-        found = identify_payload(*recordings([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed))
+        found = identified([None, LOAD], noise=20.0 * NOISE, pace=0.4, seed=seed)
         own = inertial_parameters(found.body)
         assert margin(own) > -1e-9 * own[9]
 
     def test_undetermined_parameters_are_named(self):
         """Only mass, moments in the plane and Iyy act on two axes about y."""
-        found = estimate([None, LOAD])
+        found = identified([None, LOAD])
         assert found.undetermined == ("cy", "Ixx", "Ixy", "Ixz", "Iyz", "Izz")
         assert found.body.centre[1] == pytest.approx(0.0, abs=1e-6)
 
     def test_a_large_body_is_not_moved_towards_a_point(self):
         """A bar of 1 m with a significant inertia, many times that of the reference."""
         bar = Payload(2.0, (0.2, 0.0, 0.1), (0.17, 0.0, 0.0, 0.17, 0.0, 0.001))
-        found = estimate([None, bar])
+        found = identified([None, bar])
         low, high = found.intervals[NAMES.index("Iyy")]
         middle = (low + high) / 2.0
         assert "Iyy" not in found.undetermined
@@ -250,9 +243,9 @@ class TestPossibleBody:
     def test_an_inconsistent_body_is_reported(self):
         """A tensor that is negative about the centre of mass."""
         impossible = Payload(4.0, (0.2, 0.0, 0.1), (0.0, 0.0, 0.0, -0.15, 0.0, 0.0))
-        found = identify_payload(*recordings([None, impossible], noise=0.01 * NOISE))
+        found = identified([None, impossible], noise=0.01 * NOISE)
         assert found.contradicted
-        assert not estimate([None, LOAD]).contradicted
+        assert not identified([None, LOAD]).contradicted
 
 
 class TestDifference:

@@ -20,9 +20,9 @@ from identification.validation.plausibility import Implausible, implausibilities
 from identification.validation.position_jumps import position_jumps
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
-from tests.identification.test_essential import NOISE, a_motion, samples_of
+from tests.identification.test_essential import NOISE, a_motion
 from tests.identification.test_verdict import an_error, finding_of, judged
-from tests.identification.two_link import MODEL, URDF, as_samples, one_sine
+from tests.identification.two_link import MODEL, URDF, one_sine, simulated, values_of
 
 
 def parameters(model=MODEL, **changes):
@@ -104,7 +104,7 @@ class TestSigns:
 
 
 def runs(**changes):
-    return [samples_of(MODEL, parameters(**changes), a_motion(k), NOISE, k) for k in (1, 2)]
+    return [simulated(MODEL, parameters(**changes), a_motion(k), NOISE, k) for k in (1, 2)]
 
 
 def checked(recordings):
@@ -177,24 +177,6 @@ def with_jump(one, size, rows):
     return replace(one, position=position)
 
 
-@pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
-@pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
-def test_a_lasting_jump_is_found(rate, size):
-    one, at = recording(rate), int(5 * rate)
-    (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
-    assert (jump.recording, jump.joint) == ("log.mcap", "knee")
-    assert jump.time == pytest.approx(one.time[at] - one.time[0])
-    assert jump.size == pytest.approx(size, abs=2e-3)
-    finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
-    assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
-
-
-@pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
-@pytest.mark.parametrize("jitter", [0.0, 0.3])
-def test_motion_with_an_uneven_clock_has_no_jump(rate, jitter):
-    assert position_jumps(recording(rate, jitter=jitter, seed=3)) == []
-
-
 def sudden_stop():
     """From 1 rad/s to rest within one sample."""
     time = np.arange(0.0, 8.0, 0.002)
@@ -208,13 +190,30 @@ def jump_in_a_gap():
     return replace(one, gap_before=np.arange(len(one.time)) == 2500)
 
 
-@pytest.mark.parametrize(
-    "one",
-    [sudden_stop(), jump_in_a_gap(), with_jump(recording(500.0), 0.2, slice(2500, 2501))],
-    ids=["sudden stop", "gap", "glitch of one sample"],
-)
-def test_other_steps_are_no_jumps(one):
-    assert position_jumps(one) == []
+class TestPositionJumps:
+    @pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
+    @pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
+    def test_a_lasting_jump_is_found(self, rate, size):
+        one, at = recording(rate), int(5 * rate)
+        (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
+        assert (jump.recording, jump.joint) == ("log.mcap", "knee")
+        assert jump.time == pytest.approx(one.time[at] - one.time[0])
+        assert jump.size == pytest.approx(size, abs=2e-3)
+        finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
+        assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
+
+    @pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
+    @pytest.mark.parametrize("jitter", [0.0, 0.3])
+    def test_motion_with_an_uneven_clock_has_no_jump(self, rate, jitter):
+        assert position_jumps(recording(rate, jitter=jitter, seed=3)) == []
+
+    @pytest.mark.parametrize(
+        "one",
+        [sudden_stop(), jump_in_a_gap(), with_jump(recording(500.0), 0.2, slice(2500, 2501))],
+        ids=["sudden stop", "gap", "glitch of one sample"],
+    )
+    def test_other_steps_are_no_jumps(self, one):
+        assert position_jumps(one) == []
 
 
 AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their friction
@@ -247,59 +246,53 @@ def standard(model, wrong, seed):
 def runs_of(model, values, seed):
     friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
     truth = np.concatenate([model.base.grouping @ values, friction])
-    found = []
-    for number in range(2):
-        motion = sines(model.n_joints, 10 * seed + number)
-        torque = model.torque(truth, *motion[1:])
-        torque += (
-            0.02 * torque.std(axis=0) * np.random.default_rng(seed).standard_normal(torque.shape)
-        )
-        found.append(as_samples(model, motion, torque))
-    return found
+    motions = [sines(model.n_joints, 10 * seed + number) for number in range(2)]
+    noise = [0.02 * model.torque(truth, *motion[1:]).std(axis=0) for motion in motions]
+    return [simulated(model, truth, *one, seed) for one in zip(motions, noise, strict=True)]
 
 
 def nominal(model):
-    friction = np.zeros(model.n_parameters - model.base.rank)
-    return np.concatenate([model.base.grouping @ model.nominal, friction])
+    return values_of(model, np.zeros(model.n_parameters - model.base.rank))
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_links_off_by_a_tenth_are_no_finding(model, seed):
-    found = nominal_scale(model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed))
-    assert np.isfinite(found.scale[2])
-    assert findings(model, nominal_scale=found) == []
+class TestNominalScale:
+    @pytest.mark.parametrize("seed", range(10))
+    def test_links_off_by_a_tenth_are_no_finding(self, model, seed):
+        found = nominal_scale(
+            model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed)
+        )
+        assert np.isfinite(found.scale[2])
+        assert findings(model, nominal_scale=found) == []
 
+    @pytest.mark.parametrize("axis", AXES)
+    @pytest.mark.parametrize("factor", [0.6, 1.5])
+    def test_a_wrong_torque_constant_is_a_finding(self, model, axis, factor):
+        scaled = []
+        for run in runs_of(model, standard(model, 0.05, axis), axis):
+            torque = run.torque.copy()
+            torque[:, axis] *= factor
+            scaled.append(replace(run, torque=torque))
+        found = nominal_scale(model, nominal(model), scaled)
+        assert np.flatnonzero(found.off).tolist() == [axis]
+        assert found.scale[axis] == pytest.approx(factor, rel=0.1)
+        (finding,) = findings(model, nominal_scale=found)
+        name = model.joint_names[axis]
+        assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
 
-@pytest.mark.parametrize("axis", AXES)
-@pytest.mark.parametrize("factor", [0.6, 1.5])
-def test_a_wrong_torque_constant_is_a_finding(model, axis, factor):
-    scaled = []
-    for run in runs_of(model, standard(model, 0.05, axis), axis):
-        torque = run.torque.copy()
-        torque[:, axis] *= factor
-        scaled.append(replace(run, torque=torque))
-    found = nominal_scale(model, nominal(model), scaled)
-    assert np.flatnonzero(found.off).tolist() == [axis]
-    assert found.scale[axis] == pytest.approx(factor, rel=0.1)
-    (finding,) = findings(model, nominal_scale=found)
-    name = model.joint_names[axis]
-    assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
-
-
-@pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
-def test_torques_with_another_factor_are_wrong(model, factor):
-    """Another unit, motor torques, or all of them negated; nothing is known without masses."""
-    runs = runs_of(model, standard(model, 0.05, 1), 1)
-    scaled = [replace(run, torque=factor * run.torque) for run in runs]
-    (finding,) = findings(model, nominal_scale=nominal_scale(model, nominal(model), scaled))
-    assert finding.level == "wrong"
-    if factor > 0.0:
-        assert "unit" in finding.next_step and "side" in finding.next_step
-    else:
-        assert finding.check == "direction of axes"
-        assert "all torques have the opposite sign" in finding.words
-    massless = nominal_scale(model, 0.0 * nominal(model), scaled)
-    assert np.isnan(massless.scale).all() and findings(model, nominal_scale=massless) == []
+    @pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
+    def test_torques_with_another_factor_are_wrong(self, model, factor):
+        """Another unit, motor torques, or all of them negated; nothing is known without masses."""
+        runs = runs_of(model, standard(model, 0.05, 1), 1)
+        scaled = [replace(run, torque=factor * run.torque) for run in runs]
+        (finding,) = findings(model, nominal_scale=nominal_scale(model, nominal(model), scaled))
+        assert finding.level == "wrong"
+        if factor > 0.0:
+            assert "unit" in finding.next_step and "side" in finding.next_step
+        else:
+            assert finding.check == "direction of axes"
+            assert "all torques have the opposite sign" in finding.words
+        massless = nominal_scale(model, 0.0 * nominal(model), scaled)
+        assert np.isnan(massless.scale).all() and findings(model, nominal_scale=massless) == []
 
 
 @cache
@@ -307,10 +300,7 @@ def arm():
     """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
     urdf = packaged_urdf("ur5_robot.urdf")
     model = RobotModel.from_urdf(urdf)
-    standard = model.nominal.copy()
-    standard[model.layout.rotors] = 0.2
-    friction = np.full(model.n_parameters - model.base.rank, 3.0)
-    values = np.concatenate([model.base.grouping @ standard, friction])
+    values = values_of(model, np.full(model.n_parameters - model.base.rank, 3.0), 0.2)
     position = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 6))
     reference = pin.buildModelFromXML(urdf)
     data = reference.createData()
@@ -318,20 +308,20 @@ def arm():
     return model, values, position, diagonal
 
 
-def test_inertia_matrices_are_those_of_pinocchio():
-    model, values, position, diagonal = arm()
-    matrices = inertia_matrices(model, values, position)
-    np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
+class TestInertia:
+    def test_inertia_matrices_are_those_of_pinocchio(self):
+        model, values, position, diagonal = arm()
+        matrices = inertia_matrices(model, values, position)
+        np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
 
-
-def test_another_inertia_of_the_controller_is_a_finding():
-    """A joint without one is not."""
-    model, values, position, diagonal = arm()
-    theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
-    found = inertia_ratio(model, values, position, theirs)
-    np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
-    np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
-    (finding,) = findings(model, controller_inertia=found)
-    assert finding.level == "doubtful"
-    assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
-    assert inertia_ratio(model, values, position, 0.0 * diagonal) is None
+    def test_another_inertia_of_the_controller_is_a_finding(self):
+        """A joint without one is not."""
+        model, values, position, diagonal = arm()
+        theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
+        found = inertia_ratio(model, values, position, theirs)
+        np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
+        np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
+        (finding,) = findings(model, controller_inertia=found)
+        assert finding.level == "doubtful"
+        assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
+        assert inertia_ratio(model, values, position, 0.0 * diagonal) is None

@@ -116,34 +116,33 @@ class TestChecks:
             a_recording().checked(expected)
 
 
-def test_gaps_split_a_recording_but_jitter_does_not():
-    recording = a_recording()
-    gap = np.zeros(200, dtype=bool)
-    gap[30] = True
-    time = recording.time.copy()
-    time[100:] += 0.5
-    parts = [slice(0, 30), slice(30, 100), slice(100, 200)]
-    assert replace(recording, time=time, gap_before=gap).segments() == parts
-    jitter = np.random.default_rng(1).uniform(-4e-4, 4e-4, 200)
-    assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
+class TestRecording:
+    def test_gaps_split_it_but_jitter_does_not(self):
+        recording = a_recording()
+        gap = np.zeros(200, dtype=bool)
+        gap[30] = True
+        time = recording.time.copy()
+        time[100:] += 0.5
+        parts = [slice(0, 30), slice(30, 100), slice(100, 200)]
+        assert replace(recording, time=time, gap_before=gap).segments() == parts
+        jitter = np.random.default_rng(1).uniform(-4e-4, 4e-4, 200)
+        assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
 
+    def test_arrays_of_other_shapes_raise(self):
+        recording = a_recording()
+        with pytest.raises(ShapeError, match="torque"):
+            replace(recording, torque=recording.torque[:-1])
+        with pytest.raises(ShapeError, match="gap_before"):
+            replace(recording, gap_before=np.zeros(3, dtype=bool))
 
-def test_arrays_of_other_shapes_raise():
-    recording = a_recording()
-    with pytest.raises(ShapeError, match="torque"):
-        replace(recording, torque=recording.torque[:-1])
-    with pytest.raises(ShapeError, match="gap_before"):
-        replace(recording, gap_before=np.zeros(3, dtype=bool))
-
-
-def test_a_motion_starts_with_its_command():
-    recording = a_recording()
-    command = recording.commanded_position.copy()
-    command[:40] = command[40]
-    assert replace(recording, commanded_position=command).motion_start == recording.time[41]
-    command[:10] = np.nan
-    assert replace(recording, commanded_position=command).motion_start == recording.time[41]
-    assert a_recording(commanded=False).motion_start == 0.0
+    def test_a_motion_starts_with_its_command(self):
+        recording = a_recording()
+        command = recording.commanded_position.copy()
+        command[:40] = command[40]
+        assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+        command[:10] = np.nan
+        assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+        assert a_recording(commanded=False).motion_start == 0.0
 
 
 STEP = 2e-3
@@ -186,65 +185,62 @@ class TestRepetitions:
         assert offsets_of_repetitions(runs) is None
 
 
-@pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
-def test_an_even_clock_is_uniform(rate):
-    base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
-    assert base.uniform
-    assert base.rate == pytest.approx(rate, rel=1e-4)
-    assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
-    assert len(base.describe()) == 1
+class TestTimeBase:
+    @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
+    def test_an_even_clock_is_uniform(self, rate):
+        base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
+        assert base.uniform
+        assert base.rate == pytest.approx(rate, rel=1e-4)
+        assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
+        assert len(base.describe()) == 1
 
+    def test_jitter_is_measured_against_the_usual_step(self):
+        rng = np.random.default_rng(1)
+        steps = 0.002 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, 20000))
+        base = time_base(np.cumsum(steps))
+        assert base.jitter == pytest.approx(0.2 / np.sqrt(3.0), rel=0.02)
+        assert base.largest_deviation == pytest.approx(0.2, rel=0.02)
+        assert not base.uniform
+        assert "uneven" in base.describe()[1]
 
-def test_jitter_is_measured_against_the_usual_step():
-    rng = np.random.default_rng(1)
-    steps = 0.002 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, 20000))
-    base = time_base(np.cumsum(steps))
-    assert base.jitter == pytest.approx(0.2 / np.sqrt(3.0), rel=0.02)
-    assert base.largest_deviation == pytest.approx(0.2, rel=0.02)
-    assert not base.uniform
-    assert "uneven" in base.describe()[1]
+    @pytest.mark.parametrize("seed", range(5))
+    def test_late_stamps_are_not_missing_samples(self, seed):
+        random = np.random.default_rng(seed)
+        late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
+        lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
 
+        for base, dropped in ((time_base(late), 0), (time_base(np.delete(late, lost)), 25)):
+            assert base.dropped == dropped
+            assert base.rate == pytest.approx(100.0, rel=1e-3)
 
-@pytest.mark.parametrize("seed", range(5))
-def test_late_stamps_are_not_missing_samples(seed):
-    random = np.random.default_rng(seed)
-    late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
-    lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
+    def test_repeats_falls_drops_and_gaps_are_distinguished(self):
+        index = np.arange(1000.0)
+        index[100] = index[99]  # repeats
+        index[200] = index[199] - 0.5  # falls back
+        index = np.delete(index, [300, 301, 400])  # two and one samples missing
+        index[600:] += 50.0  # a gap
+        base = time_base(index * 1e-3)
+        assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
+        # Long steps after the repeat and the fall compensate the short ones.
+        assert base.dropped == 3
+        assert not base.uniform
+        words = " ".join(base.describe())
+        for part in ("repeat", "older", "missing", "gaps"):
+            assert part in words
+        reported = np.arange(100) == 50  # without a time step
+        assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
+        with pytest.raises(RecordingError, match="same time stamp"):
+            time_base(np.full(5, 3.0))
 
-    for base, dropped in ((time_base(late), 0), (time_base(np.delete(late, lost)), 25)):
-        assert base.dropped == dropped
-        assert base.rate == pytest.approx(100.0, rel=1e-3)
-
-
-def test_repeats_falls_drops_and_gaps_are_distinguished():
-    index = np.arange(1000.0)
-    index[100] = index[99]  # repeats
-    index[200] = index[199] - 0.5  # falls back
-    index = np.delete(index, [300, 301, 400])  # two and one samples missing
-    index[600:] += 50.0  # a gap
-    base = time_base(index * 1e-3)
-    assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
-    # Long steps after the repeat and the fall compensate the short ones.
-    assert base.dropped == 3
-    assert not base.uniform
-    words = " ".join(base.describe())
-    for part in ("repeat", "older", "missing", "gaps"):
-        assert part in words
-    reported = np.arange(100) == 50  # without a time step
-    assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
-    with pytest.raises(RecordingError, match="same time stamp"):
-        time_base(np.full(5, 3.0))
-
-
-def test_samples_of_one_stamp_are_averaged():
-    time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
-    torque = np.arange(14.0).reshape(7, 2)
-    merged = without_repeats(
-        Recording(time=time, position=torque, joint_names=("a", "b"), torque=torque)
-    )
-    np.testing.assert_array_equal(merged.time, [0.0, 1.0, 2.0, 3.0])
-    np.testing.assert_array_equal(merged.position, [[0, 1], [3, 4], [6, 7], [10, 11]])
-    even = Recording(np.arange(7.0), torque, ("a", "b"))
-    assert without_repeats(even) is even
-    with pytest.raises(RecordingError, match="falls back at sample 2"):
-        without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))
+    def test_samples_of_one_stamp_are_averaged(self):
+        time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
+        torque = np.arange(14.0).reshape(7, 2)
+        merged = without_repeats(
+            Recording(time=time, position=torque, joint_names=("a", "b"), torque=torque)
+        )
+        np.testing.assert_array_equal(merged.time, [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_array_equal(merged.position, [[0, 1], [3, 4], [6, 7], [10, 11]])
+        even = Recording(np.arange(7.0), torque, ("a", "b"))
+        assert without_repeats(even) is even
+        with pytest.raises(RecordingError, match="falls back at sample 2"):
+            without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))

@@ -109,86 +109,11 @@ def fitness_of(settings, scores, scale=None):
     return first * size / spreads[0] - second * coupled / spreads[1]
 
 
-@pytest.mark.parametrize("method", ["a", "b", "balanced"])
-@pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
-def test_the_largest_fitness_is_chosen(population, method, weights):
-    """Determinant, eq. 7, or both measures in units of their spread over 200 random motions."""
-    chosen = settings(method, weights=weights)
-    design = search(population, chosen)
-    random = Scores.of_rows(population.rows[0])
-    assert len(random.duration) == (200 if method == "balanced" else 12)
-    fitness = fitness_of(chosen, population.everything, random)
-    best = np.concatenate(population.genes)[np.argmax(fitness)]
-    assert best.tobytes() == design.genes.tobytes()
-
-
-def test_the_front_is_not_dominated_and_its_knee_is_chosen(population):
-    design = search(population, settings("front"))
-    best = Front.of(np.concatenate(population.genes), population.everything)
-    assert design.front.measures.tolist() == best.measures.tolist()
-    assert design.chosen == design.front.knee(Scale.of(Scores.of_rows(population.rows[0])))
-    np.testing.assert_array_equal(design.front.genes[design.chosen], design.genes)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_a_polish_is_never_worse(population, method):
-    unpolished = search(population, settings(method))
-    chosen = settings(method, polish=60)
-    polished = search(population, chosen)
-    assert polished.excitation.tried > unpolished.excitation.tried
-    for one, other in zip(bits(unpolished)["front"], bits(polished)["front"], strict=True):
-        assert one == other  # the front stays as the search found it
-    before, after = (
-        population.problem.score(design.genes[None]) for design in (unpolished, polished)
-    )
-    assert polished.origin == unpolished.chosen
-    assert polished.origin_criteria == unpolished.excitation.criteria
-    if method == "front":
-        assert polished.chosen is None, "the polish found a better one"
-        assert np.all((after.measures - before.measures) * [1.0, -1.0] >= 0.0)
-        criteria = polished.excitation.criteria, unpolished.excitation.criteria
-        assert np.all(np.subtract(*(one.measures for one in criteria)) * [1.0, -1.0] >= 0.0)
-    else:
-        random = Scores.of_rows(population.rows[0])
-        worth = [fitness_of(chosen, scores, random)[0] for scores in (before, after)]
-        assert worth[1] >= worth[0]
-
-
-@pytest.mark.parametrize("method", ["b", "front"])
-def test_more_generations_are_never_worse(population, method):
-    short, long = (
-        search(population, settings(method, generations=count)).front for count in (3, 6)
-    )
-    assert long.merge(short).measures.tolist() == long.measures.tolist()
-
-
-def test_a_search_is_better_than_random_motions(population):
-    """Among as many motions: a larger determinant, or more room under the front."""
-    sought = {"population": 30, "generations": 25, "mutation": 0.1}
-    design = search(population, settings("a", **sought))
-    chance = population.score(np.random.default_rng(8).random((design.excitation.tried, 8)))
-    assert design.excitation.criteria.log10_det > chance.measure("log10_det").max() + 0.5
-    design = search(population, settings("front", **sought))
-    genes = np.random.default_rng(8).random((design.excitation.tried, 8))
-    by_chance = Front.of(genes, population.score(genes))
-    assert _room_under(design.front) > 1.03 * _room_under(by_chance)
-
-
 def _room_under(front):
     """The area that a front beats, above log10 det = 0 and below I_c = 30."""
     size, coupled = front.measures.T
     assert size[0] > 0.0 and coupled[-1] < 30.0
     return float(size @ np.diff(coupled, append=30.0))
-
-
-def test_sums_of_sines_are_searched_like_via_points():
-    """Method A of the paper, eq. 8, with a ramp so that it can be run."""
-    sines = problem(SineGenome(LIMITS, length=6.0, ramp=1.0))
-    with Population(sines) as population:
-        design = search(population, settings("a"))
-    assert isinstance(design.excitation.trajectory, FourierSeries)
-    assert design.excitation.method == "a"
-    assert not check_motion(design.excitation.trajectory, LIMITS)
 
 
 class FinePopulation(RecordingPopulation):
@@ -209,167 +134,158 @@ class FinePopulation(RecordingPopulation):
         return trajectory, criteria
 
 
-@pytest.mark.parametrize(
-    ("method", "measure"),
-    [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index"), ("front", None)],
-)
-def test_a_polish_must_be_better_at_a_millisecond(population, method, measure):
-    unpolished = search(population, settings(method))
-    assert search(population.begin(), settings(method, polish=60)).chosen is None
-    with FinePopulation(unpolished.genes, measure) as finer:
-        design = search(finer, settings(method, polish=60))
-    assert design.genes.tobytes() == unpolished.genes.tobytes()
-    assert design.chosen == design.origin == unpolished.chosen
-    assert design.excitation.criteria == design.origin_criteria == unpolished.excitation.criteria
+class TestChoice:
+    @pytest.mark.parametrize("method", ["a", "b", "balanced"])
+    @pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
+    def test_the_largest_fitness_is_chosen(self, population, method, weights):
+        """Determinant, eq. 7, or both measures in units of their spread over 200 random motions."""
+        chosen = settings(method, weights=weights)
+        design = search(population, chosen)
+        random = Scores.of_rows(population.rows[0])
+        assert len(random.duration) == (200 if method == "balanced" else 12)
+        fitness = fitness_of(chosen, population.everything, random)
+        best = np.concatenate(population.genes)[np.argmax(fitness)]
+        assert best.tobytes() == design.genes.tobytes()
 
+    def test_the_front_is_not_dominated_and_its_knee_is_chosen(self, population):
+        design = search(population, settings("front"))
+        best = Front.of(np.concatenate(population.genes), population.everything)
+        assert design.front.measures.tolist() == best.measures.tolist()
+        assert design.chosen == design.front.knee(Scale.of(Scores.of_rows(population.rows[0])))
+        np.testing.assert_array_equal(design.front.genes[design.chosen], design.genes)
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_seed_determines_the_design_bit_for_bit(population, method, capsys):
-    chosen = settings(method, polish=40)
-    np.random.seed(1)  # noqa: NPY002  the generator that everybody shares
-    first = search(population, chosen)
-    between = np.random.get_state()  # noqa: NPY002
-    np.random.seed(2)  # noqa: NPY002
-    np.random.random(5)  # noqa: NPY002
-    again = search(population, chosen, progress=lambda _: np.random.random(3))  # noqa: NPY002
-    assert bits(again) == bits(first)
-    np.random.seed(1)  # noqa: NPY002
-    np.testing.assert_array_equal(np.random.get_state()[1], between[1])  # noqa: NPY002
-    assert capsys.readouterr() == ("", "")
+    @pytest.mark.parametrize("method", METHODS)
+    def test_a_polish_is_never_worse(self, population, method):
+        unpolished = search(population, settings(method))
+        chosen = settings(method, polish=60)
+        polished = search(population, chosen)
+        assert polished.excitation.tried > unpolished.excitation.tried
+        # The front stays as the search found it.
+        assert bits(unpolished)["front"] == bits(polished)["front"]
+        before, after = (
+            population.problem.score(design.genes[None]) for design in (unpolished, polished)
+        )
+        assert polished.origin == unpolished.chosen
+        assert polished.origin_criteria == unpolished.excitation.criteria
+        if method == "front":
+            assert polished.chosen is None, "the polish found a better one"
+            assert np.all((after.measures - before.measures) * [1.0, -1.0] >= 0.0)
+            criteria = polished.excitation.criteria, unpolished.excitation.criteria
+            assert np.all(np.subtract(*(one.measures for one in criteria)) * [1.0, -1.0] >= 0.0)
+        else:
+            random = Scores.of_rows(population.rows[0])
+            worth = [fitness_of(chosen, scores, random)[0] for scores in (before, after)]
+            assert worth[1] >= worth[0]
 
+    def test_a_search_is_better_than_random_motions(self, population):
+        """Among as many motions: a larger determinant, or more room under the front."""
+        sought = {"population": 30, "generations": 25, "mutation": 0.1}
+        design = search(population, settings("a", **sought))
+        chance = population.score(np.random.default_rng(8).random((design.excitation.tried, 8)))
+        assert design.excitation.criteria.log10_det > chance.measure("log10_det").max() + 0.5
+        design = search(population, settings("front", **sought))
+        genes = np.random.default_rng(8).random((design.excitation.tried, 8))
+        by_chance = Front.of(genes, population.score(genes))
+        assert _room_under(design.front) > 1.03 * _room_under(by_chance)
 
-def test_the_number_of_processes_changes_no_bit(population):
-    chosen = settings("front", polish=30)
-    with Population(problem(), workers=3) as three:
-        assert bits(search(three, chosen)) == bits(search(population, chosen))
+    def test_sums_of_sines_are_searched_like_via_points(self):
+        """Method A of the paper, eq. 8, with a ramp so that it can be run."""
+        sines = problem(SineGenome(LIMITS, length=6.0, ramp=1.0))
+        with Population(sines) as population:
+            design = search(population, settings("a"))
+        assert isinstance(design.excitation.trajectory, FourierSeries)
+        assert design.excitation.method == "a"
+        assert not check_motion(design.excitation.trajectory, LIMITS)
+
+    @pytest.mark.parametrize(
+        ("method", "measure"),
+        [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index"), ("front", None)],
+    )
+    def test_a_polish_must_be_better_at_a_millisecond(self, population, method, measure):
+        unpolished = search(population, settings(method))
+        assert search(population.begin(), settings(method, polish=60)).chosen is None
+        with FinePopulation(unpolished.genes, measure) as finer:
+            design = search(finer, settings(method, polish=60))
+        assert design.genes.tobytes() == unpolished.genes.tobytes()
+        assert design.chosen == design.origin == unpolished.chosen
+        assert (
+            design.excitation.criteria == design.origin_criteria == unpolished.excitation.criteria
+        )
 
 
 def opened(file, chosen):
     return Journal(file, {"settings": asdict(chosen)})
 
 
-@pytest.mark.parametrize(("method", "after"), [("b", 1), ("front", 3), ("front", 6)])
-def test_a_resumed_search_equals_an_uninterrupted_one(population, method, after):
-    chosen = settings(method, polish=60)
-    whole = bits(search(population.begin(), chosen))
-    everything = sum(map(len, population.genes))
-    file = io.BytesIO()
-    half = search(population.begin(), chosen, journal=opened(file, chosen), stop=Stop(after))
-    assert not half.complete
-    assert half.generations == min(after, 4)
-    first = sum(map(len, population.genes))
-    journal = opened(file, chosen)
-    resumed = search(population.begin(), chosen, journal=journal)
-    assert bits(resumed) == whole
-    assert resumed.complete
-    assert journal.recalled == first
-    assert sum(map(len, population.genes)) == everything - first
+class TestRun:
+    @pytest.mark.parametrize("method", METHODS)
+    def test_a_seed_determines_every_bit(self, population, method, capsys):
+        """With any number of processes, whatever the generator that everybody shares."""
+        chosen = settings(method, polish=40)
+        np.random.seed(1)  # noqa: NPY002
+        first = search(population, chosen)
+        between = np.random.get_state()  # noqa: NPY002
+        np.random.seed(2)  # noqa: NPY002
+        again = search(population, chosen, progress=lambda _: np.random.random(3))  # noqa: NPY002
+        assert bits(again) == bits(first)
+        np.random.seed(1)  # noqa: NPY002
+        np.testing.assert_array_equal(np.random.get_state()[1], between[1])  # noqa: NPY002
+        assert capsys.readouterr() == ("", "")
+        if method == "front":
+            with Population(problem(), workers=3) as three:
+                assert bits(search(three, chosen)) == bits(first)
 
-
-@pytest.mark.parametrize("after", [0, 2, 6])
-def test_an_interrupt_loses_one_generation_only(population, after):
-    chosen = settings("front", polish=60)
-    whole = bits(search(population, chosen))
-    file = io.BytesIO()
-    with pytest.raises(KeyboardInterrupt):
-        search(population.begin(after), chosen, journal=opened(file, chosen))
-    journal = opened(file, chosen)
-    assert bits(search(population.begin(), chosen, journal=journal)) == whole
-    first = [200, 12, 12, 12, 12, 16, 16]
-    assert journal.recalled == sum(first[:after])
-
-
-def test_progress_reports_counts_and_the_best_motion():
-    seen, counts = [], []
-    with Population(problem()) as population:
-        design = search(
-            population, settings("front", polish=40), progress=seen.append, scored=counts.append
-        )
-    assert [each.phase for each in seen] == ["sample"] + 4 * ["search"] + 2 * ["polish"]
-    assert [each.generation for each in seen] == [0, 1, 2, 3, 4, 4, 4]
-    assert [each.evaluated for each in seen][:5] == [200, 212, 224, 236, 248]
-    assert seen[-1].evaluated == design.excitation.tried == sum(counts)
-    assert design.excitation.tried <= most_evaluations(settings("front", polish=40)) == 288
-    assert all(each.feasible == each.evaluated for each in seen)
-    assert list(seen[4].best) == design.front.measures[design.origin].tolist()
-
-
-def test_a_search_gets_from_infeasible_motions_to_feasible_ones(population):
-    """Infeasible motions are ranked by their excess."""
-    random = population.problem.score(np.random.default_rng(5).random((400, 8)))
-    bound = float(np.quantile(random.duration, 0.005))
-    seen = []
-    with Population(problem(max_duration=bound)) as narrow:
-        design = search(narrow, settings("b", generations=25, mutation=0.1), progress=seen.append)
-    assert seen[0].feasible == 0
-    assert design.excitation.trajectory.duration <= bound
-    excitation = design.excitation
-    assert excitation.rejected["duration"] == excitation.tried - seen[-1].feasible
-    assert np.all(design.front.duration <= bound)
-
-
-def test_the_error_has_the_smallest_violations(shared):
-    slow = JointLimits(
-        LIMITS.lower, LIMITS.upper, LIMITS.velocity * [1.0, 0.2], LIMITS.acceleration, LIMITS.jerk
+    @pytest.mark.parametrize(
+        ("method", "stop", "interrupt"),
+        [("b", 1, None), ("front", 3, None), ("front", 6, None)]
+        + [("front", 99, after) for after in (0, 2, 6)],
     )
-    with RecordingPopulation(problem(limits=slow, max_duration=0.5)) as impossible:
-        with pytest.raises(NoFeasibleMotionError) as caught:
-            search(impossible, settings("front"))
-        scores = impossible.everything
-    error = caught.value
-    assert error.tried == len(scores.duration)
-    assert error.rejected == {
-        "joint limit": int(np.count_nonzero(scores.excess[:, 1])),
-        "duration": error.tried,
-    }
-    assert not error.stopped
-    duration = error.nearest["duration"]
-    assert (duration.value, duration.bound) == (scores.duration.min(), 0.5)
-    limit = error.nearest["joint limit"]
-    assert limit.bound == slow.velocity[1]
-    assert limit.value > limit.bound
-    assert limit.excess == scores.excess[scores.excess[:, 1] > 0.0, 1].min()
-    for part in (f"none of {error.tried}", "joint limit", "velocity", f"at {limit.time:.3f} s"):
-        assert part in str(error)
+    def test_resumed_it_equals_an_uninterrupted_one(self, population, method, stop, interrupt):
+        """After a request to stop, or an interrupt that loses one generation."""
+        chosen = settings(method, polish=60)
+        whole = bits(search(population, chosen))
+        sizes = [len(genes) for genes in population.genes]
+        file, first = io.BytesIO(), population.begin(interrupt)
+        try:
+            half = search(first, chosen, journal=opened(file, chosen), stop=Stop(stop))
+            assert not half.complete and half.generations == min(stop, 4)
+        except KeyboardInterrupt:
+            assert len(population.genes) == interrupt
+        done = len(population.genes)
+        journal = opened(file, chosen)
+        resumed = search(population.begin(), chosen, journal=journal)
+        assert bits(resumed) == whole and resumed.complete
+        assert journal.recalled == sum(sizes[:done])
+        assert [len(genes) for genes in population.genes] == sizes[done:]
 
+    def test_progress_reports_counts_and_the_best_motion(self):
+        seen, counts = [], []
+        with Population(problem()) as population:
+            design = search(
+                population, settings("front", polish=40), progress=seen.append, scored=counts.append
+            )
+        assert [each.phase for each in seen] == ["sample"] + 4 * ["search"] + 2 * ["polish"]
+        assert [each.generation for each in seen] == [0, 1, 2, 3, 4, 4, 4]
+        assert [each.evaluated for each in seen][:5] == [200, 212, 224, 236, 248]
+        assert seen[-1].evaluated == design.excitation.tried == sum(counts)
+        assert design.excitation.tried <= most_evaluations(settings("front", polish=40)) == 288
+        assert all(each.feasible == each.evaluated for each in seen)
+        assert list(seen[4].best) == design.front.measures[design.origin].tolist()
 
-def test_an_early_stop_is_reported(population):
-    with pytest.raises(NoFeasibleMotionError, match=r"no motion was tried.*stopped") as caught:
-        search(population, settings("a"), stop=lambda: True)
-    assert (caught.value.tried, caught.value.stopped) == (0, True)
-    assert population.genes == []
-    with (
-        Population(problem(max_duration=0.5)) as impossible,
-        pytest.raises(NoFeasibleMotionError, match=r"none of 12 .*stopped before its end"),
-    ):
-        search(impossible, settings("a"), stop=Stop(1))
+    def test_a_motion_that_crashes_its_process_does_not_win(self, population):
+        small = settings("b", population=6, generations=1)
+        best = search(population, small).genes[0]
+        crashing = faulty(crash=(best - 0.01, best + 0.01))
+        with Population(problem(crashing), workers=2) as others:
+            design = search(others, small)
+        assert design.excitation.rejected == {"planning": 1}
+        assert abs(design.genes[0] - best) > 0.01
 
-
-def test_motions_that_excite_too_little_are_no_result():
-    """The elbow rests: all constraints are satisfied, its friction is not excited."""
-    with Population(problem(faulty(elbow_at_rest=True))) as population:
-        for method in METHODS:
-            with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:
-                search(population, settings(method, generations=2))
-            assert caught.value.unexciting == caught.value.tried
-            assert caught.value.rejected == {}
-
-
-def test_a_motion_that_crashes_its_process_does_not_win(population):
-    small = settings("b", population=6, generations=1)
-    best = search(population, small).genes[0]
-    crashing = faulty(crash=(best - 0.01, best + 0.01))
-    with Population(problem(crashing), workers=2) as others:
-        design = search(others, small)
-    assert design.excitation.rejected == {"planning": 1}
-    assert abs(design.genes[0] - best) > 0.01
-
-
-def test_a_search_without_new_motions_ends_as_exhausted(population):
-    design = search(population, settings("b", population=2, crossover=0.0, mutation=0.0))
-    assert design.complete and design.exhausted
-    assert design.generations == 1
-    assert design.excitation.tried == 2
+    def test_a_search_without_new_motions_ends_as_exhausted(self, population):
+        design = search(population, settings("b", population=2, crossover=0.0, mutation=0.0))
+        assert design.complete and design.exhausted
+        assert design.generations == 1
+        assert design.excitation.tried == 2
 
 
 PLANNING = KINDS.index("planning")
@@ -389,92 +305,91 @@ def scorers():
         yield scorers
 
 
-def test_scores_do_not_depend_on_processes_batch_and_order(scorers):
-    rows = genes(37)
-    expected = scorers.score(rows)
-    assert same(scorers.problem.score(rows), expected)
-    with Population(scorers.problem, workers=3) as three:
-        assert same(three.score(rows), expected)
-    order = np.random.default_rng(1).permutation(37)
-    assert scorers.score(rows[order]).rows.tobytes() == expected.rows[order].tobytes()
-    alone = [scorers.score(rows[k : k + 1]).rows for k in range(3)]
-    assert np.concatenate(alone).tobytes() == expected.rows[:3].tobytes()
-
-
-@pytest.mark.slow
-def test_a_timeout_applies_to_a_motion_alone(scorers):
-    """The other motions of its batch are scored."""
-    rows = genes(8, seed=4) * 0.9
-    rows[5, 0] = 1.0
-    with Population(problem(faulty(hang=(0.99, 1.0))), timeout=5.0) as slow:
-        begin = time.monotonic()
-        scores = slow.score(rows)
-        assert time.monotonic() - begin > 10.0  # once in company, once with all the time for itself
-    others = np.arange(8) != 5
-    np.testing.assert_array_equal(scores.feasible, others)
-    assert scores.rows[others].tobytes() == scorers.score(rows[others]).rows.tobytes()
-
-
-def test_unplannable_genes_are_worst_with_a_violation(scorers):
-    rows = genes(3)
-    rows[1, 0] = 1.0
-    with Population(problem(faulty(refuse=(0.999, 1.0)))) as refusing:
-        scores = refusing.score(rows)
-        (violation,) = refusing.violations(rows[1])
-        assert refusing.violations(rows[0]) == ()
-    np.testing.assert_array_equal(scores.feasible, [True, False, True])
-    np.testing.assert_array_equal(scores.rows[1], unplanned())
-    np.testing.assert_array_equal(unplanned()[:3], [-np.inf, np.inf, np.nan])
-    assert violation.kind == "planning" and "planning failed" in str(violation)
-    with Population(problem(faulty(crash=(0.0, 1.0)))) as crashing:
-        (violation,) = crashing.violations(rows[0])
-    assert violation.kind == "planning" and "signal 6" in str(violation)
-
-
-def test_a_killed_process_changes_nothing(scorers):
-    rows = genes(2)
-    expected = scorers.score(rows[:1]), scorers.evaluate(rows[0], 0.01)[1]
-    for pid in (child.pid for child in scorers._children):
-        os.kill(pid, signal.SIGKILL)
-    assert same(scorers.score(rows[:1]), expected[0])
-    os.kill(scorers._children[0].pid, signal.SIGKILL)
-    assert scorers.evaluate(rows[0], 0.01)[1] == expected[1]
-    os.kill(scorers._children[0].pid, signal.SIGKILL)
-    assert scorers.violations(rows[0]) == ()
-
-
 def currents(limit):
     model = problem().objective.model
     values = np.random.default_rng(2).uniform(0.1, 1.0, model.n_parameters)
     return CurrentModel(model, values, np.eye(2), np.ones(2), np.full(2, limit), uncertainty=0.2)
 
 
-def test_excess_is_that_of_the_violations_by_kind(scorers):
-    """Scores agree with the violations of the final check."""
-    slower = replace(LIMITS, velocity=0.8 * LIMITS.velocity)
-    asked = problem(max_duration=2.0, limits=slower, currents=currents(20.0))
-    rows = genes(16, seed=5)
-    scores = asked.score(rows)
-    for k, motion in enumerate(asked.genome.motions(rows)):
-        assert (scores.excess[k, KINDS.index("duration")] > 0.0) == (motion.duration > 2.0)
-        try:
-            check_limits(motion, slower)
-            fast = False
-        except LimitExceeded:
-            fast = True
-        assert (scores.excess[k, KINDS.index("joint limit")] > 0.0) == fast
-        assert {each.kind for each in asked.violations(rows[k])} == {
-            KINDS[j] for j in np.flatnonzero(scores.excess[k])
-        }
-        last = check_motion(motion, slower, currents=asked.constraints.currents)
-        last_excess = excess_by_kind([each for each in last if each.kind != "duration"])
-        others = np.array(KINDS) != "duration"
-        np.testing.assert_array_equal(scores.excess[k, others], last_excess[others])
-        measures = asked.objective.measures(midpoints(motion, asked.period))
-        assert scores.measures[k].tolist() == list(measures.values())
-    assert set(np.flatnonzero(scores.excess.any(axis=0))) >= {1, 2, 5}
-    # constraints decide what is feasible, not what is measured
-    np.testing.assert_array_equal(scores.measures, scorers.score(rows).measures)
+class TestScores:
+    def test_they_do_not_depend_on_processes_batch_and_order(self, scorers):
+        rows = genes(37)
+        expected = scorers.score(rows)
+        assert same(scorers.problem.score(rows), expected)
+        with Population(scorers.problem, workers=3) as three:
+            assert same(three.score(rows), expected)
+        order = np.random.default_rng(1).permutation(37)
+        assert scorers.score(rows[order]).rows.tobytes() == expected.rows[order].tobytes()
+        alone = [scorers.score(rows[k : k + 1]).rows for k in range(3)]
+        assert np.concatenate(alone).tobytes() == expected.rows[:3].tobytes()
+
+    @pytest.mark.slow
+    def test_a_timeout_applies_to_a_motion_alone(self, scorers):
+        """The other motions of its batch are scored."""
+        rows = genes(8, seed=4) * 0.9
+        rows[5, 0] = 1.0
+        with Population(problem(faulty(hang=(0.99, 1.0))), timeout=5.0) as slow:
+            begin = time.monotonic()
+            scores = slow.score(rows)
+            assert (
+                time.monotonic() - begin > 10.0
+            )  # once in company, once with all the time for itself
+        others = np.arange(8) != 5
+        np.testing.assert_array_equal(scores.feasible, others)
+        assert scores.rows[others].tobytes() == scorers.score(rows[others]).rows.tobytes()
+
+    def test_unplannable_genes_are_worst_with_a_violation(self, scorers):
+        rows = genes(3)
+        rows[1, 0] = 1.0
+        with Population(problem(faulty(refuse=(0.999, 1.0)))) as refusing:
+            scores = refusing.score(rows)
+            (violation,) = refusing.violations(rows[1])
+            assert refusing.violations(rows[0]) == ()
+        np.testing.assert_array_equal(scores.feasible, [True, False, True])
+        np.testing.assert_array_equal(scores.rows[1], unplanned())
+        np.testing.assert_array_equal(unplanned()[:3], [-np.inf, np.inf, np.nan])
+        assert violation.kind == "planning" and "planning failed" in str(violation)
+        with Population(problem(faulty(crash=(0.0, 1.0)))) as crashing:
+            (violation,) = crashing.violations(rows[0])
+        assert violation.kind == "planning" and "signal 6" in str(violation)
+
+    def test_a_killed_process_changes_nothing(self, scorers):
+        rows = genes(2)
+        expected = scorers.score(rows[:1]), scorers.evaluate(rows[0], 0.01)[1]
+        for pid in (child.pid for child in scorers._children):
+            os.kill(pid, signal.SIGKILL)
+        assert same(scorers.score(rows[:1]), expected[0])
+        os.kill(scorers._children[0].pid, signal.SIGKILL)
+        assert scorers.evaluate(rows[0], 0.01)[1] == expected[1]
+        os.kill(scorers._children[0].pid, signal.SIGKILL)
+        assert scorers.violations(rows[0]) == ()
+
+    def test_excess_is_that_of_the_violations_by_kind(self, scorers):
+        """Scores agree with the violations of the final check."""
+        slower = replace(LIMITS, velocity=0.8 * LIMITS.velocity)
+        asked = problem(max_duration=2.0, limits=slower, currents=currents(20.0))
+        rows = genes(16, seed=5)
+        scores = asked.score(rows)
+        for k, motion in enumerate(asked.genome.motions(rows)):
+            assert (scores.excess[k, KINDS.index("duration")] > 0.0) == (motion.duration > 2.0)
+            try:
+                check_limits(motion, slower)
+                fast = False
+            except LimitExceeded:
+                fast = True
+            assert (scores.excess[k, KINDS.index("joint limit")] > 0.0) == fast
+            assert {each.kind for each in asked.violations(rows[k])} == {
+                KINDS[j] for j in np.flatnonzero(scores.excess[k])
+            }
+            last = check_motion(motion, slower, currents=asked.constraints.currents)
+            last_excess = excess_by_kind([each for each in last if each.kind != "duration"])
+            others = np.array(KINDS) != "duration"
+            np.testing.assert_array_equal(scores.excess[k, others], last_excess[others])
+            measures = asked.objective.measures(midpoints(motion, asked.period))
+            assert scores.measures[k].tolist() == list(measures.values())
+        assert set(np.flatnonzero(scores.excess.any(axis=0))) >= {1, 2, 5}
+        # constraints decide what is feasible, not what is measured
+        np.testing.assert_array_equal(scores.measures, scorers.score(rows).measures)
 
 
 def scored(log10_det, coupling_index, excess):
@@ -484,26 +399,90 @@ def scored(log10_det, coupling_index, excess):
     return row
 
 
-@pytest.mark.parametrize(("method", "n_objectives"), [("b", 1), ("front", 2)])
-def test_unexciting_and_unplannable_motions_rank_last(method, n_objectives):
-    rows = np.array(
-        [
-            unplanned(),
-            scored(-np.inf, np.inf, 0.0),  # satisfies everything, and leaves a parameter out
-            scored(-np.inf, np.inf, 0.3),
-            scored(80.0, 90.0, 40.0),  # far beyond a limit
-            scored(81.0, 90.0, 0.2),
-            scored(70.0, 100.0, 0.0),
-        ]
-    )
-    first = np.linspace(0.1, 0.9, len(rows))[:, None] * np.ones(4)
-    settings = SearchSettings(method=method, population=len(rows), generations=2)
-    evolution = Evolution(settings, first, n_objectives)
-    asked = evolution.ask()
-    scores = Scores.of_rows(rows)
-    evolution.tell(scores, scores.measures[:, :n_objectives] * [-1.0, 1.0][:n_objectives])
-    children = evolution.ask()
-    without_motion = np.tile(unplanned(), (len(children), 1))
-    evolution.tell(Scores.of_rows(without_motion), np.zeros((len(children), n_objectives)))
-    ranked = evolution._algorithm.pop.get("X")
-    np.testing.assert_array_equal(ranked[:5], asked[[5, 4, 3, 1, 2]])
+class TestInfeasibleMotions:
+    def test_a_search_gets_from_them_to_feasible_ones(self, population):
+        """Infeasible motions are ranked by their excess."""
+        random = population.problem.score(np.random.default_rng(5).random((400, 8)))
+        bound = float(np.quantile(random.duration, 0.005))
+        seen = []
+        with Population(problem(max_duration=bound)) as narrow:
+            design = search(
+                narrow, settings("b", generations=25, mutation=0.1), progress=seen.append
+            )
+        assert seen[0].feasible == 0
+        assert design.excitation.trajectory.duration <= bound
+        excitation = design.excitation
+        assert excitation.rejected["duration"] == excitation.tried - seen[-1].feasible
+        assert np.all(design.front.duration <= bound)
+
+    def test_the_error_has_the_smallest_violations(self, shared):
+        slow = JointLimits(
+            LIMITS.lower,
+            LIMITS.upper,
+            LIMITS.velocity * [1.0, 0.2],
+            LIMITS.acceleration,
+            LIMITS.jerk,
+        )
+        with RecordingPopulation(problem(limits=slow, max_duration=0.5)) as impossible:
+            with pytest.raises(NoFeasibleMotionError) as caught:
+                search(impossible, settings("front"))
+            scores = impossible.everything
+        error = caught.value
+        assert error.tried == len(scores.duration)
+        assert error.rejected == {
+            "joint limit": int(np.count_nonzero(scores.excess[:, 1])),
+            "duration": error.tried,
+        }
+        assert not error.stopped
+        duration = error.nearest["duration"]
+        assert (duration.value, duration.bound) == (scores.duration.min(), 0.5)
+        limit = error.nearest["joint limit"]
+        assert limit.bound == slow.velocity[1]
+        assert limit.value > limit.bound
+        assert limit.excess == scores.excess[scores.excess[:, 1] > 0.0, 1].min()
+        for part in (f"none of {error.tried}", "joint limit", "velocity", f"at {limit.time:.3f} s"):
+            assert part in str(error)
+
+    def test_an_early_stop_is_reported(self, population):
+        with pytest.raises(NoFeasibleMotionError, match=r"no motion was tried.*stopped") as caught:
+            search(population, settings("a"), stop=lambda: True)
+        assert (caught.value.tried, caught.value.stopped) == (0, True)
+        assert population.genes == []
+        with (
+            Population(problem(max_duration=0.5)) as impossible,
+            pytest.raises(NoFeasibleMotionError, match=r"none of 12 .*stopped before its end"),
+        ):
+            search(impossible, settings("a"), stop=Stop(1))
+
+    def test_motions_that_excite_too_little_are_no_result(self):
+        """The elbow rests: all constraints are satisfied, its friction is not excited."""
+        with Population(problem(faulty(elbow_at_rest=True))) as population:
+            for method in METHODS:
+                with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:
+                    search(population, settings(method, generations=2))
+                assert caught.value.unexciting == caught.value.tried
+                assert caught.value.rejected == {}
+
+    @pytest.mark.parametrize(("method", "n_objectives"), [("b", 1), ("front", 2)])
+    def test_unexciting_and_unplannable_motions_rank_last(self, method, n_objectives):
+        rows = np.array(
+            [
+                unplanned(),
+                scored(-np.inf, np.inf, 0.0),  # satisfies everything, and leaves a parameter out
+                scored(-np.inf, np.inf, 0.3),
+                scored(80.0, 90.0, 40.0),  # far beyond a limit
+                scored(81.0, 90.0, 0.2),
+                scored(70.0, 100.0, 0.0),
+            ]
+        )
+        first = np.linspace(0.1, 0.9, len(rows))[:, None] * np.ones(4)
+        settings = SearchSettings(method=method, population=len(rows), generations=2)
+        evolution = Evolution(settings, first, n_objectives)
+        asked = evolution.ask()
+        scores = Scores.of_rows(rows)
+        evolution.tell(scores, scores.measures[:, :n_objectives] * [-1.0, 1.0][:n_objectives])
+        children = evolution.ask()
+        without_motion = np.tile(unplanned(), (len(children), 1))
+        evolution.tell(Scores.of_rows(without_motion), np.zeros((len(children), n_objectives)))
+        ranked = evolution._algorithm.pop.get("X")
+        np.testing.assert_array_equal(ranked[:5], asked[[5, 4, 3, 1, 2]])

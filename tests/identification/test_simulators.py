@@ -28,7 +28,7 @@ from identification.signals.smoothing import LowPassShape, low_passed
 from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-from tests.identification.two_link import URDF, as_samples, one_sine, sine_motion
+from tests.identification.two_link import URDF, as_samples, one_sine, sine_motion, values_of
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
 WRIST = np.eye(6)
@@ -41,18 +41,22 @@ def an_arm(urdf, **options):
     n = model.n_joints
     standard = np.zeros(model.layout.size)
     standard[: 11 * n] = some_bodies(n)
+    standard[model.layout.rotors] += 1.0
     for k, (i, j) in enumerate(model.layout.pairs):
         rotors = model.layout.rotors[[i, j]]
         standard[model.layout.couplings[k]] = 0.3 * np.sqrt(np.prod(standard[rotors]))
-    others = np.random.default_rng(1).uniform(0.1, 2.0, model.n_parameters - model.base.rank)
+    others = np.random.default_rng(1).uniform(0.5, 2.5, model.n_parameters - model.base.rank)
     values = np.concatenate([model.base.grouping @ standard, others])
     infinite = np.full(n, np.inf)
     return Arm(urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite))
 
 
-def readable(form):
+def compared(form, arm, remarks=(), samples=20):
+    """Compare the file of an arm with its model; skips without a reader of the form."""
     if form == "mjcf":
         pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    text = FORMATS[form].write(arm, "arm", list(remarks))
+    return compare(text, FORMATS[form], arm, random_states(arm, samples))
 
 
 FORMS = pytest.mark.parametrize("form", FORMATS)
@@ -64,23 +68,18 @@ class TestReadBack:
     @FORMS
     @pytest.mark.parametrize("seed", [1, 2])
     def test_trees_of_any_joints(self, form, seed):
-        readable(form)
         arm = an_arm(random_urdf(seed), friction=FrictionLaw(third="cubic"))
-        text = FORMATS[form].write(arm, "random", [])
-        assert compare(text, FORMATS[form], arm, random_states(arm, 20)).difference < AGREES
+        assert compared(form, arm).difference < AGREES
 
     @FORMS
     def test_a_published_description(self, form):
         """With rounded angles and locked joints."""
-        readable(form)
-        arm = an_arm(robot_text("panda_description/urdf/panda.urdf"),
-                     locked={"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02})  # fmt: skip
-        text = FORMATS[form].write(arm, "panda", ["a -- remark"])
-        assert compare(text, FORMATS[form], arm, random_states(arm, 20)).difference < AGREES
+        locked = dict.fromkeys(("panda_finger_joint1", "panda_finger_joint2"), 0.02)
+        arm = an_arm(robot_text("panda_description/urdf/panda.urdf"), locked=locked)
+        assert compared(form, arm, ["a -- remark"]).difference < AGREES
 
     @FORMS
     def test_everything_that_an_arm_can_have(self, form):
-        readable(form)
         arm = an_arm(
             urdf_text(),
             friction=LAW,
@@ -94,9 +93,7 @@ class TestReadBack:
                 TorqueRipple("joint_1", (("joint_1", 100.0),), (1,)),
             ],
         )
-        motion = random_states(arm, 200)
-        found = compare(FORMATS[form].write(arm, "arm", []), FORMATS[form], arm, motion)
-        left = set(found.left_out)
+        left = set(compared(form, arm, samples=200).left_out)
         everywhere = {"half the difference fd of viscous friction forwards and backwards",
                       "additional friction fs at low speed (Stribeck)", "a constant offset fo",
                       "TorqueRipple of joint_1", "GasCylinder of joint_3"}  # fmt: skip
@@ -109,10 +106,8 @@ class TestReadBack:
 
     @FORMS
     def test_parts_left_out_have_their_own_torque(self, form):
-        readable(form)
         arm = an_arm(urdf_text(), friction=FrictionLaw(offset=True), coupling=Coupling(WRIST))
-        motion = random_states(arm, 50)
-        found = compare(FORMATS[form].write(arm, "arm", []), FORMATS[form], arm, motion)
+        motion, found = random_states(arm, 50), compared(form, arm, samples=50)
         offset = arm.friction[0]["fo"]
         np.testing.assert_allclose(found.left_out["a constant offset fo"][0], offset)
         if form != "mjcf":
@@ -121,8 +116,8 @@ class TestReadBack:
 
     @FORMS
     def test_a_changed_text_is_refused(self, form):
-        readable(form)
         arm = an_arm(urdf_text())
+        compared(form, arm)
         other = replace(arm, standard=1.01 * arm.standard)
         text = FORMATS[form].write(other, "arm", [])
         with pytest.raises(WriteBackError, match="joint_"):
@@ -175,10 +170,8 @@ def model_with(**law):
     return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, offset=True, **law))
 
 
-def values_of(model):
-    standard = model.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([model.base.grouping @ standard, F0, F1, FO])
+def planted(model):
+    return values_of(model, np.concatenate([F0, F1, FO]), (0.4, 0.1))
 
 
 def samples_of(model, bandwidth=None):
@@ -191,7 +184,7 @@ def samples_of(model, bandwidth=None):
         position_bandwidth=np.full(2, 10.0),
         torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
     ).with_friction_direction(model)
-    return replace(samples, torque=samples.predicted_torque(model, values_of(model)))
+    return replace(samples, torque=samples.predicted_torque(model, planted(model)))
 
 
 class TestParts:
@@ -202,19 +195,19 @@ class TestParts:
     def test_add_up_to_it(self, bandwidth, presliding):
         model = model_with(presliding=presliding)
         samples = samples_of(model, bandwidth)
-        parts = torque_parts(model, values_of(model), samples)
+        parts = torque_parts(model, planted(model), samples)
         np.testing.assert_allclose(sum(parts), samples.torque, atol=1e-9)
 
     def test_are_those_of_the_whole_where_samples_are_a_part(self):
         model = model_with()
         whole = samples_of(model, 20.0)
-        some = torque_parts(model, values_of(model), whole.between(500, 900))
-        for part, all_rows in zip(some, torque_parts(model, values_of(model), whole), strict=True):
+        some = torque_parts(model, planted(model), whole.between(500, 900))
+        for part, all_rows in zip(some, torque_parts(model, planted(model), whole), strict=True):
             np.testing.assert_array_equal(part, all_rows[500:900])
 
     def test_follow_what_they_are_named_after(self):
         """Doubled speed: Coriolis torque grows fourfold; inertia and gravity stay."""
-        model, values = model_with(), values_of(model_with())
+        model, values = model_with(), planted(model_with())
         samples = samples_of(model)
         fast = replace(
             samples, motion=samples.motion._replace(velocity=2.0 * samples.motion.velocity)
@@ -233,7 +226,7 @@ class TestFrictionCurve:
 
     def test_jumps_at_zero_and_has_the_offset(self):
         model = model_with()
-        curve = friction_curve(model, values_of(model), 1, -2.0, 3.0)
+        curve = friction_curve(model, planted(model), 1, -2.0, 3.0)
         assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
         ends = [-F0[1] - 2.0 * F1[1] + FO[1], F0[1] + 3.0 * F1[1] + FO[1]]
         np.testing.assert_allclose(curve.sliding[[0, -1]], ends)
@@ -244,7 +237,7 @@ class TestFrictionCurve:
 
     def test_reverses_over_the_presliding_displacement(self):
         model = model_with(presliding=PRESLIDING)
-        curve = friction_curve(model, values_of(model), 0, -1.0, 1.0)
+        curve = friction_curve(model, planted(model), 0, -1.0, 1.0)
         assert curve.turning[0] == pytest.approx(FO[0] - F0[0])
         assert curve.turning[-1] == pytest.approx(FO[0] + F0[0], rel=0.01)
         zero = np.interp(0.0, curve.turning - FO[0], curve.travel)
@@ -255,13 +248,13 @@ class TestFrictionCurve:
         law = FrictionLaw(third=None, offset=True)
         spring = TorsionSpring("shoulder", 0.2, identified=True)
         model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
-        curve = friction_curve(model, np.append(values_of(model_with()), 25.0), 0, -1.0, 1.0)
+        curve = friction_curve(model, np.append(planted(model_with()), 25.0), 0, -1.0, 1.0)
         assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
 
     def test_agrees_with_the_data(self):
         """Torque minus the other parts is on the curve for a perfect model."""
         model = model_with()
-        values, samples = values_of(model), samples_of(model)
+        values, samples = planted(model), samples_of(model)
         speed = samples.motion.velocity[:, 0]
         curve = friction_curve(model, values, 0, float(speed.min()), float(speed.max()))
         on_it = np.interp(speed, curve.speed, curve.sliding)
@@ -332,13 +325,8 @@ class TestNoise:
 
 
 def an_ns16(**options):
-    model = RobotModel.from_urdf(urdf_text(), **options)
-    standard = np.zeros(model.layout.size)
-    standard[:66] = some_bodies(6)
-    standard[model.layout.rotors] += 1.0
-    others = np.random.default_rng(1).uniform(1.0, 3.0, model.n_parameters - model.base.rank)
-    values = np.concatenate([model.base.grouping @ standard, others])
-    return Simulated(model, standard[None], values[None])
+    arm = an_arm(urdf_text(), **options)
+    return Simulated(arm.model, arm.standard[None], arm.values[None])
 
 
 def recorded(arm, step=0.002):
@@ -427,9 +415,8 @@ def together(*arms):
 
 def by_mujoco(arm, given):
     mujoco = load_mujoco()
-    infinite = np.full(6, np.inf)
-    ranges = Ranges(-infinite, infinite, infinite, infinite)
-    text = mjcf(Arm(urdf_text(), arm.model, arm.standard[0], arm.values[0], ranges), "arm")
+    own = {"model": arm.model, "standard": arm.standard[0], "values": arm.values[0]}
+    text = mjcf(replace(an_arm(urdf_text()), **own), "arm")
     model = mujoco.MjModel.from_xml_string(text)
     model.opt.timestep = 1e-3
     data = mujoco.MjData(model)

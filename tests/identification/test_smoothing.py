@@ -14,11 +14,11 @@ from identification.signals.recording import Recording
 from identification.signals.smoothing import fit_smoothing_spline, low_pass
 
 
-def noisy_sines(sigma, *, samples=8000, step=0.001):
+def noisy_sines(sigma, *, jitter=0.0):
     """Time and two channels of a few hertz."""
-    time = np.arange(samples) * step
     rng = np.random.default_rng(3)
-    return time, sines(time) + sigma * rng.standard_normal((samples, 2))
+    time = np.arange(8000) * 1e-3 + jitter * rng.uniform(-1.0, 1.0, 8000)
+    return time, sines(time) + sigma * rng.standard_normal((8000, 2))
 
 
 def sines(time, derivative=0):
@@ -28,115 +28,105 @@ def sines(time, derivative=0):
     return np.asarray((a * w**derivative * np.sin(phase)).sum(axis=1))
 
 
-@given(
-    coefficients=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
-    tolerance=st.floats(1e-12, 1e-2),
-    seed=st.integers(0, 2**16),
-)
-def test_parabolas_pass_unchanged(coefficients, tolerance, seed):
-    # The roughness of a parabola is zero.
-    time = np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 300))
-    polynomial = np.polynomial.Polynomial(coefficients)
-    spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([tolerance]))
-    np.testing.assert_allclose(spline(time)[:, 0], polynomial(time), atol=1e-7)
-    np.testing.assert_allclose(spline(time, 1)[:, 0], polynomial.deriv()(time), atol=1e-5)
-    np.testing.assert_allclose(spline(time, 2)[:, 0], polynomial.deriv(2)(time), atol=1e-3)
+class TestLowPass:
+    def test_it_is_a_zero_phase_butterworth(self):
+        # |H|^2 of a third-order Butterworth is 1 / (1 + (w/w_c)^6), the smoother's own gain.
+        time, values = noisy_sines(0.1)
+        sections = butter(3, 6.0, fs=1000.0, output="sos")
+        expected = sosfiltfilt(sections, values, axis=0)
+        inner = slice(1000, -1000)
+        np.testing.assert_allclose(low_pass(time, values, 6.0)[inner], expected[inner], atol=2e-4)
+
+    @given(st.floats(1.0, 60.0), st.integers(0, 2**16))
+    def test_it_is_linear_and_keeps_constants(self, bandwidth, seed):
+        rng = np.random.default_rng(seed)
+        time = np.arange(400) * 2e-3
+        x, y = rng.standard_normal((2, 400, 3))
+        combined = low_pass(time, 2.0 * x - 0.5 * y, bandwidth)
+        apart = 2.0 * low_pass(time, x, bandwidth) - 0.5 * low_pass(time, y, bandwidth)
+        np.testing.assert_allclose(combined, apart, atol=1e-9)
+        np.testing.assert_allclose(low_pass(time, np.ones((400, 1)), bandwidth), 1.0, atol=1e-9)
 
 
-def test_quintics_are_reproduced_with_small_tolerance():
-    time = np.linspace(0.0, 1.0, 400)
-    polynomial = np.polynomial.Polynomial([0.2, -1.0, 3.0, 2.0, -4.0, 1.5])
-    spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([1e-24]))
-    # Rounding, divided by the knot spacing once per derivative.
-    for derivative, tolerance in ((0, 1e-12), (1, 1e-8), (2, 1e-4)):
-        expected = polynomial.deriv(derivative)(time) if derivative else polynomial(time)
-        np.testing.assert_allclose(spline(time, derivative)[:, 0], expected, atol=tolerance)
+class TestSmoothingSpline:
+    @given(
+        coefficients=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+        tolerance=st.floats(1e-12, 1e-2),
+        seed=st.integers(0, 2**16),
+    )
+    def test_parabolas_pass_unchanged(self, coefficients, tolerance, seed):
+        # The roughness of a parabola is zero.
+        time = np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 300))
+        polynomial = np.polynomial.Polynomial(coefficients)
+        spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([tolerance]))
+        np.testing.assert_allclose(spline(time)[:, 0], polynomial(time), atol=1e-7)
+        np.testing.assert_allclose(spline(time, 1)[:, 0], polynomial.deriv()(time), atol=1e-5)
+        np.testing.assert_allclose(spline(time, 2)[:, 0], polynomial.deriv(2)(time), atol=1e-3)
 
+    def test_quintics_are_reproduced_with_small_tolerance(self):
+        time = np.linspace(0.0, 1.0, 400)
+        polynomial = np.polynomial.Polynomial([0.2, -1.0, 3.0, 2.0, -4.0, 1.5])
+        spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([1e-24]))
+        # Rounding, divided by the knot spacing once per derivative.
+        for derivative, tolerance in ((0, 1e-12), (1, 1e-8), (2, 1e-4)):
+            expected = polynomial.deriv(derivative)(time) if derivative else polynomial(time)
+            np.testing.assert_allclose(spline(time, derivative)[:, 0], expected, atol=tolerance)
 
-@pytest.mark.parametrize("sigma", [1e-6, 1e-4, 1e-2])
-def test_the_mean_squared_residual_is_the_tolerance(sigma):
-    time, values = noisy_sines(sigma)
-    spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
-    measured = np.mean((values - spline(time)) ** 2, axis=0)
-    np.testing.assert_allclose(measured, sigma**2, rtol=1e-3)
+    @pytest.mark.parametrize(
+        ("sigma", "jitter"), [(1e-6, 0.0), (1e-4, 0.0), (1e-2, 0.0), (1e-4, 4e-4)]
+    )
+    def test_the_mean_squared_residual_is_the_tolerance(self, sigma, jitter):
+        time, values = noisy_sines(sigma, jitter=jitter)
+        spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
+        measured = np.mean((values - spline(time)) ** 2, axis=0)
+        np.testing.assert_allclose(measured, sigma**2, rtol=1e-3)
+        if jitter:
+            error = (spline(time, 2) - sines(time, 2))[200:-200]
+            assert np.std(error) < 0.01 * np.std(sines(time, 2))
 
+    def test_derivatives_are_better_than_differences(self):
+        sigma = 1e-5
+        time, values = noisy_sines(sigma)
+        spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
+        inner = slice(200, -200)
+        error = [np.std((spline(time, d) - sines(time, d))[inner]) for d in range(3)]
+        assert error[0] < 0.4 * sigma
+        assert error[1] < 2e-3 * np.std(sines(time, 1))
+        assert error[2] < 5e-3 * np.std(sines(time, 2))
+        differences = np.gradient(np.gradient(values, time, axis=0), time, axis=0)
+        assert np.std((differences - sines(time, 2))[inner]) > 50 * error[2]
 
-def test_derivatives_are_better_than_differences():
-    sigma = 1e-5
-    time, values = noisy_sines(sigma)
-    spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
-    inner = slice(200, -200)
-    error = [np.std((spline(time, d) - sines(time, d))[inner]) for d in range(3)]
-    assert error[0] < 0.4 * sigma
-    assert error[1] < 2e-3 * np.std(sines(time, 1))
-    assert error[2] < 5e-3 * np.std(sines(time, 2))
-    differences = np.gradient(np.gradient(values, time, axis=0), time, axis=0)
-    assert np.std((differences - sines(time, 2))[inner]) > 50 * error[2]
+    def test_it_minimises_squares_plus_roughness(self):
+        # Small enough for a dense solution by SciPy splines and quadrature.
+        rng = np.random.default_rng(5)
+        time = np.sort(rng.uniform(0.0, 1.0, 40))
+        values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
+        spline = fit_smoothing_spline(time, values[:, None], np.array([0.05**2]))
+        k = len(spline.coefficients)
+        knots = spline.start + spline.spacing * np.arange(-5, k + 1)
+        basis = BSpline(knots, np.eye(k), 5)
+        third = basis.derivative(3)
+        roughness = np.zeros((k, k))
+        for i in range(k):
+            for j in range(max(0, i - 5), i + 1):
+                pieces = [
+                    quad(lambda t, i=i, j=j: third(t)[i] * third(t)[j], *knots[p : p + 2])[0]
+                    for p in range(max(i, 5), min(j + 6, k))
+                ]
+                roughness[i, j] = roughness[j, i] = sum(pieces)
+        density = len(time) / (time[-1] - time[0])
+        penalty = density / (2.0 * np.pi * spline.bandwidth[0]) ** 6
+        rows = basis(time)
+        dense = np.linalg.solve(rows.T @ rows + penalty * roughness, rows.T @ values)
+        np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
 
-
-def test_it_minimises_squares_plus_roughness():
-    # Small enough for a dense solution by SciPy splines and quadrature.
-    rng = np.random.default_rng(5)
-    time = np.sort(rng.uniform(0.0, 1.0, 40))
-    values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
-    spline = fit_smoothing_spline(time, values[:, None], np.array([0.05**2]))
-    k = len(spline.coefficients)
-    knots = spline.start + spline.spacing * np.arange(-5, k + 1)
-    basis = BSpline(knots, np.eye(k), 5)
-    third = basis.derivative(3)
-    roughness = np.zeros((k, k))
-    for i in range(k):
-        for j in range(max(0, i - 5), i + 1):
-            pieces = [
-                quad(lambda t, i=i, j=j: third(t)[i] * third(t)[j], *knots[p : p + 2])[0]
-                for p in range(max(i, 5), min(j + 6, k))
-            ]
-            roughness[i, j] = roughness[j, i] = sum(pieces)
-    density = len(time) / (time[-1] - time[0])
-    penalty = density / (2.0 * np.pi * spline.bandwidth[0]) ** 6
-    rows = basis(time)
-    dense = np.linalg.solve(rows.T @ rows + penalty * roughness, rows.T @ values)
-    np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
-
-
-def test_the_low_pass_is_a_zero_phase_butterworth():
-    # |H|^2 of a third-order Butterworth is 1 / (1 + (w/w_c)^6), the smoother's own gain.
-    time, values = noisy_sines(0.1)
-    sections = butter(3, 6.0, fs=1000.0, output="sos")
-    expected = sosfiltfilt(sections, values, axis=0)
-    inner = slice(1000, -1000)
-    np.testing.assert_allclose(low_pass(time, values, 6.0)[inner], expected[inner], atol=2e-4)
-
-
-@given(st.floats(1.0, 60.0), st.integers(0, 2**16))
-def test_the_low_pass_is_linear_and_keeps_constants(bandwidth, seed):
-    rng = np.random.default_rng(seed)
-    time = np.arange(400) * 2e-3
-    x, y = rng.standard_normal((2, 400, 3))
-    combined = low_pass(time, 2.0 * x - 0.5 * y, bandwidth)
-    apart = 2.0 * low_pass(time, x, bandwidth) - 0.5 * low_pass(time, y, bandwidth)
-    np.testing.assert_allclose(combined, apart, atol=1e-9)
-    np.testing.assert_allclose(low_pass(time, np.ones((400, 1)), bandwidth), 1.0, atol=1e-9)
-
-
-def test_clock_jitter_has_no_effect():
-    rng = np.random.default_rng(11)
-    sigma = 1e-4
-    time = np.arange(8000) * 1e-3 + rng.uniform(-4e-4, 4e-4, 8000)
-    values = sines(time) + sigma * rng.standard_normal((8000, 2))
-    spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
-    np.testing.assert_allclose(np.mean((values - spline(time)) ** 2, axis=0), sigma**2, rtol=1e-3)
-    error = (spline(time, 2) - sines(time, 2))[200:-200]
-    assert np.std(error) < 0.01 * np.std(sines(time, 2))
-
-
-def test_knots_are_refined_to_the_tolerance():
-    # 120 Hz at 1 kHz: one knot per four samples cannot follow, one per sample can.
-    time = np.arange(2000) * 1e-3
-    values = np.sin(2.0 * np.pi * 120.0 * time)[:, None]
-    spline = fit_smoothing_spline(time, values, np.array([1e-8]))
-    assert spline.spacing < 3e-3
-    assert np.mean((values - spline(time)) ** 2) <= 1.001e-8
+    def test_knots_are_refined_to_the_tolerance(self):
+        # 120 Hz at 1 kHz: one knot per four samples cannot follow, one per sample can.
+        time = np.arange(2000) * 1e-3
+        values = np.sin(2.0 * np.pi * 120.0 * time)[:, None]
+        spline = fit_smoothing_spline(time, values, np.array([1e-8]))
+        assert spline.spacing < 3e-3
+        assert np.mean((values - spline(time)) ** 2) <= 1.001e-8
 
 
 STEP = 1e-3
@@ -170,51 +160,49 @@ def within(variance, expected, freedom):
     return bool(np.all(np.abs(variance / expected - 1.0) < 4.0 * np.sqrt(2.0 / freedom)))
 
 
-@pytest.mark.parametrize("count", [2, 5])
-def test_noise_is_measured_during_motion(count):
-    noise = repetition_noise([repetition(seed, start=7.0 * seed) for seed in range(count)])
-    freedom = 4500.0 * (count - 1)
-    # differences of neighbours hold fewer degrees of freedom
-    assert within(noise.position, POSITION_NOISE**2, freedom / 3.0)
-    assert within(noise.torque, TORQUE_NOISE**2, freedom / 3.0)
+class TestRepetitionNoise:
+    @pytest.mark.parametrize("count", [2, 5])
+    def test_it_is_measured_during_motion(self, count):
+        noise = repetition_noise([repetition(seed, start=7.0 * seed) for seed in range(count)])
+        freedom = 4500.0 * (count - 1)
+        # differences of neighbours hold fewer degrees of freedom
+        assert within(noise.position, POSITION_NOISE**2, freedom / 3.0)
+        assert within(noise.torque, TORQUE_NOISE**2, freedom / 3.0)
 
+    def test_noise_absent_at_standstill_is_found(self):
+        """A coarse reading is constant at rest."""
+        resolution = 1e-3
 
-def test_noise_absent_at_standstill_is_found():
-    """A coarse reading is constant at rest."""
-    resolution = 1e-3
+        def read(seed):
+            one = repetition(seed)
+            shifted = one.position + 1e-5 * np.random.default_rng(seed).standard_normal()
+            return replace(one, position=np.round(shifted / resolution) * resolution)
 
-    def read(seed):
-        one = repetition(seed)
-        shifted = one.position + 1e-5 * np.random.default_rng(seed).standard_normal()
-        return replace(one, position=np.round(shifted / resolution) * resolution)
+        moving = repetition_noise([read(1), read(2)])
+        resting = standstill_variance(STEP * np.arange(400), read(1).position[:400])
+        assert np.all(resting == 0.0)
+        assert np.all(moving.position > 1e-3 * resolution**2)
 
-    moving = repetition_noise([read(1), read(2)])
-    resting = standstill_variance(STEP * np.arange(400), read(1).position[:400])
-    assert np.all(resting == 0.0)
-    assert np.all(moving.position > 1e-3 * resolution**2)
+    @pytest.mark.parametrize(
+        "other",
+        [
+            repetition(2, drift=0.1),
+            repetition(2, start=3.0).between(200, 5000),
+            repetition(2, gap=2000),
+        ],
+        ids=["friction drift", "other start", "gap"],
+    )
+    def test_drift_starts_and_gaps_are_not_noise(self, other):
+        noise = repetition_noise([repetition(1), other])
+        assert within(noise.position, POSITION_NOISE**2, 1500.0)
+        assert within(noise.torque, TORQUE_NOISE**2, 1500.0)
 
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        repetition(2, drift=0.1),
-        repetition(2, start=3.0).between(200, 5000),
-        repetition(2, gap=2000),
-    ],
-    ids=["friction drift", "other start", "gap"],
-)
-def test_drift_starts_and_gaps_are_not_noise(other):
-    noise = repetition_noise([repetition(1), other])
-    assert within(noise.position, POSITION_NOISE**2, 1500.0)
-    assert within(noise.torque, TORQUE_NOISE**2, 1500.0)
-
-
-def test_other_recordings_raise():
-    one = repetition(1)
-    for runs, words in (
-        ([one, replace(one, joint_names=("a", "c"))], "not repetitions"),
-        ([one, replace(one, time=2.0 * one.time)], "not repetitions"),
-        ([one.between(0, 2000), one.between(4950, 5000)], "in common"),
-    ):
-        with pytest.raises(IdentificationError, match=words):
-            repetition_noise(runs)
+    def test_other_recordings_raise(self):
+        one = repetition(1)
+        for runs, words in (
+            ([one, replace(one, joint_names=("a", "c"))], "not repetitions"),
+            ([one, replace(one, time=2.0 * one.time)], "not repetitions"),
+            ([one.between(0, 2000), one.between(4950, 5000)], "in common"),
+        ):
+            with pytest.raises(IdentificationError, match=words):
+                repetition_noise(runs)

@@ -44,83 +44,79 @@ def samples_with(error, *, origin=0.0):
     return as_samples(MODEL, motion, torque, origin=origin)
 
 
-def test_error_measures_are_correct():
-    measured = np.array([[3.0, 1.0], [-4.0, 2.0]])
-    error = PredictionError.between(measured, np.array([[2.0, 1.0], [-2.0, 2.0]]))
-    np.testing.assert_allclose(error.mean_absolute, [1.5, 0.0])
-    np.testing.assert_allclose(error.mean, [-0.5, 0.0])
-    np.testing.assert_allclose(error.rms, [np.sqrt(2.5), 0.0])
-    np.testing.assert_allclose(error.relative, [np.sqrt(5.0) / 5.0, 0.0])
-    assert error.overall == pytest.approx(np.sqrt(5.0 / 30.0))
+class TestPredictionError:
+    def test_its_measures_are_correct(self):
+        measured = np.array([[3.0, 1.0], [-4.0, 2.0]])
+        error = PredictionError.between(measured, np.array([[2.0, 1.0], [-2.0, 2.0]]))
+        np.testing.assert_allclose(error.mean_absolute, [1.5, 0.0])
+        np.testing.assert_allclose(error.mean, [-0.5, 0.0])
+        np.testing.assert_allclose(error.rms, [np.sqrt(2.5), 0.0])
+        np.testing.assert_allclose(error.relative, [np.sqrt(5.0) / 5.0, 0.0])
+        assert error.overall == pytest.approx(np.sqrt(5.0 / 30.0))
 
+    @given(torques, torques, arrays(np.bool_, (20, 2)))
+    def test_unusable_rows_have_no_effect(self, measured, predicted, usable):
+        spoilt = np.where(usable, measured, np.nan)
+        one = PredictionError.between(measured, predicted, usable)
+        two = PredictionError.between(spoilt, predicted, usable)
+        np.testing.assert_array_equal(one.squared, two.squared)
+        np.testing.assert_array_equal(one.torque_squared, two.torque_squared)
+        assert (one.rows == usable.sum(axis=0)).all()
 
-@given(torques, torques, arrays(np.bool_, (20, 2)))
-def test_unusable_rows_have_no_effect(measured, predicted, usable):
-    spoilt = np.where(usable, measured, np.nan)
-    one = PredictionError.between(measured, predicted, usable)
-    two = PredictionError.between(spoilt, predicted, usable)
-    np.testing.assert_array_equal(one.squared, two.squared)
-    np.testing.assert_array_equal(one.torque_squared, two.torque_squared)
-    assert (one.rows == usable.sum(axis=0)).all()
+    @given(torques, torques, torques, torques)
+    def test_errors_of_two_recordings_add(self, m1, p1, m2, p2):
+        both = pooled_error([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
+        joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
+        np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
+        assert both.overall == pytest.approx(joined.overall, rel=1e-12, nan_ok=True)
 
+    def test_it_is_of_usable_or_all_rows(self):
+        values = np.ones(MODEL.n_parameters)
+        samples = samples_with(np.zeros((2000, 2)))
+        torque = samples.torque.copy()
+        torque[~samples.usable] += 50.0  # stiction
+        stuck = Samples(**{**samples.__dict__, "torque": torque})
+        (error,) = prediction_error(MODEL, values, [stuck])
+        assert error.overall < 1e-12
+        (error,) = prediction_error(MODEL, values, [stuck], all_rows=True)
+        assert error.overall > 0.05
 
-@given(torques, torques, torques, torques)
-def test_errors_of_two_recordings_add(m1, p1, m2, p2):
-    both = pooled_error([PredictionError.between(m1, p1), PredictionError.between(m2, p2)])
-    joined = PredictionError.between(np.concatenate([m1, m2]), np.concatenate([p1, p2]))
-    np.testing.assert_allclose(both.rms, joined.rms, rtol=1e-12)
-    assert both.overall == pytest.approx(joined.overall, rel=1e-12, nan_ok=True)
+    def test_friction_change_is_separated(self):
+        """Measured without limit, compensated up to a tenth."""
+        values = np.ones(MODEL.n_parameters)
+        motion = samples_with(np.zeros((5000, 2))).motion
+        friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), *motion[1:])
+        other = 0.2 * np.sin(2.0 * np.pi * 1.3 * motion.time)[:, None] * np.array([1.0, 0.0])
+        warm = samples_with(np.array([0.05, -0.08]) * friction + other)
+        left, change, apart = slow_error(MODEL, values, warm, 10.0)
+        np.testing.assert_allclose(change, [0.05, -0.08], atol=0.01)
+        np.testing.assert_allclose(left.rms, [0.2 / np.sqrt(2.0), 0.0], atol=0.01)
+        np.testing.assert_allclose(apart.rms, left.rms)
+        left, change, apart = slow_error(MODEL, values, samples_with(0.5 * friction), 10.0)
+        np.testing.assert_allclose(change, 0.5, atol=0.01)
+        assert (left.rms > 0.3 * np.std(friction, axis=0)).all()
+        assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
 
+    def test_noise_is_measured_between_repetitions(self):
+        """With different clock offsets."""
+        rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
+        common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
+        values = np.ones(MODEL.n_parameters)
+        runs = [
+            samples_with(common + sizes * rng.standard_normal((3000, 2)), origin=k)
+            for k in range(12)
+        ]
+        np.testing.assert_allclose(repetition_noise(MODEL, values, runs), sizes, rtol=0.05)
+        later = replace(runs[1], origin=runs[1].origin - 1e3)  # no time in common
+        assert np.isnan(repetition_noise(MODEL, values, [runs[0], later])).all()
 
-def test_prediction_error_of_usable_or_all_rows():
-    values = np.ones(MODEL.n_parameters)
-    samples = samples_with(np.zeros((2000, 2)))
-    torque = samples.torque.copy()
-    torque[~samples.usable] += 50.0  # stiction
-    stuck = Samples(**{**samples.__dict__, "torque": torque})
-    (error,) = prediction_error(MODEL, values, [stuck])
-    assert error.overall < 1e-12
-    (error,) = prediction_error(MODEL, values, [stuck], all_rows=True)
-    assert error.overall > 0.05
-
-
-def test_friction_change_is_separated():
-    """Measured without limit, compensated up to a tenth."""
-    values = np.ones(MODEL.n_parameters)
-    motion = samples_with(np.zeros((5000, 2))).motion
-    friction = MODEL.torque(np.where(MODEL.friction_columns, values, 0.0), *motion[1:])
-    other = 0.2 * np.sin(2.0 * np.pi * 1.3 * motion.time)[:, None] * np.array([1.0, 0.0])
-    warm = samples_with(np.array([0.05, -0.08]) * friction + other)
-    left, change, apart = slow_error(MODEL, values, warm, 10.0)
-    np.testing.assert_allclose(change, [0.05, -0.08], atol=0.01)
-    np.testing.assert_allclose(left.rms, [0.2 / np.sqrt(2.0), 0.0], atol=0.01)
-    np.testing.assert_allclose(apart.rms, left.rms)
-    left, change, apart = slow_error(MODEL, values, samples_with(0.5 * friction), 10.0)
-    np.testing.assert_allclose(change, 0.5, atol=0.01)
-    assert (left.rms > 0.3 * np.std(friction, axis=0)).all()
-    assert (apart.rms < 0.05 * np.std(friction, axis=0)).all()
-
-
-def test_noise_is_measured_between_repetitions():
-    """With different clock offsets."""
-    rng, sizes = np.random.default_rng(2), np.array([1.0, 2.0])
-    common = np.array([0.5, 0.4]) * rng.standard_normal((3000, 2))
-    values = np.ones(MODEL.n_parameters)
-    runs = [
-        samples_with(common + sizes * rng.standard_normal((3000, 2)), origin=k) for k in range(12)
-    ]
-    np.testing.assert_allclose(repetition_noise(MODEL, values, runs), sizes, rtol=0.05)
-    later = replace(runs[1], origin=runs[1].origin - 1e3)  # no time in common
-    assert np.isnan(repetition_noise(MODEL, values, [runs[0], later])).all()
-
-
-def test_a_joint_without_torque_has_no_relative_error():
-    measured = np.column_stack([np.ones(5), np.zeros(5)])
-    error = PredictionError.between(measured, measured + 0.1)
-    np.testing.assert_allclose(error.relative, [0.1, np.nan])
-    assert error.overall == pytest.approx(np.sqrt(2.0) * 0.1)
-    nothing = PredictionError.between(measured, measured, np.zeros((5, 2), dtype=np.bool_))
-    assert np.isnan([nothing.overall, *nothing.relative]).all()
+    def test_a_joint_without_torque_has_no_relative_error(self):
+        measured = np.column_stack([np.ones(5), np.zeros(5)])
+        error = PredictionError.between(measured, measured + 0.1)
+        np.testing.assert_allclose(error.relative, [0.1, np.nan])
+        assert error.overall == pytest.approx(np.sqrt(2.0) * 0.1)
+        nothing = PredictionError.between(measured, measured, np.zeros((5, 2), dtype=np.bool_))
+        assert np.isnan([nothing.overall, *nothing.relative]).all()
 
 
 MOTION = a_motion(20.0)

@@ -18,12 +18,11 @@ from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
 from identification.validation.verdict import Thresholds, judge
-from sim_fixtures.ns16 import urdf_text
+from sim_fixtures.ns16 import load_truth, urdf_text
+from tests.identification.robots import ns16_values
 from tests.identification.two_link import as_samples, sine_motion
 
-ROTORS = [7.6465, 24.5955, 10.48, 0.253, 0.298, 0.12]
-COULOMB = np.array([68.035, 108.777, 50.446, 9.248, 8.904, 5.148])
-VISCOUS = np.array([41.196, 63.255, 39.248, 3.2659, 16.4439, 8.8808])
+COULOMB, VISCOUS = map(np.array, (load_truth().coulomb, load_truth().viscous))
 CURRENT_NOISE = 0.02  # A
 MODEL = RobotModel.from_urdf(urdf_text())
 
@@ -53,13 +52,6 @@ class Drive:
         return replace(self, **{what: tuple(values)})
 
 
-def parameters(coulomb=COULOMB, viscous=VISCOUS, model=MODEL):
-    standard = model.nominal.reshape(6, -1).copy()
-    standard[:, -1] = ROTORS
-    base = model.base.grouping @ standard.ravel()
-    return np.concatenate([base, coulomb, viscous, np.zeros(6)])
-
-
 def a_motion(seed, *, duration=8.0, step=0.01):
     """Three sines on each joint."""
     rng = np.random.default_rng(seed)
@@ -77,9 +69,11 @@ def executed(model, truth, motion, seed, assumed, other):
     current = np.linalg.solve(real.motor_from_joint.T, torque.T).T / np.array(real.constant)
     current += CURRENT_NOISE * np.random.default_rng(seed).standard_normal(current.shape)
     seen = np.linalg.solve(assumed.motor_from_joint, real.motor_from_joint).T
-    motion = Motion(motion.time, *(part @ seen for part in motion[1:4]))
-    torque = (current * np.array(assumed.constant)) @ assumed.motor_from_joint
-    return as_samples(model, motion, torque)
+    return as_samples(
+        model,
+        Motion(motion.time, *(part @ seen for part in motion[1:4])),
+        (current * np.array(assumed.constant)) @ assumed.motor_from_joint,
+    )
 
 
 def nothing(motion, torque):
@@ -89,12 +83,12 @@ def nothing(motion, torque):
 def campaign(
     *, assumed=Drive(), truth=None, disturbance=nothing, unseen_disturbance=None, real=MODEL
 ):
-    truth = parameters(model=real) if truth is None else truth
+    truth = ns16_values(real) if truth is None else truth
     training, unseen = a_motion(17, duration=12.0), unseen_disturbance or disturbance
     fitted = [executed(real, truth, training, k, assumed, disturbance) for k in range(2)]
     held_out = [executed(real, truth, a_motion(k), 10 + k, assumed, unseen) for k in range(2)]
     result = estimate_repetitions(MODEL, fitted)
-    evidence = gather(MODEL, result, fitted, held_out, nominal=parameters())
+    evidence = gather(MODEL, result, fitted, held_out, nominal=ns16_values(MODEL))
     return judge(MODEL.joint_names, evidence), evidence
 
 
@@ -106,7 +100,7 @@ class TestValidCampaign:
         assert f"{evidence.held_out.overall:.1%}" in verdict.line
         assert evidence.systematic.max() < 0.5 * Thresholds().systematic
         assert not {"gravity", "load", "outliers"} & {one.check for one in verdict.findings}
-        assert evidence.gravity is not None and np.degrees(evidence.gravity.angle) < 0.5
+        assert np.degrees(evidence.gravity.angle) < 0.5
 
     def test_unmodelled_effects_stay_good(self):
         def effects(motion, torque):
@@ -118,7 +112,7 @@ class TestValidCampaign:
 
         verdict, evidence = campaign(disturbance=effects)
         assert verdict.good, verdict.reasons
-        assert evidence.systematic is not None and evidence.systematic.max() > 0.005
+        assert evidence.systematic.max() > 0.005
 
 
 class TestOneSidedErrors:
@@ -135,7 +129,7 @@ class TestOneSidedErrors:
         """Neither gravity nor a load; large axes are named."""
         verdict, evidence = campaign(assumed=Drive().with_wrong_sign(what, axis))
         assert not verdict.good and "must not be relied on" in verdict.line
-        assert evidence.load is not None and evidence.causes is not None
+        assert evidence.causes is not None
         assert evidence.load.explained < Thresholds().load or evidence.load.axes < 3
         assert not {"gravity", "load"} & {one.check for one in verdict.findings}
         if what == "gear" and axis < 3:
@@ -152,7 +146,7 @@ class TestOneSidedErrors:
     def test_negative_friction_is_named(self, term, axis):
         values = {"coulomb": COULOMB, "viscous": VISCOUS}[term].copy()
         values[axis] *= -1.0
-        verdict, _ = campaign(truth=parameters(**{term: values}))
+        verdict, _ = campaign(truth=ns16_values(MODEL, **{term: values}))
         assert not verdict.good
         assert any("friction" in one and f"joint_{axis + 1}" in one for one in verdict.reasons)
 
@@ -183,7 +177,7 @@ class TestUnseenMotion:
         verdict, evidence = campaign(unseen_disturbance=load)
         assert not verdict.good
         assert f"carried {mass:g} ± 0.0" in verdict.reasons[0]
-        assert evidence.load is not None and evidence.load.mass == pytest.approx(mass, rel=0.02)
+        assert evidence.load.mass == pytest.approx(mass, rel=0.02)
         assert abs(evidence.load.mass - mass) < evidence.load.half_interval
         (step,) = verdict.next_steps
         assert step.startswith("record both with the same tool and payload")
@@ -366,7 +360,7 @@ SLOW = 0.2  # rad/s; rows near a reversal are left out
 def recorded(seed, load=None):
     """Return a motion with the paper's arm, a load (m,) [kg] on its flange, and noise."""
     motion = a_motion(seed, duration=10.0, step=8e-3)
-    torque = MODEL.torque(parameters(), *motion[1:])
+    torque = MODEL.torque(ns16_values(MODEL), *motion[1:])
     if load is not None:
         torque = torque + load[:, None] * of_one_kilogram(motion)
     rng = np.random.default_rng(seed + 1000)
@@ -448,8 +442,7 @@ class TestCausesOfWholeRecordings:
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
     def test_two_faults_are_found_in_sequence(self):
-        both = FAULTS["torque sign"][1](late(recorded(1)))
-        found = causes([both])
+        found = causes([FAULTS["torque sign"][1](late(recorded(1)))])
         assert {one.fault.kind for one in found} == {"torque sign", "delay"}
 
 
@@ -466,18 +459,16 @@ class TestCausesOfParts:
             runs = [recorded(k, whole if k in (1, 3) else None) for k in range(4)]
         (cause,) = causes(runs)
         assert cause.fault.kind == "payload"
-        assert cause.fault.part is not None and cause.fault.part.name == words
+        assert cause.fault.part.name == words
         assert cause.size == pytest.approx(LOAD, abs=4.0 * cause.std + 0.1)
 
     def test_friction_of_one_recording(self):
         runs = [recorded(k) for k in range(3)]
         velocity = runs[1].motion.velocity[:, 1]
-        torque = runs[1].torque.copy()
-        torque[:, 1] += 0.4 * (COULOMB[1] * np.sign(velocity) + VISCOUS[1] * velocity)
-        runs[1] = replace(runs[1], torque=torque)
+        runs[1].torque[:, 1] += 0.4 * (COULOMB[1] * np.sign(velocity) + VISCOUS[1] * velocity)
         (cause,) = causes(runs)
         assert (cause.fault.kind, cause.fault.joints) == ("changed friction", (1,))
-        assert cause.fault.part is not None and cause.fault.part.name == "1.mcap"
+        assert cause.fault.part.name == "1.mcap"
         assert cause.size == pytest.approx(0.4, abs=0.05)
 
     def test_another_arm_in_the_second_half(self):

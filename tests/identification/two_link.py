@@ -41,11 +41,23 @@ NOISE = np.array([3.0, 0.2])
 """Standard deviation of the torque noise of each joint [N·m]."""
 
 
+def values_of(model, friction=(), rotors=0.0):
+    """Parameters (p,) of the description's bodies, with rotors and friction."""
+    standard = model.nominal
+    standard[model.layout.rotors] = rotors
+    return np.concatenate([model.base.grouping @ standard, *np.atleast_2d(friction)])
+
+
 def truth():
     """The planted parameters (p,)."""
-    standard = MODEL.nominal.copy()
-    standard[[10, 21]] = 0.4, 0.1  # rotors
-    return np.concatenate([MODEL.base.grouping @ standard, [4.0, 2.0, 1.5, 0.8]])
+    return values_of(MODEL, [4.0, 2.0, 1.5, 0.8], (0.4, 0.1))
+
+
+def simulated(model, values, motion, noise=0.0, seed=0, **changes):
+    """Samples of an arm with these parameters, with white noise of each joint [N·m]."""
+    torque = model.torque(values, *motion[1:])
+    torque += noise * np.random.default_rng(seed).standard_normal(torque.shape)
+    return as_samples(model, motion, torque, **changes)
 
 
 def one_sine(time, size=(0.9, 1.2), phase=(0.3, 1.1), **named):

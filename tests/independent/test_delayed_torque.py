@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from identification.estimators.delay import (
-    estimate_delays,
-    rate_products,
-    with_uncertain_delay,
-)
+from identification.estimators.delay import estimate_delays, rate_products, with_uncertain_delay
 from identification.estimators.least_squares import fit_least_squares
 from identification.factor.phases import PhaseFactor
 from identification.model.friction import FrictionLaw
