@@ -78,8 +78,9 @@ def report(
 ) -> NoReturn:
     """Raise for the first row and joint outside its bound; not finite values come first.
 
-    `magnitude` (k, n) is compared with `allowed` (k, n); `found` (k, n), with its sign, is in the
-    error: for a position what `position_limits` returns. `checks` has the error of each row.
+    `magnitude` (k, n) is compared with `allowed` (k, n); the error states `found` (k, n), with its
+    sign. For a position, `position_limits` (joint, distance from the middle of the range) returns
+    the position and the limit to state. `checks` has the error of each row.
     """
     not_finite = ~np.isfinite(magnitude)
     bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
@@ -181,7 +182,9 @@ class GuardLimits:
 
 
 class ActiveBounds:
-    """The active set of bounds: wider ones stay active until no difference reaches back to them.
+    """The active set of bounds.
+
+    A wider set stays active until the differences are made of set-points within a narrower one.
 
     Attributes:
         rank: of the active set.

@@ -46,7 +46,7 @@ _OLD_BACKLOG_SECONDS: Final = 0.005
 """Age of the newest packet of a backlog, in cycles and at least in s, above which the queue must
 have been full when newer ones arrived."""
 _NUMBER_WINDOW: Final = 1000
-"""Largest difference of two packet numbers that is one of age."""
+"""Largest difference of two packet numbers of one session; beyond it neither is the newer."""
 
 _Kind = tuple[int, int, bytes]
 """Session within the backlog, length, status and modes."""
@@ -298,8 +298,8 @@ def exchange(
 ) -> None:
     """Answer packets until `until()` is true, the controller ends the session or the link closes.
 
-    `until` is called once per packet, after the reply was sent, and at least every 0.1 s; it is the
-    place for work that can wait. Of a backlog only the newest packets are answered
+    `until` is called after the replies to what was received at once, and at least every 0.1 s; it
+    is the place for work that can wait. Of a backlog only the newest packets are answered
     (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More than
     `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
     """

@@ -233,7 +233,7 @@ class ControlServer:
             session.stop(self.reason)
 
     def _check_supervisor(self) -> None:
-        # Read after `program_id`, which the supervisor writes after a heartbeat.
+        # Read after `program_id`: the supervisor beats before it writes that.
         silence = self._supervisor.silence()
         if self._terminated():
             self._leave("the exchange process was asked to terminate", DETACHED_LINGER)

@@ -74,7 +74,7 @@ class PreTriggerBuffer:
         events = self._events
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
         session = (
-            _after_restart(self._records, np.dtype(np.void(0).dtype), least=1),
+            _after_restart(self._records, np.dtype(np.void), least=1),
             events[inits[-1] + 1 :] if inits else events,
             # Several packets may belong to one cycle.
             _after_restart(self._packets, PACKET_DTYPE, least=0),
