@@ -373,7 +373,7 @@ class TestBetweenReadingAndBegin:
     def test_a_stop(self):
         with running() as (exchange, controller):
             controller.open = True
-            with pytest.raises(RequestError, match="requested a stop"):
+            with pytest.raises(RequestError, match="a stop was requested"):
                 exchange.submit(Cruise(), lambda: exchange.stop() is None)
             self.assert_nothing_moves(controller)
 
