@@ -1,7 +1,7 @@
 """A load on a simulated NS 16 weighed: `python -m benchmarks.payload --seeds 200 --pairs 8`.
 
 Torques are pinocchio's. Every seed has a load of its own (4 to 16 kg), a motion of 16 s that is
-recorded without and with it, in ABBA order until the mass is known as `hil run --payload` asks, and
+recorded without and with it, in ABBA order until the interval of the mass is narrow enough, and
 noise that is half white and half correlated over 50 ms. The friction of every joint differs by 4 %
 (standard deviation) between any two recordings.
 """
@@ -17,7 +17,6 @@ import scipy
 from numpy.typing import NDArray
 
 from benchmarks import parser_of, show
-from hil.weighing import ENOUGH
 from identification.estimators.payload import NAMES, Run, figures_of, identify_payload
 from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body
@@ -29,6 +28,8 @@ from sim_fixtures.ns16 import urdf_text
 Array = NDArray[np.float64]
 
 DRIFT: Final = 0.04
+ENOUGH: Final = 0.0076
+"""Half the 95 % interval of the mass, relative, at which recording ends."""
 _RATE: Final = 250.0  # Hz
 _DURATION: Final = 16.0  # s
 _NOISE: Final = 0.014  # of a torque's own scatter

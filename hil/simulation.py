@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
-from xml.etree.ElementTree import SubElement, tostring
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Link
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
-from identification.model.urdf_text import urdf_tree
 from sim_fixtures import (
     ControllerSettings,
     PlantTruth,
@@ -27,7 +25,6 @@ from sim_fixtures.faults import ControllerFault
 
 Array = NDArray[np.float64]
 
-_LOAD = "hil_simulated_payload"
 _CHECKED = 100
 """Postures checked on each path of the controller's own motion."""
 _POSTURES = 12
@@ -42,8 +39,6 @@ def simulated_link(
     truth: PlantTruth | None = None,
     instead_of_hardware: bool = False,
     only_axis: int | None = None,
-    loaded: bool = False,
-    session: int = 0,
 ) -> Link:
     """Return a link in virtual time to a simulated controller; runs are reproducible by seed.
 
@@ -54,11 +49,9 @@ def simulated_link(
         truth: true parameters, by default those of the cell.
         instead_of_hardware: also simulate a cell with a real link.
         only_axis: number, from 1, of the only axis that is opened; None for all.
-        loaded: whether the arm carries `[simulation.payload]`, unknown to controller and PC.
-        session: number of earlier sessions of the controller; each has its own noise.
 
     Raises:
-        CellError: the cell is one of real hardware, or has no such payload.
+        CellError: the cell is one of real hardware.
     """
     if cell.controller.transport != "simulated" and not instead_of_hardware:
         raise CellError(
@@ -68,43 +61,12 @@ def simulated_link(
             "a cell of real hardware is not simulated",
             'set it to "simulated" to run without hardware',
         )
-    arm = carrying(cell) if loaded else cell
     settings = replace(controller_settings(cell, effects=effects), only_axis=only_axis)
     controller = simulated_controller(
-        arm, effects=effects, drive=drive, truth=truth, settings=settings, session=session
+        cell, effects=effects, drive=drive, truth=truth, settings=settings
     )
     transport = SimulatedTransport(controller)
     return Link.over(transport, cell, finish=controller.finish, only_axis=only_axis)
-
-
-def carrying(cell: Cell) -> Cell:
-    """Return the cell with `[simulation.payload]` as a link of its URDF, or raise CellError."""
-    payload = cell.simulation.payload
-    if payload is None:
-        raise CellError(
-            cell.path,
-            "simulation.payload",
-            None,
-            "the simulated arm has no payload",
-            "add this table: mass in kg, centre in m",
-        )
-    root = urdf_tree(cell.urdf)
-    last = root.find(f"joint[@name='{cell.joint_names[-1]}']/child")
-    frame = payload.frame or ("" if last is None else last.get("link", ""))
-    if frame not in {link.get("name") for link in root.findall("link")}:
-        raise CellError(
-            cell.path, "simulation.payload.frame", frame, "not a link of the URDF", "use a link"
-        )
-    link = SubElement(root, "link", name=_LOAD)
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "origin", xyz=" ".join(map(repr, payload.centre)))
-    SubElement(inertial, "mass", value=repr(payload.mass))
-    names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-    SubElement(inertial, "inertia", dict(zip(names, map(repr, payload.inertia), strict=True)))
-    mount = SubElement(root, "joint", name=f"{_LOAD}_mount", type="fixed")
-    SubElement(mount, "parent", link=frame)
-    SubElement(mount, "child", link=_LOAD)
-    return Cell.from_texts(cell.text, tostring(root, encoding="unicode"), cell.path)
 
 
 def simulated_controller(
@@ -115,7 +77,6 @@ def simulated_controller(
     truth: PlantTruth | None = None,
     settings: ControllerSettings | None = None,
     seed: int | None = None,
-    session: int = 0,
     faults: Sequence[ControllerFault] = (),
 ) -> SimulatedController:
     """Return controller and arm of a cell with any link; arguments as for `simulated_link`.
@@ -130,7 +91,6 @@ def simulated_controller(
         truth or planted_truth(cell),
         settings or controller_settings(cell, effects=effects),
         seed=cell.simulation.seed if seed is None else seed,
-        session=session,
         effects=unmodelled_effects(cell) if effects else UnmodelledEffects(),
         initial_position=cell.initial,
         gravity=cell.file.robot.gravity,

@@ -217,7 +217,6 @@ class Campaign:
         accept_dry_run: bool = False,
         accept_torque: Sequence[str] = (),
         live: LiveView | None = None,
-        repetitions: int | None = None,
     ) -> RunResult:
         """Run the motions that are missing, in order, and return the arm to its first position.
 
@@ -240,7 +239,6 @@ class Campaign:
             accept_torque: joints to accept whose torque had the opposite sign of gravity in the
                 dry run of an earlier run (`DryRun.against_gravity`).
             live: where viewers may connect, on the cell's own link.
-            repetitions: of the excitation, without validation motions; by default the whole plan.
 
         Raises:
             NotRehearsedError: the plan did not pass its rehearsal.
@@ -268,7 +266,6 @@ class Campaign:
             accept_dry_run=accept_dry_run,
             accept_torque=tuple(accept_torque),
             live=live,
-            repetitions=repetitions,
         ).execute()
 
 

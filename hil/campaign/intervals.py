@@ -96,20 +96,13 @@ def beyond(cell: Cell, posture: Array, verb: str = "stands at") -> str | None:
     )
 
 
-def planned_intervals(
-    cell: Cell, plan: CampaignPlan, repetitions: int | None = None
-) -> list[Interval]:
-    """Return all motions of a plan, without the moves between them.
-
-    With a number of `repetitions` of the excitation the validation motions are left out.
-    """
-    validation = plan.validation if repetitions is None else ()
-    repetitions = cell.campaign.repetitions if repetitions is None else repetitions
-    excitation = plan.excitation.trajectory
+def planned_intervals(cell: Cell, plan: CampaignPlan) -> list[Interval]:
+    """Return all motions of a plan, without the moves between them."""
+    repetitions, excitation = cell.campaign.repetitions, plan.excitation.trajectory
     return [
         Interval("standstill", 0, hold(cell.home, cell.campaign.standstill_s)),
         *(Interval("excitation", k, excitation, plan.moves) for k in range(repetitions)),
-        *(Interval("validation", k, m.trajectory, m.moves) for k, m in enumerate(validation)),
+        *(Interval("validation", k, m.trajectory, m.moves) for k, m in enumerate(plan.validation)),
     ]
 
 

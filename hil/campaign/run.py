@@ -115,7 +115,6 @@ class Run:
     accept_dry_run: bool = False
     accept_torque: tuple[str, ...] = ()
     live: LiveView | None = None
-    repetitions: int | None = None
     archives: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     plan_hash: str = ""
@@ -127,7 +126,7 @@ class Run:
         self.cell: Cell = campaign.cell
         self.plan: CampaignPlan = campaign.plan
         self.watch = RunWatch(self.operator, self.stop)
-        self.wanted = planned_intervals(self.cell, self.plan, self.repetitions)
+        self.wanted = planned_intervals(self.cell, self.plan)
         self.simulated: bool = (self.cell if self.link is None else self.link).only_simulated
         self.virtual = isinstance(self.link, Link) or (
             self.link is None and self.cell.controller.transport == "simulated"

@@ -111,9 +111,7 @@ class SimulationTable(Table):
         "a table of gears of the simulated robot",
         SimulatedDriveTable(),
     )
-    payload: PayloadTable | None = field(
-        "a table of the payload that `hil run --payload` mounts", None
-    )
+    payload: PayloadTable | None = field("a table of earlier versions, not used", None)
 
 
 ArmAxis = tuple[Annotated[Whole, Field(ge=1, le=4)], Annotated[Whole, Field(ge=1, le=10)]]

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import json as json_format
-import sys
 from collections.abc import Mapping
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from hil.archive import ArchiveName
 from hil.archive.live import LiveView
-from hil.campaign import Campaign, Link, MotionFailedError, stop_on_interrupt
+from hil.campaign import Campaign, MotionFailedError, stop_on_interrupt
 from hil.campaign.run import RunResult
 from hil.cell_link import require_real_time
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
-from hil.cli.payload import payload_lines
 from hil.cli.verdict import NOT_GOOD, as_json, finish
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
-from hil.screen import Screen, can_read, confirmed
-from hil.weighing import weigh
+from hil.screen import Screen
 
 
 def run(
@@ -32,7 +28,6 @@ def run(
     accept_dry_run: bool = False,
     accept_torque: Annotated[list[str] | None, typer.Option(metavar="JOINT")] = None,
     no_identify: bool = False,
-    payload: Annotated[str | None, typer.Option(metavar="NAME")] = None,
     live: Annotated[str | None, typer.Option(metavar="[HOST:]PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -44,9 +39,6 @@ def run(
     repetitions, validation motions, and return to the initial posture. A repetition that fails the
     quality check is archived with the reason and run again. Ctrl-C stops the arm on its path; the
     same command resumes.
-
-    With --payload only the excitation is run, in pairs without and with a payload; after each pair
-    the intervals are printed, and at the end the result as by `hil payload`.
 
     **Without a terminal:** `hil run C --dry-run`, an operator watches, then `hil run C
     --accept-dry-run --json`.
@@ -63,18 +55,11 @@ def run(
         accept_torque: With --accept-dry-run: confirm that the torque of this joint had a known
             reason to oppose the modelled gravity in the dry run (repeatable).
         no_identify: Only run; no parameters and no report.
-        payload: Identify a payload: run the excitation without and with it alternately, ask for
-            mounting and removal, and stop when another pair would not narrow the intervals. The
-            recordings are in the folder payload/NAME of CAMPAIGN.
         live: Stream the run to Foxglove; on 127.0.0.1 unless HOST is given.
     """
     if dry_run and accept_dry_run:
         remedy = "run --dry-run first, watch the arm, then --accept-dry-run"
         raise InputError(None, "--dry-run and --accept-dry-run together", remedy=remedy)
-    if payload is not None and (dry_run or no_identify):
-        problem = "includes dry run and identification"
-        remedy = "leave out --dry-run and --no-identify"
-        raise InputError(None, problem, field="--payload", remedy=remedy)
     opened = Campaign.open(campaign)
     if rehearse:
         with stop_on_interrupt() as stop:
@@ -84,48 +69,11 @@ def run(
         "accept_dry_run": accept_dry_run,
         "accept_torque": accept_torque or (),
     }
-    if payload is not None:
-        _weigh(opened, payload, choices, live=live, quiet=quiet, json=json)
-        return
     result = _run(opened, choices, quiet=quiet or json, live=live)
     if dry_run or no_identify:
         _print(result, json=json)
         return
     _identify(opened, result, quiet=quiet, json=json)
-
-
-def _weigh(
-    campaign: Campaign, name: str, choices: Mapping[str, Any], live: str | None, quiet: bool,
-    json: bool,
-) -> None:  # fmt: skip
-    """Record pairs and identify the payload; a simulated arm mounts it without asking."""
-    silent = quiet or json
-    simulated = campaign.cell.controller.transport == "simulated"
-    if not simulated and (silent or not can_read(sys.stdin)):
-        problem = "needs an operator at a terminal to mount the payload"
-        remedy = "record both by `hil run` or `hil record`: `hil payload BARE --loaded LOADED`"
-        raise InputError(None, problem, field="--payload", remedy=remedy)
-
-    def mount(load: bool) -> bool:
-        deed = f"Mount {name}" if load else f"Take {name} off"
-        if simulated:
-            return True
-        question = f"{deed}, and change nothing else. Type yes when the arm may move; anything "
-        with stop_on_interrupt() as stop:
-            return confirmed(Console(), f"{question}else ends the recording: ", "yes", stop)
-
-    def run_side(side: Campaign, repetitions: int, link: Link | None) -> None:
-        more = {**choices, "link": link, "repetitions": repetitions}
-        _run(side, more, quiet=silent, live=live)
-
-    weighed = weigh(campaign, name, run=run_side, mount=mount, reporter=make_reporter(quiet=silent))
-    found = weighed.found
-    if json:
-        print_json(found.as_json() | {"pairs": weighed.pairs})
-    else:
-        say("\n".join(payload_lines(found)))
-    if found.estimate.contradicted:
-        raise typer.Exit(NOT_GOOD)
 
 
 def _run(

@@ -124,7 +124,7 @@ class TestPayload:
     @pytest.mark.slow
     @pytest.mark.parametrize(("pairs", "within"), [(1, 0.95), (8, 0.99)])
     def test_of_200_loads_intervals_hold_90_to_99_percent(self, pairs: int, within: float) -> None:
-        """As many pairs as `hil run --payload` would record bring the masses within 1 %."""
+        """Up to eight pairs bring the masses within 1 %."""
         found = payload_coverage(range(200), pairs)
         assert found.within_one_percent >= within
         for figure, share in {**found.covered, "moment": found.moment_covered}.items():

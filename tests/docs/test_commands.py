@@ -61,7 +61,6 @@ NOT_TYPED = {
     "hil import log log.csv --map columns.toml": "typed in bring-your-own-robot.md",
     "hil gains empty.mcap": "typed in bring-your-own-robot.md",
     "hil payload bare --loaded gripper": "typed in payload.md",
-    "hil run runs/weigh --payload": "typed in payload.md",
     "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_studies.py",
     "hil reidentify /data": "needs other people's archives",
     "hil reidentify s3:": "network",

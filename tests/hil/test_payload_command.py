@@ -13,24 +13,18 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from pydantic import ValidationError
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
-from hil import weighing
-from hil.campaign import Campaign
-from hil.campaign.link import Link
-from hil.cell import Cell, CellError
 from hil.cli import app
-from hil.errors import ArchiveError, InputError, OperatorStopError
+from hil.errors import ArchiveError, InputError
 from hil.identify.options import FIXED
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.importers.column_map import Drive
 from hil.progress import Silent
-from hil.simulation import carrying
 from identification import FrictionLaw
 from identification.model.kinematics import pinocchio_model
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
-from tests.hil.fast_cell import fast_campaign, fast_cell
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
 
 MASS, CENTRE = 4.0, np.array([0.0, 0.09, 0.12])
@@ -83,14 +77,8 @@ def printed(folder: Path) -> dict[str, object]:
     return found
 
 
-CARRIED = """
-[simulation.payload]
-mass = 2.0
-centre = [0.3, 0.0, 0.05]
-inertia = [0.004, 0.0, 0.0, 0.006, 0.0, 0.005]
-"""
-BY_HAND = {"design": ("--settings", "quick.toml"), "run": ("--accept-dry-run",)}
-"""Words that a test adds to a command: a short search, the operator's answer."""
+SHORTER = {"design": ("--settings", "quick.toml")}
+"""Words that a test adds to a command."""
 
 
 class TestPage:
@@ -104,12 +92,10 @@ class TestPage:
             (folder / name / source).write_bytes((folder / source).read_bytes())
         for file in ("cell.toml", "robot.urdf"):
             (folder / file).write_bytes((ROOT / "examples" / "two_joints" / file).read_bytes())
-        with (folder / "cell.toml").open("a") as cell:
-            cell.write(CARRIED)
         (folder / "quick.toml").write_text(QUICK)
         for program, *words in commands(ROOT / "docs" / "payload.md"):
             assert program == "hil"
-            words += BY_HAND.get(words[0], ())
+            words += SHORTER.get(words[0], ())
             result = CliRunner().invoke(app, words)
             assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
         model = pinocchio_model((folder / "gripper.urdf").read_text())
@@ -179,125 +165,6 @@ class TestRefusals:
     ) -> None:
         with pytest.raises(InputError, match=sentence):
             run(folder, *arguments)
-
-
-def payload_campaign(folder: Path) -> Campaign:
-    """Campaign of the small cell, whose simulated arm carries 2 kg in loaded runs."""
-    cell = fast_cell(folder, repetitions=2)
-    carrying = Cell.from_texts(cell.text + CARRIED, cell.urdf, cell.path)
-    return fast_campaign(folder / "campaign", carrying)
-
-
-def run_campaign(campaign: Campaign, *words: str) -> Result:
-    command = ["run", str(campaign.folder.root), *words]
-    return CliRunner().invoke(app, command, catch_exceptions=False)
-
-
-@pytest.fixture(scope="module")
-def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    return payload_campaign(tmp_path_factory.mktemp("designed"))
-
-
-@pytest.fixture(scope="module")
-def pairs(designed: Campaign) -> dict[str, Any]:
-    result = run_campaign(designed, "--payload", "weight", "--accept-dry-run", "--json")
-    assert result.exit_code == 0, result.output
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
-
-
-class TestRun:
-    """Bare and loaded runs in ABBA order, with the gates of every run."""
-
-    def test_the_load_of_the_simulated_arm_is_identified(self, pairs: dict[str, Any]) -> None:
-        low, high = pairs["figures"]["mass"]["interval"]
-        assert pairs["figures"]["mass"]["value"] == pytest.approx(2.0, rel=0.02)
-        assert 0.0 < high - low < 0.2
-        low, high = pairs["figures"]["cx"]["interval"]
-        assert low < 0.3 < high
-        assert pairs["frame"] == "fore"
-        assert set(pairs["undetermined"]) >= {"cy", "Ixy", "Iyz"}
-
-    def test_each_side_is_a_campaign_with_a_dry_run(
-        self, designed: Campaign, pairs: dict[str, Any]
-    ) -> None:
-        assert not list(designed.folder.archives.iterdir())
-        for side in weighing.SIDES:
-            own = Campaign.open(designed.folder.root / "payload" / "weight" / side)
-            kinds = [path.name.split("_")[0] for path in own.folder.archives.iterdir()]
-            assert kinds.count("excitation") == pairs["pairs"]
-            assert kinds.count("dryrun") == 1
-            assert "validation" not in kinds
-
-    def test_complete_recordings_are_not_repeated(
-        self, designed: Campaign, pairs: dict[str, Any]
-    ) -> None:
-        def run(*_: object) -> None:
-            pytest.fail("no recording was missing")
-
-        again = weighing.weigh(
-            designed, "weight", run=run, mount=lambda _: False, reporter=Silent()
-        )
-        assert again.pairs == pairs["pairs"]
-
-    def test_order_is_abba_until_the_interval_is_small(
-        self, folder: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """The operator is asked to mount the payload only when it changes."""
-        found = weigh(folder, ["empty"], ["full"])
-        monkeypatch.setattr(weighing, "find_payload", lambda *_: found)
-        done, asked = list[str](), list[bool]()
-
-        def run(side: Campaign, repetitions: int, link: Link | None) -> None:
-            assert link is not None
-            done.append(f"{side.folder.root.name} {repetitions}")
-
-        def mount(load: bool) -> bool:
-            asked.append(load)
-            return True
-
-        monkeypatch.setattr(weighing, "ENOUGH", 0.0)
-        weighed = weighing.weigh(designed, "x", run=run, mount=mount, reporter=Silent())
-        assert done == ["bare 1", "loaded 1", "loaded 2", "bare 2"]
-        assert asked == [False, True, False]
-        assert "another pair is recommended" in weighed.sentence
-        monkeypatch.setattr(weighing, "ENOUGH", 0.5)
-        weighed = weighing.weigh(designed, "y", run=run, mount=mount, reporter=Silent())
-        assert weighed.pairs == 1
-        assert "another pair is not needed" in weighed.sentence
-
-    def test_a_missing_operator_ends_the_recording(self, designed: Campaign) -> None:
-        with pytest.raises(OperatorStopError, match="nothing was recorded"):
-            weighing.weigh(
-                designed, "z", run=lambda *_: None, mount=lambda _: False, reporter=Silent()
-            )
-
-    @pytest.mark.parametrize(
-        ("words", "sentence"),
-        [
-            (("--payload", "../x"), "is not a valid name of a payload"),
-            (("--payload", "x", "--dry-run"), "includes dry run"),
-        ],
-    )
-    def test_invalid_options_are_refused(
-        self, designed: Campaign, words: tuple[str, ...], sentence: str
-    ) -> None:
-        with pytest.raises(InputError, match=sentence):
-            run_campaign(designed, *words)
-
-    def test_a_real_arm_needs_an_operator(self, designed: Campaign, tmp_path: Path) -> None:
-        cell = designed.cell
-        link = 'transport = "udp"\nhost = "127.0.0.1"'
-        real = Cell.from_texts(
-            cell.text.replace('transport = "simulated"', link), cell.urdf, cell.path
-        )
-        campaign = Campaign.create(tmp_path / "real", real, designed.plan)
-        with pytest.raises(InputError, match="needs an operator at a terminal"):
-            run_campaign(campaign, "--payload", "gripper")
-
-    def test_a_simulated_arm_without_a_load_is_named(self, tmp_path: Path) -> None:
-        with pytest.raises(CellError, match=r"simulation\.payload"):
-            carrying(fast_cell(tmp_path))
 
 
 CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
