@@ -10,8 +10,8 @@ from rich.console import Console
 
 from hil.cli.arguments import JsonOption, print_json
 from hil.cli.verdict import NOT_GOOD
+from hil.doctor.checks import controller_in
 from hil.doctor.diagnosis import as_json, examine, show
-from hil.doctor.link import controller_in
 from hil.progress import reporter
 
 QUICK_SECONDS = 5.0
@@ -26,11 +26,10 @@ def doctor(
 ) -> None:
     """Measure whether this PC can answer a controller every 1 or 2 ms, and list what to change.
 
-    Checks permissions, processor, kernel, network card, route, port or CAN bus, and disk; then
-    measures wake-up and turnaround latency in processes with the real-time settings of an exchange.
-    Sends nothing to the controller, changes nothing and needs no root; run it as the user who will
-    run hil. Each remedy is a command. Without CELL the cycle is 1 ms; of CELL only [controller] has
-    to be complete.
+    Checks permissions, processor, load, route, port or CAN bus, and disk; then measures wake-up and
+    turnaround latency in processes with the real-time settings of an exchange. Sends nothing to the
+    controller, changes nothing and needs no root; run it as the user who will run hil. Each remedy
+    is a command. Without CELL the cycle is 1 ms; of CELL only [controller] has to be complete.
 
     Exit status: 0 fit for the cycle; 5 not fit, or the link cannot work, or measured for less than
     60 s (provisional); 2 bad input.

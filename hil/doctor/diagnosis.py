@@ -26,10 +26,7 @@ from drivers.exchange.realtime import RealTimeReport
 from hil.progress import Reporter
 from hil.terminal_text import printable
 
-from . import machine
-from .check import Check, Status, System, bad, named
-from .link import link_checks
-from .machine import DiskTrial, disk_checks
+from .checks import Check, DiskTrial, Status, System, computer_checks, disk_checks, link_checks
 
 if TYPE_CHECKING:
     from hil.cell.schema import ControllerTable
@@ -242,30 +239,22 @@ def examine(
     """Run all checks, and measure for twice `seconds`; archives will be written to `place`."""
     system = System()
     reporter.say("checking this PC; no packet is sent to the controller")
-    given = realtime_permissions()
     checks = [
-        *machine.permissions(given, system),
-        *machine.computer(system, no_sleep=given is not None and given.cpu_awake),
+        *computer_checks(realtime_permissions(), system),
         *link_checks(controller, system),
         *disk_checks(place, disk_trial(place)),
-        machine.load(system),
     ]
-    before = system.text("/proc/stat") or ""
     periods = {"wake-up": cycle_ms / 1000, "turnaround": TURNAROUND_PERIOD}
     measured = {name: measure(name, each, seconds, reporter) for name, each in periods.items()}
-    checks.append(machine.stolen(before, system.text("/proc/stat") or ""))
-    checks += [_unmeasured(name) for name, latency in measured.items() if latency is None]
+    command = ("python -m hil.doctor.probe permissions   # prints the error",)
+    checks += [
+        Check(f"{name} latency", Status.BAD, "the probe failed", command)
+        for name, latency in measured.items()
+        if latency is None
+    ]
     latencies = tuple(latency for latency in measured.values() if latency is not None)
     one, two = (judge(latencies, cycle) for cycle in CYCLES_MS)
     return Diagnosis(tuple(checks), latencies, (one, two), cycle_ms, seconds)
-
-
-@named("{0} latency")
-def _unmeasured(name: str) -> Check:
-    """Without it there is no verdict."""
-    del name
-    command = "python -m hil.doctor.probe permissions   # prints the error"
-    return bad("the probe failed", command)
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
@@ -312,12 +301,12 @@ def histogram(latency: Latency) -> Iterator[str]:
 
 
 def remedies(checks: Sequence[Check]) -> Iterator[str]:
-    """Yield reason and commands of each check with a remedy, worst first, each command once."""
+    """Yield the commands of each check with a remedy, worst first, each command once."""
     given: set[str] = set()
     for status in (Status.BAD, Status.WARN, Status.UNKNOWN):
         for check in checks:
             if check.status is status and check.remedy:
-                yield f"\n{check.name} ({status}): {check.why}"
+                yield f"\n{check.name} ({status}):"
                 yield from (f"    {command}" for command in check.remedy if command not in given)
                 given.update(check.remedy)
 

@@ -1,0 +1,403 @@
+"""Checks of this PC: permissions, processor, disk, and the link to the controller."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import json
+import re
+import resource
+import shutil
+import socket
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
+from hil.archive.process import STALL_LIMIT
+from hil.reading import parse_toml, read_text
+
+if TYPE_CHECKING:
+    from hil.cell.schema import CanTable, ControllerTable
+
+
+class Status(StrEnum):
+    """Result of a check: works, may cost latency, fails, is not known."""
+
+    OK = "ok"
+    WARN = "warn"
+    BAD = "bad"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check: status, facts, shell commands as remedy."""
+
+    name: str
+    status: Status
+    found: str
+    remedy: tuple[str, ...] = ()
+
+
+COMMAND_TIMEOUT = 3.0
+"""Time limit of a command, s."""
+_LARGEST = 4_000_000
+
+
+def run_command(command: Sequence[str]) -> str | None:
+    """Return the output of a command; None if it is not installed or exceeds the time limit."""
+    path = shutil.which(command[0], path="/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/bin")
+    if path is None:
+        return None
+    try:
+        done = subprocess.run(
+            [path, *command[1:]],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=COMMAND_TIMEOUT,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout
+
+
+class System:
+    """Files and commands of the operating system; `root` is the prefix of every path."""
+
+    def __init__(self, root: Path = Path("/")) -> None:
+        self.root = root
+
+    def run(self, *command: str) -> str | None:
+        """Return the output of a command; None if it is not installed."""
+        return run_command(command)
+
+    def path(self, name: str) -> Path:
+        """Return the path of the file `name` (absolute)."""
+        return self.root / name.lstrip("/")
+
+    def text(self, name: str) -> str:
+        """Return the stripped text of a file; empty if it cannot be read."""
+        try:
+            with self.path(name).open("rb") as file:
+                return file.read(_LARGEST).decode("utf-8", errors="replace").strip()
+        except OSError:
+            return ""
+
+    def texts(self, pattern: str) -> dict[Path, str]:
+        """Return the texts of the files that match a pattern, by path."""
+        found = sorted(self.root.glob(pattern.lstrip("/")))
+        return {path: self.text(str(path.relative_to(self.root))) for path in found}
+
+    def ip(self, *words: str) -> list[dict[str, Any]] | None:
+        """Return the output of `ip`; empty if it fails, None if it is not installed."""
+        output = self.run("ip", "-json", *words)
+        try:
+            return None if output is None else [*json.loads(output)]
+        except ValueError:
+            return []
+
+
+GROUP = "realtime"
+RULE_FILE = "/etc/udev/rules.d/90-hil.rules"
+_JOIN = f'sudo groupadd -f {GROUP} && sudo usermod -aG {GROUP} "$USER"'
+_LOG_IN_AGAIN = "# log out and in again, then: ulimit -r; ulimit -l"
+
+
+def _limit_lines(item: str, value: str) -> tuple[str, ...]:
+    line = f"echo '@{GROUP} - {item} {value}' | sudo tee -a {LIMITS_FILE}"
+    return (_JOIN, line, _LOG_IN_AGAIN)
+
+
+def scheduling(given: RealTimeReport, limit: int) -> Check:
+    """Check the priority of a real-time process, and the limit RLIMIT_RTPRIO of this one."""
+    name, limited = "real-time priority", "no limit" if limit < 0 else f"rtprio limit {limit}"
+    if "FIFO" in given.scheduling.upper():
+        return Check(name, Status.OK, f"{given.scheduling} given ({limited})")
+    found = f"refused, its scheduling is {given.scheduling or 'ordinary'}; {limited}"
+    remedy = _limit_lines("rtprio", "98")
+    if not 0 <= limit < RealTimeSettings().priority:
+        remedy += ("cat /proc/sys/kernel/sched_rt_runtime_us   # 0 forbids real-time programs",)
+    return Check(name, Status.BAD, found, remedy)
+
+
+def memory_lock(given: RealTimeReport, limit: int) -> Check:
+    """Check whether memory can be locked, and the limit RLIMIT_MEMLOCK: page faults cost cycles."""
+    limited = "no limit" if limit < 0 else f"memlock limit {limit // 1024} KiB"
+    name, remedy = "memory lock", _limit_lines("memlock", "unlimited")
+    if given.memory_locked:
+        return Check(name, Status.OK, f"given ({limited})")
+    if any(sentence.startswith("only memory") for sentence in given.refused):
+        return Check(name, Status.WARN, f"only what is in use at the start; {limited}", remedy)
+    return Check(name, Status.BAD, f"refused; {limited}", remedy)
+
+
+_CPU = "/sys/devices/system/cpu"
+_GOOD_CLOCKS = {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page"}
+_IDLE_LATENCY = 50
+"""Largest wake-up time of an idle state, µs."""
+
+
+def clock_source(system: System) -> Check:
+    """Check the clock, which is read several times a cycle."""
+    name, folder = "clock source", "/sys/devices/system/clocksource/clocksource0"
+    source = system.text(f"{folder}/current_clocksource")
+    if not source:
+        return Check(name, Status.UNKNOWN, "not reported by the kernel")
+    if source in _GOOD_CLOCKS:
+        return Check(name, Status.OK, source)
+    offered = "tsc" in system.text(f"{folder}/available_clocksource").split()
+    remedy = (f"echo tsc | sudo tee {folder}/current_clocksource",) if offered else ()
+    return Check(name, Status.WARN, source, remedy)
+
+
+def governor(system: System) -> Check:
+    """Check that the processors are not slowed down."""
+    name = "frequency governor"
+    found = sorted({*system.texts(f"{_CPU}/cpu[0-9]*/cpufreq/scaling_governor").values()} - {""})
+    if found in ([], ["performance"]):
+        return Check(name, Status.OK, "".join(found) or "no frequency scaling on this machine")
+    setting = f"echo performance | sudo tee {_CPU}/cpu*/cpufreq/scaling_governor"
+    return Check(name, Status.WARN, ", ".join(found), (setting,))
+
+
+def idle_states(system: System, *, cpu_awake: bool) -> Check:
+    """Check the idle states; `cpu_awake`: an exchange excludes them by /dev/cpu_dma_latency."""
+    name = "idle states"
+    if cpu_awake:
+        return Check(name, Status.OK, "not entered during an exchange")
+    latencies = {
+        path.parent: int(text)
+        for path, text in system.texts(f"{_CPU}/cpu[0-9]*/cpuidle/*/latency").items()
+        if text.isdecimal() and len(text) < 10
+    }
+    for path, text in system.texts(f"{_CPU}/cpu[0-9]*/cpuidle/*/disable").items():
+        if text == "1":
+            latencies.pop(path.parent, None)
+    if not latencies:
+        return Check(name, Status.OK, "none listed")
+    deepest = max(latencies, key=lambda folder: latencies[folder])
+    state = system.text(str((deepest / "name").relative_to(system.root))) or deepest.name
+    found = f"deepest is {state}, {latencies[deepest]} µs to wake"
+    if latencies[deepest] <= _IDLE_LATENCY:
+        return Check(name, Status.OK, found)
+    rule = f'KERNEL=="cpu_dma_latency", GROUP="{GROUP}", MODE="0660"'
+    remedy = (
+        _JOIN,
+        f"echo '{rule}' | sudo tee {RULE_FILE}",
+        "sudo udevadm control --reload && sudo udevadm trigger --name-match=cpu_dma_latency",
+        "# log out and in again, then: ls -l /dev/cpu_dma_latency; groups",
+    )
+    return Check(name, Status.WARN, f"{found}; /dev/cpu_dma_latency may not be written", remedy)
+
+
+def load(system: System) -> Check:
+    """Check the load: real-time priority has no precedence over interrupts and disk."""
+    count = max(len(system.texts(f"{_CPU}/cpu[0-9]*/uevent")), 1)
+    try:
+        minute = float(system.text("/proc/loadavg").split()[0])
+    except (IndexError, ValueError):
+        return Check("other load", Status.UNKNOWN, "not reported by the kernel", ("uptime",))
+    found = f"{minute:g} programs running or waiting over the last minute, {count} processors"
+    if minute <= 0.5 * count:
+        return Check("other load", Status.OK, found)
+    return Check("other load", Status.WARN, found, ("top   # end programs that are not needed",))
+
+
+def computer_checks(given: RealTimeReport | None, system: System) -> list[Check]:
+    """Check permissions, processor and load; `given` is None if the probe failed."""
+    if given is None:
+        command = ("python -m hil.doctor.probe permissions   # prints the error",)
+        rights = [Check("permissions", Status.BAD, "the probe failed", command)]
+    else:
+        limits = [
+            resource.getrlimit(one)[0] for one in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK)
+        ]
+        rights = [scheduling(given, limits[0]), memory_lock(given, limits[1])]
+    awake = given is not None and given.cpu_awake
+    states = idle_states(system, cpu_awake=awake)
+    return [*rights, clock_source(system), governor(system), states, load(system)]
+
+
+BYTES_PER_CYCLE = 400
+"""Upper bound of the archived bytes per cycle of six axes."""
+_SLOW, _TOO_SLOW = 0.1 * STALL_LIMIT, 0.5 * STALL_LIMIT
+"""Limits of the time of one write, s; a motion is stopped if a write takes several seconds."""
+_MOVE = "# or put the campaign folder on another, local disk"
+
+
+@dataclass(frozen=True)
+class DiskTrial:
+    """Free bytes and write times [s] of the archives' folder; none if writing failed."""
+
+    folder: str
+    free: int
+    seconds: tuple[float, ...] = ()
+    error: str = ""
+
+
+def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
+    """Check free space and write time; `trial` is None if the disk did not respond."""
+    if trial is None:
+        remedy = (f"df -h {place}", _MOVE)
+        found = f"the disk of {place} does not respond"
+        return [Check("disk write", Status.BAD, found, remedy)]
+    hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
+    status = Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD
+    found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
+    remedy = () if hours >= 2 else (f"du -xh {trial.folder} | sort -h | tail",)
+    space = Check("disk space", status, found, remedy)
+    if not trial.seconds:
+        refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
+        remedy = (f"ls -ld {trial.folder}; id", _MOVE)
+        return [space, Check("disk write", Status.BAD, refused, remedy)]
+    worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
+    status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
+    found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
+    return [space, Check("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
+
+
+def controller_in(path: Path) -> ControllerTable:
+    """Return `[controller]` of a cell file, otherwise perhaps incomplete, or raise CellError."""
+    from hil.cell import Cell
+    from hil.cell.errors import UnknownFieldsError
+    from hil.cell.schema import ControllerTable
+
+    try:
+        return Cell.load(path).controller
+    except UnknownFieldsError as unknown:
+        table = parse_toml(read_text(path)).get("controller")
+        if table is None or any(name.startswith("controller.") for name in unknown.fields):
+            raise
+        try:
+            return ControllerTable.model_validate(table)
+        except ValueError:
+            raise unknown from None
+
+
+_ARPHRD_CAN = "280"
+
+
+def can_check(bus: CanTable, system: System) -> Check:
+    """Check that a CAN interface is up at the bit rate of the cell; another one corrupts frames."""
+    # An adapter is not opened here: on the bus it would acknowledge frames.
+    name, fd = f"CAN {bus.interface} {bus.channel}", bus.profile == "fd"
+    if bus.interface != "socketcan":
+        found = "not a kernel device; it is opened by the exchange only"
+        return Check(name, Status.UNKNOWN, found)
+    folder = f"/sys/class/net/{bus.channel}"
+    if system.text(f"{folder}/type") != _ARPHRD_CAN:
+        remedy = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
+        return Check(name, Status.BAD, "is not a CAN interface", remedy)
+    rates = f"bitrate {bus.bitrate or 1_000_000}"
+    if fd:
+        rates += f" dbitrate {bus.data_bitrate or 5_000_000} fd on"
+    bring_up = f"sudo ip link set {bus.channel} up txqueuelen 100 type can {rates}"
+    if system.text(f"{folder}/operstate") == "down":
+        return Check(name, Status.BAD, "down", (bring_up,))
+    shown = system.ip("-details", "link", "show", bus.channel) or [{}]
+    details = shown[0].get("linkinfo", {})
+    if details.get("info_kind") == "vcan":
+        return Check(name, Status.OK, "virtual bus, no bit rate")
+    timings = details.get("info_data", {})
+    nominal, data = (timings.get(of, {}).get("bitrate") for of in ("bittiming", "data_bittiming"))
+    if not nominal:
+        remedy = (f"ip -details link show {bus.channel}",)
+        return Check(name, Status.UNKNOWN, "bit rate not stated", remedy)
+    found = f"up, {nominal} bit/s" + (f", data {data} bit/s" if data else "")
+    wanted = bus.data_bitrate or data if fd else data
+    if nominal == (bus.bitrate or nominal) and data == wanted and (data or not fd):
+        return Check(name, Status.OK, found)
+    down = f"sudo ip link set {bus.channel} down"
+    return Check(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))
+
+
+def try_port(bind: str, port: int) -> int:
+    """Bind the address, release it, and return the error number, 0 without one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+        try:
+            trial.bind((bind, port))
+        except OSError as error:
+            return error.errno or -1
+    return 0
+
+
+def port_check(bind: str, port: int, error: int, system: System) -> Check:
+    """Judge the error number of `try_port`."""
+    name = f"UDP port {port}"
+    if error == 0:
+        return Check(name, Status.OK, f"can be bound on {bind}")
+    found = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
+    remedy: tuple[str, ...] = ()
+    if error == errno.EADDRINUSE:
+        output = system.run("ss", "-lunpH", f"sport = :{port}") or ""
+        user = re.search(r'"(.*?)",pid=(\d+)', output)
+        who = f"{user[1]} (process {user[2]})" if user else "a program of another user"
+        found, remedy = f"in use by {who}", (f"sudo ss -lunp sport = :{port}",)
+    elif error == errno.EADDRNOTAVAIL:
+        found = f"{bind} is not an address of this PC"
+        remedy = ("ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0",)
+    elif error in (errno.EACCES, errno.EPERM):
+        found = "needs a privilege"
+        setting = f"net.ipv4.ip_unprivileged_port_start={port}"
+        remedy = (
+            f"echo '{setting}' | sudo tee /etc/sysctl.d/90-hil.conf && sudo sysctl --system",
+            "# once; hil then needs no privilege for this port",
+        )
+    return Check(name, Status.BAD, found, remedy)
+
+
+def _address_of(host: str, system: System) -> str | None:
+    """Return an IPv4 address, or that of a name in /etc/hosts; None otherwise. No DNS."""
+    lines = [line.split("#")[0].split() for line in system.text("/etc/hosts").splitlines()]
+    for text in (host, *(words[0] for words in lines if host in words[1:])):
+        try:
+            return str(ipaddress.IPv4Address(text))
+        except ValueError:
+            continue
+    return None
+
+
+def route_check(host: str, system: System) -> Check:
+    """Check that the controller is reached directly: a router adds delay, or loses all packets."""
+    name, address = "route to the controller", _address_of(host, system)
+    if address is None:
+        found = f"{host!r} is neither an IPv4 address nor in /etc/hosts"
+        remedy = (f"# write an address in the cell file: host = 10.2.12.150, not {host}",)
+        return Check(name, Status.BAD, found, remedy)
+    routes = system.ip("route", "get", address)
+    if routes is None:
+        return Check(name, Status.UNKNOWN, "ip is not installed", ("sudo apt install iproute2",))
+    head, last = address.rsplit(".", 1)
+    own = f"{head}.{int(last) - 1 if int(last) > 1 else int(last) + 1}"
+    add = f"sudo ip addr add {own}/24 dev CARD   # CARD: the one cabled to the controller"
+    if not routes:
+        return Check(name, Status.BAD, f"none to {address}", ("ip -brief link", add))
+    route = routes[0]
+    if route.get("type") == "local":
+        found = f"{address} is this PC itself (a simulated controller)"
+        return Check(name, Status.OK, found)
+    if "gateway" in route:
+        found = f"over gateway {route['gateway']} on {route['dev']}"
+        return Check(name, Status.BAD, found, (add,))
+    device = route.get("dev", "")
+    if system.text(f"/sys/class/net/{device}/carrier") == "0":
+        remedy = (f"sudo ip link set {device} up", "# check the cable")
+        return Check(name, Status.BAD, f"{device} has no carrier", remedy)
+    return Check(name, Status.OK, f"{address} directly on {device}")
+
+
+def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
+    """Check the link of a cell; None without a cell."""
+    if table is None or table.transport == "simulated":
+        return [Check("controller link", Status.OK, "none: no cell, or a simulated one")]
+    if table.can is not None and table.transport == "can":
+        return [can_check(table.can, system)]
+    error = try_port(table.bind, table.port)
+    return [route_check(table.host, system), port_check(table.bind, table.port, error, system)]
