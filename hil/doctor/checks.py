@@ -245,9 +245,8 @@ class DiskTrial:
 def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     """Check free space and write time; `trial` is None if the disk did not respond."""
     if trial is None:
-        remedy = (f"df -h {place}", _MOVE)
         found = f"the disk of {place} does not respond"
-        return [Check("disk write", Status.BAD, found, remedy)]
+        return [Check("disk write", Status.BAD, found, (f"df -h {place}", _MOVE))]
     hours = trial.free / (BYTES_PER_CYCLE * 3_600_000)
     status = Status.OK if hours >= 2 else Status.WARN if hours >= 0.5 else Status.BAD
     found = f"{trial.free / 1e9:.1f} GB free at {trial.folder}: {hours:.1f} h of recording at 1 ms"
@@ -255,8 +254,8 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     space = Check("disk space", status, found, remedy)
     if not trial.seconds:
         refused = f"cannot write to {trial.folder}: {trial.error or 'no result'}"
-        remedy = (f"ls -ld {trial.folder}; id", _MOVE)
-        return [space, Check("disk write", Status.BAD, refused, remedy)]
+        look = (f"ls -ld {trial.folder}; id", _MOVE)
+        return [space, Check("disk write", Status.BAD, refused, look)]
     worst, middle = max(trial.seconds), sorted(trial.seconds)[len(trial.seconds) // 2]
     status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
     found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
@@ -293,8 +292,8 @@ def can_check(bus: CanTable, system: System) -> Check:
         return Check(name, Status.UNKNOWN, found)
     folder = f"/sys/class/net/{bus.channel}"
     if system.text(f"{folder}/type") != _ARPHRD_CAN:
-        remedy = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
-        return Check(name, Status.BAD, "is not a CAN interface", remedy)
+        look = ("ip -brief link show type can", "sudo modprobe can_raw   # and the card's driver")
+        return Check(name, Status.BAD, "is not a CAN interface", look)
     rates = f"bitrate {bus.bitrate or 1_000_000}"
     if fd:
         rates += f" dbitrate {bus.data_bitrate or 5_000_000} fd on"
@@ -388,8 +387,8 @@ def route_check(host: str, system: System) -> Check:
         return Check(name, Status.BAD, found, (add,))
     device = route.get("dev", "")
     if system.text(f"/sys/class/net/{device}/carrier") == "0":
-        remedy = (f"sudo ip link set {device} up", "# check the cable")
-        return Check(name, Status.BAD, f"{device} has no carrier", remedy)
+        bring_up = (f"sudo ip link set {device} up", "# check the cable")
+        return Check(name, Status.BAD, f"{device} has no carrier", bring_up)
     return Check(name, Status.OK, f"{address} directly on {device}")
 
 
