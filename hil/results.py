@@ -468,21 +468,6 @@ class EstimatorResult(Frozen):
     grouping: str  #: Explanation of the number of base parameters
 
 
-class EndogeneityResult(Frozen):
-    """Durbin-Wu-Hausman test for a bias of least squares by noise in the regressor."""
-
-    sentence: str
-    biased: bool
-    statistic: float
-    p_value: float
-    degrees_of_freedom: tuple[int, int]
-    noise: list[float]
-    """Part of the regressor that the instruments do not explain, as a share of the torque."""
-    shifted: list[str]
-    """Parameters with a significant difference between least squares and instrumental variables."""
-    shift: list[float]  #: Least squares minus instrumental variables, per parameter
-
-
 class UncertaintyResult(Frozen):
     """Standard deviation of each parameter by several methods."""
 
@@ -516,8 +501,6 @@ class Results(Frozen):
     software: dict[str, str]
     excitation: ExcitationResult
     estimator: EstimatorResult
-    endogeneity: EndogeneityResult | None
-    endogeneity_untested: str | None  #: Reason if there was no test
     notes: list[str]  #: Decisions in the preparation of the recordings
     parameters: list[ParameterResult]
     n_base: int

@@ -55,7 +55,6 @@ from identification.signals.clock import TimeBase, time_base, true_times
 from identification.signals.noise import standstill_variance
 from identification.signals.recording import Recording, RecordingError
 from identification.signals.samples import Preprocessing, Samples, prepare, smooth
-from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from identification.validation.evidence import Evidence, gather
 from identification.validation.prediction import PredictionError, prediction_error
 from identification.validation.verdict import Thresholds, Verdict, judge

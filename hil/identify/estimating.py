@@ -46,7 +46,6 @@ from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.factor import QR_CONDITION, Estimate, Factor, no_rows_message
 from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
 from identification.signals.samples import Samples
-from identification.validation.endogeneity import EndogeneityTest, endogeneity_test
 from identification.validation.finding import joined
 
 from .options import Estimator, Options
@@ -80,8 +79,6 @@ class Estimation:
     held_out: tuple[PhaseFactor, ...]  #: one per held-out recording
     #: estimate with the prior from CAD, or the reason why there is none
     posterior: PosteriorEstimate | str
-    #: test for bias by noise in the regressor, or the reason why it was not possible
-    endogeneity: EndogeneityTest | str
     warnings: tuple[str, ...]
 
 
@@ -101,13 +98,12 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
                 Path(source.name), f"{no_rows_message(model)} ({lasts})", remedy="leave it out"
             )
     with reporter.task("estimating", 4) as task:
-        # The endogeneity test needs the samples of least squares, unless "iv" is the estimator.
         fitted = smoothed_for_instruments(model, prepared) if name == "iv" else prepared.fitted
-        instrumental = fit_instrumental(model, prepared, fitted)
         task.advance(1, name)
         prior = cad_prior(cell)
         if name == "iv":
-            result, warnings = _instrumental(model, fitted, instrumental)
+            found = fit_instrumental(model, prepared, fitted)
+            result, warnings = _instrumental(model, fitted, found)
         elif name in _LOSSES:
             result, warnings = _robust(model, fitted, name)
         else:
@@ -129,36 +125,13 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "held-out motion")
         held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
         task.advance(1)
-    endogeneity, more = _endogeneity(name, result.pooled, instrumental)
-    warnings += more
-    return Estimation(name, result, held_out, posterior, endogeneity, tuple(warnings))
-
-
-def _endogeneity(
-    name: str, pooled: Estimate, instrumental: InstrumentalFit | str
-) -> tuple[EndogeneityTest | str, list[str]]:
-    """Return the endogeneity test, or the reason why there is none; and warnings."""
-    warnings: list[str] = []
+    pooled = result.pooled
     if not pooled.undetermined and pooled.condition > QR_CONDITION:
         warnings.append(
             f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
             " parameters poorly (solved by QR)"
         )
-    if isinstance(instrumental, str):
-        words = "Whether noise in the positions biases least squares could not be tested"
-        return f"{words}: {instrumental}.", warnings
-    test = instrumental.test
-    # Undetermined parameters may differ by any amount.
-    if name != "iv" and test.matters and not instrumental.pooled.estimate.undetermined:
-        warnings.append(
-            "noise in the measured positions biases least squares: instrumental variables differ"
-            f" by up to {float(np.max(test.predicted)):.1%} of an axis's torque; compare with"
-            " --estimator iv, or measure positions with less noise"
-        )
-    return test, warnings
-
-
-# Prior from CAD
+    return Estimation(name, result, held_out, posterior, tuple(warnings))
 
 
 def cad_prior(cell: Cell) -> GaussianPrior | str:
@@ -302,11 +275,10 @@ def _prior_contradictions(model: RobotModel, posterior: PosteriorEstimate) -> li
 
 
 class InstrumentalFit(NamedTuple):
-    """Instrumental-variable estimates, pooled and per recording, and the endogeneity test."""
+    """Instrumental-variable estimates, pooled and per recording."""
 
     pooled: InstrumentalEstimate
     each: tuple[Estimate, ...]
-    test: EndogeneityTest
 
 
 def smoothed_for_instruments(model: RobotModel, prepared: Prepared) -> tuple[Samples, ...]:
@@ -343,7 +315,7 @@ def fit_instrumental(
         each = tuple(estimate_instrumental(model, factor).estimate for factor in factors)
     except IdentificationError as error:
         return str(error)
-    return InstrumentalFit(pooled, each, endogeneity_test(model, total, pooled))
+    return InstrumentalFit(pooled, each)
 
 
 def _instrumental(

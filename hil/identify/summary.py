@@ -66,7 +66,7 @@ def summarise(
     excitation, gram = _excitation(prepared)
     simulated = sources.header.only_simulated
     truth = true_values(cell, sources.header) if simulated else None
-    posterior, endogeneity = estimation.posterior, estimation.endogeneity
+    posterior = estimation.posterior
     return results.Results(
         name=name,
         cell=cell.name,
@@ -85,12 +85,6 @@ def summarise(
             condition=pooled.condition,
             grouping=model.base.explanation(),
         ),
-        endogeneity=None
-        if isinstance(endogeneity, str)
-        else results.EndogeneityResult.of(
-            endogeneity, sentence=endogeneity.words, degrees_of_freedom=endogeneity.freedom
-        ),
-        endogeneity_untested=endogeneity if isinstance(endogeneity, str) else None,
         notes=list(prepared.notes),
         parameters=_parameters(cell, estimation, truth),
         n_base=len(model.base.names),

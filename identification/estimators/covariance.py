@@ -50,7 +50,6 @@ _FEWEST_BLOCKS: Final = 20  # fewer blocks make the covariance itself too uncert
 # 80 % without this.
 _LOW_LEVERAGE: Final = 0.5
 _HIGH_LEVERAGE: Final = 0.9
-_ALONE: Final = 1e-6  # smallest share of information in the other blocks when one is left out
 _AT_ONCE: Final = 8  # blocks whose matrices fit the cache
 
 
@@ -177,26 +176,6 @@ def spread(information: Array, scores: Array, root: Array, left: Array | None = 
     """
     left = root if left is None else left
     return leverage_corrected(_shares(information, root, left), scores @ left) @ root.T
-
-
-def left_out(information: Array, scores: Array, root: Array, left: Array | None = None) -> Array:
-    """Return the change of an estimate when one block of samples is left out (B, p).
-
-    Arguments as for :func:`spread`. Directions that only the block determines do not change.
-    """
-    left = root if left is None else left
-    shares, scores = _shares(information, root, left), scores @ left
-    moved = np.empty_like(scores)
-    lapack, identity = scipy.linalg.lapack, np.eye(scores.shape[1])
-    for b, (share, score) in enumerate(zip(shares, scores, strict=True)):
-        others = identity - share
-        factor, pivots, _ = lapack.dgetrf(others)
-        certain, _ = lapack.dgecon(factor, np.abs(others).sum(axis=0).max(initial=0.0))
-        if certain > _ALONE:
-            moved[b] = lapack.dgetrs(factor, pivots, score)[0]
-        else:
-            moved[b] = np.linalg.lstsq(others, score, rcond=_ALONE)[0]
-    return np.asarray(moved @ root.T)
 
 
 def leverage_corrected(shares: Array, scores: Array) -> Array:

@@ -75,11 +75,6 @@ def make_results(**changes: Any) -> Results:
         "estimator": {"name": "wls", "words": "weighted least squares (eq. 4)",
                       "prior": "nominal parameters to 10 %", "condition": 26.4,
                       "grouping": "40 of 66 standard parameters are independent."},
-        "endogeneity": {"sentence": "No sign that noise has biased least squares.",
-                        "biased": False, "statistic": 1.2, "p_value": 0.33,
-                        "degrees_of_freedom": [6, 33], "noise": [0.001] * 6, "shifted": [],
-                        "shift": [0.0] * size},
-        "endogeneity_untested": None,
         "notes": ["the noise of the positions was measured at standstill"],
         "parameters": [
             {"name": row.pivot or row.parameter, "expression": row.parameter,
@@ -119,8 +114,7 @@ def real_recording() -> Results:
     unknown = {"truth": None, "table2_id": None, "repetition_std": None}
     none = dict.fromkeys(("independent_repetitions", "phase_clustered", "scatter_of_mean"))
     return make_results(
-        simulated=False, effects=[], coverage=None, repetitions=["log.mcap"], endogeneity=None,
-        endogeneity_untested="The recordings hold no commanded positions.", notes=[],
+        simulated=False, effects=[], coverage=None, repetitions=["log.mcap"], notes=[],
         excitation={"duration": 9.0, "n_via": None, "fly": None, "planned": None,
                     "executed": _criteria(70.0, 130.0)},
         parameters=[p.model_dump() | unknown for p in whole.parameters],
@@ -465,7 +459,6 @@ class TestEstimation:
             results.estimator.words,
             results.estimator.grouping,
             results.notes[0],
-            results.endogeneity.sentence,
             "58 of 58 parameters are determined by the data",
         ):
             assert words in whole.text
@@ -476,7 +469,6 @@ class TestEstimation:
         parameters = [p.model_copy(update={"learned": None}) for p in recording.parameters]
         update = {"estimator": estimator, "parameters": parameters}
         text = rendered(recording.model_copy(update=update)).text
-        assert "The recordings hold no commanded positions." in text
         assert "None: the URDF gives no inertia." in text
 
     def test_shows_the_chosen_candidate_and_the_best(self, results: Results, whole: Page) -> None:

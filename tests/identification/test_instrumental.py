@@ -19,7 +19,6 @@ from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.smoothing import fit_smoothing_spline
-from identification.validation.endogeneity import endogeneity_test
 from tests.identification import two_link
 from tests.identification.two_link import URDF, as_samples, four_sines, truth
 
@@ -66,11 +65,6 @@ def fit(samples, plan=PLAN):
     return factor, estimate_instrumental(MODEL, factor)
 
 
-def examine(samples):
-    factor, result = fit(samples)
-    return endogeneity_test(MODEL, factor, result)
-
-
 def dense(samples, plan=PLAN):
     """Return Z and W (m, n, p) and y (m, n), zero in unusable rows."""
     rows = samples.usable & MODEL.moving(plan.velocity)
@@ -104,9 +98,8 @@ class TestStrength:
 
     def test_unrelated_instruments_are_weak(self):
         samples = executed(1)
-        factor, result = fit(samples, four_sines(TIME, seed=99))
+        _, result = fit(samples, four_sines(TIME, seed=99))
         assert set(result.weak) >= {"I1yy", "I2yy", "I2m"}
-        assert "too weak for" in endogeneity_test(MODEL, factor, result).words
 
 
 class TestInstrumentalEstimate:
@@ -159,73 +152,6 @@ class TestInstrumentalEstimate:
         assert {"f0_2", "f1_2"} <= set(result.estimate.undetermined)
         assert np.isinf(result.estimate.std[MODEL.parameter_names.index("f0_2")])
         assert {"f0_2", "f1_2"} <= set(result.weak)
-
-
-class TestEndogeneity:
-    def test_without_noise_a_5_percent_test_rejects_3_to_8(self):
-        runs = [examine(executed(seed, correlation=(0.02, 0.1)[seed % 2])) for seed in range(300)]
-        assert 0.03 <= np.mean([run.biased for run in runs]) <= 0.08
-        assert np.mean([bool(run.shifted) for run in runs]) <= 0.05
-
-    @pytest.mark.parametrize(
-        ("noise", "seed", "words"),
-        [
-            (0.0, 0, "does not bias least squares significantly"),
-            (2e-5, 0, "negligible"),
-            *((LARGE, seed, "Use the instrumental variables") for seed in range(5)),
-        ],
-    )
-    def test_the_size_of_the_bias_is_reported(self, noise, seed, words):
-        test, large = examine(executed(seed, position_noise=noise)), noise == LARGE
-        assert (test.biased, test.matters) == (noise > 0.0, large)
-        assert words in test.words
-        assert test.predicted.max() > 0.05 if large else test.predicted.max() < 0.005
-        if large:
-            assert {"I1yy", "I2yy"} <= set(test.shifted)
-            assert "Least squares is biased by noise in the regressor" in test.words
-            assert "I1yy" in test.words
-
-    def test_instruments_equal_to_the_motion_are_untested(self):
-        samples = executed(0, position_noise=SMALL)
-        factor, result = fit(samples, samples.motion)
-        test = endogeneity_test(MODEL, factor, result)
-        assert np.isnan(test.p_value)
-        assert not test.biased
-        assert "was not tested" in test.words
-        np.testing.assert_allclose(
-            result.estimate.values, result.least_squares.values, rtol=1e-7, atol=1e-8
-        )
-
-    def test_the_statistic_is_that_of_the_refitted_regression(self):
-        samples = executed(3, position_noise=1e-4)
-        factor, result = fit(samples)
-        test = endogeneity_test(MODEL, factor, result)
-        scale = np.sqrt(result.weights)
-        z, w, y = (part * (scale[:, None] if part.ndim == 3 else scale) for part in dense(samples))
-        p = MODEL.n_parameters
-        explained = np.linalg.lstsq(
-            z.reshape(-1, p), w.reshape(-1, p) @ result.estimate.values, rcond=None
-        )[0]
-        error = w @ result.estimate.values - z @ explained  # (m, n)
-        own = error[:, :, None] * np.eye(2)  # one column per joint, on its own rows
-        table = np.concatenate([w, own], axis=2)
-        gamma = np.linalg.lstsq(table.reshape(-1, p + 2), y.ravel(), rcond=None)[0][-2:]
-        blocks = test.freedom[0] + test.freedom[1]
-        fine = np.floor(TIME / 0.125 + 1e-9).astype(int)
-        used = np.unique(fine[np.abs(table).sum(axis=(1, 2)) > 0.0])
-        length = -(-len(used) // blocks)
-        block = np.full(len(TIME), -1)
-        for k, one in enumerate(used):
-            block[fine == one] = k // length
-        moved = []
-        for b in range(blocks):
-            left = block != b
-            refit = np.linalg.lstsq(table[left].reshape(-1, p + 2), y[left].ravel(), rcond=None)[0]
-            moved.append(gamma - refit[-2:])
-        covariance = np.array(moved).T @ np.array(moved)
-        squared = gamma @ np.linalg.solve(covariance, gamma)
-        expected = squared * (blocks - 2) / (2 * (blocks - 1))
-        assert test.statistic == pytest.approx(expected, rel=1e-5)
 
 
 class TestPlannedMotion:
