@@ -18,7 +18,7 @@ Archives and other recordings:
 - `Options`: settings of the estimation.
 - `Results`: content of `results.json`.
 - `reidentify`: identify all arms and campaigns below some folders.
-- `export_model`, `replay_motions`: export for simulators; forward simulation of held-out motions.
+- `export_model`: file of the identified arm for simulators.
 - `run_study`: comparison of the two methods of the paper.
 - `errors`: exceptions, with file, field and remedy.
 
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from hil.move import plan_move, send
     from hil.progress import Silent, reporter
     from hil.recordings import open_recording
-    from hil.replaying import replay_motions
     from hil.results import Results
     from hil.simulation import simulated_controller
     from hil.study import run_study
@@ -61,7 +60,6 @@ _HOME = {
     "open_archive": "archive",
     "open_recording": "recordings",
     "reidentify": "batch.run",
-    "replay_motions": "replaying",
     "run_study": "study",
     "simulated_controller": "simulation",
 }
@@ -84,7 +82,6 @@ __all__ = [
     "open_archive",
     "open_recording",
     "reidentify",
-    "replay_motions",
     "reporter",
     "run_study",
     "send",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from io import BytesIO
 from pathlib import Path
@@ -26,7 +26,6 @@ from identification.export.parameters import parameters_csv, parameters_json, st
 from identification.export.urdf import write_urdf
 
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
-_WORDS: Final = ("example_archive", "replay_words")
 _LARGEST: Final = 1 << 30
 """Maximum size of series in bytes, a hundred times that of a campaign of 30 repetitions."""
 
@@ -71,23 +70,6 @@ def rewrite_report(folder: Path) -> Results:
     return results
 
 
-def report_replay(
-    folder: Path,
-    results: Results,
-    replay: Callable[[ReportSeries], ReportSeries],
-    reporter: Reporter,
-) -> None:
-    """Add a replay of the same parameters to the report in a folder; InputError, OutputError."""
-    existing = Results.load(folder / RESULTS)
-    if [p.estimate for p in existing.parameters] != [p.estimate for p in results.parameters]:
-        reporter.say(f"note: {folder / REPORT} is of another identification and was not changed")
-        return
-    series = replay(_load_series(folder / SERIES, len(existing.joint_names)))
-    pages = {SERIES: _series_bytes(series), REPORT: report_bytes(existing, series)}
-    write_files(folder, pages)
-    reporter.say(f"report: {folder / REPORT}")
-
-
 def _series_bytes(series: ReportSeries) -> bytes:
     """Return the series of the figures as a `.npz` file."""
     content = BytesIO()
@@ -105,8 +87,7 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as found:
                 arrays = {name: found[name] for name in found.files}
-        words = {name: str(one) for name, one in arrays.items() if name in _WORDS}
-        series = ReportSeries(**(arrays | words))
+        series = ReportSeries(**arrays | {"example_archive": str(arrays["example_archive"])})
         return series.checked_for(n_joints)
     except Exception as error:  # readers of a corrupt file may raise anything
         problem = f"does not contain the series of a report ({error})"

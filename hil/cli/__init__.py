@@ -165,7 +165,7 @@ def presented(command: Any) -> Any:
 COMMANDS = LazyCommands(
     dict.fromkeys(
         (
-            "demo", "design", "rehearse", "status", "report", "replay", "identify", "reidentify",
+            "demo", "design", "rehearse", "status", "report", "identify", "reidentify",
             "compare", "export", "gains", "payload", "plan", "plot", "new", "move", "run",
             "record", "simulate", "study", "doctor", "import", "archive",
         )

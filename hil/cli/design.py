@@ -85,7 +85,7 @@ def _draw(
     together: bool,
 ) -> None:
     """Draw the picture; a failure is only reported."""
-    from hil.plots.design_picture import draw_design  # loads the arm's shapes
+    from hil.plots.design_picture import draw_design  # matplotlib is slow to import
 
     figure = draw_design(
         done.design,

@@ -1,4 +1,4 @@
-"""`hil export`: write the identified arm for MuJoCo, Gazebo and other simulators."""
+"""`hil export`: write the identified arm for MuJoCo and other simulators."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ def export(
     archives: ArchivesArgument,
     to: Annotated[FormatName, typer.Option()],
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
-    ensemble: Annotated[int, typer.Option(min=0, max=10000)] = 0,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
     estimator: EstimatorOption = "auto",
     *,
     how: Identifying,
@@ -42,20 +40,17 @@ def export(
     those of the model at 1000 random states. Effects that the format cannot express are listed with
     their torque over the recorded motion. Exit status 5 if the model is not good.
 
-    **Examples:** `hil export runs/demo --to mjcf`, `hil export runs/demo --to sdf --ensemble 100`
+    **Example:** `hil export runs/demo --to mjcf`
 
     Options:
-        to: mjcf: MuJoCo XML; sdf: Gazebo, Drake; urdf: other tools.
-        output: File to write. Default: identified.xml, .sdf or .urdf in the campaign folder or the
+        to: mjcf: MuJoCo XML; urdf: other tools.
+        output: File to write. Default: identified.xml or .urdf in the campaign folder or the
             working directory.
-        ensemble: Number of variants, sampled from the uncertainty of the parameters and physically
-            consistent, in a folder next to OUTPUT.
-        seed: Seed of the variants.
     """
     reporter = make_reporter(quiet=quiet or json)
     found = identify_sources(archives, reporter, how.options(estimator=estimator))
     target = output or default_output(archives, to)
-    exported = export_model(found, target, to, ensemble=ensemble, seed=seed)
+    exported = export_model(found, target, to)
     if json:
         print_json(exported.to_dict())
     else:

@@ -28,7 +28,7 @@ DelayOption = Annotated[
 ]
 
 FEW: Final = ("bandwidth", "velocity", "standstill", "torque_bandwidth")
-"""Options that `hil export` and `hil replay` do not have."""
+"""Options that `hil export` does not have."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Picture of a designed motion: joints and limits, correlations, front, postures."""
+"""Picture of a designed motion: joints and limits, correlations, front."""
 
 from __future__ import annotations
 
@@ -14,11 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from hil.arm import Arm
 from hil.cell import AngleFrame, Cell
 from hil.plots import style
 from hil.plots.plan_picture import draw_motion
-from hil.plots.posture_strip import VIEWS, Strip, draw_strip
 from hil.report.drawing import label
 from hil.report.figures import shade_scale
 from identification.excitation import (
@@ -36,7 +34,6 @@ from planner import Trajectory
 Array = NDArray[np.float64]
 Measures = tuple[float, ...]  #: log10 det, I_c
 
-POSTURES: Final = 7
 _PERIOD: Final = 0.001
 """Sampling period of the correlations, s."""
 _MARKERS: Final = "DsP^vX"
@@ -131,10 +128,6 @@ def _heading(
         figures += " with earlier archives, not comparable with those of a single motion"
     duration = f"{excitation.trajectory.duration:.2f} s"
     parts = (label(cell.name), f"method {excitation.method}", duration, figures)
-    legend = (
-        "red dashes: limits; grey lines: postures numbered below; blue: volume swept by the arm; "
-        "brown: path of the end effector to the next posture"
-    )
     for text, size, colour in (
         (" · ".join(parts), style.TITLE, style.INK),
         (
@@ -148,7 +141,7 @@ def _heading(
             style.LIMIT,
         ),
         (margins, style.SMALL, style.INK),
-        (legend, style.SMALL, style.MUTED),
+        ("red dashes: limits", style.SMALL, style.MUTED),
     ):
         for line in textwrap.wrap(text, int(_LINE_LENGTH / size)):
             yield line, size, colour
@@ -174,28 +167,24 @@ def draw_design(
         margins: text on the distance to the limits.
     """
     model, trajectory = cell.model, design.excitation.trajectory
-    strip = Strip.of(Arm.from_urdf(cell.urdf), trajectory, cell.workspace, POSTURES)
     lines = list(_heading(design, cell, unchecked, margins, together=together))
     side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
     beside = _FRONT + _LEGEND_LINE * (len(references) + 3)
     head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT
     upper = max(_ROW * model.n_joints + 0.6, side + 1.0 + beside)
-    shapes = [strip.shape(one) for one in VIEWS]
-    lower = 0.9 + sum(shapes) * (_WIDTH - 1.2) / POSTURES
-    height = head + upper + lower
+    height = head + upper
     with style.page():
         figure = Figure(figsize=(_WIDTH, height), layout="constrained")
-        parts: Any = figure.subfigures(3, 1, height_ratios=(head, upper, lower))
-        _, top, bottom = parts
+        parts: Any = figure.subfigures(2, 1, height_ratios=(head, upper))
+        top = parts[1]
         left, right = top.subfigures(1, 2, width_ratios=(_WIDTH - side - 1.7, side + 1.7))
         rows = left.subplots(model.n_joints, 2, squeeze=False).tolist()
         frame = AngleFrame.of(cell)
-        draw_motion(rows, trajectory, cell.joint_limits, cell.joint_names, frame, strip.postures)
+        draw_motion(rows, trajectory, cell.joint_limits, cell.joint_names, frame)
         left.align_ylabels()
         matrix, below = right.subplots(2, 1, height_ratios=(side + 0.6, beside))
         draw_correlation(matrix, trajectory, model)
         draw_front(below, design, references)
-        draw_strip(bottom.subplots(2, POSTURES, height_ratios=shapes).tolist(), strip)
         for k, (text, size, colour) in enumerate(lines):
             at = 1.0 - (_TITLE_AT + k * _HEAD_LINE) / height
             weight = "bold" if colour == style.LIMIT else "normal"
@@ -203,7 +192,7 @@ def draw_design(
         figure.draw_without_rendering()
         figure.set_layout_engine("none")
         # The layout solver is not reproducible to the last digit.
-        for part in (top, bottom, left, right):
+        for part in (top, left, right):
             part.bbox_relative.set_points(np.round(part.bbox_relative.get_points(), 4))
         for axes in figure.axes:
             axes.set_position(np.round(axes.get_position(original=True).bounds, 4).tolist())

@@ -6,7 +6,6 @@ import textwrap
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -38,11 +37,10 @@ def draw_motion(
     limits: JointLimits,
     joint_names: Sequence[str],
     frame: AngleFrame,
-    postures: Sequence[float] | Array = (),
 ) -> None:
     """Draw a row per joint: position, velocity and, if there is a third column, acceleration.
 
-    Limits are URDF angles, displayed in `frame`; the times of `postures` (k,) [s] are numbered.
+    Limits are URDF angles, displayed in `frame`.
     """
     time = np.linspace(0.0, trajectory.duration, _SAMPLES)
     q, *rates = trajectory.sample(time)
@@ -56,8 +54,6 @@ def draw_motion(
     for joint, (name, row) in enumerate(zip(joint_names, rows, strict=True)):
         for axes, (_, values, low, high, colour) in zip(row, columns, strict=False):
             _against_limits(axes, float(low[joint]), float(high[joint]), values[:, joint])
-            for at in postures:
-                axes.axvline(at, color=style.RULE, linewidth=0.8)
             axes.plot(*thinned(time, values[:, joint], 400), color=colour, linewidth=1.1)
             axes.set_xlim(0.0, max(trajectory.duration, 1e-9))
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
@@ -66,8 +62,6 @@ def draw_motion(
         row[0].set_ylabel(wrapped(name), color=style.INK)
     for axes, (title, *_) in zip(rows[0], columns, strict=False):
         axes.set_title(title, loc="left", color=style.MUTED, pad=13.0)
-        for number, at in enumerate(postures, 1):
-            _number(axes, number, at, fontweight="bold", annotation_clip=False)
     for axes in rows[-1]:
         axes.set_xlabel("time [s]")
 
@@ -88,11 +82,11 @@ def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
     axes.yaxis.set_major_formatter("{x:.4g}")
 
 
-def _number(axes: Axes, number: int, at: float, **words: Any) -> None:
+def _number(axes: Axes, number: int, at: float) -> None:
     """Write a number above the axes."""
     axes.annotate(
         str(number), (at, 1.0), xycoords=("data", "axes fraction"), xytext=(0.0, 2.0),
-        textcoords="offset points", ha="center", fontsize=style.SMALL, color=style.INK, **words,
+        textcoords="offset points", ha="center", fontsize=style.SMALL, color=style.INK,
     )  # fmt: skip
 
 

@@ -40,7 +40,6 @@ from hil.report.drawing import (
     panel,
     place,
     ruled,
-    thinned,
     time_panel,
     to_panel,
 )
@@ -53,7 +52,6 @@ Array = NDArray[np.float64]
 _LEFT, _RIGHT = 46.0, 10.0
 _INNER: Final = PANEL_WIDTH - _LEFT - _RIGHT
 _POINTS: Final = 1200  # of lines that are smooth
-_BAND_POINTS: Final = 400
 _INTERVAL: Final = 1.96  # Half a 95 % interval, in standard errors
 MEAN_ABS_OF_NORMAL: Final = math.sqrt(2.0 / math.pi)
 """Mean |e| of normal residuals of standard deviation 1."""
@@ -182,29 +180,6 @@ def _left_out(time: Array, used: Array, joint: int) -> Sequence[tuple[float, flo
     edges = np.concatenate([time[:1], 0.5 * (time[1:] + time[:-1]), time[-1:]])
     changes = edges[np.flatnonzero(np.diff(out.astype(np.int8)))].tolist()
     return tuple(zip(changes[::2], changes[1::2], strict=True))
-
-
-def replay_panels(series: ReportSeries, joints: Sequence[Joint]) -> list[Panel]:
-    """Position error of each joint over time; none where nothing was simulated."""
-    time = series.replay_time
-    panels: list[Panel] = []
-    for j, name, torque, _ in joints if time.size > 1 else ():
-        error, unit = np.nan_to_num(series.replay_error[:, j]), "°" if torque == "N·m" else "mm"
-        rms = f"{significant(float(np.sqrt(np.mean(error**2))), 2)} {unit} rms"
-        caption = Caption(f"q{j}r", name, rms, "simulated less recorded position over time")
-        with panel(panels, 170.0, caption, f"position error [{unit}]", "time [s]") as axes:
-            if series.replay_spread.size:
-                some = slice(None, None, 1 + len(time) // _BAND_POINTS)
-                width = 2.0 * np.nan_to_num(series.replay_spread[some, j])
-                edges = error[some] - width, error[some] + width
-                axes.fill_between(time[some], *edges, color=BAND, linewidth=0.0)
-            if series.replay_nominal.size:
-                nominal = np.nan_to_num(series.replay_nominal[:, j])
-                axes.plot(*thinned(time, nominal), color=SECOND, linewidth=1.0)
-            axes.plot(*thinned(time, error), color=INK, linewidth=1.2)
-            axes.set_xlim(float(time[0]), float(time[-1]))
-            ruled(axes, "y")
-    return panels
 
 
 # Friction

@@ -51,7 +51,6 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "torque_panels": figures.torque_panels(series, joints),
         "split_panels": figures.split_panels(series, joints),
         "spectrum_panels": figures.spectrum_panels(series, joints),
-        "replay_panels": figures.replay_panels(series, joints),
         "curve_panels": figures.friction_curve_panels(series, joints),
         **figures.residual_panels(results),
     }

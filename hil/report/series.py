@@ -25,7 +25,6 @@ _LENGTHS: Final = {
     "s": "law_speed",
     "r": "reversal_travel",
     "f": "spectrum_frequency",
-    "q": "replay_time",
 }
 
 
@@ -76,13 +75,6 @@ class ReportSeries:
     spectrum_residual: Annotated[Array, "fn"] = field(default_factory=_empty)
     #: of the smoothed positions of the example [Hz]; NaN where unknown
     motion_bandwidth: Annotated[Array, "n"] = field(default_factory=_empty)
-    replay_time: Annotated[Array, "q"] = field(default_factory=lambda: np.empty(0))
-    #: simulated minus recorded position of the identified and the nominal model [° or mm]
-    replay_error: Annotated[Array, "qn"] = field(default_factory=_empty)
-    replay_nominal: Annotated[Array, "qn"] = field(default_factory=_empty)
-    #: standard deviation of variants of the identified model
-    replay_spread: Annotated[Array, "qn"] = field(default_factory=_empty)
-    replay_words: str = ""  #: causes of drift of the identified model, one sentence per line
 
     def __post_init__(self) -> None:
         position = self.excitation_position

@@ -1,4 +1,4 @@
-"""The identified arm for simulators: MuJoCo's XML (MJCF), SDF, URDF."""
+"""The identified arm for simulators: MuJoCo's XML (MJCF) and URDF."""
 
 from __future__ import annotations
 
@@ -9,18 +9,10 @@ from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
-from identification.export.urdf import (
-    TENSOR,
-    WriteBackError,
-    as_text,
-    comment_text,
-    rnea,
-    write_urdf,
-)
+from identification.export.urdf import WriteBackError, as_text, comment_text, rnea, write_urdf
 from identification.model.elements import TorsionSpring
 from identification.model.friction import COULOMB, CUBIC, QUADRATIC, TANH, VISCOUS, FrictionTerm
 from identification.model.kinematics import pinocchio_model
@@ -39,7 +31,6 @@ AGREES: Final = 1e-6
 _SEED: Final = 20140903
 # Default ranges of random states: rad or m, rad/s or m/s, rad/s² or m/s².
 _ANYWHERE, _SPEED, _ACCELERATION = math.pi, 2.0, 10.0
-_BASE: Final = "robot_base"
 _DRY: Final = (COULOMB, TANH)
 _DRY_LABELS: Final = tuple(term.label for term in _DRY)
 _TIMESTEP: Final = 1e-3  # s
@@ -169,45 +160,6 @@ def mjcf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     return _text(root)
 
 
-def sdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
-    """Return the arm as a model of SDF 1.9, its base fixed to the world."""
-    model = arm.model
-    document = Node("sdf", version="1.9")
-    _comment(document, remarks)
-    root = _add(document, "model", name=name)
-    links = [arm.link(j) for j in range(model.n_joints)]
-    _add(root, "link", name=_BASE)
-    _nested(_add(root, "joint", name=f"{_BASE}_fixed", type="fixed"), parent="world", child=_BASE)
-    for j, (joint_name, mass) in enumerate(zip(model.joint_names, arm.bodies, strict=True)):
-        parent = int(model.chain.parents[j])
-        above = links[parent] if parent >= 0 else _BASE
-        link = _add(root, "link", name=links[j])
-        place = _rpy(model.chain.rotation[j], model.chain.translation[j])
-        _add(link, "pose", relative_to=above).text = place
-        inertial = _add(link, "inertial")
-        _nested(inertial, pose=as_text([*mass.centre, 0.0, 0.0, 0.0]), mass=as_text(mass.mass))
-        tensor = {n: as_text(mass.inertia[place]) for n, place in TENSOR.items()}
-        _nested(_add(inertial, "inertia"), **tensor)
-        kind = "revolute" if model.chain.revolute[j] else "prismatic"
-        node = _add(root, "joint", name=joint_name, type=kind)
-        _nested(node, parent=above, child=links[j])
-        axis = _add(node, "axis")
-        _nested(axis, xyz=as_text(model.chain.axis[j]))
-        known = {key: float(value[j]) for key, value in arm.ranges._asdict().items()}
-        _nested(
-            _add(axis, "limit"), **{k: as_text(v) for k, v in known.items() if math.isfinite(v)}
-        )
-        friction, (stiffness, rest) = arm.friction[j], arm.spring(j)
-        dry = max(0.0, friction.get("f0", 0.0))
-        figures = {"damping": friction.get("f1", 0.0), "friction": dry}
-        if stiffness:
-            figures |= {"spring_stiffness": stiffness, "spring_reference": rest}
-        _nested(_add(axis, "dynamics"), **{k: as_text(v) for k, v in figures.items()})
-        for frame, pose in arm.fixed(j).items():
-            _add(_add(root, "frame", name=frame, attached_to=links[j]), "pose").text = _rpy(*pose)
-    return _text(document)
-
-
 def urdf(arm: Arm, name: str, remarks: Sequence[str] = ()) -> str:
     """Return the URDF with the arm's bodies and friction; see `write_urdf`."""
     del name
@@ -223,9 +175,8 @@ class Format(NamedTuple):
     # torques (m, n) of bodies, rotors, springs and speed-dependent friction, from text, arm, motion
     read: Callable[[str, Arm, Motion], Array]
     friction: tuple[FrictionTerm, ...] = (COULOMB, TANH, VISCOUS)
-    rotors: bool = False  # rotor inertias, and inertia and friction of coupled motors
-    springs: bool = True  # torsion springs
-    payload: bool = True  # a stated payload
+    # rotor inertias, inertia and friction of coupled motors, torsion springs, a stated payload
+    drives: bool = False
 
 
 class Comparison(NamedTuple):
@@ -290,15 +241,19 @@ def _parts(form: Format, arm: Arm, motion: Motion) -> Iterator[tuple[str, Array,
             of_kind = [one.term.label == kind.label and not one.motor for one in terms]
             yield kind.description, _friction(arm, motion, of_kind), kind in form.friction
     diagonal = np.diag(np.diag(arm.rotors))
-    motors = [one.motor and not (form.rotors and one.term.label in _DRY_LABELS) for one in terms]
-    yield "rotor inertias", qdd @ diagonal, form.rotors
-    yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.rotors
-    yield "friction of coupled motors", _friction(arm, motion, motors), form.rotors
-    yield "the payload", model.load_torque(*motion[1:4]) - model.elements.known(q), form.payload
+    motors = [one.motor and not (form.drives and one.term.label in _DRY_LABELS) for one in terms]
+    yield "rotor inertias", qdd @ diagonal, form.drives
+    yield "inertia of coupled motors", qdd @ (arm.rotors - diagonal), form.drives
+    yield "friction of coupled motors", _friction(arm, motion, motors), form.drives
+    yield (
+        "the payload",
+        model.load_torque(*motion[1:4]) - model.elements.known(q),
+        form.drives,
+    )
     for one in model.elements.placed:
         torque, values = np.zeros(q.shape), arm.values[model.element_part][one.part]
         torque[:, one.joint] = one.columns(q) @ values + one.known(q)
-        supported = form.springs and isinstance(one.element, TorsionSpring)
+        supported = form.drives and isinstance(one.element, TorsionSpring)
         yield f"{type(one.element).__name__} of {one.element.joint}", torque, supported
 
 
@@ -356,37 +311,6 @@ def _pinocchio_torque(text: str, arm: Arm, motion: Motion) -> Array:
     return rnea(model, *motion[1:4]) + np.asarray(model.damping) * motion.velocity
 
 
-def _sdf_torque(text: str, arm: Arm, motion: Motion) -> Array:
-    """Return the torques of the bodies, damping and springs of an SDF text."""
-    root = ElementTree.fromstring(text).find("model")
-    assert root is not None
-    model, places = pin.Model(), dict[str | None, int]()
-    model.gravity.linear = arm.model.gravity
-    links = {link.get("name"): link for link in root.iter("link")}
-    dynamics = []
-    for joint in root.iter("joint"):
-        child, parent = joint.findtext("child"), joint.findtext("parent")
-        if joint.get("type") == "fixed":
-            places[child] = 0
-            continue
-        kind = "Revolute" if joint.get("type") == "revolute" else "Prismatic"
-        joint_model = getattr(pin, f"JointModel{kind}Unaligned")(_figures(joint, "axis/xyz"))
-        x, y, z, *rpy = _figures(links[child], "pose")
-        pose = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array([x, y, z]))
-        places[child] = model.addJoint(places[parent], joint_model, pose, joint.get("name"))
-        tensor = np.zeros((3, 3))
-        for name, (i, j) in TENSOR.items():
-            tensor[i, j] = tensor[j, i] = _figures(links[child], f"inertial/inertia/{name}")[0]
-        centre = _figures(links[child], "inertial/pose")[:3]
-        inertia = pin.Inertia(_figures(links[child], "inertial/mass")[0], centre, tensor)
-        model.appendBodyToJoint(places[child], inertia, pin.SE3.Identity())
-        tags = ("damping", "spring_stiffness", "spring_reference")
-        dynamics.append([float(joint.findtext(f"axis/dynamics/{tag}") or 0.0) for tag in tags])
-    damping, stiffness, rest = np.array(dynamics).T
-    torque = rnea(model, *motion[1:4]) + damping * motion.velocity
-    return np.asarray(torque + stiffness * (motion.position - rest))
-
-
 def _mujoco_torque(text: str, arm: Arm, motion: Motion, *, friction: bool = False) -> Array:
     """Return the torques of MuJoCo's inverse dynamics."""
     mujoco = load_mujoco()
@@ -427,10 +351,9 @@ FORMATS: Final[Mapping[str, Format]] = {
         mjcf,
         _mujoco_torque,
         friction=(COULOMB, TANH, VISCOUS, QUADRATIC, CUBIC),
-        rotors=True,
+        drives=True,
     ),
-    "sdf": Format(".sdf", sdf, _sdf_torque),
-    "urdf": Format(".urdf", urdf, _pinocchio_torque, springs=False, payload=False),
+    "urdf": Format(".urdf", urdf, _pinocchio_torque),
 }
 """Formats by name."""
 
@@ -471,10 +394,6 @@ def _pose(rotation: Array, translation: Array) -> dict[str, str]:
     }
 
 
-def _rpy(rotation: Array, translation: Array) -> str:
-    return as_text([*translation, *pin.rpy.matrixToRpy(rotation)])
-
-
 def _comment(node: Node, remarks: Sequence[str]) -> None:
     if remarks:
         lines = "".join(f"  {comment_text(line)}\n" for line in remarks)
@@ -484,15 +403,6 @@ def _comment(node: Node, remarks: Sequence[str]) -> None:
 def _add(parent: Node, tag: str, /, **attributes: str | None) -> Node:
     known = {key: value for key, value in attributes.items() if value is not None}
     return ElementTree.SubElement(parent, tag, known)
-
-
-def _nested(node: Node, /, **texts: str) -> None:
-    for tag, text in texts.items():
-        _add(node, tag).text = text
-
-
-def _figures(node: Node, path: str) -> Array:
-    return np.array([float(part) for part in (node.findtext(path) or "").split()])
 
 
 def _rms(torque: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Files of the identified model, and `hil export`: files for simulators, ensembles."""
+"""Files of the identified model, and `hil export`."""
 
 from __future__ import annotations
 
@@ -22,14 +22,11 @@ from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from hil.cli import app
-from hil.exporting import arm_of, spread_of
 from hil.importers import ColumnMap, Robot, import_log
 from hil.outcome import FILES, Exports, provenance_of
 from hil.results import Results, VerdictResult
-from identification.estimators.consistent import sample_ensemble
 from identification.export.parameters import parameters_json
 from identification.model.kinematics import chain_from_urdf
-from identification.model.pseudo_inertia import margin
 
 from .identified_arm import (
     TWO_LINK,
@@ -332,61 +329,15 @@ def log(arm: IdentifiedArm, tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
-class TestEnsemble:
-    """Variants are consistent and have the covariance of the estimate."""
-
-    def test_torque_spreads_as_wide_as_its_interval(self, arm: IdentifiedArm) -> None:
-        """A standard deviation of 200 variants has an error of 5 %; three times that is allowed."""
-        variants = sample_ensemble(arm.cell.model, arm.estimate, 200, 1)
-        motion, consistent = a_motion(2, 7), arm.consistency.consistent
-        spread = spread_of(arm_of(arm.cell, consistent), variants, arm.estimate.covariance, motion)
-        np.testing.assert_allclose(spread.variants, spread.covariance, rtol=0.15)
-        centre = arm.cell.model.torque(arm.estimate.values, *motion[1:])
-        mean = np.mean([arm.cell.model.torque(v, *motion[1:]) for v in variants.values], axis=0)
-        assert np.all(np.abs(mean - centre).mean(axis=0) < 0.2 * spread.covariance)
-
-    @pytest.mark.parametrize("factor", [1.0, 1e6])
-    def test_every_variant_is_a_possible_machine(self, arm: IdentifiedArm, factor: float) -> None:
-        """Also with intervals far beyond consistent values."""
-        model = arm.cell.model
-        wide = replace(arm.estimate, covariance=factor * arm.estimate.covariance)
-        variants = sample_ensemble(model, wide, 20, 1)
-        assert np.all(margin(variants.standard[:, model.layout.links]) > 0.0)
-        assert np.all(variants.standard[:, model.layout.rotors] >= 0.0)
-        base = variants.standard @ model.base.grouping.T
-        np.testing.assert_allclose(variants.values[:, : model.base.rank], base)
-        for values in variants.values:
-            for row in model.friction.table(values[model.friction_part]):
-                assert row["f0"] >= 0.0
-                assert row["f1"] >= 0.0
-
-    def test_one_seed_is_one_ensemble(self, arm: IdentifiedArm) -> None:
-        one, same, other = (
-            sample_ensemble(arm.cell.model, arm.estimate, 5, seed).standard for seed in (1, 1, 2)
-        )
-        np.testing.assert_array_equal(one, same)
-        assert not np.array_equal(one, other)
-        still = identified_arm(TWO_LINK, still=(0,))
-        variants = sample_ensemble(still.cell.model, still.estimate, 5, 1)
-        place = still.cell.model.parameter_names.index("f1_1")
-        np.testing.assert_allclose(variants.values[:, place], variants.values[0, place])
-
-
 class TestCommand:
     """Files and output of the command."""
 
-    def test_an_arm_and_its_variants(self, log: Path, tmp_path: Path) -> None:
-        output = tmp_path / "deep" / "arm.sdf"
-        words = (log, "--to", "sdf", "--ensemble", 3, "--seed", 2, "-o", output)
-        found = json.loads(command("export", *words, "--json").stdout)
+    def test_an_arm(self, log: Path, tmp_path: Path) -> None:
+        output = tmp_path / "deep" / "arm.urdf"
+        found = json.loads(command("export", log, "--to", "urdf", "-o", output, "--json").stdout)
         assert found["path"] == str(output)
         assert found["read_back"] < 1e-6
         assert "rotor inertias" in found["left_out"]
-        folder = tmp_path / "deep" / "arm_ensemble"
-        assert sorted(p.name for p in folder.glob("*.sdf")) == ["0.sdf", "1.sdf", "2.sdf"]
-        with np.load(folder / "ensemble.npz") as arrays:
-            assert arrays["standard"].shape == (3, len(arrays["standard_names"]))
-            assert arrays["values"].shape == (3, len(arrays["names"]))
         text = output.read_text()
         assert "verdict: " in text
         assert "log.mcap sha256" in text
@@ -399,22 +350,3 @@ class TestCommand:
         output = command("export", log, "--to", "mjcf").stdout
         assert "not read back: MuJoCo is not installed" in output
         assert (tmp_path / "identified.xml").read_text().startswith("<mujoco")
-
-    def test_a_replay_shows_the_deviation_of_models(self, log: Path, tmp_path: Path) -> None:
-        picture = tmp_path / "deep" / "replay.svg"
-        models = json.loads(command("replay", log, "-o", picture, "--json").stdout)["models"]
-        assert max(models["identified"]["rms"]) < min(models["nominal"]["rms"])
-        assert 0.0 < max(models["spread of the ensemble"]["rms"]) < min(models["nominal"]["rms"])
-        assert "</svg>" in picture.read_text()
-
-    def test_a_replay_goes_into_a_report_of_the_same_parameters(
-        self, log: Path, tmp_path: Path
-    ) -> None:
-        """Not into that of another estimate; a new identification removes it."""
-        (tmp_path / log.name).write_bytes(log.read_bytes())
-        reports = []
-        few = ("replay", "--ensemble", "2")
-        for words in (("identify",), (*few, "--estimator", "ols"), few, ("identify",)):
-            command(*words, tmp_path)
-            reports.append("Forward simulation" in (tmp_path / "report.html").read_text())
-        assert reports == [False, False, True, False]

@@ -1,4 +1,4 @@
-"""Files for simulators, parts of torque, noise, and replays of motions."""
+"""Files for simulators, parts of torque, and noise."""
 
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -6,17 +6,15 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from identification import FrictionLaw, Motion, RobotModel
+from identification import FrictionLaw, RobotModel
 from identification.export.simulators import (
     AGREES,
     FORMATS,
     Arm,
     Ranges,
     compare,
-    load_mujoco,
     mjcf,
     random_states,
-    sdf,
 )
 from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.export.urdf import WriteBackError
@@ -25,10 +23,9 @@ from identification.model.elements import Anchors, GasCylinder, TorqueRipple, To
 from identification.model.payload import Payload
 from identification.signals.noise import noiseless_above, spectrum
 from identification.signals.smoothing import LowPassShape, low_passed
-from identification.validation.replay import FEEDBACK, Simulated, replay, slow_residual
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-from tests.identification.two_link import URDF, as_samples, one_sine, sine_motion, values_of
+from tests.identification.two_link import URDF, as_samples, one_sine, values_of
 
 LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
 WRIST = np.eye(6)
@@ -139,26 +136,24 @@ class TestTexts:
         assert (joint.get("stiffness"), joint.get("springref")) == ("50.0", "0.3")
         assert [one.get("ctrlrange") for one in model.iter("motor")] == ["-40.0 40.0"] * n
         assert "gravcomp" not in mjcf(arm, "arm")
-        limit = ElementTree.fromstring(sdf(arm, "arm")).find(".//joint[@name='joint_2']/axis/limit")
-        assert {one.tag: one.text for one in limit} == {
-            "lower": "-1.0", "upper": "2.0", "velocity": "3.0", "effort": "40.0"}  # fmt: skip
 
     @FORMS
     def test_dry_friction_is_written_as_it_was_identified(self, form):
         arm = an_arm(urdf_text())
         f0 = [row["f0"] for row in arm.friction]
         root = ElementTree.fromstring(FORMATS[form].write(arm, "arm", []))
-        if form == "sdf":
-            found = [float(one.text or 0) for one in root.iter("friction")]
-        else:
-            where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
-            found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
+        where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
+        found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
         assert found == f0
 
     def test_a_link_does_not_share_its_name_with_a_joint(self):
         urdf = urdf_text().replace('"link_2"', '"joint_2"')
-        root = ElementTree.fromstring(sdf(an_arm(urdf), "arm"))
-        names = [one.get("name") for tag in ("link", "joint", "frame") for one in root.iter(tag)]
+        root = ElementTree.fromstring(mjcf(an_arm(urdf), "arm"))
+        names = [
+            one.get("name")
+            for tag in ("body", "joint", "site")
+            for one in root.find("worldbody").iter(tag)
+        ]
         assert len(names) == len(set(names))
 
 
@@ -322,133 +317,3 @@ class TestNoise:
     def test_of_a_constant_or_a_few_samples_is_not_judged(self):
         assert self.above(np.ones((4000, 2))) is None
         assert self.above(self.torque(0.0)[:20]) is None
-
-
-def an_ns16(**options):
-    arm = an_arm(urdf_text(), **options)
-    return Simulated(arm.model, arm.standard[None], arm.values[None])
-
-
-def recorded(arm, step=0.002):
-    """A motion of three seconds of sines with its torque."""
-    time = np.arange(0.0, 3.0, step)
-    rng = np.random.default_rng(2)
-    size, rate, phase = (rng.uniform(low, high, 6) for low, high in ((0.2, 0.5), (2, 4), (0, 6)))
-    motion = sine_motion(time, size, rate, phase)
-    return samples(arm.model, motion, arm.model.torque(arm.values[0], *motion[1:]))
-
-
-def samples(model, motion, torque):
-    return as_samples(model, motion, torque, usable=np.ones(torque.shape, dtype=np.bool_))
-
-
-OPTIONS = {
-    "all friction": {"friction": FrictionLaw(asymmetric=True, stribeck=0.2, third="cubic")},
-    "smooth sign": {"friction": FrictionLaw(tanh=0.05)},
-    "coupled wrist": {"coupling": Coupling(WRIST)},
-    "spring": {"elements": [TorsionSpring("joint_2", 0.3, identified=True)]},
-}
-
-
-class TestReplay:
-    """The true model reproduces the motion; another one does not."""
-
-    @pytest.mark.parametrize("name", OPTIONS)
-    def test_the_true_arm_makes_the_motion(self, name):
-        arm = an_ns16(**OPTIONS[name])
-        error = replay(arm, recorded(arm))
-        assert np.abs(error).max() < 2e-3  # rad, of a motion of about 0.7
-
-    @pytest.mark.parametrize("name", OPTIONS)
-    def test_arms_side_by_side_move_as_each_by_itself(self, name):
-        arm = an_ns16(**OPTIONS[name])
-        given = recorded(arm)
-        short = samples(arm.model, given.motion.rows(slice(0, 300)), given.torque[:300])
-        both = together(arm, changed_weight(arm, 1.2))
-        back = together(changed_weight(arm, 1.2), arm)
-        found, alone, heavy = (replay(one, short) for one in (both, arm, back))
-        np.testing.assert_allclose(found[0], alone[0], atol=1e-12)
-        assert not np.allclose(found[1], heavy[0], atol=1e-6)  # another inertia's feedback
-
-    def test_an_arm_of_another_weight_drifts(self):
-        arm = an_ns16()
-        good, bad = replay(together(arm, changed_weight(arm, 1.2)), recorded(arm))
-        assert np.all(np.sqrt(np.mean(bad**2, axis=0)) > 3.0 * np.sqrt(np.mean(good**2, axis=0)))
-
-    def test_dry_friction_holds_an_arm_at_rest(self):
-        """Without friction every joint would fall."""
-        arm = an_ns16(friction=FrictionLaw(viscous=False, third=None))
-        values = arm.values.copy()
-        values[:, arm.model.friction_part] = 1e4
-        time, still = np.arange(0.0, 0.2, 2e-3), np.full((100, 6), 0.5)
-        motion = Motion(time, still, 0.0 * still, 0.0 * still)
-        error = replay(arm._replace(values=values), samples(arm.model, motion, 0.0 * still))
-        assert np.abs(error).max() < 1e-9
-
-    def test_a_gap_starts_a_new_simulation(self):
-        arm = an_ns16()
-        given = recorded(arm)
-        parts = replace(given, segments=(slice(0, 600), slice(800, 1500)))
-        error = replay(arm, parts)
-        assert np.isnan(error[:, 600:800]).all()
-        assert not error[:, [0, 800]].any()
-
-    def test_mujoco_makes_the_same_motion(self):
-        """With half of the true mass, from the same description with the same feedback."""
-        pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
-        truth = an_ns16(coupling=Coupling(WRIST))
-        given, arm = recorded(truth, 1e-3), changed_weight(truth, 0.5)
-        found = given.motion.position + replay(arm, given)[0]
-        np.testing.assert_allclose(found, by_mujoco(arm, given), atol=5e-3)
-
-
-def changed_weight(arm, factor):
-    values = arm.values.copy()
-    values[:, : arm.model.base.rank] *= factor
-    return arm._replace(standard=factor * arm.standard, values=values)
-
-
-def together(*arms):
-    standard, values = (np.concatenate([one[k] for one in arms]) for k in (1, 2))
-    return Simulated(arms[0].model, standard, values)
-
-
-def by_mujoco(arm, given):
-    mujoco = load_mujoco()
-    own = {"model": arm.model, "standard": arm.standard[0], "values": arm.values[0]}
-    text = mjcf(replace(an_arm(urdf_text()), **own), "arm")
-    model = mujoco.MjModel.from_xml_string(text)
-    model.opt.timestep = 1e-3
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = given.motion.position[0], given.motion.velocity[0]
-    mujoco.mj_forward(model, data)
-    full = np.zeros((6, 6))
-    for row, unit in zip(full, np.eye(6), strict=True):
-        mujoco.mj_mulM(model, data, row, unit)
-    rate = 2.0 * np.pi * FEEDBACK
-    positions = []
-    for q, v, torque in zip(*given.motion[1:3], given.torque, strict=True):
-        positions.append(data.qpos.copy())
-        wanted = rate**2 * (q - data.qpos) + 2.0 * rate * (v - data.qvel)
-        data.ctrl[:] = torque + np.diag(full) * wanted
-        mujoco.mj_step(model, data)
-    return np.array(positions)
-
-
-class TestSlowResidual:
-    """Causes of drift are separated by their dependence on the motion."""
-
-    @pytest.mark.parametrize("joint", [0, 3])
-    def test_an_offset_and_friction_are_separated(self, joint):
-        arm = an_ns16()
-        right = recorded(arm)
-        velocity = right.motion.velocity[:, joint]
-        for torque, shares in ((5.0, (1.0, 0.0)), (5.0 * np.sign(velocity), (0.0, 1.0))):
-            wrong = right.torque.copy()
-            wrong[:, joint] += torque
-            found = slow_residual(arm, [replace(right, torque=wrong)])
-            explained = found.constant[joint], found.friction[joint]
-            others = np.delete(found.rms, joint)
-            assert np.argmax(explained) == np.argmax(shares)
-            assert explained[0] + explained[1] > 0.9
-            assert others.max() < 1e-6 * found.rms[joint]

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.arm import Arm
 from hil.errors import InputError
 from hil.importers import Robot
 from hil.new import cell_of_urdf
@@ -85,12 +84,11 @@ def import_robot(path: Path) -> bool:
 
 
 def model_of(text: str) -> bool:
-    """Chain, model, shapes and collisions."""
+    """Chain, model and collisions."""
     try:
         chain = chain_from_urdf(text)
     except ModelError:
         assert refuses(RobotModel.from_urdf, text)
-        assert refuses(Arm.from_urdf, text)
         return False
     n = chain.n_joints
     for values in (chain.rotation, chain.translation, chain.axis, chain.inertial):
@@ -105,8 +103,6 @@ def model_of(text: str) -> bool:
     if model is not None:
         motion = np.linspace(-1.0, 1.0, 3 * n).reshape(3, n)
         assert np.isfinite(model.regressor(motion, motion, motion).dense(model.n_parameters)).all()
-    arm = Arm.from_urdf(text)
-    assert all(np.isfinite(corners).all() for corners in arm.corners(np.zeros((1, n))))
     with suppress(CollisionModelError, ModelError):
         CollisionChecker(text, Workspace(floor=0.0))
     return model is not None
