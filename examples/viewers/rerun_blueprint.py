@@ -1,4 +1,4 @@
-"""Write `arm.rbl`: `rerun arm.rbl runs/demo/annotated/validation_000_a1.mcap` opens both.
+"""Write `arm.rbl`: `rerun arm.rbl runs/demo/archives/validation_000_a1.mcap` opens both.
 
 Needs `pip install rerun-sdk`; hil itself does not.
 """
@@ -10,7 +10,6 @@ import rerun.blueprint as rrb
 PLOTS = {
     "position, velocity and torque": "/joint_states",
     "commanded": "/joint_states_commanded",
-    "predicted": "/joint_states_predicted",
 }
 EVENTS = "/hil/events"
 ARM = ("/robot_description", "/tf_static")

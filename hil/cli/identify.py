@@ -7,11 +7,9 @@ from typing import Annotated
 
 import typer
 
-from hil.annotating import annotate as write_annotated
 from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, with_options
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.verdict import finish
-from hil.errors import InputError
 from hil.files import make_folder
 from hil.identify import identify_sources
 from hil.outcome import write_outcome
@@ -29,7 +27,6 @@ def identify(
     estimator: EstimatorOption = "auto",
     *,
     how: Identifying,
-    annotate: bool = False,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -48,8 +45,6 @@ def identify(
             predicted.
         in_sample: Fit all recordings and hold nothing out. All errors are then in-sample, and the
             model cannot be judged good.
-        annotate: Also write copies of the archives with the predicted torque as a third JointState
-            channel, for viewers, to the folder annotated of OUTPUT.
     """
     reporter = make_reporter(quiet=quiet or json)
     method = "paper" if paper else "default"
@@ -58,13 +53,8 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
     if output is not None:
         make_folder(output)
-    elif annotate:
-        problem, remedy = "needs an output folder", "add -o FOLDER"
-        raise InputError(None, problem, field="--annotate", remedy=remedy)
     found = identify_sources(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:
         results = write_outcome(output, found, reporter)
-        if annotate:
-            write_annotated(found, output, reporter)
     finish(results, json=json, quiet=quiet)

@@ -1,4 +1,4 @@
-"""Content of an archive: `hil plot`, copies for viewers, and layouts of viewers."""
+"""Content of an archive: `hil plot`, and layouts of viewers."""
 
 from __future__ import annotations
 
@@ -23,25 +23,20 @@ from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from drivers.record import cycle_dtype
-from hil.annotating import PREDICTED, annotate, annotated
 from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
-from hil.campaign import Campaign, design
+from hil.campaign import Campaign
 from hil.cli import app
-from hil.errors import ArchiveError, InputError, NotAnArchiveError
-from hil.identify import Identification, identify_campaign
-from hil.identify.options import FIXED
+from hil.errors import ArchiveError, InputError
 from hil.plots.archive_view import (
     ArchiveView,
     archive_page,
     draw_archive,
     view_of,
 )
-from hil.progress import Silent
 from sim_fixtures.ns16 import URDF_PATH
-from tests.hil.fast_cell import fast_cell
 
 VIEWERS = Path(__file__).parents[2] / "examples" / "viewers"
-STATES = ("/joint_states", "/joint_states_commanded", PREDICTED)
+STATES = ("/joint_states", "/joint_states_commanded")
 
 Messages = Mapping[str, list[tuple[int, Any]]]
 
@@ -57,90 +52,8 @@ def messages(path: Path) -> Messages:
 
 
 @pytest.fixture(scope="module")
-def short_campaign(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
-    folder = tmp_path_factory.mktemp("viewers")
-    cell = fast_cell(folder, repetitions=2)
-    short_campaign = Campaign.create(folder / "campaign", cell, design(cell, Silent()))
-    short_campaign.run(unrehearsed=True, durable=False)
-    return short_campaign
-
-
-@pytest.fixture(scope="module")
-def found(short_campaign: Campaign) -> Identification:
-    return identify_campaign(short_campaign.folder.root, Silent(), FIXED)
-
-
-@pytest.fixture(scope="module")
-def copies(found: Identification, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return annotate(found, tmp_path_factory.mktemp("output"), Silent())
-
-
-@pytest.fixture(scope="module")
-def seen(copies: list[Path]) -> Messages:
-    return messages(next(path for path in copies if path.name == "validation_000_a1.mcap"))
-
-
-class TestCopies:
-    """Copies have measured, commanded and predicted joint states."""
-
-    def test_each_archive_of_a_motion_has_one_that_is_no_archive(
-        self, copies: list[Path], found: Identification
-    ) -> None:
-        """The same recording is fitted once."""
-        moving = {path.name for path in found.paths if "standstill" not in path.name}
-        assert {path.name for path in copies} == moving
-        with pytest.raises(NotAnArchiveError, match="no 'hil' metadata"):
-            open_archive(copies[0])
-
-    def test_copies_have_predicted_and_commanded_states(
-        self, seen: Messages, found: Identification
-    ) -> None:
-        """At the same times, with the prediction error of the results."""
-        torque = {time: np.array(state.effort) for time, state in seen["/joint_states"]}
-        times, predicted = zip(*seen[PREDICTED], strict=True)
-        error = np.array([torque[t] - one.effort for t, one in zip(times, predicted, strict=True)])
-        usable, samples = found.prepared.held_out[0].usable, found.prepared.held_out[0]
-        expected = samples.torque - samples.predicted_torque(
-            found.cell.model, found.estimate.pooled.values
-        )
-        np.testing.assert_allclose(error[usable], expected[usable], atol=1e-9)
-        # The arm rests before the first set-point: the controller's own target stands there.
-        position = np.array([state.position for _, state in seen["/joint_states_commanded"]])
-        velocity = np.array([state.velocity for _, state in seen["/joint_states_commanded"]])
-        assert np.isfinite(position).all()
-        assert np.isfinite(velocity).all()
-
-    def test_times_are_those_of_the_recording_day(
-        self, short_campaign: Campaign, tmp_path: Path
-    ) -> None:
-        """If the archive states it; otherwise times are those of the archive."""
-        archive = open_archive(short_campaign.folder.archives / "excitation_000_a1.mcap")
-        n = len(archive.joint_names)
-        prediction = {"time": np.array([0.0, 1.0]), "effort": np.zeros((2, n))}
-        begins = []
-        for day in (None, "2026-03-04T05:06:07+00:00", "someday"):
-            entries = {**archive.header.entries, **({} if day is None else {"recorded_at": day})}
-            header = type(archive.header).of(entries)
-            path = tmp_path / "day.mcap"
-            path.write_bytes(annotated(replace(archive, header=header), prediction))
-            stamps = messages(path)[PREDICTED]
-            assert stamps[1][0] - stamps[0][0] == 10**9
-            assert stamps[0][0] == stamps[0][1].header.stamp.sec * 10**9 + (
-                stamps[0][1].header.stamp.nanosec
-            )
-            begins.append(stamps[0][0])
-        first = int(archive.columns["stamp"][0])
-        assert begins == [first, 1_772_600_767 * 10**9, first]
-
-    def test_a_folder_is_needed(self, short_campaign: Campaign) -> None:
-        archive = str(short_campaign.folder.archives / "excitation_000_a1.mcap")
-        with pytest.raises(InputError, match="--annotate: needs an output folder"):
-            CliRunner().invoke(app, ["identify", archive, "--annotate"], catch_exceptions=False)
-
-
-@pytest.fixture(scope="module")
 def six(tmp_path_factory: pytest.TempPathFactory) -> Messages:
-    """A copy of an archive of the NS 16."""
+    """Messages of an archive of the NS 16."""
     path = tmp_path_factory.mktemp("six") / "move_000_a1.mcap"
     names = tuple(f"joint_{k}" for k in range(1, 7))
     rows = np.zeros(100, cycle_dtype(6))
@@ -153,20 +66,18 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Messages:
         archive.event(0, "MotionStarted", "off we go")
         archive.write(rows, np.ones((100, 6)))
         archive.close("completed")
-    prediction = {"time": np.arange(0.1, 0.2, 0.002), "effort": np.ones((50, 6))}
-    path.write_bytes(annotated(open_archive(path), prediction))
     return messages(path)
 
 
 class TestLayouts:
-    """Every topic and field that a layout names is in a copy of an arm of six joints."""
+    """Every topic and field that a layout names is in an archive of an arm of six joints."""
 
     def test_foxglove(self, six: Messages) -> None:
         layout = json.loads((VIEWERS / "foxglove.json").read_text())
         panels = layout["configById"]
         assert set(re.findall(r'"([\w ]+![\w]+)"', json.dumps(layout["layout"]))) == set(panels)
         paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
-        assert len(paths) == 36
+        assert len(paths) == 30
         for text in paths:
             topic, word, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d)\]", text).groups()  # type: ignore[union-attr]
             assert np.isfinite(getattr(six[topic][0][1], word)[int(index)])
@@ -187,7 +98,7 @@ class TestLayouts:
             )
         }
         curves = [curve.get("name") for curve in root.iter("curve")]
-        assert len(curves) == 36
+        assert len(curves) == 30
         assert set(curves) <= series
         for splitter in root.iter("DockSplitter"):
             sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
@@ -209,7 +120,7 @@ class TestLayouts:
             for call in view.call_args_list
             for topic in re.findall(r"(/\w[\w/]*)/\*\*", str(call.kwargs["contents"]))
         ]
-        assert set(named) == set(six)
+        assert set(named) == set(six) - {"/hil/cycle"}
 
 
 @pytest.fixture
