@@ -6,24 +6,20 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
 from hil.archive import schema
-from hil.archive.cdr import LayoutError, MessageLayout, Rows
-from hil.archive.chunk import Messages
-from hil.archive.container import Damage
+from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome
-from hil.archive.scan import ALWAYS, NUMBERS, Scan
-from hil.archive.schema import CYCLE, EVENTS, LATER_FIELDS
+from hil.archive.scan import ALWAYS, Scan
+from hil.archive.schema import CYCLE, LATER_FIELDS
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json
-
-_COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,107 +128,6 @@ class Archive:
         return rows
 
 
-class _Content:
-    """Columns and events selected from a file; see `open_archive` for the arguments."""
-
-    def __init__(
-        self,
-        fields: Collection[str] | None,
-        topics: Collection[str] | None,
-        times: tuple[int, int],
-    ) -> None:
-        self.events: list[ArchivedEvent] = []
-        self._fields = fields
-        self._topics = topics
-        self._times = times
-        self._layouts: dict[str, MessageLayout] = {}
-        self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
-        self._stamps = np.zeros(0, np.int64)
-        self._count = 0
-
-    def visit(self, scan: Scan, found: Mapping[str, Messages], offset: int) -> None:
-        """Decode messages; none of them is added before all are verified."""
-        topics = scan.topics
-        wanted = [topic for topic in topics if topic in found and topic != EVENTS]
-        if self._topics is None and not wanted and not found.keys().isdisjoint(NUMBERS):
-            raise Damage(offset, "(chunk) has samples in other channels than those before")
-        layouts = {topic: self._layout(scan, topic, found[topic], offset) for topic in wanted}
-        for topic, layout in layouts.items():
-            if not all(map(layout.matches, found[topic].data)):
-                raise Damage(offset, "(chunk) has messages that differ from those before")
-        start, stop = self._times
-        if EVENTS in topics and EVENTS in found:
-            try:
-                events = [ArchivedEvent.decode(message) for message in found[EVENTS].all()]
-            except LayoutError as error:
-                problem = f"(chunk) has an event that cannot be read: {error}"
-                raise Damage(offset, problem) from error
-            self.events += [event for event in events if start <= event.stamp < stop]
-        if not wanted:
-            return
-        room = scan.expected_samples if self._times == ALWAYS else 0
-        for topic in layouts.keys() - self._layouts.keys():
-            self._begin(topic, layouts[topic], max(room, len(self._stamps)))
-        stamps, chosen = found[wanted[0]].stamps, None
-        if self._times != ALWAYS:
-            chosen = (stamps >= start) & (stamps < stop)
-            stamps = stamps[chosen]
-        begin, self._count = self._count, self._count + len(stamps)
-        if self._count > len(self._stamps):
-            self._stamps = np.resize(self._stamps, 2 * self._count)
-            self._raw = {key: np.resize(raw, 2 * self._count) for key, raw in self._raw.items()}
-        self._stamps[begin : self._count] = stamps
-        for topic in wanted:
-            self._append(topic, found[topic], begin, chosen)
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the columns, contiguous and read-only, all of the same length."""
-        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
-        for (topic, name), raw in self._raw.items():
-            dtype = self._layouts[topic].dtype[name]
-            base, shape = dtype.subdtype or (dtype, ())
-            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
-        for column in columns.values():
-            column.flags.writeable = False
-        return columns
-
-    def _layout(self, scan: Scan, topic: str, messages: Messages, offset: int) -> MessageLayout:
-        """Return the layout of a topic's messages, known or by the first of them."""
-        if topic in self._layouts:
-            return self._layouts[topic]
-        assert scan.header is not None
-        record, first = scan.parser.schema(topic), bytes(messages.data[0][0])
-        try:
-            return schema.message_layout(topic, scan.header.joint_names, record, first)
-        except LayoutError as error:
-            raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
-
-    def _begin(self, topic: str, layout: MessageLayout, room: int) -> None:
-        """Create the columns of a topic, with room for so many samples."""
-        self._layouts[topic], self._stamps = layout, np.resize(self._stamps, room)
-        for name in layout.dtype.names or ():
-            wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
-            if wanted and name not in ("sec", "nanosec"):
-                self._raw[topic, name] = np.empty(room, f"V{layout.dtype[name].itemsize}")
-
-    def _append(
-        self, topic: str, messages: Messages, at: int, chosen: NDArray[np.bool_] | None
-    ) -> None:
-        """Copy messages, or those chosen of them (k,), into the columns from `at` on."""
-        fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
-        columns = [(raw, fields[name][1]) for (own, name), raw in self._raw.items() if own == topic]
-        begin = 0
-        for data in messages.data:
-            part = slice(begin, begin + len(data))
-            begin = part.stop
-            if chosen is not None:
-                data = data[chosen[part]]
-            now = slice(at, at + len(data))
-            at = now.stop
-            for raw, start in columns:
-                raw[now] = data[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
-
-
 def open_archive(
     path: str | PathLike[str],
     *,
@@ -269,16 +164,7 @@ def open_archive(
         ALWAYS[0] if start is None else round(start * 1e9),
         ALWAYS[1] if stop is None else round(stop * 1e9),
     )
-    content = _Content(fields, topics, times)
-    try:
-        with open_file(path) as stream:
-            scan = Scan(stream, content.visit, topics=topics, times=times)
-    except OSError as error:
-        raise refusal(path, error) from error
-    except MemoryError as error:
-        raise ArchiveError(
-            path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
-        ) from error
+    scan = scan_file(path, fields=fields, topics=topics, times=times)
     damage = scan.damage
     if scan.header is None:
         raise _unreadable(path, scan)
@@ -287,7 +173,7 @@ def open_archive(
     if damage is None and recorded and unknown:
         remedy = f"it has {', '.join(recorded)}"
         raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
-    columns, text = content.columns(), None
+    columns, text = scan.columns, None
     if damage is not None:
         text = f"the record at byte {damage.offset} {damage.reason}"
         text += f" ({scan.size - damage.offset} bytes from there on are unused)"
@@ -299,15 +185,23 @@ def open_archive(
         outcome=scan.outcome,
         attachments=scan.attachments,
         columns=columns,
-        events=tuple(content.events),
+        events=tuple(scan.events),
         damage=text,
     )
 
 
-def refusal(path: Path, error: OSError) -> ArchiveError:
-    """Return the error of an archive that the system cannot read."""
-    remedy = "check whether it was moved or removed, and whether it can be copied"
-    return ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy)
+def scan_file(path: Path, **options: Any) -> Scan:
+    """Scan a file, with the options of `Scan`; ArchiveError if it cannot be read."""
+    try:
+        with open_file(path) as stream:
+            return Scan(stream, **options)
+    except OSError as error:
+        remedy = "check whether it was moved or removed, and whether it can be copied"
+        raise ArchiveError(path, f"cannot be read: {error.strerror}", remedy=remedy) from error
+    except MemoryError as error:
+        raise ArchiveError(
+            path, "does not fit into memory", remedy="read a part of its time, or fewer columns"
+        ) from error
 
 
 def _unreadable(path: Path, scan: Scan) -> ArchiveError:

@@ -16,25 +16,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from hil.archive import container, header, schema
-from hil.archive.chunk import ChunkParser, Messages
+from hil.archive.chunk import ChunkParser
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.reader import open_archive, refusal
+from hil.archive.reader import open_archive, scan_file
 from hil.archive.scan import Scan
 from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
 from hil.files import replace_file, sync_folder
 from hil.reading import open_file
-
-Visit = Callable[[Scan, Mapping[str, Messages], int], None]
-
-
-def scan_file(path: Path, visit: Visit = lambda *_: None) -> Scan:
-    """Scan a whole file, past its damages; ArchiveError if it cannot be read."""
-    try:
-        with open_file(path) as stream:
-            return Scan(stream, visit, past_damage=True)
-    except OSError as error:
-        raise refusal(path, error) from error
 
 
 @dataclass(frozen=True)
@@ -78,7 +67,7 @@ def repair(
         ArchiveError: it cannot be read, or nothing of it can be saved.
     """
     path = Path(path)
-    found = scan_file(path)
+    found = scan_file(path, past_damage=True)
     if found.header is None:
         open_archive(path, fields=())  # raises with the reason
         raise NotAnArchiveError(path, "is not an archive")
@@ -104,7 +93,7 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
         ArchiveWriteError: it cannot be written; the archive is unchanged.
     """
     path = Path(path)
-    found = scan_file(path)
+    found = scan_file(path, past_damage=True)
     if (
         found.faults
         or found.header is None

@@ -1,4 +1,4 @@
-"""Verification of an archive, record by record.
+"""Verification of an archive, record by record: the one judge of what is whole in a file.
 
 A reader stops at the first damage, checks and repairs continue behind it. The checksum of a chunk
 does not show that it belongs to this recording: a file system may put a chunk of another archive in
@@ -9,17 +9,19 @@ missing, cycle numbers must increase.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from typing import BinaryIO, Final, NamedTuple
+from typing import Any, BinaryIO, Final
 
 import numpy as np
 from mcap.records import Header
 from numpy.typing import NDArray
 
 from hil.archive import container, schema
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import ChunkParser, Content, Messages
 from hil.archive.container import Damage, Record, Summary
+from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     METADATA,
     OUTCOME,
@@ -37,27 +39,14 @@ ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
 _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
-_ASPECTS = {
-    container.METADATA: "metadata",
-    container.ATTACHMENT: "attachments",
-    container.CHUNK: "chunks",
-}
-
-
-class Fault(NamedTuple):
-    """A violation of the profile: its aspect, a sentence, and whether content is lost."""
-
-    aspect: str
-    text: str
-    loss: bool
+_COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
 
 
 class Scan:
     """The verified content of an archive.
 
     Args:
-        visit: receives verified messages by topic, of the chunk at an offset (and of some that
-            follow); raises `Damage` where they cannot be used, and then they do not count.
+        fields: columns wanted, None for all.
         topics: channels wanted, None for those of the samples and the events; others are verified
             only with `past_damage`.
         times: range of the stamps wanted [ns]; chunks outside, by the index, are not read.
@@ -68,19 +57,19 @@ class Scan:
         metadata, header: the ``hil`` record as read, and parsed: None where invalid
             (`header_error`) or of another version.
         outcome: the ``hil.outcome`` record, None until it was read.
-        expected_samples: how many the outcome states, limited to what fits into the file.
+        events: those of the times wanted.
         definitions: schema and channel records of the summary.
         counts: messages by topic.
         chunks: number of valid chunks.
         pieces: opcode, offset and length of the valid records except header and outcome.
-        faults: what is wrong, except message indexes and summary.
+        faults: what is wrong, a sentence each, except message indexes and summary.
     """
 
     def __init__(
         self,
         stream: BinaryIO,
-        visit: Callable[[Scan, Mapping[str, Messages], int], None],
         *,
+        fields: Collection[str] | None = (),
         topics: Collection[str] | None = None,
         times: tuple[int, int] = ALWAYS,
         past_damage: bool = False,
@@ -91,16 +80,16 @@ class Scan:
         self.header_error: HeaderError | None = None
         self.outcome: ArchiveOutcome | None = None
         self.attachments: dict[str, bytes] = {}
+        self.events: list[ArchivedEvent] = []
         self.parser = ChunkParser()
         self.counts: dict[str, int] = {}
         self.chunks = 0
         self.pieces: list[tuple[int, int, int]] = []
-        self.record = Record(0, 0, b"")
         self.damage: Damage | None = None
-        self.faults: list[Fault] = []
-        self._visit = visit
-        self._topics = topics
+        self.faults: list[str] = []
+        self._fields, self._topics, self._times = fields, topics, times
         self._past_damage = past_damage
+        self._lost = False
         self._gap = False  # whether something was lost behind the last valid chunk
         self._skipped = False  # whether chunks were left out: channels continue at any number
         self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
@@ -109,6 +98,10 @@ class Scan:
         self._next: dict[str, int] = {}
         self._numbers: set[str] = set()
         self._newest = -1  # stamp of a cycle [ns]
+        self._layouts: dict[str, MessageLayout] = {}
+        self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
+        self._stamps = np.zeros(0, np.int64)
+        self._count = 0
         start = _data_end(stream, self.size) if past_damage else None
         summary = Summary.read(stream, self.size, start=start)
         self._written_by = _written_by(stream, self.size)
@@ -118,7 +111,8 @@ class Scan:
         # Another program that copies a file may divide it into other chunks, and writes its name.
         if self._written_by[1] == schema.LIBRARY and stated.chunks is not None:
             self._chunk_list = np.array(stated.chunks, np.uint32)
-        self.expected_samples = min(stated.samples or 0, self.size // _LEAST)
+        expected = min(stated.samples or 0, self.size // _LEAST)
+        self._room = expected if times == ALWAYS and fields != () else 0
         self.definitions = summary.definitions if summary else []
         stream.seek(0)
         if past_damage:
@@ -136,6 +130,18 @@ class Scan:
         return (*samples, schema.EVENTS)
 
     @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns wanted and ``stamp``, contiguous and read-only, all of the same length."""
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for (topic, name), raw in self._raw.items():
+            dtype = self._layouts[topic].dtype[name]
+            base, shape = dtype.subdtype or (dtype, ())
+            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
+        for column in columns.values():
+            column.flags.writeable = False
+        return columns
+
+    @property
     def mixed(self) -> bool:
         """Whether begin and end are of two recordings; the samples may be of either."""
         return self.outcome is not None and not self.outcome.belongs_to(self.header)
@@ -148,14 +154,12 @@ class Scan:
     @property
     def losses(self) -> list[str]:
         """What is lost, and where; empty if all that was written is there."""
-        if not any(fault.loss for fault in self.faults):
-            return []
-        return [fault.text for fault in self.faults if fault.loss or fault.aspect == "container"]
+        return self.faults if self._lost else []
 
     @property
     def samples_lost(self) -> int | None:
         """Number of lost samples, None where unknown."""
-        if not self.losses:
+        if not self._lost:
             return 0
         stated = self.outcome.samples if self.outcome else None
         return None if stated is None else max(0, stated - self.samples)
@@ -179,7 +183,7 @@ class Scan:
             if outside and chunks is not None and self._place < len(chunks):
                 raise Damage(self.size, "is not there: a chunk is missing")
             if not outside and self.header is not None:
-                for _, text in self._shortfalls():
+                for text in self._shortfalls():
                     raise Damage(self.size, f"is not there: {text}")
         except Damage as damage:
             self.damage = damage
@@ -203,39 +207,40 @@ class Scan:
                 self._try_add(record)
         except Damage as damage:
             self._gap = True  # counts and outcome show what is lost
-            self._add_fault("container", damage, loss=False)
+            self._add_fault(damage, loss=False)
         for place in summary.places if summary else ():
             if place[0] not in seen:
                 seen.add(place[0])
                 try:
                     self._try_add(container.record_at(stream, *place))
                 except Damage as damage:
-                    self._add_fault("container", damage, loss=True)
+                    self._add_fault(damage)
         if self.metadata is not None:
             if self._written_by != (schema.PROFILE, schema.LIBRARY):
-                self._add_fault("container", "the header is not that of the profile", loss=False)
+                self._add_fault("the header is not that of the profile", loss=False)
             if self.mixed:
-                self._add_fault("outcome", "the outcome is that of another recording", loss=True)
-            for aspect, text in self._shortfalls():
-                self._add_fault(aspect, text, loss=True)
+                self._add_fault("the outcome is that of another recording")
+            for text in self._shortfalls():
+                self._add_fault(text)
 
     def _try_add(self, record: Record) -> None:
         try:
             self._add(record)
         except Damage as damage:
-            self._add_fault(_ASPECTS.get(record.opcode, "container"), damage, loss=True)
+            self._add_fault(damage)
 
-    def _add_fault(self, aspect: str, problem: Damage | str, *, loss: bool) -> None:
+    def _add_fault(self, problem: Damage | str, *, loss: bool = True) -> None:
+        """Add a fault, which does not lose content unless `loss`."""
         self._gap |= loss
+        self._lost |= loss
         if isinstance(problem, Damage):
             problem = f"the record at byte {problem.offset} {problem.reason}"
-        fault = Fault(aspect, problem, loss)
-        if fault not in self.faults:
-            self.faults.append(fault)
+        if problem not in self.faults:
+            self.faults.append(problem)
 
     def _add(self, record: Record) -> None:
         """Verify the next record, and add its content; `Damage` if it is not the next one."""
-        self.record, offset = record, record.offset
+        offset = record.offset
         if record.opcode == container.CHUNK:
             if self.metadata is None:
                 return  # some other MCAP file
@@ -306,14 +311,14 @@ class Scan:
             self._decode(self._buffer[place], offset)
             self.chunks += 1
 
-    def _shortfalls(self) -> Iterator[tuple[str, str]]:
-        """Yield aspect and sentence for what the file states to contain and does not."""
+    def _shortfalls(self) -> Iterator[str]:
+        """Yield a sentence for what the file states to contain and does not."""
         for name in self.header.attachments if self.header else ():
             if name not in self.attachments:
-                yield "attachments", f"attachment {name!r} is missing"
+                yield f"attachment {name!r} is missing"
         outcome = self.outcome
         if outcome is None:
-            yield "outcome", "the outcome is missing"
+            yield "the outcome is missing"
             return
         found: dict[str, tuple[int | None, int]] = {}
         counts = {"samples": NUMBERS, "events": (schema.EVENTS,), "packets": (schema.PACKETS,)}
@@ -326,7 +331,7 @@ class Scan:
             found["chunks"] = len(self._chunk_list), self.chunks
         for key, (stated, count) in found.items():
             if stated != count:
-                yield "outcome", f"{stated} {key} were written, {count} are there"
+                yield f"{stated} {key} were written, {count} are there"
 
     def _check_order(self, crc: int, offset: int) -> None:
         """Check that the chunk with this checksum is the next of those that were written."""
@@ -364,19 +369,18 @@ class Scan:
             if unknown := by_number.keys() - parser.channels.keys():
                 raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
             found = {parser.channels[number].topic: one for number, one in by_number.items()}
+            wanted = [topic for topic in self.topics if topic in found]
             numbers = found.keys() & set(NUMBERS)
-            if numbers and self._numbers not in (set(), numbers):
-                reason = "(chunk) has samples in other channels than those before"
-                raise Damage(offset, reason)
-            verified = found
-            if not self._past_damage:
-                wanted = self.topics
-                verified = {topic: one for topic, one in found.items() if topic in wanted}
+            lacking = self._topics is None and numbers and numbers.isdisjoint(wanted)
+            if lacking or (numbers and self._numbers not in (set(), numbers)):
+                raise Damage(offset, "(chunk) has samples in other channels than those before")
+            verified = found if self._past_damage else {topic: found[topic] for topic in wanted}
             missing = self._check_sequences(verified, offset)
             newest = self._check_times(verified, offset)
             if missing:
                 self._check_gap(missing, offset)
-            self._visit(self, found, offset)
+            layouts = self._check_layouts(verified, offset)
+            events = self._decode_events(verified, offset)
         except Damage:
             parser.schemas, parser.channels = before
             raise
@@ -386,6 +390,75 @@ class Scan:
         for topic, messages in verified.items():
             self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
+        self._layouts |= layouts
+        self.events += [one for one in events if self._times[0] <= one.stamp < self._times[1]]
+        if self.header is not None:
+            self._append({topic: found[topic] for topic in wanted if topic != schema.EVENTS})
+
+    def _check_layouts(
+        self, found: Mapping[str, Messages], offset: int
+    ) -> dict[str, MessageLayout]:
+        """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
+        layouts = {}
+        numbers = {*NUMBERS, schema.PACKETS, *(self._topics or ())} - {schema.EVENTS}
+        for topic in found.keys() & numbers if self.header else ():
+            messages, layout = found[topic], self._layouts.get(topic)
+            if layout is None:
+                assert self.header is not None
+                record, first = self.parser.schema(topic), bytes(messages.data[0][0])
+                try:
+                    layout = schema.message_layout(topic, self.header.joint_names, record, first)
+                except LayoutError as error:
+                    raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
+            if not all(map(layout.matches, messages.data)):
+                raise Damage(offset, "(chunk) has messages that differ from those before")
+            layouts[topic] = layout
+        return layouts
+
+    @staticmethod
+    def _decode_events(found: Mapping[str, Messages], offset: int) -> list[ArchivedEvent]:
+        if schema.EVENTS not in found:
+            return []
+        try:
+            return [ArchivedEvent.decode(message) for message in found[schema.EVENTS].all()]
+        except LayoutError as error:
+            problem = f"(chunk) has an event that cannot be read: {error}"
+            raise Damage(offset, problem) from error
+
+    def _append(self, found: Mapping[str, Messages]) -> None:
+        """Copy verified messages of the wanted channels and times into the columns."""
+        if not found:
+            return
+        stamps, chosen = next(iter(found.values())).stamps, None
+        if self._times != ALWAYS:
+            chosen = (stamps >= self._times[0]) & (stamps < self._times[1])
+            stamps = stamps[chosen]
+        begin, self._count = self._count, self._count + len(stamps)
+        room = max(self._room, len(self._stamps))
+        if self._count > room:
+            room = 2 * self._count
+        if room > len(self._stamps):
+            self._stamps = np.resize(self._stamps, room)
+            self._raw = {key: np.resize(raw, room) for key, raw in self._raw.items()}
+        self._stamps[begin : self._count] = stamps
+        for topic, messages in found.items():
+            fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
+            columns = []
+            for name, (dtype, start, *_) in fields.items():
+                wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
+                if wanted and name not in ("sec", "nanosec"):
+                    if (topic, name) not in self._raw:
+                        self._raw[topic, name] = np.empty(room, f"V{dtype.itemsize}")
+                    columns.append((self._raw[topic, name], start))
+            first, at = 0, begin
+            for data in messages.data:
+                part = slice(first, first + len(data))
+                first = part.stop
+                rows = data if chosen is None else data[chosen[part]]
+                now = slice(at, at + len(rows))
+                at = now.stop
+                for raw, start in columns:
+                    raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
     def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> list[str]:
         """Check that no message is repeated; return the topics of which some are missing."""
@@ -414,7 +487,7 @@ class Scan:
             raise Damage(offset, "(chunk) follows a gap that no cycle number would show")
         if not self._gap and not self._repaired:
             damage = Damage(offset, "(chunk) does not continue the one before")
-            self._add_fault("sequence", damage, loss=True)
+            self._add_fault(damage)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.

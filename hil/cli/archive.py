@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hil.archive.check import ASPECTS, Check, Overview, check_archive, read_overview
+from hil.archive.check import Check, Overview, check_archive, read_overview
 from hil.archive.repair import repair as repair_archive
 from hil.cli import exit_code_of
 from hil.cli.arguments import JsonOption, print_json
@@ -43,7 +44,7 @@ def info(files: Files, as_json: JsonOption = False) -> None:
 
 @app.command("check")
 def check(files: Files, as_json: JsonOption = False) -> None:
-    """Check files against the archive profile (docs/archive-format.md), aspect by aspect.
+    """Check whether all of a file can be used, by the rules that readers and repairs follow.
 
     Exit status: 0 all conform, 5 at least one does not, 2 at least one is not an archive.
     """
@@ -123,26 +124,15 @@ def _shown(lines: Sequence[str]) -> str:
 def _check_lines(found: Check) -> list[str]:
     verdict = "conforms to" if found.conforms else "does not conform to"
     lines = [f"{found.path}: {verdict} profile {found.version}, {found.samples} samples"]
-    for aspect in ASPECTS:
-        faults = found.faults.get(aspect, ())
-        lines.append(f"  {aspect:<13} {'no' if faults else 'ok'}")
-        lines += [f"    {fault}" for fault in faults]
+    lines += [f"  {fault}" for fault in found.faults]
     if not found.conforms:
         lines.append(f"  to repair it: hil archive repair {found.path}")
     return lines
 
 
 def _check_dict(found: Check) -> dict[str, Any]:
-    faults = {aspect: list(found.faults.get(aspect, ())) for aspect in ASPECTS}
-    return {
-        "file": str(found.path),
-        "archive": True,
-        "keeps": found.conforms,
-        "version": found.version,
-        "samples": found.samples,
-        "repaired": found.repaired,
-        "aspects": {name: {"keeps": not some, "faults": some} for name, some in faults.items()},
-    }
+    entries = asdict(found)
+    return {"file": str(entries.pop("path")), "archive": True, "keeps": found.conforms, **entries}
 
 
 def _info_lines(found: Overview) -> list[str]:

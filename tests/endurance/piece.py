@@ -219,7 +219,7 @@ def checked(folder: Path) -> dict[str, Any]:
         lost += outcome.records_lost or 0
         records += check.samples
         if not check.conforms:
-            faulty.append(f"{path.name}: {dict(check.faults)}")
+            faulty.append(f"{path.name}: {[*check.faults]}")
     return {
         "archives": len(paths), "outcomes": outcomes, "faulty": faulty, "records": records,
         "records_lost": lost,

@@ -183,7 +183,7 @@ class TestChunksOfAnotherArchive:
         archive = open_archive(path)
         assert "another recording" in str(archive.missing)
         assert archive.n_samples == 0
-        assert "outcome" in check_archive(path).faults
+        assert "the outcome is that of another recording" in check_archive(path).faults
         with pytest.raises(ArchiveError, match=r"two recordings.*copy"):
             repair(path)
 
