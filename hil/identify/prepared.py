@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from hil.errors import ArchiveError
 from hil.progress import Reporter
 from identification.estimators.delay import DelayEstimate
-from identification.estimators.gains import CurrentScale, scale_from_nominal
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
-from identification.signals.samples import Samples, smooth
+from identification.signals.samples import Samples
 from planner.checked_data import numbers
 
 from .options import Options
@@ -63,7 +62,7 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         if not base.uniform or base.gaps:
             notes.append(f"{source.name}: {'; '.join(base.describe())}")
     sources, noise = with_noise(sources)
-    sources = with_torques(sources)
+    _require_torques(sources)
     decided = decide(sources, options, reporter)
     settings, cell = decided.settings, decided.settings.with_friction_law(sources.cell)
     read, held = (
@@ -116,83 +115,18 @@ def _excluded(sources: Sources, masked: Mapping[str, NDArray[np.intp]], rows: in
     ]
 
 
-# Torques of recordings without torques
-
-
 def motor_from_joint(recording: Recording) -> Array:
     """Motor angles per joint angle (n, n) as imported, by default the identity."""
     stored = recording.provenance.get("motor_from_joint")
     return np.eye(recording.n_joints) if stored is None else numbers(json.loads(stored), 2)
 
 
-def with_torques(sources: Sources) -> Sources:
-    """Return the sources with a torque in every recording.
-
-    Currents are scaled to the nominal masses of the URDF, with a warning; the scale is found from
-    the fitted recordings only.
-
-    Raises:
-        ArchiveError: the URDF has no masses, or the currents do not match them.
-    """
-    everything = (*sources.training, *sources.held_out)
-    if all(source.recording.torque is not None for source in everything):
-        return sources
-    model, recordings = sources.cell.model, [source.recording for source in sources.training]
-    currents = [one.motor_current for one in recordings if one.motor_current is not None]
-    reason = "the URDF has no masses to compare currents with"
-    if len(currents) == len(recordings) and np.any(model.nominal):
-        turns = motor_from_joint(recordings[0])
-        motions = [smooth(one, sources.noise_variance)[0] for one in recordings]
-        scale = scale_from_nominal(model, motions, currents, turns)
-        reason = "their currents do not match weight and inertia of the URDF on any axis"
-        reason = "" if scale.determined.any() else reason
-    if reason:
-        problem = f"the recordings contain no torques, and {reason}"
-        remedy = "give drive.torque_constant in the column map, or identify it by `hil gains`"
-        raise ArchiveError(None, problem, field="torque", remedy=remedy)
-
-    def with_torque(one: Recording) -> Recording:
-        if one.torque is not None or one.motor_current is None:
-            return one
-        return replace(one, torque=(one.motor_current * scale.values) @ turns)
-
-    training, held_out = (
-        tuple(source.map_recording(with_torque) for source in some)
-        for some in (sources.training, sources.held_out)
-    )
-    warnings = (*sources.warnings, *current_warnings(sources.cell.joint_names, scale))
-    return replace(sources, training=training, held_out=held_out, warnings=warnings)
-
-
-def current_warnings(names: tuple[str, ...], scale: CurrentScale) -> list[str]:
-    """Return the warnings about torques that were computed from currents."""
-    rows = zip(names, scale.values, scale.std, strict=True)
-    figures = ", ".join(
-        f"{n} {value:.4g} ± {2.0 * s:.2g}" for n, value, s in rows if np.isfinite(s)
-    )
-    warnings = [
-        "only currents were recorded, without torque constants: these were estimated from the "
-        f"masses of the URDF ({figures} N·m/A), so torques and parameters are only as accurate as "
-        "those masses; `hil gains` with a known payload does not need them"
-    ]
-    for chosen, text in (
-        (
-            scale.turned,
-            "the estimated torque constant of {} is negative: the sign of the current or of the "
-            "axis is reversed in the recording, or the URDF's masses are wrong; check before using "
-            "the torques",
-        ),
-        (
-            scale.inertial,
-            "the torque constant of {} depends on inertia, as gravity hardly acts there, and "
-            "attributes the rotor inertia to the links",
-        ),
-        (
-            ~scale.determined,
-            "no torque constant could be estimated for {}: its torque is the current in A (times "
-            "the gear ratio)",
-        ),
-    ):
-        if found := [name for name, one in zip(names, chosen, strict=True) if one]:
-            warnings.append(text.format(", ".join(found)))
-    return warnings
+def _require_torques(sources: Sources) -> None:
+    """Raise ArchiveError if a recording has currents only."""
+    if any(one.recording.torque is None for one in (*sources.training, *sources.held_out)):
+        raise ArchiveError(
+            None,
+            "the recordings contain no torques",
+            field="torque",
+            remedy="give drive.torque_constant in the column map, or identify it by `hil gains`",
+        )

@@ -1,4 +1,4 @@
-r"""Current-to-torque gains of all drives, from a payload of known torque or nominal masses.
+r"""Current-to-torque gains of all drives, from a payload of known torque.
 
 Weighted least squares of the measured currents on one
 :func:`identification.factor.phases.gain_factor` (after Gautier and Briot 2014),
@@ -22,9 +22,6 @@ from identification.errors import IdentificationError
 from identification.estimators.covariance import cluster_covariance
 from identification.factor.factor import NormalEquations, Solution, solve
 from identification.factor.phases import PhaseFactor
-from identification.model.motion import Motion
-from identification.model.robot import RobotModel
-from identification.signals.masks import SHORTEST_STRETCH
 
 Array = NDArray[np.float64]
 
@@ -176,96 +173,3 @@ def _linearised(gram: Array, unknowns: Array, noise: Array) -> tuple[Array, Arra
         scores[:, place] += own @ residual @ slope
         squares += np.einsum("i,bij,j->b", residual, own, residual)
     return information, scores, squares
-
-
-# Without known payload: from the nominal masses, linear motor by motor:
-#
-#     i_m = kappa_m [M^-T tau_nominal]_m + J_m qdd_m + c_m sgn(qd_m) + v_m qd_m + o_m
-#
-# for motor angles M q; kappa_m = 1 / K_m is as accurate as the masses.
-
-WORST_SCALE_STD: Final = 0.1
-_BLOCKS: Final = 20  # of time, for the jackknife
-
-
-@dataclass(frozen=True, eq=False)
-class CurrentScale:
-    """Torque per current of n motors relative to the nominal masses."""
-
-    values: Array  # (n,) [N·m/A or N/A, motor side], 1 if undetermined
-    std: Array  # standard deviations for exact masses (n,); infinite if undetermined
-    # motors identified by inertia without rotor, for lack of gravity load (n,)
-    inertial: NDArray[np.bool_]
-
-    @property
-    def determined(self) -> NDArray[np.bool_]:
-        """Which gains the data determine (n,)."""
-        return np.isfinite(self.std)
-
-    @property
-    def turned(self) -> NDArray[np.bool_]:
-        """Motors whose current has the wrong sign (n,)."""
-        return self.determined & (self.values < 0.0)
-
-
-def scale_from_nominal(
-    model: RobotModel,
-    motions: Sequence[Motion],
-    currents: Sequence[Array],
-    motor_from_joint: Array | None = None,
-) -> CurrentScale:
-    """Estimate gains from motions and currents (m, n) [A]; without transmission with the gears."""
-    n = model.n_joints
-    turns = np.eye(n) if motor_from_joint is None else np.asarray(motor_from_joint, np.float64)
-    parts = [_columns(model, motion, turns) for motion in motions]
-    columns = np.concatenate([part[0] for part in parts])  # (m, n, 5)
-    moving = np.concatenate([part[1] for part in parts])
-    current = np.concatenate(list(currents))
-    values, std, inertial = np.ones(n), np.full(n, np.inf), np.zeros(n, dtype=np.bool_)
-    for motor in range(n):
-        rows = moving[:, motor]
-        table, target = columns[rows, motor], current[rows, motor]
-        for with_rotor in (True, False):
-            used = table if with_rotor else np.delete(table, 1, axis=1)
-            share, spread = _share(used, target)
-            if spread <= WORST_SCALE_STD * abs(share):
-                values[motor], std[motor] = 1.0 / share, spread / share**2
-                inertial[motor] = not with_rotor
-                break
-    return CurrentScale(values, std, inertial)
-
-
-def _columns(model: RobotModel, motion: Motion, turns: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return [nominal torque, acceleration, sign, speed, 1] (m, n, 5), and usable rows."""
-    values = np.zeros(model.n_parameters)
-    values[: model.base.rank] = model.base.grouping @ model.nominal
-    values[model.element_part] = model.elements.nominal
-    torque = model.torque(values, *motion[1:]) + model.load_torque(*motion[1:4])
-    speed, acceleration = motion.velocity @ turns.T, motion.acceleration @ turns.T
-    motors = np.linalg.solve(turns.T, torque.T).T
-    columns = np.stack([motors, acceleration, np.sign(speed), speed, np.ones_like(speed)], axis=2)
-    moving = model.moving(motion.velocity)
-    acting = turns != 0.0
-    return columns, np.stack([moving[:, joints].all(axis=1) for joints in acting], axis=1)
-
-
-def _share(table: Array, current: Array) -> tuple[float, float]:
-    """Return the coefficient of the first column and its deviation; (0, inf) without any."""
-    scale = np.sqrt(np.mean(table**2, axis=0)) if len(table) else np.zeros(1)
-    if len(table) < _BLOCKS * SHORTEST_STRETCH or scale[0] <= _NO_LOAD:
-        return 0.0, np.inf
-    table = table[:, scale > 0.0] / scale[scale > 0.0]
-    blocks = np.array_split(np.arange(len(table)), _BLOCKS)
-    grams = np.array([table[b].T @ table[b] for b in blocks])
-    scores = np.array([table[b].T @ current[b] for b in blocks])
-    total, right = grams.sum(axis=0), scores.sum(axis=0)
-    if np.linalg.cond(total) > 1e10:
-        return 0.0, np.inf
-    best = np.linalg.solve(total, right)[0]
-    without = [
-        np.linalg.lstsq(total - gram, right - score, rcond=None)[0][0]
-        for gram, score in zip(grams, scores, strict=True)
-    ]
-    # Jackknife over blocks, for coloured noise.
-    spread = np.sqrt((_BLOCKS - 1.0) / _BLOCKS * np.sum((np.array(without) - best) ** 2))
-    return float(best / scale[0]), float(spread / scale[0])

@@ -129,44 +129,12 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     assert "1 gaps" in notes
 
 
-def test_currents_are_scaled_by_the_masses_with_a_warning(tmp_path: Path) -> None:
-    """One array per joint, mA; gains, one of them negative, are found again where weight acts."""
-    simulated = simulate(UR5, np.arange(0.0, 30.0, 2e-3))
-    gains = np.array([9.0, 11.0, -10.0, 7.0, 6.0, 5.0])  # N·m/A
-    current = 1e3 * simulated.torque / gains
-    arrays = {f"i{j + 1}": current[:, j] for j in range(6)}
-    arrays |= {f"q{j + 1}": simulated.position[:, j] for j in range(6)}
-    np.savez(tmp_path / "log.npz", t=simulated.time, **arrays)
-    columns = """
-        [time]
-        column = "t"
-        [position]
-        columns = "q{}"
-        [motor_current]
-        columns = "i{}"
-        unit = "mA"
-        """
-    found = identify(tmp_path, simulated, "log.npz", columns)
-    torque = found.prepared.fitted[0].torque
-    recorded = found.prepared.sources.training[0].recording
-    made = (torque / recorded.motor_current).mean(axis=0)
-    assert made[1:5] == pytest.approx(gains[1:5], rel=0.03)
-    assert found.held_out_error < 2.0 * TORQUE_NOISE
-    warnings = " ".join(found.prepared.sources.warnings)
-    assert "only currents were recorded" in warnings
-    assert "shoulder_pan_joint" in warnings  # its axis is vertical: no weight
-
-
-def test_currents_without_masses_are_refused(tmp_path: Path) -> None:
+def test_currents_without_torque_constants_are_refused(tmp_path: Path) -> None:
     simulated = simulate(UR5, np.arange(0.0, 5.0, 4e-3))
-    bare = tmp_path / "bare.urdf"
-    bare.write_text(re.sub(r"(?s)<inertial>.*?</inertial>", "", simulated.urdf.read_text()))
     np.savez(tmp_path / "log.npz", q=simulated.position, i=simulated.torque)
     columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[motor_current]\ncolumns = "i"\n'
-    with pytest.raises(
-        ArchiveError, match=r"no masses to compare currents with; give drive\.torque_constant"
-    ):
-        identify(tmp_path, replace(simulated, urdf=bare), "log.npz", columns)
+    with pytest.raises(ArchiveError, match=r"no torques; give drive\.torque_constant"):
+        identify(tmp_path, simulated, "log.npz", columns)
 
 
 def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:

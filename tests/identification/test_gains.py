@@ -1,11 +1,10 @@
-"""Torque constants from a known payload, and from the nominal masses."""
+"""Torque constants from a known payload."""
 
 import numpy as np
 import pytest
 
-from hil.identify.prepared import current_warnings
 from identification.errors import IdentificationError
-from identification.estimators.gains import CurrentScale, identify_gains, scale_from_nominal
+from identification.estimators.gains import identify_gains
 from identification.factor.phases import gain_factor, joined
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Load, Payload
@@ -14,9 +13,7 @@ from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import joint, link, ns16_values, robot
 from tests.identification.two_link import (
     MODEL,
-    a_motion,
     as_samples,
-    coloured,
     four_sines,
     truth,
     values_of,
@@ -92,18 +89,6 @@ def ns16(motion=None):
     return gains_of(factor, model)
 
 
-GAINS = np.array([12.0, 3.0])  # N·m/A
-
-
-def scale(signs):
-    """Return gains from currents of the nominal arm with rotors and friction, times signs."""
-    motion = a_motion()
-    values = values_of(MODEL, [4.0, 2.0, 1.5, 0.8])
-    noise = 0.1 * coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
-    torque = MODEL.torque(values, *motion[1:]) + noise
-    return scale_from_nominal(MODEL, [motion], [torque / (GAINS * np.array(signs))])
-
-
 @pytest.fixture(scope="module")
 def many():
     return [gains_of(factor_of(seed=seed)) for seed in range(SEEDS)]
@@ -160,19 +145,3 @@ class TestGains:
     def test_missing_payload_raises(self):
         with pytest.raises(IdentificationError, match="no recording has a known payload"):
             gains_of(factor_of(load=None))
-
-
-class TestCurrentScale:
-    @pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
-    def test_a_current_of_the_wrong_sign_is_reported(self, signs):
-        found, names = scale(signs), MODEL.joint_names
-        np.testing.assert_allclose(found.values, GAINS * signs, rtol=0.02)
-        np.testing.assert_array_equal(found.turned, np.array(signs) < 0.0)
-        negative = [text for text in current_warnings(names, found) if "negative" in text]
-        assert len(negative) == any(found.turned)
-        for name, turned in zip(names, found.turned, strict=True):
-            assert any(name in text for text in negative) == turned
-
-    def test_an_undetermined_gain_has_no_wrong_sign(self):
-        std, inertial = np.array([np.inf, 0.1]), np.zeros(2, dtype=np.bool_)
-        assert not CurrentScale(np.array([-1.0, 2.0]), std, inertial).turned.any()
