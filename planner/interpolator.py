@@ -45,7 +45,7 @@ from planner.rrs import (
     Step,
 )
 from planner.time_law import RateBounds, TimeLaw, admits, slowing_bounds, within
-from planner.worker import in_child, in_child_now
+from planner.worker import in_child
 
 # Tolerance on motion times [s], and on times as a share of a period.
 _ROUNDING: Final = 1e-9
@@ -62,7 +62,7 @@ def corner(legs: Legs, fly: Fly) -> Corner:
 
 
 def _isolated_corner(legs: Legs, fly: Fly) -> Corner:
-    return in_child_now(corner, legs, fly)
+    return in_child(corner, legs, fly)
 
 
 class _Stretch(NamedTuple):

@@ -1,14 +1,12 @@
-"""Plan files: moves and the motion planned through them, as JSON (SI units), TOML and CSV.
+"""Plan files: moves and the motion planned through them, as JSON (SI units) and CSV.
 
-The JSON of `PlanFile.to_dict` is part of archives. The TOML has angles in degrees, from which the
-same bits are read again. `to_csv` writes the motion alone.
+The JSON of `PlanFile.to_dict` is part of archives. `to_csv` writes the motion alone.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
@@ -32,28 +30,7 @@ from planner.moves import (
     plan_moves,
 )
 from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
-from planner.toml_text import Angles, Rows, from_text, to_text
 from planner.verify import check_limits, check_smooth
-
-_HEAD = """\
-A motion of joint moves. Names that end in _deg hold degrees, degrees/s, degrees/s^2,
-degrees/s^3; shares of speed and acceleration lie in (0, 1]; a move without fly_percent
-(0 to 100) or fly_distance_deg stops at its target."""
-_MOTION = """\
-What the moves above were planned to, to the last bit: per joint the times of its knots [s] and
-position, velocity, acceleration, jerk at each (rad, s). After a change above, delete this table."""
-_ANGLES: Mapping[str, frozenset[str]] = {
-    "": frozenset({"start"}),
-    "limits": frozenset({"lower", "upper", "velocity", "acceleration", "jerk"}),
-    "moves": frozenset({"target", "fly_distance"}),
-}
-"""Fields of each table that are angles or their rates."""
-
-
-def _with_angles(table: str, values: Mapping[str, Any]) -> dict[str, Any]:
-    angles = _ANGLES[table]
-    return {name: Angles(value) if name in angles else value for name, value in values.items()}
-
 
 FORMAT: Final = "joint motion plan"
 VERSION: Final = 1
@@ -225,33 +202,6 @@ class PlanFile:
             raise InvalidPlanFile(f"not a plan: {place}: {first['msg']}") from error
         except (PlannerError, *DAMAGED) as error:
             raise InvalidPlanFile(f"not a plan: {error}") from error
-
-    def to_toml(self) -> str:
-        """Return the file as TOML, angles in degrees."""
-        data = self.to_dict()
-        marked = _with_angles("", data)
-        if "limits" in data:
-            marked["limits"] = _with_angles("limits", data["limits"])
-        marked["moves"] = [_with_angles("moves", move) for move in data["moves"]]
-        if "motion" in data:
-            lists = {name: Rows(data["motion"][name]) for name in ("knots", "coefficients")}
-            marked["motion"] = {**data["motion"], **lists}
-        return to_text(marked, {"": _HEAD, "motion": _MOTION})
-
-    @classmethod
-    def from_toml(cls, text: str) -> PlanFile:
-        """Read a TOML file written by `to_toml` or by hand.
-
-        Raises:
-            InvalidPlanFile: the text is not TOML, or not a plan.
-        """
-        try:
-            data = from_text(text, _ANGLES)
-        except tomllib.TOMLDecodeError as error:
-            raise InvalidPlanFile(f"not TOML: {error}") from error
-        except DAMAGED as error:
-            raise InvalidPlanFile(f"not a plan: {error!r:.200}") from error
-        return cls.from_dict(data)
 
 
 def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:

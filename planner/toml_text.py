@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, time
 from decimal import Context, Decimal, InvalidOperation, localcontext
@@ -30,13 +30,6 @@ class Angles:
     values: Any
 
 
-@dataclass(frozen=True)
-class Rows:
-    """Nested lists of numbers, written one row per line."""
-
-    values: Sequence[Any]
-
-
 def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
     """Return tables, lists of tables, lists, numbers and texts as TOML; None is left out.
 
@@ -45,17 +38,15 @@ def to_text(data: Mapping[str, Any], comments: Mapping[str, str]) -> str:
     return "\n".join(_table("", data, comments))
 
 
-def from_text(text: str, angles: Mapping[str, Collection[str]] | None = None) -> dict[str, Any]:
-    """Return the data of a TOML text, angles in rad with names without `_deg`.
-
-    `angles` are the fields of each table (by its name, "" for the first) that are angles; None for
-    all whose names end in `_deg`.
+def from_text(text: str) -> dict[str, Any]:
+    """Return the data of a TOML text, fields `NAME_deg` as NAME in rad.
 
     Raises:
         ValueError: the text is not TOML, or an angle is not a number or given twice.
     """
     try:
-        return _read(tomllib.loads(text, parse_float=Decimal), angles)
+        data: dict[str, Any] = _read(tomllib.loads(text, parse_float=Decimal))
+        return data
     except RecursionError as error:
         raise ValueError("nested too deep") from error
     except InvalidOperation as error:
@@ -90,17 +81,7 @@ def _is_table(value: Any) -> bool:
 def _field(name: str, value: Any) -> str:
     if isinstance(value, Angles):
         return f"{toml_key(name + _SUFFIX)} = {_degrees(value.values)}\n"
-    text = _row_lines(value.values) if isinstance(value, Rows) else toml_value(value)
-    return f"{toml_key(name)} = {text}\n"
-
-
-def _row_lines(values: Sequence[Any], indent: str = "") -> str:
-    inner = indent + "  "
-    rows = (
-        _row_lines(row, inner) if row and isinstance(row[0], Sequence) else toml_value(row)
-        for row in values
-    )
-    return f"[\n{''.join(f'{inner}{row},' + chr(10) for row in rows)}{indent}]"
+    return f"{toml_key(name)} = {toml_value(value)}\n"
 
 
 def _degrees(values: Any) -> str:
@@ -109,27 +90,18 @@ def _degrees(values: Any) -> str:
     return degrees_text(values)
 
 
-def _read(
-    table: Mapping[str, Any], angles: Mapping[str, Collection[str]] | None, path: str = ""
-) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name, value in table.items():
-        stem = name.removesuffix(_SUFFIX)
-        if stem == name or (angles is not None and stem not in angles.get(path, ())):
-            found[name] = _read_value(value, angles, name)
-        elif stem in table:
-            raise ValueError(f"both {stem!r} and {name!r} are given")
-        else:
-            found[stem] = radians_in(name, value)
-    return found
-
-
-def _read_value(value: Any, angles: Mapping[str, Collection[str]] | None, path: str) -> Any:
-    if isinstance(value, Mapping):
-        return _read(value, angles, path)
+def _read(value: Any) -> Any:
     if isinstance(value, list):
-        return [_read_value(entry, angles, path) for entry in value]
-    return float(value) if isinstance(value, Decimal) else value
+        return [_read(entry) for entry in value]
+    if not isinstance(value, Mapping):
+        return float(value) if isinstance(value, Decimal) else value
+    found: dict[str, Any] = {}
+    for name, entry in value.items():
+        stem = name.removesuffix(_SUFFIX)
+        if stem != name and stem in value:
+            raise ValueError(f"both {stem!r} and {name!r} are given")
+        found[stem] = _read(entry) if stem == name else _radians(name, entry)
+    return found
 
 
 def toml_key(name: str) -> str:
@@ -193,14 +165,10 @@ def _same(a: float, b: float) -> bool:
     return a == b and str(a) == str(b)  # str distinguishes -0.0 from 0.0
 
 
-def radians_in(name: str, value: Any) -> Any:
-    """Return a number or nested lists of degrees of the field `name` in rad.
-
-    Raises:
-        ValueError: an entry is not a number.
-    """
+def _radians(name: str, value: Any) -> Any:
+    """Return a number or nested lists of degrees of the field `name` in rad."""
     if isinstance(value, list):
-        return [radians_in(name, entry) for entry in value]
+        return [_radians(name, entry) for entry in value]
     if isinstance(value, bool) or not isinstance(value, Decimal | int):
         raise ValueError(f"{name}: {value!r} is not a number of degrees")
     return radians_of(value)

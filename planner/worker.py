@@ -22,7 +22,7 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
@@ -46,7 +46,7 @@ _ONE_THREAD: Final = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
 _SERVE: Final = "import sys; from planner.worker import serve; serve(int(sys.argv[1]))"
-# Restarts of a child that died before its first call, for an external reason such as full memory.
+# Consecutive starts that may fail, for an external reason such as full memory.
 _RESTARTS: Final = 2
 
 
@@ -136,23 +136,20 @@ T = TypeVar("T")
 class WorkerProcess:
     """A child process that calls functions of importable modules, one at a time.
 
-    Arguments and results are copied. A fork of this process that uses the object gets its own
-    child. A call takes up to `timeout` s, the present one until `deadline` on the monotonic clock
-    [s]; `connection` is readable when `receive` can return or raise.
+    Arguments and results are copied. A call takes up to `timeout` s, the present one until
+    `deadline` on the monotonic clock [s]; `connection` is readable when `receive` can return or
+    raise.
 
-    Raises, in `call`, `send` and `receive`:
-        PlannerCrashed: the child died and is restarted.
+    Raises, in `call`, `begin` and `receive`:
+        PlannerCrashed: the child died; the next call starts another.
         PlannerNotStarted: the child died before its first call; the reason is on stderr.
-        PlanningTimedOut: the call took too long; the child is restarted.
-        RuntimeError: this process sent no call.
+        PlanningTimedOut: the call took too long; the next one starts another child.
         Exception: raised by the function.
     """
 
     def __init__(self, *, timeout: float = 10.0) -> None:
-        self._owner = os.getpid()
         self._timeout = timeout
         self._process: subprocess.Popen[bytes] | None = None
-        self._ready = False
         self.deadline = 0.0
         self._start()
 
@@ -164,55 +161,41 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int | None:
-        """Process id; None once closed."""
-        self._detach_in_fork()
+        """Process id; None without a process."""
         return self._process.pid if self._process is not None else None
 
     def call(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-        """Return the result of a function called in the child; restart one that died idle."""
+        """Return the result of a function called in the child."""
         self.begin(function, *args, **kwargs)
         result: T = self.receive()
         return result
 
     def begin(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Begin a call as `send` does; restart a child that died before."""
-        for _ in range(_RESTARTS):
-            with suppress(PlannerCrashed, PlannerNotStarted):
-                return self.send(function, *args, **kwargs)
-        return self.send(function, *args, **kwargs)
-
-    def send(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Begin a call; `receive` returns its result."""
+        """Begin a call, in a new child if the last one died; `receive` returns its result."""
         message = pack((self._timeout, function, args, kwargs))
-        self._detach_in_fork()
-        if self._process is None:
+        if self._process is None or self._process.poll() is not None:
+            self.close()
             self._start()
         self.deadline = monotonic() + self._timeout + (0.0 if self._ready else _START_TIMEOUT)
         try:
             self.connection.send_bytes(message)
-        except OSError:  # the child died while idle
-            raise self._crashed() from None
+        except ConnectionError:  # the child died meanwhile, which `receive` reports
+            pass
         except BaseException:
             self.close()
             raise
 
     def receive(self) -> Any:
-        """Return the result of the call that `send` began, or raise its exception."""
-        self._detach_in_fork()
-        if self._process is None:
-            raise RuntimeError("no call was sent from this process")
+        """Return the result of the call that `begin` began, or raise its exception."""
         try:
             if not self._ready:
                 self._read()
                 self._ready = True
                 self.deadline = monotonic() + self._timeout
             result, error = load(self._read())
-        except PlanningTimedOut:
-            self._restart()
-            raise
-        except (EOFError, OSError):
+        except (EOFError, ConnectionError):
             raise self._crashed() from None
-        except BaseException:  # interrupted: a later result must not be received by another call
+        except BaseException:  # too late or interrupted: no other call may receive the result
             self.close()
             raise
         if error is not None:
@@ -221,22 +204,10 @@ class WorkerProcess:
 
     def close(self) -> None:
         """End the process; a later call starts a new one."""
-        self._detach_in_fork()
-        if self._process is None:
-            return
-        self.connection.close()
-        self._process.kill()
-        self._process.wait()
-        self._process = None
-
-    def _detach_in_fork(self) -> None:
-        """In a fork, release the child of the parent process without ending it."""
-        if self._owner == os.getpid():
-            return
-        self._owner = os.getpid()
         if self._process is not None:
-            self.connection.close()  # closes the copy of this process only
-            self._process.returncode = 0  # it is no child of this process
+            self.connection.close()
+            self._process.kill()
+            self._process.wait()
             self._process = None
 
     def _read(self) -> bytes:
@@ -260,21 +231,16 @@ class WorkerProcess:
             )
         self._ready = False
 
-    def _restart(self) -> None:
-        self.close()
-        self._start()
-
     def _crashed(self) -> PlannerCrashed | PlannerNotStarted | PlanningTimedOut:
-        """Return the error for the exit status of the child; restart it if it had ever started."""
+        """Return the error for the exit status of the child."""
         assert self._process is not None
         try:
             status = self._process.wait(1.0)
         except subprocess.TimeoutExpired:  # it closed its end of the socket without ending
             status = -signal.SIGKILL
+        self.close()
         if not self._ready:
-            self.close()
             return PlannerNotStarted(status)
-        self._restart()
         if status == -signal.SIGALRM:
             return PlanningTimedOut(self._timeout)
         return PlannerCrashed(status)
@@ -290,22 +256,9 @@ def in_child(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> 
     Calls from several threads are made one after the other. Raises as `WorkerProcess`.
     """
     with _lock:
-        return _warm_child().call(function, *args, **kwargs)
-
-
-def in_child_now(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Return the result as `in_child` does, without restarting a child that died before."""
-    with _lock:
-        child = _warm_child()
-        child.send(function, *args, **kwargs)
-        result: T = child.receive()
-        return result
-
-
-def _warm_child() -> WorkerProcess:
-    if not _warm:
-        _warm.append(WorkerProcess())
-    return _warm[0]
+        if not _warm:
+            _warm.append(WorkerProcess())
+        return _warm[0].call(function, *args, **kwargs)
 
 
 def plan_in_child(
@@ -315,23 +268,12 @@ def plan_in_child(
     return in_child(plan, via_points, limits, speed=speed, fly=fly)
 
 
+@atexit.register
 def close_child() -> None:
     """End the shared child; the next call of `in_child` starts another."""
     with _lock:
         while _warm:
             _warm.pop().close()
-
-
-def _after_fork() -> None:
-    """In a fork, release the shared child, and the lock, which another thread may have held."""
-    global _lock
-    _lock = threading.Lock()
-    while _warm:
-        _warm.pop().close()
-
-
-atexit.register(close_child)
-os.register_at_fork(after_in_child=_after_fork)
 
 
 Chunk: TypeAlias = Sequence[int]
@@ -381,7 +323,7 @@ def stream_in_children(
     child died before its first call several times, and what the function raises.
     """
     fresh, again = iter(chunks), deque[Chunk]()
-    crashed, not_started = set[int](), Counter[int]()
+    crashed, not_started = set[int](), 0
     idle = list(children)
     busy: dict[Any, tuple[WorkerProcess, Chunk]] = {}
     found: list[tuple[int, Outcome[T]]] = []
@@ -405,10 +347,10 @@ def stream_in_children(
                 idle.append(child)
                 try:
                     found += zip(chunk, child.receive(), strict=True)
-                    not_started.pop(id(child), None)
+                    not_started = 0
                 except PlannerNotStarted:
-                    not_started[id(child)] += 1
-                    if not_started[id(child)] > _RESTARTS:
+                    not_started += 1
+                    if not_started > _RESTARTS:
                         raise
                     again.append(chunk)
                 except (PlannerCrashed, PlanningTimedOut) as error:

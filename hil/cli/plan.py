@@ -37,15 +37,13 @@ Array = NDArray[np.float64]
 P = ParamSpec("P")
 T = TypeVar("T")
 
-PLAN_FILES = (".toml", ".json")
+PLAN_SUFFIX = ".json"
 
 
 def read_plan_file(path: Path) -> PlanFile:
-    """Read a plan file, TOML or JSON; InputError if it is not one."""
+    """Read a plan file (JSON); InputError if it is not one."""
     text = read_input(path).removeprefix("\ufeff")
     try:
-        if path.suffix.lower() == ".toml":
-            return PlanFile.from_toml(text)
         return PlanFile.from_dict(parse_json(text))
     except (ValueError, AttributeError) as error:
         raise InputError(path, str(error), remedy="name a plan file") from error
@@ -144,20 +142,20 @@ def plan(
     Options:
         cell: The cell file.
         via: Via points: a table in degrees, one row per point, first the start; or a plan file
-            (*.toml, *.json).
+            (*.json).
         random: Number of random via points, in place of --via.
         seed: Seed of the random via points.
         speed: Percent of the joint speed limits.
         acceleration: Percent of the joint acceleration limits.
         fly: Fly in percent (FLY_NORM); 0 stops at each point.
         fly_distance: Largest distance to a via point in joint space, degrees; in place of --fly.
-        output: Write a plan file (*.toml, *.json).
+        output: Write a plan file (*.json).
         csv: Write a table of time, position, velocity, acceleration.
         rate: Rows per second of that table. Default: one per cycle of the cell.
         picture: Plot the plan (*.png, *.svg, *.pdf).
     """
-    if output is not None and output.suffix.lower() not in PLAN_FILES:
-        problem, remedy = f"{output.suffix!r} is not a plan file", f"use {' or '.join(PLAN_FILES)}"
+    if output is not None and output.suffix.lower() != PLAN_SUFFIX:
+        problem, remedy = f"{output.suffix!r} is not a plan file", f"use {PLAN_SUFFIX}"
         raise InputError(output, problem, field="--output", remedy=remedy)
     if picture is not None:
         check_format(picture)
@@ -166,7 +164,7 @@ def plan(
     exactly_one(via=via, random=random)
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
-    if via is not None and via.suffix.lower() in PLAN_FILES:
+    if via is not None and via.suffix.lower() == PLAN_SUFFIX:
         planned = planned_again(via, loaded)
     else:
         points = (
@@ -189,9 +187,7 @@ def plan(
     else:
         typer.echo(printable(_table(summary, frame.shown(planned.start), names)))
     if output is not None:
-        file = PlanFile.of(planned, names)
-        toml = output.suffix.lower() == ".toml"
-        _write(output, file.to_toml() if toml else json_text(file.to_dict()) + "\n")
+        _write(output, json_text(PlanFile.of(planned, names).to_dict()) + "\n")
     if csv is not None:
         _write(csv, to_csv(planned.trajectory, rate, names))
     if picture is not None:

@@ -17,7 +17,6 @@ from hil.errors import InputError
 from hil.plots import draw_plan
 from hil.plots.plan_picture import corner_times
 from planner.moves import FlyPercent, Move, plan_moves
-from planner.plan_file import PlanFile
 from sim_fixtures.ns16 import CELL_PATH
 from tests.motion_table import MotionTable
 
@@ -95,15 +94,14 @@ def test_random_via_points_are_within_limits_and_repeatable(run):
 
 
 def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
-    for name in ("plan.toml", "plan.json"):
-        path = tmp_path / name
-        out = run("--via", via, "--fly", 75, "--output", path)
-        assert run("--via", path) == out
-        file = read_plan_file(path)
-        assert file.moves[0].fly == FlyPercent(75.0)
-        assert file.plan().trajectory.duration == pytest.approx(
-            float(out.splitlines()[-2].split()[0]), abs=1e-3
-        )
+    path = tmp_path / "plan.json"
+    out = run("--via", via, "--fly", 75, "--output", path)
+    assert run("--via", path) == out
+    file = read_plan_file(path)
+    assert file.moves[0].fly == FlyPercent(75.0)
+    assert file.plan().trajectory.duration == pytest.approx(
+        float(out.splitlines()[-2].split()[0]), abs=1e-3
+    )
 
 
 def test_the_table_holds_the_motion(run, via, tmp_path, cell):
@@ -176,15 +174,14 @@ def test_a_byte_order_mark_is_ignored(run, via, tmp_path):
     assert run("--via", marked) == run("--via", points_only) == run("--via", via)
 
 
-@pytest.mark.parametrize("suffix", ["toml", "json"])
-def test_a_motion_that_is_not_that_of_its_moves_is_refused(app, run, via, tmp_path, suffix):
+def test_a_motion_that_is_not_that_of_its_moves_is_refused(app, run, via, tmp_path):
     """Limits of the cell and the planned motion may be left out."""
-    path, edited = tmp_path / "plan.json", tmp_path / f"edited.{suffix}"
+    path, edited = tmp_path / "plan.json", tmp_path / "edited.json"
     out = run("--via", via, "--output", path)
     data = json.loads(path.read_text())
     data["moves"][1]["target"][0] += 0.1
-    edited.write_text(json.dumps(data) if suffix == "json" else PlanFile.from_dict(data).to_toml())
-    with pytest.raises(InputError, match=rf"edited\.{suffix}: .*motion"):
+    edited.write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"edited\.json: .*motion"):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(edited)], catch_exceptions=False)
     data["moves"][1]["target"][0] -= 0.1
     del data["motion"], data["limits"]
@@ -207,8 +204,8 @@ def test_a_crash_of_the_solver_is_reported(run, via, tmp_path, how):
     (tmp_path / "sitecustomize.py").write_text(CRASH)
     arguments = ["--via", str(via)]
     if how == "file":
-        run("--via", via, "--output", tmp_path / "plan.toml")
-        arguments = ["--via", str(tmp_path / "plan.toml")]
+        run("--via", via, "--output", tmp_path / "plan.json")
+        arguments = ["--via", str(tmp_path / "plan.json")]
     ended = subprocess.run(
         [sys.executable, "-m", "hil", "plan", str(CELL_PATH), *arguments],
         env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))},
@@ -222,13 +219,13 @@ def test_a_crash_of_the_solver_is_reported(run, via, tmp_path, how):
 
 
 def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):
-    path = tmp_path / "plan.toml"
+    path = tmp_path / "plan.json"
     run("--via", via, "--output", path)
     path.write_text(path.read_text().replace('"joint_6"', '"tail"'))
     with pytest.raises(InputError, match="tail"):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
     path.write_text("not = [a plan")
-    with pytest.raises(InputError, match="TOML"):
+    with pytest.raises(InputError, match="JSON"):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
 
 

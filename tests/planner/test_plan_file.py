@@ -70,10 +70,9 @@ def files(draw):
 
 @given(files())
 @settings(max_examples=150, deadline=None)
-def test_toml_and_json_restore_every_bit(file):
+def test_json_restores_every_bit(file):
     data = json.dumps(file.to_dict())  # distinguishes -0.0 from 0.0
-    for restored in (PlanFile.from_toml(file.to_toml()), PlanFile.from_dict(json.loads(data))):
-        assert json.dumps(restored.to_dict()) == data
+    assert json.dumps(PlanFile.from_dict(json.loads(data)).to_dict()) == data
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False, min_value=-1e6, max_value=1e6))
@@ -99,9 +98,9 @@ def planned():
 
 def test_a_plan_is_restored_to_the_last_bit(planned):
     file = PlanFile.of(planned, NAMES)
-    restored = PlanFile.from_toml(file.to_toml()).plan()
+    restored = PlanFile.from_dict(json.loads(json.dumps(file.to_dict()))).plan()
     assert restored.targets == planned.targets
-    assert PlanFile.of(restored, NAMES).to_toml() == file.to_toml()
+    assert PlanFile.of(restored, NAMES).to_dict() == file.to_dict()
 
 
 def test_the_stored_motion_is_used_not_one_planned_again(planned):
@@ -113,12 +112,12 @@ def test_the_stored_motion_is_used_not_one_planned_again(planned):
 
 
 def test_edited_moves_do_not_match_the_stored_motion(planned):
-    text = PlanFile.of(planned, NAMES).to_toml()
-    edited = text.replace("speed = 0.8", "speed = 0.79", 1)
-    assert edited != text
+    data = PlanFile.of(planned, NAMES).to_dict()
+    data["moves"][0]["speed"] = 0.79
+    edited = PlanFile.from_dict(data)
     with pytest.raises(InvalidPlanFile, match="delete the motion"):
-        PlanFile.from_toml(edited).plan()
-    without = replace(PlanFile.from_toml(edited), trajectory=None)
+        edited.plan()
+    without = replace(edited, trajectory=None)
     assert without.plan().trajectory.duration > planned.trajectory.duration
 
 
@@ -130,101 +129,64 @@ def test_a_damaged_stored_motion_is_refused(planned):
             PlanFile.from_dict(data).plan()
 
 
-HAND_WRITTEN = """
-format = "joint motion plan"
-version = 1
-joints = ["shoulder", "elbow"]
-start_deg = [0, 0]
-[limits]
-lower_deg = [-90, -90]
-upper_deg = [90, 90.0]
-velocity_deg = [100, 100]
-acceleration_deg = [300, 300]
-jerk_deg = [3000, 3000]
-[[moves]]
-target_deg = [30, 60.5]
-fly_percent = 50
-[[moves]]
-target = [0.5, -1]
-fly_distance_deg = 2
-speed = 0.5
-[[moves]]
-target_deg = [0, 0]
-"""
-
-
-def test_a_file_can_be_written_by_hand():
-    file = PlanFile.from_toml(HAND_WRITTEN)
-    np.testing.assert_array_equal(file.moves[0].target, np.radians([30.0, 60.5]))
-    np.testing.assert_array_equal(file.moves[1].target, [0.5, -1.0])
-    assert file.moves[1].fly == FlyDistance(np.radians(2.0))
-    planned = file.plan()
-    assert [target.how for target in planned.targets][-1] == "stopped"
-    assert planned.targets[0].distance > 0.0
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "problem"),
-    [
-        ("version = 1", "version = 2", "version"),
-        ('"joint motion plan"', '"poem"', "format"),
-        ("fly_percent = 50", "fly_percent = 50\nfly_distance = 0.1", "not both"),
-        ("fly_percent = 50", "fly_percent = 150", "fly percentage"),
-        ("fly_percent = 50", "flyby = 50", "flyby: Extra"),
-        ("target_deg = [30, 60.5]", "target_deg = [30]", "joints are named"),
-        ("target_deg = [30, 60.5]", 'target_deg = ["30", 60.5]', "not a number of degrees"),
-        ("target_deg = [30, 60.5]", "target_deg = [30, 60.5]\ntarget = [1, 2]", "both"),
-        ("target_deg = [30, 60.5]", "target_deg = [30, nan]", "finite"),
-        ("lower_deg = [-90, -90]", "lower_deg = [-90, 95]", "lower"),
-        ("jerk_deg = [3000, 3000]", "", "limits.jerk: Field required"),
-        ("[[moves]]", "[moves]", "TOML"),
+HAND_WRITTEN = {
+    "format": "joint motion plan",
+    "version": 1,
+    "joints": ["shoulder", "elbow"],
+    "start": [0, 0],
+    "limits": {
+        "lower": [-1.6, -1.6],
+        "upper": [1.6, 1.6],
+        "velocity": [2, 2],
+        "acceleration": [5, 5],
+        "jerk": [50, 50],
+    },
+    "moves": [
+        {"target": [0.5, 1], "fly_percent": 50},
+        {"target": [0.5, -1], "fly_distance": 0.03, "speed": 0.5},
+        {"target": [0, 0]},
     ],
-)
-def test_errors_of_a_file_are_named(old, new, problem):
-    with pytest.raises(InvalidPlanFile, match=problem):
-        PlanFile.from_toml(HAND_WRITTEN.replace(old, new, 1))
+}
 
 
-def test_a_file_without_limits_needs_some():
-    complete = PlanFile.from_toml(HAND_WRITTEN)
+def test_a_file_can_be_written_by_hand_without_limits():
+    complete = PlanFile.from_dict(HAND_WRITTEN)
+    assert complete.moves[1].fly == FlyDistance(0.03)
+    targets = complete.plan().targets
+    assert targets[-1].how == "stopped" and targets[0].distance > 0.0
     file = replace(complete, limits=None)
     with pytest.raises(InvalidPlanFile, match="limits"):
         file.plan()
     assert file.plan(complete.limits).duration == complete.plan().duration
 
 
-SMALLEST = {
-    "format": "joint motion plan",
-    "version": 1,
-    "joints": ["a", "b"],
-    "start": [0, 0],
-    "moves": [{"target": [1, 1]}],
-}
+CUBIC = {"type": "piecewise_cubic", "knots": [["0", 1]], "coefficients": [[[0] * 4]]}
 DAMAGE = [
-    {"version": True},
-    {"joints": ["a", "a"]},
-    {"start": [10**400, 0]},
-    {"start": ["0", 0]},
-    {"moves": [{"target": [1, 1], "speed": 10**400}]},
-    {"moves": [{"target": [1, 1], "fly_distance": True}]},
-    {"overrides": {"joint": ["1", 1]}},
-    {"limits": {"lower": [0, 0]}},
-    {"motion": {"type": "piecewise_cubic", "knots": [["0", 1]], "coefficients": [[[0] * 4]]}},
-    {"motion": {"type": "piecewise_cubic", "knots": 5, "coefficients": 5}},
+    ({"version": True}, "version"),
+    ({"version": 2}, "version"),
+    ({"format": "poem"}, "format"),
+    ({"joints": ["a", "a"]}, "named twice"),
+    ({"start": [10**400, 0]}, "start"),
+    ({"start": ["0", 0]}, "start"),
+    ({"moves": [{"target": [1]}]}, "joints are named"),
+    ({"moves": [{"target": [1, np.nan]}]}, "finite"),
+    ({"moves": [{"target": [1, 1], "speed": 10**400}]}, "speed"),
+    ({"moves": [{"target": [1, 1], "fly_distance": True}]}, "fly_distance"),
+    ({"moves": [{"target": [1, 1], "fly_distance": 0.1, "fly_percent": 50}]}, "not both"),
+    ({"moves": [{"target": [1, 1], "fly_percent": 150}]}, "fly percentage"),
+    ({"moves": [{"target": [1, 1], "flyby": 50}]}, "flyby: Extra"),
+    ({"overrides": {"joint": ["1", 1]}}, "overrides"),
+    ({"limits": {"lower": [0, 0]}}, "limits.upper: Field required"),
+    ({"limits": HAND_WRITTEN["limits"] | {"lower": [-1, 2]}}, "lower"),
+    ({"motion": CUBIC}, "pieces"),
+    ({"motion": CUBIC | {"knots": 5}}, "pieces"),
 ]
 
 
-@pytest.mark.parametrize("damage", DAMAGE)
-def test_a_damaged_file_is_invalid(damage):
-    assert PlanFile.from_dict(SMALLEST).joint_names == ("a", "b")
-    with pytest.raises(InvalidPlanFile):
-        PlanFile.from_dict(SMALLEST | damage)
-
-
-@pytest.mark.parametrize("angle", ["1e999999999", "1" * 5000, "[" * 5000 + "]" * 5000], ids=len)
-def test_impossible_numbers_are_refused(angle):
-    with pytest.raises(InvalidPlanFile):
-        PlanFile.from_toml(HAND_WRITTEN.replace("start_deg = [0,", f"start_deg = [{angle},"))
+@pytest.mark.parametrize(("damage", "problem"), DAMAGE)
+def test_errors_of_a_file_are_named(damage, problem):
+    with pytest.raises(InvalidPlanFile, match=problem):
+        PlanFile.from_dict(HAND_WRITTEN | damage)
 
 
 def test_a_short_detour_differs_from_the_planned_motion():

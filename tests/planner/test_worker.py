@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -181,7 +180,6 @@ def test_a_process_that_cannot_start_has_its_own_error(tmp_path, monkeypatch):
     with WorkerProcess() as child:
         with pytest.raises(PlannerNotStarted, match="status 3"):
             child.call(abs, -1)
-        assert child.pid is None
         (tmp_path / "ruckig.py").unlink()
         assert child.call(abs, -1) == 1
 
@@ -195,7 +193,7 @@ def test_a_call_that_takes_too_long_is_ended():
         assert child.call(abs, -1) == 1
 
 
-@pytest.mark.parametrize("task", ["", "child.send(time.sleep, 60.0)"], ids=["idle", "busy"])
+@pytest.mark.parametrize("task", ["", "child.begin(time.sleep, 60.0)"], ids=["idle", "busy"])
 def test_a_child_ends_with_its_parent(task):
     script = f"""
 import os, signal, time
@@ -251,55 +249,6 @@ with WorkerProcess() as one, WorkerProcess() as other:
     assert errors.rstrip().endswith("KeyboardInterrupt")
     assert len(pids) == 2
     assert all(gone(pid, 5.0) for pid in pids)
-
-
-def in_fork(check) -> bool:
-    """Whether a check holds in a fork of this process, in less than 30 s."""
-    pid = os.fork()
-    if pid == 0:
-        try:
-            os._exit(0 if check() else 1)
-        finally:
-            os._exit(2)
-    deadline = time.monotonic() + 30.0
-    while time.monotonic() < deadline:
-        ended, status = os.waitpid(pid, os.WNOHANG)
-        if ended:
-            return status == 0
-        time.sleep(0.01)
-    os.kill(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    return False
-
-
-def test_a_fork_cannot_receive_the_result_of_its_parent():
-    with WorkerProcess() as child:
-        child.send(os.getpid)
-
-        def refused() -> bool:
-            try:
-                child.receive()
-            except RuntimeError as error:
-                return "no call" in str(error)
-            return False
-
-        assert in_fork(refused)
-        assert child.receive() == child.pid
-
-
-def test_a_fork_while_a_thread_plans_can_plan_and_end():
-    in_child(os.getpid)
-    busy = threading.Thread(target=in_child, args=(time.sleep, 1.0))
-    busy.start()
-    time.sleep(0.2)
-
-    def plans_and_ends() -> bool:
-        own = in_child(os.getpid)
-        close_child()  # what runs at its exit
-        return own != os.getpid()
-
-    assert in_fork(plans_and_ends)
-    busy.join()
 
 
 @pytest.fixture

@@ -225,7 +225,7 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "bag.db3": bag_files,
     "bag.mcap": lambda path: topics(*bag_files(path)),
     "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
-    "plan.toml": read_plan_file,
+    "plan.json": read_plan_file,
     "results.json": StudyResults.load,
     "excitation_000_a1.mcap": open_archive,
     "excitation_001_a1.mcap": check_archive,
