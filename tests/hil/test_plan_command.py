@@ -225,7 +225,7 @@ def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):
     with pytest.raises(InputError, match="tail"):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
     path.write_text("not = [a plan")
-    with pytest.raises(InputError, match="JSON"):
+    with pytest.raises(InputError, match="name a plan file"):
         CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
 
 
