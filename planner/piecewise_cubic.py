@@ -140,6 +140,10 @@ class PiecewiseCubic:
 
     def extrema(self) -> Extrema:
         """Return the extremes over all time, from the roots of each piece."""
+        return self._extrema
+
+    @cached_property
+    def _extrema(self) -> Extrema:
         first = np.cumsum([0, *(len(c) for c in self.coefficients[:-1])])
         pieces = np.concatenate(self.coefficients)
         reach = _reach(pieces, np.concatenate([np.diff(knots) for knots in self.knots]))

@@ -119,7 +119,7 @@ class Constraints:
         """Return the worst violation of each kind and subject, and the deepest contact.
 
         `motion` are its samples, both ends included. Joint limits and contacts are checked between
-        them too; contacts only at them if a joint limit is broken, not at all if not finite.
+        them too; contacts only every 8 ms if a joint limit is broken, not at all if not finite.
 
         Raises:
             ShapeError: samples of another arm.
@@ -135,7 +135,7 @@ class Constraints:
             return tuple(found)
         if self.checker is not None:
             # With rates beyond the limits, the bounds between samples are too wide to be of use.
-            contact = self.checker.deepest_along(trajectory, motion, between=not beyond)
+            contact = self.checker.deepest_along(trajectory, between=not beyond)
             found += [] if contact is None else [_collision(self.checker, contact)]
         if self.currents is not None:
             found += self.currents.check(motion)

@@ -139,22 +139,14 @@ def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool
     )
 
 
-def rate_bounds(
+def acceleration_bound(
     trajectory: PiecewiseCubic | FourierSeries, start: Array, stop: Array
-) -> tuple[Array, Array, Array]:
-    """Return upper bounds of velocity, acceleration and jerk in parts of a motion, (n, g) each.
-
-    The parts are from `start` to `stop` (g,) [s].
-    """
+) -> Array:
+    """Return an upper bound of |qdd| in parts of a motion from `start` to `stop` [s], (n, g)."""
     if isinstance(trajectory, FourierSeries):
         ramp, length = trajectory.ramp, trajectory.length
         between_ramps = (start >= ramp) & (stop <= length - ramp)
-
-        def bound(order: int) -> Array:
-            without = trajectory.derivative_bound(order, ramps=False)[:, None]
-            return np.where(between_ramps, without, trajectory.derivative_bound(order)[:, None])
-
-        return bound(1), bound(2), bound(3)
-    extrema, parts = trajectory.extrema(), np.ones(len(start))
-    velocity, acceleration, jerk = (np.outer(getattr(extrema, name), parts) for name in _RATES)
-    return velocity, acceleration, jerk
+        without = trajectory.derivative_bound(2, ramps=False)[:, None]
+        return np.where(between_ramps, without, trajectory.derivative_bound(2)[:, None])
+    largest = trajectory.extrema().acceleration
+    return np.broadcast_to(largest[:, None], (len(largest), len(start)))

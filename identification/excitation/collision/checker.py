@@ -1,15 +1,14 @@
 """Collision checks along a motion.
 
-A coarse bound of all pairs gives the candidates. A candidate is clear between two samples if the
-travel of both bodies is too short to meet, or if a slab separates them at both samples and is
-thicker than their deviation from straight lines. Intervals that remain open are divided.
+No distance of two bodies changes by more than the sum over the joints between them of reach times
+step. Where the distances at two instants do not suffice, the interval between them is divided.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import coal
 import numpy as np
@@ -20,36 +19,28 @@ from identification.errors import ShapeError
 from identification.excitation.collision.bodies import Workspace, floor_at, link_bodies, obstacles
 from identification.excitation.collision.hulls import (
     Bodies,
-    Curvature,
     Frames,
     Indices,
     Separation,
-    common_joint,
     frames,
     placed,
-    travel,
-    turning,
+    reaches,
 )
-from identification.excitation.joint_limits import rate_bounds
+from identification.excitation.joint_limits import acceleration_bound
 from identification.model.kinematics import Chain, chain_from_urdf
-from identification.model.motion import Motion
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
 Array = NDArray[np.float64]
 
-_DEPTH_RESOLUTION: Final = 0.005  # of the deepest contact [m]
-# Only every k-th sample of a motion is checked, k at most _LONGEST_STRIDE, if no point of the arm
-# deviates from the straight line between two of these by more than _BULGE [m].
-_BULGE: Final = 0.02
-_LONGEST_STRIDE: Final = 4
-_PART: Final = 4000  # samples checked together
-# Limit of the computed distances: for the deepest contact of a part, and between samples.
-_MOST_DISTANCES: Final = 10_000
-_MOST_PER_SAMPLE: Final = 5
-# Samples per block of the coarse check, and parts into which an open interval is divided.
-_BLOCK: Final = 8
-_DIVISIONS: Final = 4
-_MOST_GAPS: Final = 1000  # open intervals; with more the motion is not divided further
+# Another contact may be deeper by this: in given postures, and along a motion [m].
+_DEPTH: Final = 0.005
+_DEPTH_ALONG: Final = 0.02
+_STEP: Final = 0.08  # of the first instants of a motion [s]
+_SAMPLE_STEP: Final = 0.008  # of the last ones, if only instants are checked
+_DIVISIONS: Final = 16  # of an interval; one that is still open counts as a contact
+# Most open intervals, and distances that are computed; with more, the motion counts as a contact.
+_MOST_OPEN: Final = 20_000
+_MOST_DISTANCES: Final = 30_000
 # Pairs closer than this [m] (and than the margin) in all sampled postures are not checked; a wider
 # margin does not exclude more.
 _NEAR: Final = 0.05
@@ -67,7 +58,7 @@ class Contact(NamedTuple):
 
     first: str  #: link
     second: str  #: link or obstacle ("floor", "wall 0", "box 1")
-    sample: int  #: index of the posture
+    sample: int | None  #: index of the posture, if postures were given
     time: float | None  #: [s], of a motion
     posture: tuple[float, ...]  #: joint positions there [rad]
     distance: float  #: [m], negative if they overlap
@@ -91,10 +82,8 @@ class ClosePair(NamedTuple):
 class Path(NamedTuple):
     """Positions of all bodies at m samples."""
 
-    q: Array  # postures (m, n)
     frames: Frames  # of base and links
     bodies: Bodies  # hulls
-    travel: Array  # (b, m) upper bound of the path length of each body's points [m]
 
 
 class CollisionChecker:
@@ -112,8 +101,6 @@ class CollisionChecker:
 
     Attributes:
         separation: distance bounds of the p pairs.
-        common_joint: (p,) last joint that moves both bodies of a pair, -1: the base.
-        from_base, from_common_joint: bounds of the curvature of the pairs' motion seen from these.
         unchecked, reduced: pairs that are not checked, or with less than the margin.
         arm_length: length along the arm from the base to its last joint [m]; 1 if it is zero.
 
@@ -144,18 +131,11 @@ class CollisionChecker:
             if a < len(links) and self._joints_apart(a, b) > (0 if b >= len(links) else 1)
         ]
         self.separation = Separation(self._bodies, pairs)
-        self._tried = self.path(random_postures(chain.n_joints, limits))
+        self._postures = random_postures(chain.n_joints, limits)
+        self._tried = self.path(self._postures)
         self.unchecked, self.reduced = self._find_close_pairs()
-        first, second = self.separation.first, self.separation.second
-        joints = np.array([body.joint for body in self._bodies], dtype=np.intp)
-        joint_pairs = zip(joints[first], joints[second], strict=True)
-        self.common_joint: Indices = np.array(
-            [common_joint(chain, *pair) for pair in joint_pairs], dtype=np.intp
-        )
-        self.from_base, self.from_common_joint = (
-            Curvature(chain, self._bodies, first, second, frame)
-            for frame in (np.full_like(self.common_joint, -1), self.common_joint)
-        )
+        still = np.zeros(chain.n_joints)
+        self._turning_reaches = reaches(chain, self._bodies, self.separation, still)
         self.arm_length = _length(chain)
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -192,8 +172,13 @@ class CollisionChecker:
         if not np.all(np.isfinite(q)):
             raise ValueError("positions of joints must be finite")
         at = frames(self._chain, q)
-        bodies = placed(self._bodies, at)
-        return Path(q, at, bodies, travel(self._bodies, bodies, turning(self._chain, q)))
+        return Path(at, placed(self._bodies, at))
+
+    def reaches(self, largest: Array) -> Array:
+        """Return `hulls.reaches` of the pairs (p, n) for postures up to `largest` |q| (n,)."""
+        if np.all(self._chain.revolute):
+            return self._turning_reaches
+        return reaches(self._chain, self._bodies, self.separation, largest)
 
     def distance(self, pair: int, path: Path, sample: int) -> float:
         """Return the signed distance of a pair at a sample [m], -inf if it cannot be determined."""
@@ -208,12 +193,6 @@ class CollisionChecker:
         self._result.clear()
         distance = float(coal.distance(*placed_shapes, self._request, self._result))
         return -np.inf if np.isnan(distance) else distance
-
-    def normal(self, second: int) -> Array:
-        """Return the direction of the last computed distance, from second to first body."""
-        fixed = self._bodies[second].normal
-        normal: Array = -self._result.normal if fixed is None else fixed
-        return normal
 
     def indices(self, pair: int) -> tuple[int, int]:
         """Return the two bodies of a pair."""
@@ -240,7 +219,7 @@ class CollisionChecker:
             least, most = -np.inf, np.inf
             if joints <= 2:
                 repeated = np.full(_N_POSTURES, pair)
-                bound, _ = self.separation.bound(self._tried.bodies, repeated, samples)
+                bound = self.separation.bound(self._tried.bodies, repeated, samples)
                 if np.all(bound < near):
                     distances = self._distances(pair)
                     least, most = float(distances.min()), float(distances.max())
@@ -265,7 +244,7 @@ class CollisionChecker:
             ValueError: it is not one of `pairs`.
         """
         pairs = [k for k in range(len(self.separation.first)) if self.names(k) == (first, second)]
-        self._tried = self.path(self._tried.q)  # with the planes that were moved back
+        self._tried = self.path(self._postures)  # with the planes that were moved back
         distances = np.min([self._distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
 
@@ -286,51 +265,57 @@ class CollisionChecker:
 
         Another contact may be deeper by up to 5 mm.
         """
-        path = self.path(q)
-        touch = _deepest(self, path, _candidates(self, path, np.zeros((2, 1, 1))))
-        return None if touch is None else _contact(self, touch, q)
+        nearest = _Nearest(self, _DEPTH)
+        pair, sample = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
+        nearest.visit(q, np.arange(len(q), dtype=np.float64), pair, sample)
+        if nearest.contact is None:
+            return None
+        return nearest.contact._replace(sample=int(nearest.contact.time or 0), time=None)
 
     def deepest_along(
-        self,
-        trajectory: PiecewiseCubic | FourierSeries,
-        motion: Motion,
-        *,
-        between: bool = True,
+        self, trajectory: PiecewiseCubic | FourierSeries, *, between: bool = True
     ) -> Contact | None:
         """Return the deepest contact along a trajectory, None if it is clear.
 
-        `motion` are its samples, both ends included. If they are clear, the motion is checked
-        continuously `between` them; an interval that division does not resolve counts as a
-        contact. If samples touch, another contact may be deeper by up to 2.5 cm.
+        It is checked at every instant, or, if not `between`, at instants up to 8 ms apart. An
+        interval that division does not resolve counts as a contact. Another contact may be deeper
+        by up to 2 cm.
         """
-        motion = motion.rows(_checked_samples(self, trajectory, motion))
-        deepest: Contact | None = None
-        for start in range(0, max(motion.n_samples - 1, 1), _PART):
-            part = motion.rows(slice(start, start + _PART + 1))
-            contact = self._deepest_in(trajectory, part, between)
-            if deepest is None or (contact is not None and contact.distance < deepest.distance):
-                deepest = contact
-        return deepest
-
-    def _deepest_in(
-        self, trajectory: PiecewiseCubic | FourierSeries, motion: Motion, between: bool
-    ) -> Contact | None:
-        path = self.path(motion.position)
-        bulges = _bulges_of(self, trajectory, motion) if between else np.zeros((2, 1, 1))
-        candidates = _candidates(self, path, bulges)
-        touch = _deepest(self, path, candidates)
-        if touch is None:
-            found = _touch_between(self, trajectory, motion, path, candidates) if between else None
-            if found is None:
-                return None
-            touch, motion = found
-        return _contact(self, touch, motion.position, motion.time)
+        nearest = _Nearest(self, _DEPTH_ALONG)
+        time = np.linspace(0.0, trajectory.duration, 1 + _steps(trajectory.duration, _STEP))
+        q = trajectory.sample(time)[0]
+        beyond = acceleration_bound(trajectory, time[:1], time[-1:])[:, 0] * _STEP**2 / 8.0
+        reach = self.reaches(np.abs(q).max(axis=0) + beyond)
+        pair, node = np.indices((len(reach), len(time))).reshape(2, -1)
+        found = nearest.visit(q, time, pair, node).reshape(-1, len(time))
+        ends = time[:-1], time[1:], q[:-1], q[1:]
+        change = reach @ _passed(trajectory, *ends, between=between)
+        least = (found[:, :-1] + found[:, 1:] - change) / 2.0
+        pair, node = np.nonzero(~(least >= nearest.limit))
+        gaps = _Gaps(pair, *(end[node] for end in ends), found[pair, node], found[pair, node + 1])
+        for _ in range(_DIVISIONS):
+            if not between:
+                gaps = gaps.take(gaps.stop - gaps.start > _SAMPLE_STEP)
+            many = len(gaps.pair) > _MOST_OPEN or nearest.distances > _MOST_DISTANCES
+            if many or len(gaps.pair) == 0:
+                break
+            time, node = np.unique((gaps.start + gaps.stop) / 2.0, return_inverse=True)
+            q = trajectory.sample(time)[0]
+            gaps = gaps.divided(time[node], q[node], nearest.visit(q, time, gaps.pair, node))
+            passed = _passed(trajectory, *gaps[1:5], between=between)
+            change = np.einsum("kn,nk->k", reach[gaps.pair], passed)
+            gaps = gaps.take(~((gaps.before + gaps.after - change) / 2.0 >= nearest.limit))
+        if nearest.contact is None and len(gaps.pair) > 0:
+            nearest.touch(
+                int(gaps.pair[0]), float(np.nextafter(self.margin, -1.0)), gaps.start[0], gaps.q0[0]
+            )
+        return nearest.contact
 
     def clear(self, q: Array) -> NDArray[np.bool_]:
         """Return which of the postures (m, n) are clear, (m,)."""
         path = self.path(q)
         pairs, samples = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
-        lower, _ = self.separation.bound(path.bodies, pairs, samples)
+        lower = self.separation.bound(path.bodies, pairs, samples)
         blocked = np.zeros(len(q), dtype=np.bool_)
         near = np.flatnonzero(~(lower >= self.margin))
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
@@ -340,280 +325,127 @@ class CollisionChecker:
         return np.asarray(~blocked)
 
 
-class Touch(NamedTuple):
-    """A pair of bodies closer than the margin at a sample."""
-
-    pair: int  # of the checker
-    sample: int  # of the motion
-    distance: float  # signed [m]
-
-
-class Candidates(NamedTuple):
-    """Pairs (k,) and samples (k,) that may touch, with bounds (k,) [m] and directions (3, k).
-
-    In rows of `_BLOCK` + 1 consecutive samples, pair by pair. `bulge` (2, rows) [m] bounds the
-    deviation of both bodies from straight lines between samples, seen from the base and from
-    their common joint.
-    """
+class _Gaps(NamedTuple):
+    """Pairs (k,) between two instants (k,) [s], with positions (k, n) and distances (k,) there."""
 
     pair: Indices
-    sample: Indices
-    lower: Array
-    normal: Array
-    bulge: Array
+    start: Array
+    stop: Array
+    q0: Array
+    q1: Array
+    before: Array
+    after: Array
 
+    def take(self, rows: NDArray[np.bool_] | Indices) -> _Gaps:
+        """Return gaps by index or mask."""
+        columns: list[Any] = [column[rows] for column in self]
+        return _Gaps(*columns)
 
-def _contact(
-    checker: CollisionChecker, touch: Touch, q: Array, time: Array | None = None
-) -> Contact:
-    sample = touch.sample
-    return Contact(
-        *checker.names(touch.pair),
-        sample,
-        None if time is None else float(time[sample]),
-        tuple(q[sample].tolist()),
-        touch.distance,
-    )
-
-
-def _checked_samples(
-    checker: CollisionChecker, trajectory: PiecewiseCubic | FourierSeries, motion: Motion
-) -> Indices:
-    """Return the samples of a motion to check, both ends included."""
-    last = motion.n_samples - 1
-    velocity, acceleration, _ = rate_bounds(trajectory, motion.time[:1], motion.time[-1:])
-    step = float(np.max(np.diff(motion.time), initial=0.0))
-    bulges = checker.from_base.bulge(velocity, acceleration, motion.position, step)
-    share = np.sqrt(_BULGE / np.max(bulges, initial=1e-9))
-    stride = 1 if np.isnan(share) else int(np.clip(share, 1, _LONGEST_STRIDE))
-    return np.append(np.arange(0, max(last, 1), stride), last)
-
-
-def _deepest(checker: CollisionChecker, path: Path, candidates: Candidates) -> Touch | None:
-    """Return the deepest contact at the samples by branch and bound."""
-    near = np.flatnonzero(~(candidates.lower >= checker.margin))
-    if len(near) == 0:
-        return None
-    pair, sample, lower = (column[near] for column in candidates[:3])
-    exact = checker.separation.exact[pair]
-    best, found = checker.margin, -1
-    if np.any(exact):
-        found = int(np.argmin(np.where(exact, lower, np.inf)))
-        best = float(lower[found])
-        lower[exact] = np.inf
-    separation = checker.separation
-    travel = path.travel[separation.first[pair], sample]
-    travel += path.travel[separation.second[pair], sample]
-    for _ in range(_MOST_DISTANCES):
-        k = int(np.argmin(lower))
-        if not lower[k] < best - (0.0 if found < 0 else _DEPTH_RESOLUTION):
-            break
-        distance = checker.distance(int(pair[k]), path, int(sample[k]))
-        if distance < best:
-            best, found = distance, k
-        start, stop = np.searchsorted(pair, (pair[k], pair[k] + 1))
-        reached = distance - np.abs(travel[start:stop] - travel[k])
-        np.maximum(lower[start:stop], reached, out=lower[start:stop])
-        lower[k] = np.inf
-    else:
-        if found < 0:  # not all candidates were checked: not clear
-            best, found = float(np.nextafter(checker.margin, -1.0)), k
-    if found < 0:
-        return None
-    return Touch(int(pair[found]), int(sample[found]), best)
-
-
-def _bulges_of(
-    checker: CollisionChecker, trajectory: PiecewiseCubic | FourierSeries, motion: Motion
-) -> Array:
-    """Bound the deviation of pairs from straight lines in blocks of samples, (2, p, rows) [m]."""
-    starts = _starts(motion.n_samples)
-    step = float(np.max(np.diff(motion.time), initial=0.0))
-    ends = np.append(starts[1:], motion.n_samples - 1)
-    _, change, jerk = rate_bounds(trajectory, motion.time[starts], motion.time[ends])
-
-    def largest(rate: Array, slope: Array) -> Array:
-        size = np.abs(rate.T)
-        sampled = np.maximum(np.maximum.reduceat(size, starts, axis=1), size[:, ends])
-        return np.asarray(sampled + slope * (step / 2.0))
-
-    velocity = largest(motion.velocity, change)
-    acceleration = largest(motion.acceleration, jerk)
-    return np.array(
-        [
-            curvature.bulge(velocity, acceleration, motion.position, step)
-            for curvature in (checker.from_base, checker.from_common_joint)
+    def divided(self, time: Array, q: Array, distance: Array) -> _Gaps:
+        """Return both halves of each gap, by rising pair, divided at instants (k,)."""
+        first = self._replace(stop=time, q1=q, after=distance)
+        second = self._replace(start=time, q0=q, before=distance)
+        order = np.argsort(np.concatenate((self.pair, self.pair)), kind="stable")
+        columns: list[Any] = [
+            np.concatenate(halves)[order] for halves in zip(first, second, strict=True)
         ]
-    )
+        return _Gaps(*columns)
 
 
-def _candidates(checker: CollisionChecker, path: Path, bulges: Array) -> Candidates:
-    """Return the pairs that may come closer than the margin at or next to a sample."""
-    first, second = checker.separation.first, checker.separation.second
-    last = len(path.q) - 1
-    starts = _starts(len(path.q))
-    grid = np.append(starts, last)
-    bound = checker.separation.coarse(path.bodies, grid)
-    travel = np.diff(path.travel[:, grid])
-    least = (bound[:, :-1] + bound[:, 1:] - travel[first] - travel[second]) / 2.0 - bulges[0]
-    pairs, blocks = np.nonzero(~(least >= checker.margin))
-    bulge = np.broadcast_to(bulges, (2, *least.shape))[:, pairs, blocks]
-    sample = np.minimum(starts[blocks][:, None] + np.arange(_BLOCK + 1), last)
-    return _rows_of(checker, path, pairs, sample, bulge)
+class _Nearest:
+    """The deepest contact at the visited postures.
+
+    Contacts deeper by less than `resolution` [m] are not looked for; `distances` counts those
+    computed.
+    """
+
+    def __init__(self, checker: CollisionChecker, resolution: float) -> None:
+        self._checker, self._resolution = checker, resolution
+        self.contact: Contact | None = None
+        self.distances = 0
+
+    @property
+    def limit(self) -> float:
+        """Distance [m] below which a contact would be the deepest one."""
+        if self.contact is None:
+            return self._checker.margin
+        return self.contact.distance - self._resolution
+
+    def visit(self, q: Array, time: Array, pair: Indices, sample: Indices) -> Array:
+        """Return bounds of the distances of pairs (k,), in rising order, at samples (k,) of q."""
+        checker = self._checker
+        path = checker.path(q)
+        lower = checker.separation.bound(path.bodies, pair, sample)
+        near = np.flatnonzero(~(lower >= self.limit))
+        exact = checker.separation.exact[pair]
+        for k in near[np.argsort(lower[near], kind="stable")].tolist():
+            if lower[k] >= self.limit:
+                break
+            if not exact[k]:
+                lower[k] = checker.distance(int(pair[k]), path, int(sample[k]))
+                self.distances += 1
+            if lower[k] < checker.margin and (
+                self.contact is None or lower[k] < self.contact.distance
+            ):
+                self.touch(int(pair[k]), float(lower[k]), time[sample[k]], q[sample[k]])
+        return lower
+
+    def touch(self, pair: int, distance: float, time: float, posture: Array) -> None:
+        """Set the deepest contact."""
+        first, second = self._checker.names(pair)
+        self.contact = Contact(first, second, None, float(time), tuple(posture.tolist()), distance)
 
 
-def _rows_of(
-    checker: CollisionChecker, path: Path, pairs: Indices, sample: Indices, bulge: Array
-) -> Candidates:
-    """Return pairs (rows,) at samples (rows, `_BLOCK` + 1)."""
-    pair = np.repeat(pairs, _BLOCK + 1)
-    bound = checker.separation.bound(path.bodies, pair, sample.ravel())
-    return Candidates(pair, sample.ravel(), *bound, bulge)
+def _steps(duration: float, step: float) -> int:
+    return max(1, int(np.ceil(duration / step)))
 
 
-def _starts(samples: int) -> Indices:
-    return np.arange(0, max(samples - 1, 1), _BLOCK)
-
-
-_Distances = dict[int, tuple[float, Array]]  # and directions, by sample
-
-
-class _Interval(NamedTuple):
-    """A pair of bodies between two samples."""
-
-    pair: int
-    start: int
-    stop: int
-    bulge: float  # deviation from straight lines seen from the base [m]
-    joint_bulge: float  # seen from the common joint
-
-    def gap(self, left: int) -> _Interval:
-        """Return the part between one sample and the next."""
-        return self._replace(start=left, stop=left + 1)
-
-
-def _touch_between(
-    checker: CollisionChecker,
+def _passed(
     trajectory: PiecewiseCubic | FourierSeries,
-    motion: Motion,
-    path: Path,
-    candidates: Candidates,
-) -> tuple[Touch, Motion] | None:
-    """Return a touch between the samples, which are clear, and the finer samples it is at."""
-    distances_left = max(_MOST_DISTANCES, _MOST_PER_SAMPLE * motion.n_samples)
-    for division in range(_DIVISIONS + 1):
-        gaps: list[_Interval] = []
-        for interval in _open_intervals(checker, path, candidates):
-            if division == 0 and checker.separation.sharp[interval.pair]:
-                # for exact hulls division is cheaper than distances
-                gaps += [interval.gap(k) for k in range(interval.start, interval.stop)]
-                continue
-            distances: _Distances = {}
-            found = _open_gaps(checker, path, interval, distances)
-            if isinstance(found, Touch):
-                return found, motion
-            gaps += found
-            distances_left -= len(distances)
-            if distances_left < 0:
-                return _unresolved(checker, interval), motion
-        if not gaps or division == _DIVISIONS or len(gaps) > _MOST_GAPS:
-            break
-        gaps.sort()
-        pairs, left = (np.array([gap[column] for gap in gaps]) for column in (0, 1))
-        time = np.linspace(motion.time[left], motion.time[left + 1], _BLOCK + 1, axis=1)
-        motion = Motion(time.ravel(), *trajectory.sample(time.ravel()))
-        path = checker.path(motion.position)
-        bulge = np.array([(gap.bulge, gap.joint_bulge) for gap in gaps]).T / _BLOCK**2
-        candidates = _rows_of(checker, path, pairs, np.arange(time.size).reshape(time.shape), bulge)
-    return (_unresolved(checker, gaps[0]), motion) if gaps else None
-
-
-def _unresolved(checker: CollisionChecker, interval: _Interval) -> Touch:
-    """Return a touch just below the margin for an interval that was not resolved."""
-    return Touch(interval.pair, interval.start, float(np.nextafter(checker.margin, -1.0)))
-
-
-def _open_intervals(
-    checker: CollisionChecker, path: Path, candidates: Candidates
-) -> list[_Interval]:
-    """Return intervals in which neither travel nor a slab proves the bodies to be clear."""
-    rows = (-1, _BLOCK + 1)
-    sample, lower = candidates.sample.reshape(rows), candidates.lower.reshape(rows)
-    pair = candidates.pair.reshape(rows)[:, :-1].ravel()
-    bulge, joint_bulge = np.repeat(candidates.bulge, _BLOCK, axis=1)
-    before, after = sample[:, :-1].ravel(), sample[:, 1:].ravel()
-    bound = lower[:, :-1].ravel(), lower[:, 1:].ravel()
-    travel = path.travel
-    a, b = checker.separation.first[pair], checker.separation.second[pair]
-    length = travel[a, after] - travel[a, before] + travel[b, after] - travel[b, before]
-    margin = checker.margin
-    reach = (bound[0] + bound[1] - length) / 2.0 - bulge
-    open_ = np.flatnonzero(~(reach >= margin) & (after > before))
-    normals = candidates.normal.reshape(3, *rows)
-    least = np.full(len(open_), -np.inf)
-    for side, (here, there) in ((0, (before, after)), (1, (after, before))):
-        normal = normals[:, :, side : side + _BLOCK].reshape(3, -1)[:, open_]
-        thickness = _slab(checker, path, pair[open_], here[open_], there[open_], normal)
-        np.maximum(least, np.minimum(bound[side][open_], thickness), out=least)
-    intervals: list[_Interval] = []
-    for k in open_[~(least - joint_bulge[open_] >= margin)].tolist():
-        ends = int(pair[k]), int(before[k]), int(after[k])
-        new = _Interval(*ends, float(bulge[k]), float(joint_bulge[k]))
-        last = intervals[-1] if intervals else None
-        if last is not None and (last.pair, last.stop) == (new.pair, new.start):
-            bulges = max(last.bulge, new.bulge), max(last.joint_bulge, new.joint_bulge)
-            intervals[-1] = _Interval(last.pair, last.start, new.stop, *bulges)
-        else:
-            intervals.append(new)
-    return intervals
-
-
-def _slab(
-    checker: CollisionChecker,
-    path: Path,
-    pair: Indices,
-    here: Indices,
-    there: Indices,
-    normal: Array,
+    start: Array,
+    stop: Array,
+    q0: Array,
+    q1: Array,
+    *,
+    between: bool,
 ) -> Array:
-    """Return the thickness at samples `there` of slabs (k,) with normals at samples `here` [m]."""
-    joint = checker.common_joint[pair] + 1
-    local = np.einsum("kij,ik->jk", path.frames.rotation[joint, :, :, here], normal)
-    turned = np.einsum("kij,jk->ik", path.frames.rotation[joint, :, :, there], local)
-    return checker.separation.along(path.bodies, pair, there, turned)
+    """Bound the way of each joint from instants `start` to `stop` (k,), q0 to q1 (k, n): (n, k).
+
+    With |qdd| up to A it is at most |q1 - q0| + A h²/4 in a time h; without `between` only the
+    first term is returned.
+    """
+    change = np.abs(q1 - q0).T
+    if not between:
+        return change
+    step = stop - start
+    return np.asarray(change + acceleration_bound(trajectory, start, stop) * (step * step / 4.0))
 
 
-def _open_gaps(
-    checker: CollisionChecker, path: Path, interval: _Interval, distances: _Distances
-) -> list[_Interval] | Touch:
-    """Return gaps between neighbouring samples in which a pair may touch, or a touch at one."""
-    a, b = checker.indices(interval.pair)
-    margin = checker.margin
-    gaps, stack = [], [(interval.start, interval.stop)]
-    while stack:
-        left, right = stack.pop()
-        for sample in (left, right):
-            if sample not in distances:
-                distances[sample] = checker.distance(interval.pair, path, sample), checker.normal(b)
-            if not distances[sample][0] >= margin:
-                return Touch(interval.pair, sample, distances[sample][0])
-        travel = path.travel[a, right] - path.travel[a, left]
-        travel += path.travel[b, right] - path.travel[b, left]
-        reach = (distances[left][0] + distances[right][0] - travel) / 2.0
-        if reach - interval.bulge >= margin:
-            continue
-        if right - left > 1:
-            middle = (left + right) // 2
-            stack += [(middle, right), (left, middle)]
-            continue
-        ends = np.array([left, right])
-        normal = np.array([distances[left][1], distances[right][1]]).T
-        pair = np.full(2, interval.pair)
-        here = checker.separation.along(path.bodies, pair, ends, normal)
-        there = _slab(checker, path, pair, ends, ends[::-1], normal)
-        if not np.max(np.minimum(here, there)) - interval.joint_bulge >= margin:
-            gaps.append(interval.gap(left))
-    return gaps
+def _passed(
+    trajectory: PiecewiseCubic | FourierSeries,
+    start: Array,
+    stop: Array,
+    q0: Array,
+    q1: Array,
+    *,
+    between: bool,
+) -> Array:
+    """Bound the way of each joint from instants `start` to `stop` (k,), q0 to q1 (k, n): (n, k).
+
+    With |qdd| up to A it is at most |q1 - q0| + A h²/4 in a time h; without `between` only the
+    first term is returned.
+    """
+    change = np.abs(q1 - q0).T
+    if not between:
+        return change
+    step = stop - start
+    return np.asarray(change + acceleration_bound(trajectory, start, stop) * (step * step / 4.0))
+
+
+def _slide(trajectory: PiecewiseCubic | FourierSeries) -> Array:
+    """Return how far a joint may be beyond its samples [rad, m] (n,)."""
+    ends = np.array([[0.0], [trajectory.duration]])
+    return acceleration_bound(trajectory, *ends)[:, 0] * _STEP**2 / 8.0
 
 
 def random_postures(n: int, limits: JointLimits | None) -> Array:
