@@ -150,6 +150,7 @@ class WorkerProcess:
     def __init__(self, *, timeout: float = 10.0) -> None:
         self._timeout = timeout
         self._process: subprocess.Popen[bytes] | None = None
+        self._ready = False
         self.deadline = 0.0
         self._start()
 

@@ -292,7 +292,8 @@ class CollisionChecker:
         change = reach @ _passed(trajectory, *ends, between=between)
         least = (found[:, :-1] + found[:, 1:] - change) / 2.0
         pair, node = np.nonzero(~(least >= nearest.limit))
-        gaps = _Gaps(pair, *(end[node] for end in ends), found[pair, node], found[pair, node + 1])
+        start, stop, q0, q1 = (end[node] for end in ends)
+        gaps = _Gaps(pair, start, stop, q0, q1, found[pair, node], found[pair, node + 1])
         for _ in range(_DIVISIONS):
             if not between:
                 gaps = gaps.take(gaps.stop - gaps.start > _SAMPLE_STEP)
@@ -419,33 +420,6 @@ def _passed(
         return change
     step = stop - start
     return np.asarray(change + acceleration_bound(trajectory, start, stop) * (step * step / 4.0))
-
-
-def _passed(
-    trajectory: PiecewiseCubic | FourierSeries,
-    start: Array,
-    stop: Array,
-    q0: Array,
-    q1: Array,
-    *,
-    between: bool,
-) -> Array:
-    """Bound the way of each joint from instants `start` to `stop` (k,), q0 to q1 (k, n): (n, k).
-
-    With |qdd| up to A it is at most |q1 - q0| + A h²/4 in a time h; without `between` only the
-    first term is returned.
-    """
-    change = np.abs(q1 - q0).T
-    if not between:
-        return change
-    step = stop - start
-    return np.asarray(change + acceleration_bound(trajectory, start, stop) * (step * step / 4.0))
-
-
-def _slide(trajectory: PiecewiseCubic | FourierSeries) -> Array:
-    """Return how far a joint may be beyond its samples [rad, m] (n,)."""
-    ends = np.array([[0.0], [trajectory.duration]])
-    return acceleration_bound(trajectory, *ends)[:, 0] * _STEP**2 / 8.0
 
 
 def random_postures(n: int, limits: JointLimits | None) -> Array:
