@@ -14,11 +14,9 @@ from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.payload import (
     NAMES,
-    Difference,
     PayloadEstimate,
     Run,
     figures_of,
-    find_difference,
     identify_payload,
 )
 from identification.model.pseudo_inertia import Body
@@ -42,7 +40,6 @@ class PayloadFound:
     estimate: PayloadEstimate
     body: Body
     frame: str  #: link in whose frame `body` is
-    box: tuple[float, float, float] | None  #: edges of the reference body [m]; None for a point
     gravity: float  #: magnitude [m/s²]
     bare: tuple[str, ...]  #: names of the archives without payload
     loaded: tuple[str, ...]  #: names of the archives with payload
@@ -93,16 +90,9 @@ class PayloadFound:
             f" ({torque[1]:.3g} to {torque[2]:.3g})."
         ]
         if estimate.undetermined:
-            shape = "a point mass" if self.box is None else "the box"
             lines.append(
-                f"The motion does not determine {', '.join(estimate.undetermined)}: their values"
-                f" are those of the physically consistent body closest to {shape}."
-            )
-        if estimate.contradicted:
-            lines.append(
-                "No physically consistent body explains the recordings within their noise:"
-                " check torque constants, the geometry of the URDF and friction that depends on the"
-                " load; the intervals do not include this error."
+                f"The motion does not determine {', '.join(estimate.undetermined)}: taken as zero"
+                " where the other figures allow it."
             )
         return lines
 
@@ -171,7 +161,6 @@ class PayloadFound:
             },
             "wrist_torque": figure(*torque, "N·m"),
             "undetermined": list(estimate.undetermined),
-            "contradicted": estimate.contradicted,
             "least_squares": estimate.parameters.tolist(),
             "method": estimate.method,
             "controllers": self.controllers,
@@ -187,17 +176,16 @@ def find_payload(
     reporter: Reporter,
     *,
     frame: str | None = None,
-    box: tuple[float, float, float] | None = None,
     options: Options = Options(estimator="wls"),
 ) -> PayloadFound:
     """Identify the payload of the loaded recordings as their difference to the bare ones.
 
     Both are archives, folders of them, or campaign folders. Settings are chosen on the bare
     recordings; `[robot.payload]` of the cells is ignored. The payload is in the frame of a link, by
-    default that of `flange_of`; `box` are the edges [m] of the reference body, None for a point.
+    default that of `flange_of`.
 
     Raises:
-        InputError: archives cannot be used, are of two arms, have two payloads or none.
+        InputError: archives cannot be used, are of two arms, or have no payload.
         IdentificationError: the recordings do not determine the mass.
     """
     sides = {False: list(archives_in(bare)), True: list(archives_in(loaded))}
@@ -215,7 +203,6 @@ def find_payload(
         problem = f"is of another arm than {bare_cell.path}: {' and '.join(differing)} differ"
         remedy = "give bare and loaded recordings of one arm"
         raise ArchiveError(sides[True][0], problem, field="--loaded", remedy=remedy)
-    paths = {path.name: path for path in (*sides[False], *sides[True])}
     training = (*found[False].training, *found[True].training)
     for source in training:
         if source.recording.torque is None:
@@ -239,11 +226,8 @@ def find_payload(
             samples = samples_of(signals_of(source, settings), cell, settings)
             runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
             task.advance(1, source.name)
-    with reporter.task("weighing", 2) as task:
-        if (difference := find_difference(cell.model, runs)) is not None:
-            raise _mixed(difference, paths[difference.run.name])
-        task.advance(1)
-        estimate = identify_payload(cell.model, runs, box)
+    with reporter.task("weighing", 1) as task:
+        estimate = identify_payload(cell.model, runs)
         task.advance(1)
     warnings = (*prepared.sources.warnings, *found[True].warnings)
     if estimate.body is None:
@@ -258,7 +242,6 @@ def find_payload(
         estimate=estimate,
         body=estimate.body,
         frame=frame,
-        box=box,
         gravity=float(np.linalg.norm(cell.model.gravity)),
         bare=tuple(source.name for source in first),
         loaded=tuple(source.name for source in last),
@@ -273,14 +256,3 @@ def flange_of(model: RobotModel) -> str:
     }
     named = next((name for name in _FLANGES if name in last), None)
     return named or min(last, key=lambda name: float(np.abs(last[name].translation).sum()))
-
-
-def _mixed(found: Difference, path: Path) -> InputError:
-    """Return the error about recordings of one side with different payloads."""
-    more = "more" if found.mass > 0.0 else "less"
-    amount = f"{abs(found.mass):.3g} kg {more} than {found.reference.name}"
-    if found.run.loaded:
-        problem, remedy = "carries another payload", "identify each payload separately"
-        return InputError(path, f"{problem}: {amount}", field="--loaded", remedy=remedy)
-    problem = f"was recorded with another tool: it carries {amount}, also given as bare"
-    return InputError(path, problem, remedy="give it with --loaded, or omit it")

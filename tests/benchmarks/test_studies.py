@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from benchmarks import excitation_study
 from benchmarks.identification_study import Covered, coverage, recorded, study
-from benchmarks.payload import arm_model, load_of, runs_of
 from benchmarks.payload import coverage as payload_coverage
 from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
 from identification.estimators.least_squares import estimate
-from identification.estimators.payload import find_difference
 from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -129,12 +127,6 @@ class TestPayload:
         assert found.within_one_percent >= within
         for figure, share in {**found.covered, "moment": found.moment_covered}.items():
             assert 0.90 <= share <= 0.99, figure
-
-    def test_pairs_of_one_load_do_not_differ(self) -> None:
-        """A, B, B, A: nothing is refused that is one load."""
-        model, load = arm_model(), load_of(3)
-        runs = runs_of(3, model, loads=(None, load, load, None))
-        assert find_difference(model, runs) is None
 
 
 @pytest.fixture(scope="module")
