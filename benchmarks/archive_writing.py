@@ -5,8 +5,7 @@ exchange: it fills the shared memory with a cycle of six joints every millisecon
 recorded excitation (`benchmarks.archive_files`). The archive process drains, encodes, compresses
 and writes it to the disk of the present folder with fdatasync, as on a real link. Its processor
 time, that of both its threads, from the opening of the archive to its closing is set against the
-time it took: ``writing_share_of_core``, and ``writing_share_of_core_with_packets`` where raw
-packets of both directions are stored as well.
+time it took: ``writing_share_of_core``.
 """
 
 from __future__ import annotations
@@ -26,8 +25,7 @@ from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventWriter
-from drivers.packets import AXIS_DTYPE, HEADER_LENGTH, Mode, next_number
-from drivers.record import CycleRing, PacketRing
+from drivers.record import CycleRing
 from hil.archive import ArchiveSpec, open_archive
 from hil.archive.supervised import ArchiveProcessHandle, Close, Closed, Open, Opened
 
@@ -41,19 +39,13 @@ ANSWER = 30.0  # s
 class Exchange:
     """The memory of an exchange, and its descriptors."""
 
-    def __init__(self, *, packets: bool) -> None:
+    def __init__(self) -> None:
         self.ring = CycleRing.shared(JOINTS, 20_000)
         self.ring_fd, self.event_fd = self.ring.fd, event_log.create()
         self.control_fd = control_memory.create()
         self.events, self.control = EventWriter(self.event_fd), ControlBlock(self.control_fd)
-        self.packets = PacketRing.shared() if packets else None
         self.pid = os.getpid()
         self._rows = records(0)
-
-    @property
-    def packets_fd(self) -> int:
-        """Descriptor of the raw packets, -1 without."""
-        return -1 if self.packets is None else self.packets.fd
 
     def run(self, seconds: float) -> None:
         """A cycle every millisecond."""
@@ -70,36 +62,20 @@ class Exchange:
         self.ring.rows[slot] = self._rows[cycle % len(self._rows)]
         self.ring.cycle[slot] = cycle
         self.ring.commit()
-        if self.packets is not None:
-            number = int(self.ring.number[slot])
-            received = _packet(number, self.ring.measured[slot])
-            sent = _packet(next_number(number), self.ring.commanded[slot])
-            self.packets.put(cycle, cycle * PERIOD, False, received)
-            self.packets.put(cycle, cycle * PERIOD, True, sent)
 
     def close(self) -> None:
         """Give the memory up."""
-        for fd in (self.ring_fd, self.event_fd, self.control_fd, self.packets_fd):
-            if fd >= 0:
-                os.close(fd)
+        for fd in (self.ring_fd, self.event_fd, self.control_fd):
+            os.close(fd)
 
 
-def _packet(number: int, values: Array) -> bytes:
-    """A packet whose axes have these values, (k, joints), in their first places."""
-    axes = np.zeros(JOINTS, AXIS_DTYPE)
-    axes["mode"] = Mode.POSITION
-    axes["d"][:, : len(values[:5])] = values[:5].T
-    axes["extra"][:, : len(values[5:])] = values[5:].T
-    return number.to_bytes(4, "little") + bytes(HEADER_LENGTH - 4) + axes.tobytes()
-
-
-def measure(folder: Path, seconds: float, *, packets: bool) -> dict[str, Any]:
+def measure(folder: Path, seconds: float) -> dict[str, Any]:
     """Share of one core and size, of one archive of so many seconds."""
-    exchange = Exchange(packets=packets)
-    process = ArchiveProcessHandle.start(exchange, JOINTS, exchange.packets_fd)
-    path = folder / f"excitation_{int(packets):03d}_a1.mcap"
+    exchange = Exchange()
+    process = ArchiveProcessHandle.start(exchange, JOINTS)
+    path = folder / "excitation_000_a1.mcap"
     try:
-        spec = ArchiveSpec(path, NAMES, PERIOD, metadata={}, packets=packets)
+        spec = ArchiveSpec(path, NAMES, PERIOD, metadata={})
         process.send(Open(1, spec, drive_train(), from_now=True, until_ended=False))
         _require(process.answer(ANSWER, 1), Opened)
         used, started = _processor_time(process.process.pid), time.monotonic()
@@ -139,15 +115,11 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=SECONDS, help="length of each archive")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:
-        ordinary, with_packets = (
-            measure(Path(folder), arguments.seconds, packets=packets) for packets in (False, True)
-        )
+        measured = measure(Path(folder), arguments.seconds)
     result = {
-        "writing_share_of_core": round(ordinary["share"], 4),
-        "writing_share_of_core_with_packets": round(with_packets["share"], 4),
-        "megabytes_per_minute": round(ordinary["megabytes_per_minute"], 1),
-        "megabytes_per_minute_with_packets": round(with_packets["megabytes_per_minute"], 1),
-        "records_lost": ordinary["records_lost"] + with_packets["records_lost"],
+        "writing_share_of_core": round(measured["share"], 4),
+        "megabytes_per_minute": round(measured["megabytes_per_minute"], 1),
+        "records_lost": measured["records_lost"],
         "seconds": arguments.seconds,
         "cycles_per_second": round(1.0 / PERIOD),
     }

@@ -1,4 +1,4 @@
-"""Ring buffers of cycle records and raw packets.
+"""Ring buffers of cycle records.
 
 A ring uses its own memory or that of a descriptor, which other processes can read. The writer fills
 a row and then increments the count of rows written; it never waits. A reader copies rows and then
@@ -10,13 +10,10 @@ from __future__ import annotations
 
 import mmap
 import os
-import struct
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-
-from drivers.packets import INIT_LENGTH
 
 Array = NDArray[np.float64]
 
@@ -64,25 +61,6 @@ def cycle_dtype(n_joints: int) -> np.dtype[np.void]:
     return np.dtype(fields, align=True)
 
 
-LONGEST_PACKET: Final = INIT_LENGTH
-"""Bytes stored of a packet; those of a controller are not longer."""
-CAPACITY: Final = 16_384
-"""Packets stored: 8 s of both directions at 1 kHz, longer than an archive may wait for a disk."""
-_MOST_LENGTH: Final = 0xFFFF
-_ROW: Final = struct.Struct(f"<qdHBx{LONGEST_PACKET}s4x")
-PACKET_DTYPE: Final = np.dtype(
-    {
-        "names": ["cycle", "time", "length", "sent", "data"],
-        "formats": ["<i8", "<f8", "<u2", "u1", ("u1", (LONGEST_PACKET,))],
-        "offsets": [0, 8, 16, 18, 20],
-        "itemsize": _ROW.size,
-    }
-)
-"""One packet. ``cycle`` of the controller, as its cycle record has it; ``time`` s, on the link's
-clock, when it arrived or was sent; ``length`` in bytes; ``sent`` 1 if the PC sent it, 0 if it
-received it; ``data`` its bytes, then zeros (the first ones of a longer packet)."""
-
-
 def create_memory(name: str, size: int) -> int:
     """Return a descriptor of `size` zero bytes to be shared; the name is for diagnosis only."""
     fd = os.memfd_create(name, os.MFD_CLOEXEC)
@@ -105,7 +83,6 @@ class _Kind(NamedTuple):
 
 
 _CYCLES: Final = _Kind(0x31474E4952434948, "hil-cycles", "cycle records", "joints")
-_PACKETS: Final = _Kind(0x31474E4952504948, "hil-packets", "raw packets", "bytes a packet")
 _HEADER_BYTES: Final = 256
 # Indices of 8-byte words, those of different writers on different cache lines.
 _TAG, _WIDTH, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
@@ -191,13 +168,6 @@ class RingReader(_Ring):
         super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), fd=fd, acknowledge=acknowledge)
 
 
-class PacketReader(_Ring):
-    """Reader of a ring of raw packets, rows of `PACKET_DTYPE`."""
-
-    def __init__(self, fd: int) -> None:
-        super().__init__(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, fd=fd, acknowledge=False)
-
-
 class _Writer(_Ring):
     """Writer of a ring; if rows are not drained in time, the oldest are overwritten.
 
@@ -267,25 +237,3 @@ class CycleRing(_Writer):
         """Return a copy of the newest `count` records (or all of them), oldest first."""
         count = min(count, self.written, self.capacity)
         return self.rows.take(np.arange(self.written - count, self.written), mode="wrap")
-
-
-class PacketRing(_Writer):
-    """The last `capacity` packets; arguments as of `CycleRing`."""
-
-    def __init__(self, capacity: int = CAPACITY, *, fd: int | None = None) -> None:
-        width = PACKET_DTYPE.itemsize
-        super().__init__(_PACKETS, width, PACKET_DTYPE, capacity=capacity, fd=fd)
-        self.fd = -1 if fd is None else fd
-        self.written = self._words[_WRITTEN]
-
-    @classmethod
-    def shared(cls, capacity: int = CAPACITY) -> Self:
-        """Allocate shared memory for `capacity` packets."""
-        return cls(fd=cls._create(_PACKETS, PACKET_DTYPE.itemsize, PACKET_DTYPE, capacity))
-
-    def put(self, cycle: int, time: float, sent: bool, packet: bytes) -> None:
-        """Store one packet; see `PACKET_DTYPE`."""
-        place = self.written % self.capacity * _ROW.size
-        length = min(len(packet), _MOST_LENGTH)
-        _ROW.pack_into(self._memory, place, cycle, time, length, sent, packet)
-        self.commit()

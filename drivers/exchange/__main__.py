@@ -33,11 +33,10 @@ from drivers.packets import (
     Mode,
     next_number,
 )
-from drivers.record import CycleRing, PacketRing
+from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport
-from drivers.transports.tapped import TappedTransport
 
 Array = NDArray[np.float64]
 
@@ -98,11 +97,8 @@ def warm_up(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run the exchange on descriptors: channel, settings, ring, events, control block, packets.
-
-    The last one is absent if raw packets are not stored.
-    """
-    channel_fd, settings_fd, ring_fd, event_fd, control_fd, *packets_fd = map(int, arguments)
+    """Run the exchange on descriptors: channel, settings, ring, events, control block."""
+    channel_fd, settings_fd, ring_fd, event_fd, control_fd = map(int, arguments)
     # The terminal of the supervisor may send these while an arm moves.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -119,8 +115,6 @@ def main(arguments: Sequence[str]) -> int:
         guard = Guard(settings.guard_limits, settings.period)
         session = Session(settings.drive_train, guard, ring, **settings.session)
         transport = settings.transport.open()
-        for fd in packets_fd:
-            transport = TappedTransport(transport, PacketRing(fd=fd), lambda: session.cycle)
         control = ControlBlock(control_fd)
         server = ControlServer(
             session,

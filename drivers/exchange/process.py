@@ -24,7 +24,7 @@ from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, h
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.guard import GuardLimits
 from drivers.motion_source import MotionSource
-from drivers.record import CycleRing, PacketRing, create_memory
+from drivers.record import CycleRing, create_memory
 from drivers.transports.base import TransportSpec
 
 
@@ -37,7 +37,6 @@ class ExchangeSettings:
         session: further keyword arguments of `Session`.
         realtime: requested permissions.
         ring_capacity: cycle records buffered for the archive.
-        packets: raw packets buffered for the archive; 0 for none.
         preload: modules imported before the link opens, so that motions of their classes are read
             quickly.
         needs_archive: whether motions require an archive process that is ready.
@@ -52,7 +51,6 @@ class ExchangeSettings:
     session: Mapping[str, Any] = field(default_factory=dict)
     realtime: RealTimeSettings = field(default_factory=RealTimeSettings)
     ring_capacity: int = 20_000
-    packets: int = 0
     preload: tuple[str, ...] = ()
     needs_archive: bool = True
     max_late: int | None = None
@@ -92,14 +90,12 @@ class ExchangeProcess:
         realtime: permissions granted by the system.
         notes: options of the link that the system refused.
         ring_fd: memory of the cycle records, for a `RingReader`.
-        packets_fd: memory of the raw packets, for a `PacketReader`; -1 if they are not stored.
         event_fd, control_fd: memory for an `EventReader` and a `ControlBlock`.
     """
 
     def __init__(self, settings: ExchangeSettings) -> None:
         n_joints = settings.drive_train.n_joints
         self.ring_fd = CycleRing.shared(n_joints, settings.ring_capacity).fd
-        self.packets_fd = PacketRing.shared(settings.packets).fd if settings.packets else -1
         self.event_fd = event_log.create()
         self.control_fd = control.create()
         self._log_fd = create_memory("hil-exchange-log", 0)
@@ -112,8 +108,6 @@ class ExchangeProcess:
         try:
             os.pwrite(settings_fd, pickle.dumps(settings, protocol=5), 0)
             fds = [theirs.fileno(), settings_fd, self.ring_fd, self.event_fd, self.control_fd]
-            if settings.packets:
-                fds.append(self.packets_fd)
             self._process = _spawn(fds, self._log_fd)
         except OSError as error:
             self.close()
@@ -266,7 +260,7 @@ class ExchangeProcess:
     def close(self) -> None:
         """Close socket and memory; a process that still runs stops the arm and ends."""
         self._channel.close()
-        for name in ("ring_fd", "packets_fd", "event_fd", "control_fd", "_log_fd"):
+        for name in ("ring_fd", "event_fd", "control_fd", "_log_fd"):
             fd, closed = getattr(self, name), -1
             if fd != closed:
                 os.close(fd)

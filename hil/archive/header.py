@@ -242,7 +242,7 @@ class ArchiveOutcome(BaseModel):
 
     Attributes:
         outcome, reason: such as ``completed``, ``stopped``, ``refused``; why it did not complete.
-        samples, events, packets: numbers written.
+        samples, events: numbers written.
         lost_packets, records_lost, events_lost: lost by the link and by this PC.
         late_replies: late, or omitted because a newer packet had arrived.
         repaired: whether the file was repaired with loss.
@@ -258,7 +258,6 @@ class ArchiveOutcome(BaseModel):
     reason: str = ""
     samples: _Count = None
     events: _Count = None
-    packets: _Count = None
     lost_packets: _Count = None
     records_lost: _Count = None
     events_lost: _Count = None

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from drivers.events import InitReceived
 from drivers.exchange.control import ArchiveState, ControlBlock, HeartbeatMonitor
 from drivers.exchange.event_log import EventReader, ExchangeEvent
-from drivers.record import PACKET_DTYPE, PacketReader, RingReader
+from drivers.record import RingReader
 from hil.archive.live import LivePublisher, Serve
 from hil.archive.recorder import Recorder
 from hil.archive.supervised import (
@@ -44,57 +44,37 @@ from hil.errors import ArchiveError, InputError
 Records = NDArray[np.void]
 
 BUFFERED_CYCLES: Final = 5000  # Cycles buffered while no archive is open
-_PACKETS_PER_CYCLE: Final = 2
 
 
 class PreTriggerBuffer:
-    """The newest records, events and raw packets that came while no archive was open."""
+    """The newest records and events that came while no archive was open."""
 
     def __init__(self) -> None:
         self._records: list[Records] = []
-        self._packets: list[Records] = []
         self._events: list[ExchangeEvent] = []
 
-    def add(
-        self, records: Records, events: Sequence[ExchangeEvent], packets: Records | None = None
-    ) -> None:
-        """Append what has come; `packets` is None if they are not recorded."""
+    def add(self, records: Records, events: Sequence[ExchangeEvent]) -> None:
+        """Append what has come."""
         self._events = [*self._events, *events][-BUFFERED_CYCLES:]
-        for parts, rows, count in (
-            (self._records, records, BUFFERED_CYCLES),
-            (self._packets, packets, _PACKETS_PER_CYCLE * BUFFERED_CYCLES),
-        ):
-            if rows is not None and len(rows):
-                parts.append(rows)
-            while sum(map(len, parts[1:])) >= count:
-                parts.pop(0)
+        if len(records):
+            self._records.append(records)
+        while sum(map(len, self._records[1:])) >= BUFFERED_CYCLES:
+            self._records.pop(0)
 
-    def pop_session(self) -> tuple[Records, list[ExchangeEvent], Records]:
+    def pop_session(self) -> tuple[Records, list[ExchangeEvent]]:
         """Remove and return what is of the last session, behind its init packet."""
-        events = self._events
+        events, parts = self._events, self._records
+        self._records, self._events = [], []
         inits = [index for index, event in enumerate(events) if isinstance(event, InitReceived)]
-        session = (
-            _after_restart(self._records, np.dtype(np.void), least=1),
-            events[inits[-1] + 1 :] if inits else events,
-            # Several packets may belong to one cycle.
-            _after_restart(self._packets, PACKET_DTYPE, least=0),
-        )
-        self._records, self._events, self._packets = [], [], []
-        return session
-
-
-def _after_restart(parts: list[Records], dtype: np.dtype[np.void], *, least: int) -> Records:
-    """Return the rows since the cycle number last increased by less than `least`."""
-    if not parts:
-        return np.zeros(0, dtype)
-    rows = np.concatenate(parts)
-    restarts = np.flatnonzero(np.diff(rows["cycle"]) < least)
-    return rows[int(restarts[-1]) + 1 :] if restarts.size else rows
+        own = events[inits[-1] + 1 :] if inits else events
+        if not parts:
+            return np.zeros(0, np.dtype(np.void)), own
+        rows = np.concatenate(parts)
+        restarts = np.flatnonzero(np.diff(rows["cycle"]) < 1)
+        return (rows[int(restarts[-1]) + 1 :] if restarts.size else rows), own
 
 
 POLL_PERIOD: Final = 0.02  # Time between two readings of the ring, s
-PACKET_DELAY: Final = 0.005  # Usual delay of raw packets behind their record, s
-MAX_PACKET_DELAY: Final = 0.2  # Longest delay of raw packets, s
 CHUNK_DELAY: Final = 0.0005  # Time after the last cycle of a chunk is due at which it is read, s
 HEARTBEAT_PERIOD: Final = 0.05  # Time between two heartbeats, s
 STALL_LIMIT: Final = 5.0
@@ -114,7 +94,7 @@ class Job:
     Attributes:
         number: identifies it to the supervisor.
         until_ended: whether it is closed at the end of the motion.
-        overflow, packets_overflow: of the readers.
+        overflow: of the reader.
         accepted, ended_count: of the control block at its begin.
         last_record, ended: times of the last record and of the end of the motion, monotonic s.
         flushed: whether all records were written to the disk.
@@ -124,7 +104,6 @@ class Job:
     recorder: Recorder
     until_ended: bool
     overflow: int
-    packets_overflow: int
     accepted: int
     ended_count: int
     last_record: float
@@ -134,9 +113,9 @@ class Job:
 
 
 class ArchiveProcess:
-    """Transfers records, events and packets to archives as commanded by the supervisor.
+    """Transfers records and events to archives as commanded by the supervisor.
 
-    `exchange` is a pidfd of the exchange process; `packets` is None if they are not recorded.
+    `exchange` is a pidfd of the exchange process.
     """
 
     def __init__(
@@ -146,7 +125,6 @@ class ArchiveProcess:
         control: ControlBlock,
         commands: Channel,
         exchange: int,
-        packets: PacketReader | None = None,
     ) -> None:
         self._ring, self._events, self._control = ring, events, control
         self._commands: Channel | None = commands
@@ -155,7 +133,6 @@ class ArchiveProcess:
         self._progress = time.monotonic()
         self._exchange = exchange
         self._monitor = HeartbeatMonitor(lambda: control.exchange_heartbeat)
-        self._packets = packets
         self._live: LivePublisher | None = None
         self._buffer = PreTriggerBuffer()
 
@@ -229,13 +206,12 @@ class ArchiveProcess:
             self._transfer()
             self._close("interrupted", "another archive was opened")
         self._fill_buffer()
-        records, events, packets = self._buffer.pop_session()
+        records, events = self._buffer.pop_session()
         overflow, control = self._ring.missed, self._control
         accepted, ended_count = control.program_accepted, control.ended_count
         try:
             recorder = Recorder(command.spec.open(), command.drive_train)
             if not command.from_now:
-                recorder.record_packets(packets)
                 recorder.record(records, events)
         except Exception as error:
             self._fail(command.job, error)
@@ -245,7 +221,6 @@ class ArchiveProcess:
             recorder,
             command.until_ended,
             overflow,
-            0 if self._packets is None else self._packets.missed,
             accepted,
             ended_count,
             last_record=time.monotonic(),
@@ -269,7 +244,6 @@ class ArchiveProcess:
             self._live.publish(records, events)
         now = time.monotonic()
         try:
-            self._transfer_packets(job)
             job.recorder.record(records, events, lost)
             if ended_count != job.ended_count and job.recorder.ended is None:
                 job.recorder.motion_ended(self._control.outcome, self._control.ended_interval)
@@ -282,14 +256,6 @@ class ArchiveProcess:
             self._fail(job.number, error)
             return
         self._close_if_ended(job, now, exchange_ended=exchange_ended)
-
-    def _transfer_packets(self, job: Job) -> None:
-        """Write the raw packets that have come, and count those overwritten."""
-        if self._packets is None:
-            return
-        packets, before = self._packets.drain(), job.packets_overflow
-        job.packets_overflow = self._packets.missed
-        job.recorder.record_packets(packets, job.packets_overflow - before)
 
     def _close_if_ended(self, job: Job, now: float, *, exchange_ended: bool) -> None:
         """Close the archive at the end of the interval."""
@@ -335,21 +301,15 @@ class ArchiveProcess:
         records, events = self._ring.drain(), self._events.drain()
         if self._live is not None:
             self._live.publish(records, events)
-        packets = None if self._packets is None else self._packets.drain()
-        self._buffer.add(records, events, packets)
+        self._buffer.add(records, events)
 
     def _close(self, outcome: str, reason: str) -> None:
         job, self._job = self._job, None
         if job is None:
             return
         self._control.archive_state = ArchiveState.NONE
-        recorder = job.recorder
         try:
-            until = time.monotonic() + MAX_PACKET_DELAY
-            while self._packets and recorder.lacks_packets and time.monotonic() < until:
-                time.sleep(PACKET_DELAY)
-                self._transfer_packets(job)
-            recorded = recorder.close(outcome, reason)
+            recorded = job.recorder.close(outcome, reason)
         except Exception as error:
             self._fail(job.number, error)
             return
@@ -380,7 +340,7 @@ class ArchiveProcess:
 
 def main() -> None:
     """Attach the descriptors of the command line, and run."""
-    ring, events, control, commands, exchange, n_joints, *packets = map(int, sys.argv[1:])
+    ring, events, control, commands, exchange, n_joints = map(int, sys.argv[1:])
     for signum in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
         signal.signal(signum, signal.SIG_IGN)
     process = ArchiveProcess(
@@ -389,7 +349,6 @@ def main() -> None:
         ControlBlock(control),
         Channel(socket(fileno=commands, type=SOCK_SEQPACKET)),
         exchange,
-        PacketReader(packets[0]) if packets else None,
     )
     signal.signal(signal.SIGTERM, process.leave)
     process.run()

@@ -156,7 +156,7 @@ def open_archive(
         ArchiveError: the file cannot be read, or has no such channel.
     """
     path = Path(path)
-    alike = {CYCLE, schema.MEASURED, schema.COMMANDED, schema.PACKETS}.intersection(topics or ())
+    alike = {CYCLE, schema.MEASURED, schema.COMMANDED}.intersection(topics or ())
     if len(alike) > 1:
         names = ", ".join(sorted(alike))
         raise ValueError(f"columns of {names} have the same names: open one at a time")

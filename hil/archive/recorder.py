@@ -113,7 +113,6 @@ class ArchiveSpec:
     metadata: Mapping[str, str]
     attachments: Mapping[str, bytes] = field(default_factory=dict)
     durable: bool = True
-    packets: bool = False
 
     def open(self) -> ArchiveWriter:
         """Create the file; ArchiveWriteError if it exists or cannot be written."""
@@ -171,25 +170,10 @@ class Recorder:
         self.records = 0
         self._records_lost = 0
         self._events_lost = 0
-        self._packets_lost = 0
         self._late = 0
         self._not_accepted = 0
         self._drive_train = drive_train
-        self._newest_packet = -1
         self._cut = False
-        self._packets_cut = False
-
-    def record_packets(self, packets: Records, lost: int = 0) -> None:
-        """Archive raw packets, `lost` of which were overwritten, before their records."""
-        if not self.writer.with_packets:
-            return
-        self._packets_lost += lost
-        if self._packets_cut or not len(packets):
-            return
-        packets, self._packets_cut = self._own_rows(packets, self._newest_packet, least=0)
-        if len(packets):
-            self.writer.add_packets(packets)
-            self._newest_packet = int(packets["cycle"][-1])
 
     def record(self, records: Records, events: Sequence[ExchangeEvent], lost: int = 0) -> None:
         """Archive records and events; `lost` records were overwritten before.
@@ -226,12 +210,6 @@ class Recorder:
         self.writer.event(None, name, text, level=Level.WARN)
 
     @property
-    def lacks_packets(self) -> bool:
-        """Whether raw packets of the newest archived record are missing."""
-        expected = self.writer.with_packets and not self._packets_cut
-        return expected and self._newest_packet < self.writer.newest
-
-    @property
     def complete(self) -> bool:
         """Whether the interval has ended and is archived, aftermath included."""
         if self.ended is None:
@@ -248,8 +226,6 @@ class Recorder:
             "late_answers": self._late,
             "answers_not_taken": self._not_accepted,
         }
-        if self.writer.with_packets:
-            counts["packets_lost"] = self._packets_lost
         details = {key: str(value) for key, value in counts.items()}
         self.writer.close(outcome, reason=reason, details=details)
         return Recorded(
@@ -290,24 +266,17 @@ class Recorder:
             return int(np.iinfo(np.int64).max)
         return self.ended.cycle + round(AFTERMATH / self.writer.period)
 
-    def _own_rows(self, rows: Records, newest: int, *, least: int) -> tuple[Records, bool]:
-        """Return rows up to the end of session and aftermath, and whether others follow.
-
-        `newest` is the cycle before them, `least` the smallest step of the cycle from row to row.
-        """
-        cycles = rows["cycle"]
-        beyond = (np.diff(cycles, prepend=newest) < least) | (cycles > self._last_cycle)
-        return (rows[: int(np.argmax(beyond))], True) if beyond.any() else (rows, False)
-
     def _write(self, records: Records) -> None:
         """Archive the records up to the end of the session and of the aftermath."""
         if self._cut or not len(records):
             return
-        records, self._cut = self._own_rows(records, self.writer.newest, least=1)
-        if not len(records):
-            return
-        self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
-        self.records += len(records)
+        cycles = records["cycle"]
+        beyond = (np.diff(cycles, prepend=self.writer.newest) < 1) | (cycles > self._last_cycle)
+        if beyond.any():
+            records, self._cut = records[: int(np.argmax(beyond))], True
+        if len(records):
+            self.writer.write(records, self._drive_train.joint_torque(records["target_current"]))
+            self.records += len(records)
 
 
 _DATA: Final[Mapping[type, Sequence[str]]] = {

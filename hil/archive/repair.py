@@ -200,14 +200,12 @@ def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -
     unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
     before = found.outcome or ArchiveOutcome.of(unknown)
     lost, earlier = found.samples_lost, before.samples_lost
-    packets = str(found.counts.get(schema.PACKETS, 0))
     return {
         **before.record,
         header.DESCRIPTION: header.checksum(described),
         **chunk_list,
         "samples": str(found.samples),
         "events": str(found.counts.get(schema.EVENTS, 0)),
-        **({"packets": packets} if "packets" in before.record else {}),
         "repaired": "yes",
         "repaired.samples_lost": (
             "unknown" if lost is None or earlier is None else str(lost + earlier)

@@ -321,10 +321,8 @@ class Scan:
             yield "the outcome is missing"
             return
         found: dict[str, tuple[int | None, int]] = {}
-        counts = {"samples": NUMBERS, "events": (schema.EVENTS,), "packets": (schema.PACKETS,)}
-        for key, topics in counts.items():
-            known = key != "packets" or key in outcome.record
-            if known and (self._past_damage or not set(topics).isdisjoint(self.topics)):
+        for key, topics in {"samples": NUMBERS, "events": (schema.EVENTS,)}.items():
+            if self._past_damage or not set(topics).isdisjoint(self.topics):
                 count = max(self.counts.get(topic, 0) for topic in topics)
                 found[key] = getattr(outcome, key), count
         if self._chunk_list is not None:
@@ -400,7 +398,7 @@ class Scan:
     ) -> dict[str, MessageLayout]:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
         layouts = {}
-        numbers = {*NUMBERS, schema.PACKETS, *(self._topics or ())} - {schema.EVENTS}
+        numbers = {*NUMBERS, *(self._topics or ())} - {schema.EVENTS}
         for topic in found.keys() & numbers if self.header else ():
             messages, layout = found[topic], self._layouts.get(topic)
             if layout is None:

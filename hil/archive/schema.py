@@ -17,7 +17,6 @@ import numpy as np
 from mcap.records import Schema
 from numpy.typing import NDArray
 
-from drivers.record import LONGEST_PACKET
 from hil.archive.cdr import (
     LayoutBuilder,
     LayoutError,
@@ -36,7 +35,6 @@ CYCLE = "/hil/cycle"
 MEASURED = "/joint_states"
 COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
-PACKETS = "/hil/packets"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
 TRANSFORMS = "/tf_static"
@@ -108,17 +106,6 @@ _MOTOR_CURRENT = """\
 # Measured motor currents of a foreign recording, motor side.
 std_msgs/Header header
 float64[{n}] motor_current        # A
-"""
-
-_PACKET = """\
-# One packet of the controller link, byte by byte, in the order in which the PC received and sent.
-# header.stamp is that of the cycle in /hil/cycle to which it belongs.
-std_msgs/Header header
-int64 cycle                     # cycles of the controller since its initialisation
-float64 time                    # s, clock of the PC: when it arrived or was sent
-uint16 length                   # bytes
-uint8 sent                      # 1: sent by the PC, 0: received by it
-uint8[{size}] data               # the packet, then zeros
 """
 
 _LOG = """\
@@ -197,16 +184,14 @@ TRANSFORM_CHANNEL = Channel(
 def profile(n_joints: int) -> Mapping[str, Channel]:
     """Return the channels of the profile by topic, for a number of joints."""
     state = "sensor_msgs/msg/JointState", _text(_JOINT_STATE, _HEADER, _TIME)
-    cycle, current, packet = (
-        _text(text.format(n=n_joints, size=LONGEST_PACKET), _HEADER, _TIME)
-        for text in (_CYCLE, _MOTOR_CURRENT, _PACKET)
+    cycle, current = (
+        _text(text.format(n=n_joints), _HEADER, _TIME) for text in (_CYCLE, _MOTOR_CURRENT)
     )
     channels = (
         Channel(CYCLE, f"hil_msgs/msg/Cycle{n_joints}", cycle),
         Channel(MEASURED, *state),
         Channel(COMMANDED, *state),
         Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
-        Channel(PACKETS, "hil_msgs/msg/Packet", packet),
         EVENT_CHANNEL,
         DESCRIPTION_CHANNEL,
         TRANSFORM_CHANNEL,
@@ -238,13 +223,6 @@ def cycle_messages(names: Sequence[str], period: float, records: Rows, torque: A
             COMMANDED: joint_states(names, stamp, commanded),
         },
     )
-
-
-def packet_messages(period: float, packets: Rows) -> Batch:
-    """Return raw packets of the link, rows of `drivers.record.PACKET_DTYPE`, as messages."""
-    stamp = _stamp(packets, period)
-    columns = {name: packets[name] for name in packets.dtype.names or ()}
-    return Batch(stamp, {PACKETS: _numbers(profile(0)[PACKETS], stamp, columns)})
 
 
 def sample_messages(
@@ -328,7 +306,7 @@ def message_layout(
     layout = fixed_layout(record.data.decode(errors="replace"))
     found: Mapping[str, Any] = layout.dtype.fields or {}
     expected: Mapping[str, Any] = _STAMP_TYPES
-    if topic in (CYCLE, MOTOR_CURRENT, PACKETS):
+    if topic in (CYCLE, MOTOR_CURRENT):
         expected = fixed_layout(profile(n)[topic].definition).dtype.fields or {}
     for name, (kind, *_) in expected.items():
         if name not in found and name not in LATER_FIELDS:

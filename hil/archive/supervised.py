@@ -163,10 +163,8 @@ class ArchiveProcessHandle:
     _ended_for: str = field(default="")
 
     @classmethod
-    def start(
-        cls, memory: SharedMemory, n_joints: int, packets_fd: int = -1
-    ) -> ArchiveProcessHandle:
-        """Start the process on the exchange's shared memory; `packets_fd` if packets are stored."""
+    def start(cls, memory: SharedMemory, n_joints: int) -> ArchiveProcessHandle:
+        """Start the process on the exchange's shared memory."""
         control = ControlBlock(memory.control_fd)
         monitor = HeartbeatMonitor(lambda: control.archive_heartbeat)
         with contextlib.ExitStack() as undo:
@@ -177,12 +175,11 @@ class ArchiveProcessHandle:
             undo.callback(theirs.close)
             undo.callback(ours.close)
             passed = (memory.ring_fd, memory.event_fd, memory.control_fd, theirs.fileno(), exchange)
-            packets = () if packets_fd < 0 else (packets_fd,)
-            numbers = map(str, (*passed, n_joints, *packets))
+            numbers = map(str, (*passed, n_joints))
             import_paths = [path or str(Path.cwd()) for path in sys.path]
             process = subprocess.Popen(
                 [sys.executable, "-m", "hil.archive.process", *numbers],
-                pass_fds=(*passed, *packets),
+                pass_fds=passed,
                 start_new_session=True,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

@@ -38,13 +38,11 @@ from hil.archive.schema import (
     LIBRARY,
     MEASURED,
     MOTOR_CURRENT,
-    PACKETS,
     PROFILE,
     Batch,
     Channel,
     cycle_messages,
     description_messages,
-    packet_messages,
     profile,
     sample_messages,
 )
@@ -263,7 +261,6 @@ class ArchiveWriter:
         metadata: see `ArchiveFile`. Times of day only if a real arm moves.
         attachments: ``cell.toml``, ``robot.urdf``, ``drive_train.json``, ``plan.json`` by name.
         durable: wait at each flush until the data are on the disk.
-        packets: whether to store raw packets, see `add_packets`.
 
     Attributes:
         file: counts of messages, time of the slowest flush, and whether it is closed.
@@ -283,22 +280,19 @@ class ArchiveWriter:
         metadata: Mapping[str, str],
         attachments: Mapping[str, bytes] | None = None,
         durable: bool = True,
-        packets: bool = False,
     ) -> None:
         self.path = Path(path)
         self.period = period
-        self.with_packets = packets
         self._joint_names = tuple(joint_names)
         self._cycles_per_chunk = max(1, round(FLUSH_PERIOD / period))
         self._pending: list[tuple[Rows, Array]] = []
-        self._pending_packets: list[Rows] = []
         self._first: int | None = None
         self.newest = -1
         self.missed = 0
         self.file = ArchiveFile(
             self.path,
             joint_names=joint_names,
-            topics=(CYCLE, MEASURED, COMMANDED, EVENTS, *([PACKETS] if packets else [])),
+            topics=(CYCLE, MEASURED, COMMANDED, EVENTS),
             metadata=metadata,
             period=period,
             attachments=attachments or {},
@@ -356,17 +350,6 @@ class ArchiveWriter:
             remedy="begin another archive for another session with the controller",
         )
 
-    def add_packets(self, packets: Rows) -> None:
-        """Add raw packets (k,) of type `drivers.record.PACKET_DTYPE`, cycles not decreasing.
-
-        Each is written with the chunk of its cycle; one whose chunk was written goes into the next.
-        They are referenced until then, so pass a copy.
-        """
-        if not self.with_packets:
-            raise ValueError("this archive was opened without packets")
-        if len(packets):
-            self._pending_packets.append(packets)
-
     def event(
         self,
         cycle: int | None,
@@ -387,7 +370,6 @@ class ArchiveWriter:
     def flush(self) -> None:
         """Write all pending records, also those of an incomplete chunk."""
         self._emit(everything=True)
-        self._emit_packets(None)
         self.file.flush()
 
     def close(
@@ -400,13 +382,11 @@ class ArchiveWriter:
         if self.file.closed:
             return
         self._emit(everything=True)
-        self._emit_packets(None if self._first is None else self.newest)
         counts = self.file.counts
         cycles = {
             "samples": counts[CYCLE],
             "events": counts[EVENTS],
             "lost_packets": self.missed,
-            **({"packets": counts[PACKETS]} if self.with_packets else {}),
         }
         if self._first is not None:
             cycles |= {"first_cycle": self._first, "last_cycle": self.newest}
@@ -440,21 +420,9 @@ class ArchiveWriter:
             part = records[start:stop]
             batch = cycle_messages(self._joint_names, self.period, part, torque[start:stop])
             self.file.add(batch)
-            self._emit_packets(int(part["cycle"][-1]))
             self.file.flush()
         rest = cuts[-1]
         self._pending = [(records[rest:], torque[rest:])] if rest < len(records) else []
-
-    def _emit_packets(self, last: int | None) -> None:
-        """Add the packets up to the cycle `last`, None for all, to the chunk in progress."""
-        if not self._pending_packets:
-            return
-        packets = np.concatenate(self._pending_packets)
-        count = len(packets)
-        if last is not None:
-            count = int(np.searchsorted(packets["cycle"], last, side="right"))
-        self.file.add(packet_messages(self.period, packets[:count]))
-        self._pending_packets = [packets[count:]] if count < len(packets) else []
 
 
 @dataclass(frozen=True, eq=False)

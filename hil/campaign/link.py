@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 import numpy as np
@@ -15,12 +15,11 @@ from drivers.events import Event, MotionEnded, MotionStarted
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard
 from drivers.motion_source import MotionSource, progress_of
-from drivers.record import CycleRing, PacketRing
+from drivers.record import CycleRing
 from drivers.session import Session
 from drivers.states import HAS_SET_POINTS, State
 from drivers.transports.base import Transport
 from drivers.transports.simulated import SimulatedTransport
-from drivers.transports.tapped import TappedTransport
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
 from hil.archive.recorder import Recorded
 from hil.cell import Cell
@@ -52,7 +51,6 @@ class Link(MotionLink):
     Attributes:
         guard: the session's, with the active limits.
         finish: asks the controller to end the session.
-        packets: the raw packets, where archives store them.
     """
 
     transport: Transport
@@ -61,7 +59,6 @@ class Link(MotionLink):
     guard: Guard
     cell: Cell
     finish: Callable[[], None] = field(default=lambda: None)
-    packets: PacketRing | None = None
     cycles: int = 0
     connection: Connection = field(default_factory=Connection)
     only_simulated: bool = True
@@ -88,11 +85,7 @@ class Link(MotionLink):
         guard = Guard(cell.guard_limits, cell.period)
         settings = cell.session_settings(accept_init=accept_init, only_axis=only_axis)
         session = Session(cell.drive_train, guard, ring, **settings)
-        link = cls(transport, session, ring, guard, cell, finish)
-        if cell.controller.packets:
-            link.packets = PacketRing(20 * DRAIN_CYCLES)
-            link.transport = TappedTransport(transport, link.packets, lambda: session.cycle)
-        return link
+        return cls(transport, session, ring, guard, cell, finish)
 
     def close(self) -> None:
         """Ask the controller to end the session, and reply until it does, at most `END_TIMEOUT` s.
@@ -107,7 +100,6 @@ class Link(MotionLink):
 
         def finished() -> bool:
             self.ring.drain()
-            self.drain_packets()
             return self.transport.now > deadline
 
         exchange(self.transport, self.session, until=finished)
@@ -120,11 +112,10 @@ class Link(MotionLink):
     def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
         """See `MotionLink.open_archive`; records of before belong to a recording only."""
         spec = described(spec, self.connection, self.session.drive_train)
-        with replace(spec, packets=self.packets is not None).open() as writer:
+        with spec.open() as writer:
             self._archiving = _Archiving(self, writer)
             if not own_motion:
                 self.ring.drain()
-                self.drain_packets()
                 self._poll()
             try:
                 yield
@@ -134,13 +125,6 @@ class Link(MotionLink):
     def complete(self, outcome: str, reason: str) -> Recorded:
         """See `MotionLink.complete`."""
         return self._open_archiving.recorder.close(outcome, reason)
-
-    def drain_packets(self) -> NDArray[np.void] | None:
-        """Return the raw packets since the last call; None if they are not stored."""
-        if self.packets is None or not isinstance(self.transport, TappedTransport):
-            return None
-        self.transport.flush()
-        return self.packets.drain()
 
     @property
     def _open_archiving(self) -> _Archiving:
@@ -268,16 +252,15 @@ class _Archiving:
         self.steering: Steering | None = None
         self._failure: Exception | None = None
         self._link = link
-        self._overflow, self._packets_overflow = self._overflows()
+        self._overflow = link.ring.overflow
 
     def update(self) -> None:
         """Archive what came since the last call; a failure stops the motion on its path."""
         link, recorder = self._link, self.recorder
-        packets = link.drain_packets()
         events, records, before = link._poll(), link.ring.drain(), recorder.records
         self.started |= any(isinstance(one, MotionStarted | MotionEnded) for one in events)
-        earlier = self._overflow, self._packets_overflow
-        self._overflow, self._packets_overflow = self._overflows()
+        earlier = self._overflow
+        self._overflow = link.ring.overflow
         if self.steering is not None:
             self.steering.add_events(events)
             self.steering.add_records(records)
@@ -285,9 +268,7 @@ class _Archiving:
             recorder.update(events)
             return
         try:
-            if packets is not None:
-                recorder.record_packets(packets, self._packets_overflow - earlier[1])
-            recorder.record(records, events, self._overflow - earlier[0])
+            recorder.record(records, events, self._overflow - earlier)
         except Exception as error:  # of any kind: the arm comes to rest first
             self._failure = error
             link.session.stop("the archive cannot be written")
@@ -298,7 +279,3 @@ class _Archiving:
         self.update()
         if self._failure is not None:
             raise self._failure
-
-    def _overflows(self) -> tuple[int, int]:
-        packets = self._link.packets
-        return self._link.ring.overflow, 0 if packets is None else packets.overflow

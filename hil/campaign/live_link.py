@@ -43,7 +43,7 @@ from drivers.exchange.process import ExchangeProcess, ExchangeSettings
 from drivers.exchange.realtime import RealTimeSettings
 from drivers.exchange.serving import ARM_MOVED
 from drivers.motion_source import MotionSource
-from drivers.record import CAPACITY, RingReader
+from drivers.record import RingReader
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from hil.archive import ArchiveSpec
@@ -345,7 +345,6 @@ class LiveLink(MotionLink):
             session=cell.session_settings(accept_init=accept_init, only_axis=only_axis),
             realtime=realtime or RealTimeSettings(),
             preload=("planner",),
-            packets=CAPACITY if cell.controller.packets else 0,
         )
         try:
             exchange = ExchangeProcess.start(settings)
@@ -357,9 +356,7 @@ class LiveLink(MotionLink):
         heart = Heartbeat(exchange.send_heartbeat)
         heart.start()
         try:
-            archive = ArchiveProcessHandle.start(
-                exchange, len(cell.joint_names), exchange.packets_fd
-            )
+            archive = ArchiveProcessHandle.start(exchange, len(cell.joint_names))
         except BaseException as error:
             heart.end()
             exchange.finish()
@@ -409,7 +406,6 @@ class LiveLink(MotionLink):
         """See `MotionLink.open_archive`; what is still open at an error is closed with the link."""
         drives = active_drive_train(self.cell, self.connection)
         spec = described(spec, self.connection, drives)
-        spec = replace(spec, packets=self.cell.controller.packets)
         self.view.lost = None
         self.job += 1
         self.open_path = str(spec.path)

@@ -370,7 +370,7 @@ class ControllerTable(Table):
     current_delay_cycles: Number = field(
         "cycles by which the target current of a packet lags its position", 0.0
     )
-    packets: bool = field("true or false: archive the raw packets of both directions", False)
+    packets: bool = field("a key of earlier versions, not used", False)
 
     @model_validator(mode="after")
     def _adapter_named(self) -> ControllerTable:

@@ -51,9 +51,7 @@ class TestArchive:
         """It fails where a cycle is not archived."""
         figures = run("archive_writing", "--seconds", "2")
         assert figures["records_lost"] == 0
-        share = figures["writing_share_of_core"]
-        assert 0.0 < share < figures["writing_share_of_core_with_packets"] < 0.2
-        assert figures["megabytes_per_minute"] < figures["megabytes_per_minute_with_packets"]
+        assert 0.0 < figures["writing_share_of_core"] < 0.2
 
 
 def test_no_two_archives_hold_the_same(tmp_path: Path) -> None:

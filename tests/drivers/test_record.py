@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import pickle
-from collections import deque
 from typing import get_args
 
 import numpy as np
@@ -32,11 +31,8 @@ from drivers.packets import InitPacket
 from drivers.record import (
     MEASURED,
     CycleRing,
-    PacketReader,
-    PacketRing,
     RingReader,
 )
-from drivers.transports.tapped import MAX_BUFFERED, TappedTransport
 from tests.drivers.rig import Cruise, N, moving
 
 
@@ -149,121 +145,6 @@ def test_last_records_drained_or_not():
     assert ring.last(4)["cycle"].tolist() == [3, 4, 5, 6]
     assert ring.last(50)["cycle"].tolist() == [0, 1, 2, 3, 4, 5, 6]
     assert ring.drain()["cycle"].tolist() == [5, 6]
-
-
-class Wire:
-    """A link that gives what is put into it."""
-
-    ages = None
-
-    def __init__(self, *packets: bytes) -> None:
-        self.now = 0.0
-        self.packets = deque(packets)
-        self.sent: list[bytes] = []
-        self.closed = False
-
-    def receive(self, timeout: float) -> bytes | None:
-        self.now += 0.25
-        return self.packets.popleft() if self.packets else None
-
-    def send(self, packet: bytes) -> None:
-        self.now += 0.25
-        self.sent.append(packet)
-
-    def rejected(self) -> dict[str, int]:
-        return {"torn": 3}
-
-    def forget_peer(self) -> None:
-        pass
-
-    def close(self) -> None:
-        self.closed = True
-
-
-class StampedWire(Wire):
-    arrived: float | None = 0.125
-
-
-def drained(ring: PacketRing) -> list[tuple[int, float, int, bytes]]:
-    return [
-        (
-            int(row["cycle"]),
-            float(row["time"]),
-            int(row["sent"]),
-            row["data"].tobytes().rstrip(b"\0"),
-        )
-        for row in ring.drain()
-    ]
-
-
-def test_packets_are_stored_with_their_cycle() -> None:
-    ring, cycle = PacketRing(10), 6
-    link = TappedTransport(Wire(b"one", b"two"), ring, lambda: cycle)
-    assert link.receive(0.1) == b"one"
-    cycle = 7  # what the session makes of it
-    link.send(b"answer")
-    assert drained(ring) == []
-    assert link.receive(0.1) == b"two"
-    assert drained(ring) == [(7, 0.25, 0, b"one"), (7, 0.5, 1, b"answer")]
-    cycle = 8
-    link.close()
-    assert drained(ring) == [(8, 0.75, 0, b"two")]
-
-
-def test_packets_of_a_backlog_have_the_cycle_of_the_reply() -> None:
-    ring, cycle = PacketRing(10), 6
-    link = TappedTransport(Wire(b"old", b"older", b"newest"), ring, lambda: cycle)
-    link.receive(0.1)
-    link.receive(0.0)
-    link.receive(0.0)
-    cycle = 9
-    link.flush()
-    assert [(row[0], row[3]) for row in drained(ring)] == [
-        (9, b"old"), (9, b"older"), (9, b"newest")
-    ]  # fmt: skip
-
-
-def test_buffer_without_replies_is_bounded() -> None:
-    ring = PacketRing(10_000)
-    link = TappedTransport(Wire(*[b"flood"] * 5000), ring, lambda: 3)
-    for _ in range(5000):
-        link.receive(0.0)
-    handed_on = drained(ring)
-    assert 5000 - MAX_BUFFERED <= len(handed_on) < 5000
-    link.close()
-    assert len(handed_on) + len(drained(ring)) == 5000
-
-
-def test_tapped_link_passes_everything_through() -> None:
-    wire = Wire(b"packet")
-    link = TappedTransport(wire, PacketRing(10), lambda: 0)
-    assert link.receive(0.1) == b"packet"
-    assert link.receive(0.1) is None
-    link.send(b"answer")
-    assert (wire.sent, link.rejected(), link.now) == ([b"answer"], {"torn": 3}, wire.now)
-    link.close()
-    assert wire.closed
-
-
-def test_time_of_arrival_of_the_link_is_stored() -> None:
-    ring = PacketRing(10)
-    link = TappedTransport(StampedWire(b"packet"), ring, lambda: 0)
-    assert link.arrived == 0.125
-    link.receive(0.1)
-    link.flush()
-    assert drained(ring)[0][1] == 0.125
-
-
-def test_memory_of_the_other_kind_is_refused() -> None:
-    packets, cycles = PacketRing.shared(4), CycleRing.shared(2, 4)
-    with pytest.raises(ValueError, match="not a ring of raw packets"):
-        PacketReader(cycles.fd)
-    with pytest.raises(ValueError, match="not a ring of cycle records"):
-        RingReader(packets.fd, 2)
-    with pytest.raises(ValueError, match="at least 2"):
-        PacketRing.shared(1)
-    os.close(packets.fd)
-    os.close(cycles.fd)
 
 
 EXAMPLES = {

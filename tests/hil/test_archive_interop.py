@@ -17,7 +17,7 @@ from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
-from drivers.record import LONGEST_PACKET, PacketRing, cycle_dtype
+from drivers.record import cycle_dtype
 from hil.archive import (
     Archive,
     ArchiveWriter,
@@ -35,17 +35,6 @@ URDF = """<robot name="arm"><link name="base"/><link name="plate"/>
 <joint name="mount" type="fixed"><parent link="base"/><child link="plate"/>
 <origin xyz="0.1 -0.2 0.3" rpy="0.4 -1.1 2.5"/></joint></robot>"""
 STATE = {"position": "position", "velocity": "velocity", "effort": "torque"}
-
-
-def packets() -> NDArray[np.void]:
-    """Two packets for each cycle, of different lengths."""
-    rng = np.random.default_rng(6)
-    ring = PacketRing(2 * COUNT)
-    for cycle in range(COUNT):
-        for sent in (False, True):
-            data = rng.bytes(int(rng.integers(12, LONGEST_PACKET + 1)))
-            ring.put(2_000_000 + cycle, rng.normal(), sent, data)
-    return ring.drain()
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +56,8 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         metadata={},
         attachments={"cell.toml": b"[cell]", "robot.urdf": URDF.encode()},
         durable=False,
-        packets=True,
     ) as archive:
         archive.event(2_000_000, "MotionStarted", "off we go")
-        archive.add_packets(packets())
         archive.write(rows, rng.normal(size=(COUNT, len(JOINTS))))
         archive.close("completed")
     return file
@@ -115,7 +102,6 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in messages]
         assert stamps == ours.columns["stamp"].tolist()
         assert {message.header.frame_id for message in messages} == {""}
-    assert_same_packets(found[profile.PACKETS], ours)
     assert [message.data for message in found[profile.DESCRIPTION]] == [URDF]
     (still,) = found[profile.TRANSFORMS]
     assert_transforms(still.transforms)
@@ -136,15 +122,6 @@ def assert_transforms(found: list[Any]) -> None:
     np.testing.assert_allclose(quaternion.matrix(), expected, atol=1e-14)
 
 
-def assert_same_packets(found: list[Any], ours: Archive) -> None:
-    columns, written = open_archive(ours.path, topics=[profile.PACKETS]).columns, packets()
-    for name in written.dtype.names or ():
-        assert columns[name].tobytes() == written[name].tobytes(), name
-        assert bits(stacked(found, name), written[name]) == written[name].tobytes(), name
-    stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in found]
-    assert stamps == columns["stamp"].tolist() == (columns["cycle"] * 2_000_000).tolist()
-
-
 @pytest.mark.parametrize("reader", [make_reader, NonSeekingReader])
 def test_mcap_with_its_ros2_decoder_reads_the_same_values(
     path: Path, ours: Archive, reader: Any
@@ -163,7 +140,7 @@ def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: 
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == "ros2"
         summary = reader.get_summary()
-        assert summary.statistics.message_count == 5 * COUNT + 3
+        assert summary.statistics.message_count == 3 * COUNT + 3
         assert len(summary.chunk_indexes) == 5
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         attachments = {record.name: record.data for record in reader.iter_attachments()}

@@ -9,12 +9,9 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
 import numpy as np
 import pytest
@@ -24,15 +21,13 @@ from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketReject
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import OUTCOMES, ArchiveState, ControlBlock
-from drivers.exchange.event_log import EventReader, EventWriter
-from drivers.record import CycleRing, PacketReader, PacketRing, RingReader, cycle_dtype
+from drivers.exchange.event_log import EventWriter
+from drivers.record import CycleRing, cycle_dtype
 from hil.archive import Archive, ArchiveOutcome, ArchiveSpec, ArchiveWriter, open_archive
-from hil.archive.process import ArchiveProcess
 from hil.archive.recorder import Recorded
 from hil.archive.supervised import (
     Answer,
     ArchiveProcessHandle,
-    Channel,
     Close,
     Closed,
     Open,
@@ -248,65 +243,6 @@ class TestArchiveProcess:
         assert failure is not None
         assert "accepted no command" in failure
         assert rig.process.process.poll() is not None
-
-
-@contextmanager
-def with_packets(path: Path) -> Iterator[tuple[ArchiveProcess, Memory, PacketRing]]:
-    """An archive process in this one, with an archive of raw packets open; room for ten."""
-    memory, ring = Memory(), PacketRing.shared(10)
-    ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
-    channel, exchange = Channel(theirs), os.pidfd_open(memory.pid)
-    process = ArchiveProcess(
-        RingReader(memory.ring_fd, 2),
-        EventReader(memory.event_fd),
-        memory.control,
-        channel,
-        exchange,
-        PacketReader(ring.fd),
-    )
-    spec = ArchiveSpec(path, ("a", "b"), PERIOD, metadata={}, durable=False, packets=True)
-    process._open(Open(1, spec, drive_train(), from_now=True, until_ended=False))
-    try:
-        yield process, memory, ring
-    finally:
-        for end in (ours, channel):
-            end.close()
-        os.close(exchange)
-        memory.close()
-
-
-class TestRawPackets:
-    def test_packets_overwritten_at_the_end_are_counted(self, tmp_path: Path) -> None:
-        with with_packets(tmp_path / NAME) as (process, memory, ring):
-            memory.cycles(3)
-            process._transfer()
-            for cycle in range(30):  # after the last reading, and before the archive is closed
-                ring.put(cycle // 10, 0.0, False, b"packet")
-            process._close("completed", "")
-        found = outcome(tmp_path / NAME)
-        assert int(found.entries["packets_lost"]) + found.packets == 30
-        assert found.entries["packets_lost"] != "0"
-
-    def test_packets_behind_their_cycle_are_waited_for(self, tmp_path: Path) -> None:
-        """The exchange was delayed between record and packet while the archive is closed."""
-        with with_packets(tmp_path / NAME) as (process, memory, ring):
-            memory.cycles(3)
-            for cycle in range(2):
-                ring.put(cycle, 0.0, False, b"packet")
-            process._transfer()
-            late = threading.Timer(0.05, ring.put, (2, 0.0, False, b"packet"))
-            late.start()
-            process._close("completed", "")
-            late.join()
-        found = outcome(tmp_path / NAME)
-        assert (found.packets, found.entries["packets_lost"]) == (3, "0")
-
-    def test_wait_for_missing_packets_is_short(self, tmp_path: Path) -> None:
-        with with_packets(tmp_path / NAME) as (process, memory, _):
-            memory.cycles(3)
-            process._transfer()
-            process._close("completed", "")
-        assert complete_archive(tmp_path / NAME).n_samples == 3
 
 
 FLUSH = 100  # cycles
