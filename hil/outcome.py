@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from io import BytesIO
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def rewrite_report(folder: Path) -> Results:
 def _series_bytes(series: ReportSeries) -> bytes:
     """Return the series of the figures as a `.npz` file."""
     content = BytesIO()
-    np.savez_compressed(content, **asdict(series))
+    np.savez_compressed(content, **vars(series))
     return content.getvalue()
 
 
@@ -86,8 +86,9 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
                 raise ValueError(f"it would take {size} bytes")
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as found:
-                arrays = {name: found[name] for name in found.files}
-        series = ReportSeries(**arrays | {"example_archive": str(arrays["example_archive"])})
+                arrays: dict[str, Any] = {name: found[name] for name in found.files}
+        arrays["example_archive"] = str(arrays["example_archive"])
+        series = ReportSeries(**{one.name: arrays[one.name] for one in fields(ReportSeries)})
         return series.checked_for(n_joints)
     except Exception as error:  # readers of a corrupt file may raise anything
         problem = f"does not contain the series of a report ({error})"

@@ -9,12 +9,10 @@ import typer
 
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
-from hil.files import convert_write_errors, make_folder, write_atomically
+from hil.files import make_folder
 from hil.plots import check_format, save
-from hil.plots.archive_view import archive_page, draw_archive, view_of
+from hil.plots.archive_view import draw_archive, view_of
 from hil.terminal_text import printable
-
-PAGE = ".html"
 
 
 def plot(
@@ -28,16 +26,15 @@ def plot(
     """Plot an archive: position, velocity, current, torque, following error, events.
 
     Imported archives are plotted as far as they contain these. Long archives are reduced to minimum
-    and maximum per interval, so that peaks remain; --start and --stop select a part. A page
-    (*.html) can be zoomed with mouse, touch or the keys + - 0. Time is counted from the first
-    sample.
+    and maximum per interval, so that peaks remain; --start and --stop select a part. Time is
+    counted from the first sample.
 
-    **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.html`
+    **Example:** `hil plot runs/demo/archives/excitation_000_a1.mcap --joint 2 -o joint_2.svg`
 
     Options:
         archive: The archive (*.mcap).
-        output: The picture (*.png, *.svg, *.pdf) or page (*.html). Default: the name of the archive
-            with .png, in the working directory.
+        output: The picture (*.png, *.svg, *.pdf). Default: the name of the archive with .png, in
+            the working directory.
         start: Start of the plotted part, s.
         stop: End of the plotted part, s.
         joint: Plot this joint only, by name or number from 1 (repeatable).
@@ -47,15 +44,10 @@ def plot(
             archive, "is a folder", remedy=f"name an archive, such as one of {archive}/archives"
         )
     target = output or Path(archive.with_suffix(".png").name)
-    kind = target.suffix.lower()
-    check_format(target, PAGE)
+    check_format(target)
     view = view_of(archive, start=start, stop=stop, joints=tuple(joint or ()))
     make_folder(target.parent)
-    if kind == PAGE:
-        with convert_write_errors(target):
-            write_atomically(target, archive_page(view))
-    else:
-        save(draw_archive(view), target)
+    save(draw_archive(view), target)
     if json:
         peaks = {
             quantity.title: {

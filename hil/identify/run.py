@@ -21,11 +21,10 @@ from hil.results import Results
 from identification import Factor, IdentificationError, RobotModel, estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
-from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
+from identification.export.friction import friction_curve, friction_torque
 from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.selection.essential import EssentialChoice, choose_essential
-from identification.signals.noise import spectrum
 from identification.signals.samples import Samples
 from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import gather
@@ -238,9 +237,6 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
     shown, seen = _shown(prepared.training[0]), _shown(example)
     time = example.motion.time
     predicted = example.predicted_torque(model, values)
-    parts = torque_parts(model, values, example)
-    both = np.column_stack([example.torque, example.torque - predicted])
-    frequency, density = spectrum(time, both, example.segments)
     speed, torque = _friction_data(model, values, fitted)
     slowest, fastest = (end(speed, axis=0, initial=0.0) for end in (np.nanmin, np.nanmax))
     curves = [
@@ -257,22 +253,10 @@ def report_series(prepared: Prepared, estimate: RepeatedEstimate) -> ReportSerie
         example_predicted=for_figure(time, predicted)[seen],
         excitation_fitted=excitation.usable[shown].astype(np.float64),
         example_used=example.usable[seen].astype(np.float64),
-        example_inertia=for_figure(time, parts.inertia)[seen],
-        example_coriolis=for_figure(time, parts.coriolis)[seen],
-        example_gravity=for_figure(time, parts.gravity)[seen],
-        example_friction=for_figure(time, parts.friction)[seen],
         friction_speed=speed,
         friction_torque=torque,
         law_speed=np.column_stack([curve.speed for curve in curves]),
-        law_torque=np.column_stack([curve.sliding for curve in curves]),
-        reversal_travel=np.column_stack([curve.travel for curve in curves]),
-        reversal_torque=np.column_stack([curve.turning for curve in curves]),
-        spectrum_frequency=frequency,
-        spectrum_torque=density[:, : model.n_joints],
-        spectrum_residual=density[:, model.n_joints :],
-        motion_bandwidth=np.where(
-            np.isfinite(example.position_bandwidth), example.position_bandwidth, np.nan
-        ),
+        law_torque=np.column_stack([curve.torque for curve in curves]),
     )
 
 

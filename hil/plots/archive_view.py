@@ -1,4 +1,4 @@
-"""Plots of an archive as a page or a picture, reduced to minimum and maximum per interval."""
+"""Pictures of an archive, reduced to minimum and maximum per interval."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -21,8 +22,7 @@ from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveError, HilError, InputError
 from hil.plots import style
 from hil.plots.plan_picture import wrapped
-from hil.report import drawing
-from hil.report.rendering import environment, page_bytes
+from hil.report.drawing import thinned
 from hil.terminal_text import plural
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 _SAMPLES: Final = 30_000
 """Samples in memory at a time."""
 _BINS: Final = 4000
-"""Intervals of a page, each with its minimum and maximum: all samples of 16 s at 500 Hz."""
+"""Intervals of a picture, each with its minimum and maximum."""
 _LEAP: Final = 10.0  # Missing samples that interrupt a line
 _TITLES: Final = {
     "position": "position [deg]",
@@ -47,15 +47,12 @@ _FIELDS: Final = (
 )  # fmt: skip
 _SECONDS: Final = "time since the first sample [s]"
 _COLOURS: Final = {
-    "position": (drawing.FIRST, style.POSITION),
-    "speed": (drawing.SECOND, style.VELOCITY),
-    "motor current": (drawing.ROUTES[3], style.ACCELERATION),
-    "torque at the joint": (drawing.INK, "#5b3a8c"),
-    "following error": (drawing.ROUTES[0], style.INK),
+    "position": style.POSITION,
+    "speed": style.VELOCITY,
+    "motor current": style.ACCELERATION,
+    "torque at the joint": "#5b3a8c",
+    "following error": style.INK,
 }
-"""Line colours on the page and in the picture."""
-# px, of the page
-_WIDTH, _LEFT, _RIGHT, _TOP, _PLOT, _STEP, _BOTTOM = 440.0, 56.0, 10.0, 20.0, 66.0, 90.0, 22.0
 _MOST_GAPS: Final = 200
 
 
@@ -105,11 +102,6 @@ class ArchiveView:
         if not self.states:
             return ""
         return f"missed at {plural(len(self.gaps), 'place')}" if len(self.gaps) else "none missed"
-
-    def marks(self, warning: str, other: str) -> list[tuple[float, str]]:
-        """Return times of events and missed packets [s] with one of two colours."""
-        events = [(at, warning if warns else other) for at, _, _, warns in self.events]
-        return [*events, *((float(gap), other) for gap in self.gaps[:_MOST_GAPS])]
 
 
 def view_of(
@@ -282,6 +274,13 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
     return np.array([not turns.get(name, True) for name in archive.joint_names])
 
 
+def _runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
+    """Yield intervals of finite values (m,), each thinned, with `bins` bins in total."""
+    edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
+
+
 def _collect(
     lines: Mapping[str, list[list[tuple[Array, Array]]]],
     scales: _Scales,
@@ -298,7 +297,7 @@ def _collect(
     with np.errstate(over="ignore", invalid="ignore"):
         for name, values in scales.shown(columns):
             for line, joint in zip(lines[name], joints, strict=True):
-                for t, v in drawing.runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
+                for t, v in _runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
                     if line and t[0] - line[-1][0][-1] > leap:
                         line.append((np.array([np.nan]), np.array([np.nan])))
                     line.append((t, v))
@@ -341,67 +340,12 @@ def _share(recorded: Trace) -> str:
     return "" if share is None else "< 1" if share < 0.01 else f"{100.0 * share:.0f}"
 
 
-def even(recorded: Trace, grid: Array) -> Array:
-    """Resample a line (k,) to an even grid (m,) with pairs of minimum and maximum; NaN: gap."""
-    found = np.full(grid.shape, np.nan)
-    step = (grid[-1] - grid[0]) / (len(grid) - 1)
-    for times, values in _stretches(recorded):
-        inside = (grid >= times[0] - 0.5 * step) & (grid <= times[-1] + 0.5 * step)
-        found[inside] = np.interp(grid[inside], times, values)
-        pair = np.clip(((times - grid[0]) / step + 0.5).astype(np.intp) // 2, 0, len(grid) // 2 - 1)
-        starts = np.flatnonzero(np.diff(pair, prepend=-1))
-        counts = np.diff(np.append(starts, len(pair)))
-        for start, count in zip(starts[counts > 1], counts[counts > 1], strict=True):
-            here = values[start : start + count]
-            low, high = int(here.argmin()), int(here.argmax())
-            first, last = sorted((low, high))
-            place_of = 2 * pair[start]
-            found[place_of : place_of + 2] = here[first], here[last]
-    return found
-
-
-def _stretches(recorded: Trace) -> list[tuple[Array, Array]]:
-    """Return the uninterrupted parts of a line."""
-    broken = np.flatnonzero(np.isnan(recorded.time))
-    parts = zip(np.split(recorded.time, broken), np.split(recorded.value, broken), strict=True)
-    finite = [(t[np.isfinite(t)], v[np.isfinite(t)]) for t, v in parts]
-    return [(t, v) for t, v in finite if t.size]
-
-
-def _panel(view: ArchiveView, j: int) -> drawing.Panel:
-    length = max(view.stop - view.start, 1e-9)
-    most = max((q.traces[j].time.size for q in view.quantities), default=0)
-    grid = np.linspace(view.start, view.start + length, 2 * max(1, min(_BINS, most // 2)))
-    plots, shares = [], []
-    for k, quantity in enumerate(view.quantities):
-        recorded, name = quantity.traces[j], quantity.title.partition(" [")[0]
-        line = drawing.Trace(even(recorded, grid), _COLOURS[name][0], 1.0, quantity.title)
-        box = (_LEFT, _TOP + k * _STEP, _WIDTH - _LEFT - _RIGHT, _PLOT)
-        plots.append(drawing.Plot(box, quantity.title, [line], recorded.limits))
-        shares += [f"{name} {share}"] if (share := _share(recorded)) else []
-    note = f"peaks in % of limits: {', '.join(shares)}" if shares else ""
-    what = ", ".join(plot.heading for plot in plots)
-    caption = drawing.Caption(f"a{j}", drawing.label(view.joint_names[j]), note, what)
-    height = _TOP + max(1, len(plots)) * _STEP + _BOTTOM
-    marks = view.marks(drawing.OUTSIDE_3, drawing.MUTED)
-    return drawing.time_panel(
-        height, grid, plots, caption, grid.size, width=_WIDTH, foot=_SECONDS, marks=marks
-    )
-
-
-def archive_page(view: ArchiveView) -> bytes:
-    """Return the page; the same archive gives the same bytes."""
-    template = environment().get_template("archive.html.j2")
-    joints = [_panel(view, j) for j in range(len(view.joint_names))]
-    text = template.render(view=view, facts=view.facts, joints=joints)
-    return page_bytes(text)
-
-
 def draw_archive(view: ArchiveView) -> Figure:
     """Draw a picture with one row per joint and one column per quantity."""
     rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
     width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
-    marks = view.marks(style.LIMIT, style.MUTED)
+    marks = [(at, style.LIMIT if warns else style.MUTED) for at, _, _, warns in view.events]
+    marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MOST_GAPS]]
     with style.page():
         figure = Figure(figsize=(width, height))
         grid = figure.add_gridspec(
@@ -409,13 +353,12 @@ def draw_archive(view: ArchiveView) -> Figure:
             bottom=0.5 / height, hspace=0.26, wspace=0.24,
         )  # fmt: skip
         for k, quantity in enumerate(view.quantities):
-            colour = _COLOURS[quantity.title.partition(" [")[0]][1]
+            colour = _COLOURS[quantity.title.partition(" [")[0]]
             for j, trace in enumerate(quantity.traces):
                 axes = figure.add_subplot(grid[j, k])
                 axes.plot(trace.time, trace.value, color=colour, linewidth=1.0)
-                drawing.marked(axes, trace.limits, style.LIMIT, marks)
+                _mark(axes, trace.limits, marks)
                 axes.set_xlim(view.start, max(view.stop, view.start + 1e-9))
-                style.bare(axes)
                 axes.tick_params(labelbottom=j == rows - 1)
                 share = f"{share} % of limit" if (share := _share(trace)) else ""
                 # A fixed height: an exponent of the axis would move it.
@@ -436,3 +379,17 @@ def draw_archive(view: ArchiveView) -> Figure:
         ):
             figure.text(0.95 / width, 1.0 - at / height, text, fontsize=size)
     return figure
+
+
+def _mark(axes: Axes, limits: Sequence[float], marks: Sequence[tuple[float, str]]) -> None:
+    """Draw dashed lines at limits inside the range of the axis, dotted ones at times [s]."""
+    low, high = axes.get_ylim()
+    if (least := 1e-3 * max(-low, high, 1e-6)) > high - low:  # noise at standstill is not magnified
+        low, high = 0.5 * (low + high - least), 0.5 * (low + high + least)
+    for limit in limits:
+        if low <= limit <= high:
+            axes.axhline(limit, color=style.LIMIT, linewidth=0.9, linestyle=(0, (5, 2)))
+    for at, colour in marks:
+        axes.axvline(at, color=colour, linewidth=0.8, linestyle=(0, (1, 2)))
+    axes.set_ylim(low, high)
+    axes.ticklabel_format(axis="y", useOffset=False)

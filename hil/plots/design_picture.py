@@ -18,7 +18,6 @@ from hil.cell import AngleFrame, Cell
 from hil.plots import style
 from hil.plots.plan_picture import draw_motion
 from hil.report.drawing import label
-from hil.report.figures import shade_scale
 from identification.excitation import (
     Design,
     correlation,
@@ -83,7 +82,6 @@ def draw_front(axes: Axes, design: Design, references: Mapping[str, Measures]) -
         loc="lower left", bbox_to_anchor=(0.0, 1.02), frameon=False, borderaxespad=0.0,
         borderpad=0.0, labelspacing=0.35, fontsize=style.SMALL,
     )  # fmt: skip
-    style.bare(axes)
 
 
 def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> None:
@@ -106,15 +104,15 @@ def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> N
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_ticks(middles, joints, color=style.INK)
     axes.tick_params(length=0.0, pad=3.0)
+    axes.grid(False)
     axes.set_xlabel("parameters by joint, without friction")
     axes.set_title(
-        f"|correlation| from this motion alone\nall {p} parameters: I_c "
+        f"|correlation| from this motion alone, 0 white, 1 black\nall {p} parameters: I_c "
         f"{coupling_index(gram):.1f} of {coupling_index_max(p):.0f}",
         loc="left",
         color=style.MUTED,
         pad=5.0,
     )
-    shade_scale(axes.inset_axes((1.03, 0.5, 0.04, 0.5)), style.INK, style.MUTED)
 
 
 def _heading(

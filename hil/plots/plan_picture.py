@@ -57,7 +57,6 @@ def draw_motion(
             axes.plot(*thinned(time, values[:, joint], 400), color=colour, linewidth=1.1)
             axes.set_xlim(0.0, max(trajectory.duration, 1e-9))
             axes.tick_params(labelbottom=joint == len(rows) - 1, length=2.0, pad=2.0)
-            style.bare(axes)
             axes.grid(False, axis="x")
         row[0].set_ylabel(wrapped(name), color=style.INK)
     for axes, (title, *_) in zip(rows[0], columns, strict=False):
@@ -151,12 +150,11 @@ def draw_plan(
     return figure
 
 
-def check_format(path: Path, *others: str) -> None:
-    """Raise InputError unless the suffix of a path is that of a picture, or one of `others`."""
-    formats = (*FORMATS, *others)
-    if path.suffix.lower() not in formats:
+def check_format(path: Path) -> None:
+    """Raise InputError unless the suffix of a path is that of a picture."""
+    if path.suffix.lower() not in FORMATS:
         problem = f"{path.suffix!r} is not a picture format"
-        raise InputError(path, problem, remedy=f"use {', '.join(formats)}")
+        raise InputError(path, problem, remedy=f"use {', '.join(FORMATS)}")
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
-import matplotlib as mpl
-from matplotlib.axes import Axes
+from contextlib import AbstractContextManager
 
 from hil.report.drawing import drawing
 
@@ -14,32 +10,25 @@ INK, MUTED, RULE, SHADE = "#1a1a1a", "#666666", "#dddddd", "#f0e8d2"
 LIMIT = "#b3261e"
 POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
 SMALL, TEXT, TITLE = 7.5, 9.0, 12.0
+_STYLE = {
+    "font.size": TEXT,
+    "axes.axisbelow": True,
+    "axes.edgecolor": MUTED,
+    "axes.grid": True,
+    "axes.linewidth": 0.7,
+    "axes.labelcolor": INK,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": TEXT,
+    "grid.color": RULE,
+    "grid.linewidth": 0.5,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+}
 
 
-@contextmanager
-def page() -> Iterator[None]:
-    """Draw with fixed settings, one thread at a time."""
-    with drawing():
-        mpl.rcParams.update(
-            {
-                "font.size": TEXT,
-                "axes.edgecolor": MUTED,
-                "axes.linewidth": 0.7,
-                "axes.labelcolor": INK,
-                "axes.titlesize": TEXT,
-                "xtick.color": MUTED,
-                "ytick.color": MUTED,
-                "xtick.labelsize": SMALL,
-                "ytick.labelsize": SMALL,
-                "figure.facecolor": "white",
-            }
-        )
-        yield
-
-
-def bare(axes: Axes) -> None:
-    """Remove the upper and right spine, and draw a light grid."""
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.grid(True, color=RULE, linewidth=0.5)
-    axes.set_axisbelow(True)
+def page() -> AbstractContextManager[None]:
+    """Draw with these settings, one thread at a time."""
+    return drawing(_STYLE)

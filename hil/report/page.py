@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, get_args
+from typing import Final
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from hil.archive.header import ArchiveName
 from hil.report import figures
 from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
-from hil.results import ChoiceResult, RecordedResult, Results, UncertaintyResult, outside_mark
+from hil.results import ChoiceResult, RecordedResult, Results, outside_mark
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -32,7 +32,6 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "results": results,
         "series": series,
         "shown_candidates": shown_candidates,
-        "routes": routes(results),
         "has_truth": any(p.truth is not None for p in results.parameters),
         "has_ids": any(p.table2_id is not None for p in results.parameters),
         "has_repetitions": any(p.repetition_std is not None for p in results.parameters),
@@ -43,15 +42,10 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "every_row_errors": every_row_errors(results),
         "when": when(recorded),
         "motion_name": motion_name,
-        "warm_up_panels": figures.warm_up_panels(results),
-        "excitation_panels": figures.excitation_panels(series, results.joint_names),
-        "has_reversals": bool(np.isfinite(series.reversal_travel).any()),
+        "excitation_panels": figures.excitation_panels(series, joints),
         "correlation": figures.correlation_matrix(results),
-        "box_panels": figures.error_boxes(results),
         "torque_panels": figures.torque_panels(series, joints),
-        "split_panels": figures.split_panels(series, joints),
-        "spectrum_panels": figures.spectrum_panels(series, joints),
-        "curve_panels": figures.friction_curve_panels(series, joints),
+        "friction_panels": figures.friction_panels(series, joints),
         **figures.residual_panels(results),
     }
     return page_bytes(environment().get_template("report.html.j2").render(**context))
@@ -63,26 +57,6 @@ def every_row_errors(results: Results) -> list[float]:
     if not known and results.fitted is not None:
         known = [results.fitted.all_rows_joint_errors]
     return np.median(np.array(known), axis=0).tolist() if known and all(known) else []
-
-
-def routes(results: Results) -> dict[str, dict[str, Any]]:
-    """Return the computed methods for the standard deviation, compared with the reported one."""
-    uncertainty, reported = results.uncertainty, np.array([p.std for p in results.parameters])
-    far = np.array(
-        [abs(p.estimate - p.truth) if p.truth is not None else np.nan for p in results.parameters]
-    )
-    found = {}
-    for key in get_args(UncertaintyResult.model_fields["reported"].annotation):
-        if getattr(uncertainty, key) is None:
-            continue
-        std = np.array(getattr(uncertainty, key), dtype=np.float64)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio, z = std / reported, far / std
-        ratio, z = ratio[np.isfinite(ratio)], z[~np.isnan(far)]
-        low, median, high = np.quantile(ratio, (0.0, 0.5, 1.0)) if ratio.size else [None] * 3
-        within = [f"{np.sum(z <= most)} of {z.size}" for most in (2.0, 3.0)]
-        found[key] = {"ratios": (median, low, high), "within": within}
-    return found
 
 
 def shown_candidates(choice: ChoiceResult) -> list[int]:

@@ -11,7 +11,6 @@ import numpy as np
 from hil.files import write_files
 from hil.progress import Reporter
 from hil.report import drawing
-from hil.report.figures import matrix_panel
 from hil.report.numbers import significant
 from hil.report.rendering import environment, page_bytes
 
@@ -41,7 +40,7 @@ def study_page(results: StudyResults) -> bytes:
         ),
         trajectories=_trajectories(first, results.joint_names),
         correlations=[
-            matrix_panel(np.array(one.correlation)[:n, :n], labels, f"c{k}", one.label)
+            drawing.matrix_panel(np.array(one.correlation)[:n, :n], labels, f"c{k}", one.label)
             for k, one in enumerate(first.methods)
         ],
         boxes={one.key: _boxes(one, results.joint_names) for one in results.conditions},
@@ -94,23 +93,21 @@ def _examples(condition: ConditionResult, joint_names: list[str]) -> list[drawin
     time, panels = np.array(example.time), []
     for j, name in enumerate(joint_names):
         measured = np.array(example.measured[j])
+        names = [condition.labels[key] for key in example.predicted]
         lines = [
-            drawing.Trace(
-                np.array(series[j]), COLOURS[k], 1.1, condition.labels[key], dashed=k == 1
-            )
-            for k, (key, series) in enumerate(example.predicted.items())
+            drawing.Trace(np.array(series[j]), COLOURS[k], 1.1, dashed=k == 1)
+            for k, series in enumerate(example.predicted.values())
         ]
         errors = [measured - one.values for one in lines]
         reach = 1.05 * max(float(np.abs(error).max()) for error in errors) or 1.0
-        both = [drawing.Trace(measured, drawing.WIDE, 4.0, "measured"), *lines]
-        plots, rms = [drawing.Plot((46.0, 20.0, 314.0, 128.0), "torque [N·m]", both)], []
+        both = [drawing.Trace(measured, drawing.WIDE, 4.0), *lines]
+        plots, rms = [drawing.Plot(128.0, "torque [N·m]", both)], []
         # A row for each error: where there is noise, one line over another would hide it.
-        for row, (one, error) in enumerate(zip(lines, errors, strict=True)):
-            box, heading = (46.0, 172.0 + 72.0 * row, 314.0, 48.0), f"measured − {one.name} [N·m]"
-            trace = drawing.Trace(error, one.colour, 1.0, one.name)
-            plots.append(drawing.Plot(box, heading, [trace], reach=reach))
-            rms.append(f"{one.name} {significant(float(np.sqrt(np.mean(error**2))))}")
+        for which, one, error in zip(names, lines, errors, strict=True):
+            trace = drawing.Trace(error, one.colour, 1.0)
+            plots.append(drawing.Plot(48.0, f"measured − {which} [N·m]", [trace], reach=reach))
+            rms.append(f"{which} {significant(float(np.sqrt(np.mean(error**2))))}")
         note, what = f"RMS error {', '.join(rms)} N·m", "measured and predicted torque"
         caption = drawing.Caption(f"e{condition.key}{j}", name, note, what)
-        panels.append(drawing.time_panel(188.0 + 72.0 * len(errors), time, plots, caption))
+        panels.append(drawing.time_panel(time, plots, caption))
     return panels

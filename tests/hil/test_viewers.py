@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import html
 import json
 import os
 import re
@@ -29,7 +27,6 @@ from hil.cli import app
 from hil.errors import ArchiveError, InputError
 from hil.plots.archive_view import (
     ArchiveView,
-    archive_page,
     draw_archive,
     view_of,
 )
@@ -171,7 +168,6 @@ class TestFrame:
         view = view_of(excitation)
         frame = "angles, speeds and torques as on the teach pendant"
         assert view.frame == frame
-        assert frame in html.unescape(archive_page(view).decode("utf-8"))
         assert any(frame in text.get_text() for text in draw_archive(view).texts)
 
 
@@ -216,7 +212,7 @@ def test_a_part_of_the_time_and_some_joints(excitation: Path) -> None:
         view_of(excitation, start=1e4)
 
 
-@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf", "a.html"])
+@pytest.mark.parametrize("name", ["a.png", "a.svg", "a.pdf"])
 def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key}
     done = subprocess.run(
@@ -226,28 +222,8 @@ def test_a_picture_without_a_display(excitation: Path, name: str, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith(f"{name}: repetition 1, attempt 1")
     content = (tmp_path / name).read_bytes()
-    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "html": b"<!DOCTYPE html>"}
+    head = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF"}
     assert content.startswith(head[name.partition(".")[2]])
-    if name == "a.html":
-        assert b"http://" not in content.replace(b"http://www.w3.org", b"")
-        assert b"MotionEnded" in content
-
-
-def test_a_page_has_every_sample_for_the_zoom(excitation: Path) -> None:
-    view = view_of(excitation, joints=("2",))
-    page = archive_page(view).decode("utf-8")
-    (text,) = re.findall(r'data-traces="([^"]*)"', page)
-    content = json.loads(html.unescape(text))
-    assert [plot["heading"] for plot in content["plots"]] == [q.title for q in view.quantities]
-    (line,) = content["plots"][2]["lines"]
-    counts = np.frombuffer(base64.b64decode(line["data"]), dtype="<u2")
-    current = open_archive(excitation).columns["target_current"][:, 1]
-    values = line["low"] + line["step"] * counts
-    assert values.max() == pytest.approx(current.max(), abs=line["step"])
-    assert values.min() == pytest.approx(current.min(), abs=line["step"])
-    assert content["marks"] == [round(time, 6) for time, _, _, _ in view.events]
-    assert content["plots"][2]["limits"] == pytest.approx(view.quantities[2].traces[0].limits)
-    assert "Zoom over time" in page and "MotionEnded" in page
 
 
 def test_the_header_counts_missed_packets(excitation: Path) -> None:

@@ -1,4 +1,4 @@
-"""Files for simulators, parts of torque, and noise."""
+"""Files for simulators, friction curves, and noise."""
 
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from identification import FrictionLaw, RobotModel
+from identification.export.friction import friction_curve, friction_torque
 from identification.export.simulators import (
     AGREES,
     FORMATS,
@@ -16,7 +17,6 @@ from identification.export.simulators import (
     mjcf,
     random_states,
 )
-from identification.export.torque_parts import friction_curve, friction_torque, torque_parts
 from identification.export.urdf import WriteBackError
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
@@ -182,61 +182,18 @@ def samples_of(model, bandwidth=None):
     return replace(samples, torque=samples.predicted_torque(model, planted(model)))
 
 
-class TestParts:
-    """Inertia, Coriolis, gravity and friction of a predicted torque."""
-
-    @pytest.mark.parametrize("bandwidth", [None, 20.0])
-    @pytest.mark.parametrize("presliding", [0.0, PRESLIDING])
-    def test_add_up_to_it(self, bandwidth, presliding):
-        model = model_with(presliding=presliding)
-        samples = samples_of(model, bandwidth)
-        parts = torque_parts(model, planted(model), samples)
-        np.testing.assert_allclose(sum(parts), samples.torque, atol=1e-9)
-
-    def test_are_those_of_the_whole_where_samples_are_a_part(self):
-        model = model_with()
-        whole = samples_of(model, 20.0)
-        some = torque_parts(model, planted(model), whole.between(500, 900))
-        for part, all_rows in zip(some, torque_parts(model, planted(model), whole), strict=True):
-            np.testing.assert_array_equal(part, all_rows[500:900])
-
-    def test_follow_what_they_are_named_after(self):
-        """Doubled speed: Coriolis torque grows fourfold; inertia and gravity stay."""
-        model, values = model_with(), planted(model_with())
-        samples = samples_of(model)
-        fast = replace(
-            samples, motion=samples.motion._replace(velocity=2.0 * samples.motion.velocity)
-        )
-        slow, quick = torque_parts(model, values, samples), torque_parts(model, values, fast)
-        np.testing.assert_allclose(quick.coriolis, 4.0 * slow.coriolis, atol=1e-9)
-        np.testing.assert_allclose(quick.inertia, slow.inertia, atol=1e-9)
-        np.testing.assert_array_equal(quick.gravity, slow.gravity)
-        velocity = samples.motion.velocity
-        expected = F0 * np.sign(velocity) + F1 * velocity + FO
-        np.testing.assert_allclose(slow.friction, expected, atol=1e-9)
-
-
 class TestFrictionCurve:
-    """Friction of a joint over speed and after a reversal."""
+    """Friction of a joint over speed."""
 
     def test_jumps_at_zero_and_has_the_offset(self):
         model = model_with()
         curve = friction_curve(model, planted(model), 1, -2.0, 3.0)
         assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
         ends = [-F0[1] - 2.0 * F1[1] + FO[1], F0[1] + 3.0 * F1[1] + FO[1]]
-        np.testing.assert_allclose(curve.sliding[[0, -1]], ends)
+        np.testing.assert_allclose(curve.torque[[0, -1]], ends)
         middle = len(curve.speed) // 2
-        jump = curve.sliding[middle] - curve.sliding[middle - 1]
+        jump = curve.torque[middle] - curve.torque[middle - 1]
         assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
-        assert np.isnan(curve.travel).all() and np.isnan(curve.turning).all()
-
-    def test_reverses_over_the_presliding_displacement(self):
-        model = model_with(presliding=PRESLIDING)
-        curve = friction_curve(model, planted(model), 0, -1.0, 1.0)
-        assert curve.turning[0] == pytest.approx(FO[0] - F0[0])
-        assert curve.turning[-1] == pytest.approx(FO[0] + F0[0], rel=0.01)
-        zero = np.interp(0.0, curve.turning - FO[0], curve.travel)
-        assert zero == pytest.approx(PRESLIDING * np.log(2.0), rel=0.02)
 
     def test_of_an_arm_with_an_identified_spring(self):
         """Parameters after those of friction are ignored."""
@@ -244,7 +201,7 @@ class TestFrictionCurve:
         spring = TorsionSpring("shoulder", 0.2, identified=True)
         model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
         curve = friction_curve(model, np.append(planted(model_with()), 25.0), 0, -1.0, 1.0)
-        assert curve.sliding[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
+        assert curve.torque[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
 
     def test_agrees_with_the_data(self):
         """Torque minus the other parts is on the curve for a perfect model."""
@@ -252,7 +209,7 @@ class TestFrictionCurve:
         values, samples = planted(model), samples_of(model)
         speed = samples.motion.velocity[:, 0]
         curve = friction_curve(model, values, 0, float(speed.min()), float(speed.max()))
-        on_it = np.interp(speed, curve.speed, curve.sliding)
+        on_it = np.interp(speed, curve.speed, curve.torque)
         sliding = np.abs(speed) > 1e-3
         data = friction_torque(model, values, samples)[:, 0]
         np.testing.assert_allclose(data[sliding], on_it[sliding], atol=1e-6)
