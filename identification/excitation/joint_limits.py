@@ -13,7 +13,6 @@ from planner.piecewise_cubic import Extrema
 
 Array = NDArray[np.float64]
 
-_IN_RAMP = 17  # samples within a short ramp
 _RATES = ("velocity", "acceleration", "jerk")
 
 
@@ -24,12 +23,6 @@ def limit_violations(
 
     Its time is that of one of the samples of the motion, which include both ends.
     """
-    if isinstance(trajectory, FourierSeries):
-        for samples in (motion, *_short_ramps(trajectory, motion)):
-            if found := _beyond(_attained(samples), limits, samples):
-                return found
-        if _certain(trajectory, limits, motion):
-            return []
     return _beyond(trajectory.extrema(), limits, motion)
 
 
@@ -95,48 +88,6 @@ def _rates(motion: Motion) -> tuple[Array, Array, Array]:
     """Return |qd|, |qdd| at the samples and the mean |jerk| between them."""
     jerk = np.diff(motion.acceleration, axis=0) / np.diff(motion.time)[:, None]
     return np.abs(motion.velocity), np.abs(motion.acceleration), np.abs(jerk)
-
-
-def _attained(motion: Motion) -> Extrema:
-    ends = motion.position.min(axis=0), motion.position.max(axis=0)
-    return Extrema(*ends, *(rate.max(axis=0) for rate in _rates(motion)))
-
-
-def _short_ramps(series: FourierSeries, motion: Motion) -> list[Motion]:
-    """Return samples within the ramps if these are shorter than three sample periods."""
-    step = float(np.max(np.diff(motion.time)))
-    if not 0.0 < series.ramp < 3.0 * step:
-        return []
-    shares = np.linspace(0.0, series.ramp, _IN_RAMP)
-    parts = (shares, series.length - shares[::-1])
-    return [
-        Motion(time, *series.sample(time)) for time in parts if bool(np.all(np.diff(time) > 0.0))
-    ]
-
-
-def _certain(series: FourierSeries, limits: JointLimits, motion: Motion) -> bool:
-    """Whether the samples are farther from all limits than the series deviates between them.
-
-    That is at most M h²/8 (M: largest second derivative); else exact extrema are computed.
-    """
-    step = float(np.max(np.diff(motion.time)))
-    second, third, fourth = (series.derivative_bound(order) for order in (2, 3, 4))
-    # The jerk jumps at the ends of the ramps. If each part of the motion lasts three steps, a pair
-    # of samples on the same side gives the jerk with an error of two steps.
-    parts = [series.ramp, series.length - 2.0 * series.ramp]
-    long_enough = all(part == 0.0 or part >= 3.0 * step for part in parts)
-    reached = _attained(motion)
-    position = second * step**2 / 8.0
-    velocity = third * step**2 / 8.0
-    acceleration = fourth * step**2 / 8.0 if series.ramp == 0.0 else third * step / 2.0
-    jerk = 2.0 * step * fourth if long_enough else np.full_like(fourth, np.inf)
-    return bool(
-        np.all(reached.lower - position >= limits.lower)
-        and np.all(reached.upper + position <= limits.upper)
-        and np.all(reached.velocity + velocity <= limits.velocity)
-        and np.all(reached.acceleration + acceleration <= limits.acceleration)
-        and np.all(reached.jerk + jerk <= limits.jerk)
-    )
 
 
 def acceleration_bound(

