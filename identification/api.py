@@ -6,8 +6,7 @@ from identification.estimators.consistent import ConsistentEstimate, consistent_
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.delay import (
     DelayEstimate,
-    compensate,
-    estimate_delays,
+    estimate_delay,
     rate_products,
     with_uncertain_delay,
 )

@@ -22,7 +22,6 @@ from hil.identify.settings import (
     carried_over,
     decide,
     samples_of,
-    signals_of,
     validation_samples,
     with_noise,
 )
@@ -213,7 +212,6 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
         IdentificationError: it has no usable row.
     """
     archive, source = load_source(ref)
-    source = signals_of(source, settings)
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
     samples = (samples_of if fitted else validation_samples)(source, cell, settings)
     model = cell.model

@@ -24,7 +24,7 @@ from identification.model.robot import RobotModel
 
 from .options import Options
 from .prepared import prepare_sources
-from .settings import samples_of, signals_of
+from .settings import samples_of
 from .sources import aligned, archives_in, arm_differences, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
@@ -223,7 +223,7 @@ def find_payload(
             runs.append(Run.of(source.name, cell.model, samples, frame, loaded=False))
             task.advance(1, source.name)
         for source in last:
-            samples = samples_of(signals_of(source, settings), cell, settings)
+            samples = samples_of(source, cell, settings)
             runs.append(Run.of(source.name, cell.model, samples, frame, loaded=True))
             task.advance(1, source.name)
     with reporter.task("weighing", 1) as task:

@@ -18,7 +18,7 @@ from identification.signals.samples import Samples
 from planner.checked_data import numbers
 
 from .options import Options
-from .settings import Settings, decide, samples_of, signals_of, validation_samples, with_noise
+from .settings import Settings, decide, samples_of, validation_samples, with_noise
 from .sources import Sources
 
 Array = NDArray[np.float64]
@@ -40,9 +40,9 @@ class Prepared:
     notes: tuple[str, ...]  #: decisions, one sentence each
 
     @property
-    def assumed_delay(self) -> Array:
-        """Delay of each axis that the fit used (n,) [s]."""
-        return self.settings.delays(len(self.sources.cell.joint_names))
+    def assumed_delay(self) -> float:
+        """Delay of the torque that the fit used [s]."""
+        return self.settings.preprocessing.torque_delay
 
 
 def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> Prepared:
@@ -65,11 +65,7 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
     _require_torques(sources)
     decided = decide(sources, options, reporter)
     settings, cell = decided.settings, decided.settings.with_friction_law(sources.cell)
-    read, held = (
-        tuple(signals_of(source, settings) for source in some)
-        for some in (sources.training, sources.held_out)
-    )
-    sources = replace(sources, cell=cell, training=read, held_out=held)
+    sources = replace(sources, cell=cell)
     unseen = () if sources.in_sample else sources.held_out
     with reporter.task("smoothing recordings", len(sources.training) + len(unseen)) as task:
         fitted, held_out = [], []

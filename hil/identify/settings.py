@@ -15,7 +15,7 @@ from hil.cell.robot import ripples
 from hil.progress import Reporter
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage
-from identification.estimators.delay import DelayEstimate, compensate, estimate_delays
+from identification.estimators.delay import DelayEstimate, estimate_delay
 from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
@@ -43,7 +43,6 @@ class Settings:
     #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
     torque_variance: tuple[float, ...] | None = None
     stated_delay: float = 0.0  #: of the torque, by cell or options [s]
-    axis_delays: tuple[float, ...] | None = None  #: compensated per axis (n,) [s]; None for none
     delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
     shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
     choices: tuple[Choice, ...] = ()  #: made by inner prediction
@@ -55,12 +54,6 @@ class Settings:
     def with_friction_law(self, cell: Cell) -> Cell:
         """Return the cell with the friction law of these settings."""
         return cell.with_friction(**self.friction) if self.friction else cell
-
-    def delays(self, n_joints: int) -> Array:
-        """Delay of the torque of each axis (n,) [s]."""
-        if self.axis_delays is not None:
-            return np.array(self.axis_delays)
-        return np.full(n_joints, self.preprocessing.torque_delay)
 
 
 def stated_delay(cell: Cell) -> float:
@@ -87,19 +80,10 @@ def stated_settings(cell: Cell, options: Options) -> Settings:
     )
 
 
-def signals_of(source: Source, settings: Settings) -> Source:
-    """Return the source with the delay of each axis compensated, where delays differ by axis."""
-    if settings.axis_delays is None:
-        return source
-    return replace(
-        source, recording=compensate(source.recording, settings.axis_delays), context=None
-    )
-
-
 def samples_of(
     source: Source, cell: Cell, settings: Settings, model: RobotModel | None = None
 ) -> Samples:
-    """Return the samples of a source from :func:`signals_of`, for a fit.
+    """Return the samples of a source, for a fit.
 
     The friction law is that of the cell; `model` replaces the cell's.
 
@@ -182,20 +166,16 @@ def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
     suggested: tuple[float, ...] = ()
     if found is not None and options.delay == "auto":
         notes = _described(found)
-        if found.significant and found.agree:
-            settings = stated.preprocessed(torque_delay=found.common)
-            notes.append(f"a delay of {found.common * 1e3:.3g} ms of all axes was compensated")
-        elif found.significant:
-            applied = tuple(found.applied.tolist())
-            settings = replace(stated, axis_delays=applied).preprocessed(torque_delay=0.0)
-            notes.append("each axis was compensated by its own delay")
+        if found.significant:
+            settings = stated.preprocessed(torque_delay=found.delay)
+            notes.append(f"a delay of {found.delay * 1e3:.3g} ms of all axes was compensated")
     elif found is not None and options.delay is None:
         # A controller's delay is known; the estimate replaces it only if well determined and
         # different by more than its bias in closed loop.
-        far = abs(found.common - found.assumed) > Thresholds().delay * found.cycle
+        far = abs(found.delay - found.assumed) > Thresholds().delay * found.cycle
         if sources.cell.file.controller is None or (far and found.determined):
             notes = _described(found)
-            suggested = (found.common,) if found.significant else ()
+            suggested = (found.delay,) if found.significant else ()
     assumed = settings.preprocessing.torque_delay
     chosen = _chosen(sources, settings, suggested, options, reporter)
     how = chosen.preprocessing
@@ -268,7 +248,6 @@ def _chosen(
         return settings
     # One repetition of a motion is enough.
     read = sources.training[:1] if sources.same_motion else sources.training
-    read = tuple(signals_of(source, settings) for source in read)
 
     def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
         trial = replace(settings, preprocessing=how)
@@ -325,7 +304,7 @@ def _delays(
         recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
     with reporter.task("estimating the delay", 1) as task:
         try:
-            found = estimate_delays(
+            found = estimate_delay(
                 recording,
                 sources.cell.model,
                 noise_variance=sources.noise_variance,
@@ -340,7 +319,7 @@ def _delays(
 
 
 def _described(found: DelayEstimate) -> list[str]:
-    notes = [f"delay of the torque behind the position, {line}" for line in found.describe()]
+    notes = [f"delay of the torque behind the position, {found.describe()}"]
     if not found.significant:
         notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
     return notes

@@ -353,11 +353,12 @@ def _delays(prepared: Prepared) -> results.DelaysResult | None:
     found = prepared.delays
     if found is None:
         return None
-    half = found.interval_factor * found.std
+    every = np.ones(len(prepared.sources.cell.joint_names))
+    known = every if found.determined else np.nan * every
     return results.DelaysResult.of(
-        found=np.where(found.determined, found.delays, np.nan),
-        interval=np.where(found.determined, half, np.nan),
-        applied=prepared.assumed_delay,
+        found=found.delay * known,
+        interval=found.half_interval * known,
+        applied=prepared.assumed_delay * every,
     )
 
 

@@ -1,13 +1,11 @@
 r"""Constant delay of the torque or current channel relative to the positions.
 
-The torque of axis j is recorded with delay d_j:
+The torque of all axes is recorded with a delay d, as by one logger:
 
-.. math:: \tau_j(t) = W_j\bigl(q, \dot q, \ddot q\bigr)(t - d_j)\,\pi + e_j(t)
+.. math:: \tau(t) = W\bigl(q, \dot q, \ddot q\bigr)(t - d)\,\pi + e(t)
 
-One logger records all torques, so a common delay is estimated first: the minimum of a residual
-profile is refined by Gauss-Newton steps on parameters and delay together, with the column
-:math:`-d\tau/dt`. An axis gets its own deviation only where that is significant and predicts
-left-out blocks of time better.
+The minimum of a residual profile is refined by Gauss-Newton steps on parameters and delay together,
+with the column :math:`-d\tau/dt`.
 
 The motion is interpolated at other times, not the torque, whose noise that would smooth. Rows near
 a velocity reversal are left out: presliding friction is similar to a delay.
@@ -15,7 +13,6 @@ a velocity reversal are left out: presliding friction is similar to a delay.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -45,37 +42,26 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, Samples, prepare
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
-
-def compensate(recording: Recording, delays: Sequence[float] | Array) -> Recording:
-    """Return the checked recording with torque and current shifted by delays (n,) [s].
-
-    Channels are interpolated by cubics, not across gaps; samples without data at the ends of
-    segments are dropped. For a common delay, :attr:`Preprocessing.torque_delay` leaves the torque
-    unchanged.
-
-    Raises:
-        IdentificationError: no sample is left.
-    """
-    shift, time = np.asarray(delays, dtype=np.float64), recording.time
-    keep, gap = np.zeros((2, recording.n_samples), dtype=np.bool_)
-    channels = {"torque": recording.torque, "motor_current": recording.motor_current}
-    moved = {name: array.copy() for name, array in channels.items() if array is not None}
-    for segment in recording.segments():
-        inside = time[segment]
-        covered = (inside + shift.min() >= inside[0]) & (inside + shift.max() <= inside[-1])
-        if not covered.any() or len(inside) < 2:
-            continue
-        keep[segment] = covered
-        gap[segment.start + int(np.argmax(covered))] = True
-        for array in moved.values():
-            for joint in np.flatnonzero(shift):
-                at = inside + shift[joint]
-                array[segment, joint] = read_at(inside, array[segment, joint], at)
-    if not keep.any():
-        raise IdentificationError("every segment of the recording is shorter than the delay")
-    changes: dict[str, Any] = {**moved, "gap_before": gap}
-    return replace(recording, **changes).rows(keep)
+LONGEST_DELAY: Final = 0.05  # s, either way
+# Encoder noise correlates with the torque through the servo loop. Simulated NS 16, delay 0.2 ms,
+# four seeds: mean 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at 40 Hz, where wrist axes deviate by 0.3
+# ms.
+DELAY_BANDWIDTH: Final = 10.0  # Hz
+# Half a 95 % interval of a determined delay.
+WIDEST_INTERVAL: Final = 1e-3  # s
+# Averaging interval of torques, symmetric in time; 2 % loss at 10 Hz.
+_BIN: Final = 0.01  # s
+# Minima of the profile are wider.
+_PROFILE_STEP: Final = 0.01  # s
+_ITERATIONS: Final = 12
+_CONVERGED, _OF_STD = 1e-6, 0.02  # s, and share of the standard deviation
+_MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
+_REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
+_FOLDS: Final = 5
+_BLOCKS: Final = 80  # blocks of time
+_CHANCE: Final = 0.005  # one-sided probability of a false delay
 
 
 def read_at(time: Array, values: Array, at: Array) -> Array:
@@ -121,110 +107,56 @@ def with_uncertain_delay(
     return replace(estimate, covariance=estimate.covariance + variance * np.outer(known, known))
 
 
-Rows = NDArray[np.bool_]
-
-LONGEST_DELAY: Final = 0.05  # s, either way
-# Encoder noise correlates with the torque through the servo loop. Simulated NS 16, delay 0.2 ms,
-# four seeds: mean 0.18 ms at 10 Hz, 0.155 at 15 and 0.16 at 40 Hz, where wrist axes deviate by 0.3
-# ms.
-DELAY_BANDWIDTH: Final = 10.0  # Hz
-# Half a 95 % interval of a determined delay.
-WIDEST_INTERVAL: Final = 1e-3  # s
-# Averaging interval of torques, symmetric in time; 2 % loss at 10 Hz.
-_BIN: Final = 0.01  # s
-# Minima of the profile are wider.
-_PROFILE_STEP: Final = 0.01  # s
-_ITERATIONS: Final = 12
-_CONVERGED, _OF_STD = 1e-6, 0.02  # s, and share of the standard deviation
-_MODEL_ERROR: Final = 0.05  # difference of log variance up to which two minima are equally good
-_REVERSAL_PERIODS: Final = 0.5  # periods of the smoothing's bandwidth beside a velocity reversal
-_FOLDS: Final = 5
-_BLOCKS: Final = 80  # blocks of time
-_WORTHWHILE: Final = 0.02  # required reduction of the squared error by a deviation
-_CHANCE: Final = 0.005  # one-sided probability of a false delay
-
-
 @dataclass(frozen=True, eq=False)
 class DelayEstimate:
-    """Delay of the torque of n axes relative to the position."""
+    """Delay of the torque of all axes relative to the position."""
 
-    joint_names: tuple[str, ...]  # (n,)
-    common: float  # delay of all axes without own deviation [s]
-    common_std: float  # cluster-robust standard deviation [s]; infinite if undetermined
-    # of each axis from the common delay (n,) [s]; zero if prediction does not improve
-    deviations: Array
-    deviation_std: Array  # standard deviations (n,) [s]
+    delay: float  # [s]
+    std: float  # cluster-robust standard deviation [s]; infinite if undetermined
     assumed: float  # delay with which the samples were prepared [s]
     cycle: float  # usual step of the clock [s]
     interval_factor: float  # standard deviations in half a 95 % interval
-    reason: str | None  # why the common delay is undetermined, or None
-    # whether the delays differ from `assumed` at 99 % and predict left-out blocks better
+    reason: str | None  # why the delay is undetermined, or None
+    # whether the delay differs from `assumed` at 99 % and predicts left-out blocks better
     significant: bool
 
     @property
     def determined(self) -> bool:
-        """Whether the delays of the axes are determined."""
+        """Whether the delay is determined."""
         return self.reason is None
 
     @property
-    def delays(self) -> Array:
-        """Delays of the axes (n,) [s], NaN if undetermined."""
-        return np.where(self.determined, self.common + self.deviations, np.nan)
+    def applied(self) -> float:
+        """Delay to compensate [s]: that assumed unless significant."""
+        return self.delay if self.significant else self.assumed
 
     @property
-    def std(self) -> Array:
-        """Standard deviations of `delays` (n,) [s], infinite if undetermined."""
-        own = np.where(self.deviations != 0.0, self.deviation_std, self.common_std)
-        return np.where(self.determined, own, np.inf)
-
-    @property
-    def agree(self) -> bool:
-        """Whether all axes have the common delay."""
-        return not self.deviations.any()
-
-    @property
-    def applied(self) -> Array:
-        """Delays to compensate (n,) [s]: those assumed unless significant."""
-        n = len(self.joint_names)
-        return self.common + self.deviations if self.significant else np.full(n, self.assumed)
+    def half_interval(self) -> float:
+        """Half a 95 % interval [s]."""
+        return self.interval_factor * self.std
 
     @property
     def variance(self) -> float:
-        """Variance of the common delay [s²], at most that of a uniform one in `LONGEST_DELAY`.
+        """Variance of the delay [s²], at most that of a uniform one in `LONGEST_DELAY`.
 
         Also the error variance of an assumed delay inside the interval.
         """
-        return float(np.fmin(self.common_std**2, LONGEST_DELAY**2 / 3.0))
+        return float(np.fmin(self.std**2, LONGEST_DELAY**2 / 3.0))
 
-    def describe(self) -> list[str]:
-        """Return lines on the common delay and each axis that deviates."""
-        axes = "all axes" if self.agree else "all other axes"
-        against = f"the {self.assumed * 1e3:.3g} ms assumed"
-        if self.reason is None or self.significant:
-            line = f"{self._text(self.common, self.common_std)},"
-            line += f" {'' if self.significant else 'not '}significantly different from {against}"
-        else:
-            line = f"not determined; {self.reason}"
-        lines = [f"{axes}: {line}"]
-        lines += [
-            f"{name}: {self._text(self.common + deviation, std)}, which predicts better than the"
-            " common delay"
-            for name, deviation, std in zip(
-                self.joint_names, self.deviations, self.deviation_std, strict=True
-            )
-            if deviation != 0.0
-        ]
-        return lines
-
-    def _text(self, delay: float, std: float) -> str:
-        half = self.interval_factor * std
+    def describe(self) -> str:
+        """Return the result as a sentence."""
+        if not self.determined and not self.significant:
+            return f"all axes: not determined; {self.reason}"
+        half = self.half_interval
         return (
-            f"{delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
-            f" ({delay / self.cycle:.2f} ± {half / self.cycle:.2f} cycles)"
+            f"all axes: {self.delay * 1e3:.3f} ms ± {half * 1e3:.3f} ms"
+            f" ({self.delay / self.cycle:.2f} ± {half / self.cycle:.2f} cycles),"
+            f" {'' if self.significant else 'not '}significantly different from the"
+            f" {self.assumed * 1e3:.3g} ms assumed"
         )
 
 
-def estimate_delays(
+def estimate_delay(
     recording: Recording,
     model: RobotModel,
     *,
@@ -240,7 +172,7 @@ def estimate_delays(
         RecordingError: see :func:`identification.signals.samples.prepare`.
         IdentificationError: no usable row.
     """
-    n, p, assumed = model.n_joints, model.n_parameters, options.torque_delay
+    p, assumed = model.n_parameters, options.torque_delay
     narrow = min(options.rigid_bandwidth, DELAY_BANDWIDTH)
     options = replace(options, smooth_torque=False, rigid_bandwidth=narrow)
     samples = prepare(recording, model, noise_variance=noise_variance, options=options)
@@ -248,84 +180,34 @@ def estimate_delays(
     ends = (-LONGEST_DELAY - assumed, LONGEST_DELAY - assumed)
     grid = np.linspace(*ends, 1 + 2 * int(np.ceil(LONGEST_DELAY / _PROFILE_STEP)))
     heights, values = reader.profile(grid)
-    shift = np.full(n, grid[np.argmin(heights)])
-    shift, blocks = _descend(reader, shift, values, _basis(p, n), ends)
-    other = _other_minimum(grid, heights, float(shift[0]), reader.profile(shift[:1])[0][0])
-    axes = _deviating(blocks, p, n)
-    basis = _basis(p, n, axes)
-    if axes:
-        shift, blocks = _descend(reader, shift, values, basis, ends)
-    solution = blocks.solution(basis)
-    covariance, factor = blocks.covariance(basis, solution)
-    _, by_chance = blocks.covariance(basis, solution, _CHANCE)
-    std = np.sqrt(np.einsum("jk,kl,jl->j", basis[p:, p:], covariance[p:, p:], basis[p:, p:]))
-    own = np.isin(np.arange(n), axes)
-    first = int(np.argmin(own))  # first axis with the common delay
-    common = float(shift[first])
-    common_std = float(std[first]) if solution.determined[p] else np.inf
-    at_limit = bool(np.any((shift <= ends[0]) | (shift >= ends[1])))
-    before = reader.linearised(np.zeros(n), solution.values[:p], blocks.weights)
+    shift = float(grid[np.argmin(heights)])
+    for _ in range(_ITERATIONS):
+        blocks = reader.linearised(shift, values)
+        solution = blocks.solution()
+        values = solution.values[:p]
+        step = np.clip(solution.values[p], -_PROFILE_STEP, _PROFILE_STEP)
+        before, shift = shift, float(np.clip(shift + step, *ends))
+        if abs(shift - before) <= max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p]))):
+            break
+    other = _other_minimum(grid, heights, shift, reader.profile(np.array([shift]))[0][0])
+    std, count = blocks.delay_std(solution)
+    factor, by_chance = (float(student_limit(share, count - 1)) for share in (0.025, _CHANCE))
+    at_limit = shift <= ends[0] or shift >= ends[1]
+    unshifted = reader.linearised(0.0, solution.values[:p], blocks.weights)
     return DelayEstimate(
-        joint_names=model.joint_names,
-        common=common + assumed,
-        common_std=common_std,
-        deviations=np.where(own, shift - common, 0.0),
-        deviation_std=np.where(own, std, 0.0),
+        delay=shift + assumed,
+        std=std,
         assumed=assumed,
         cycle=reader.cycle,
         interval_factor=factor,
-        reason=_undetermined_reason(factor * common_std, at_limit, other + assumed),
+        reason=_undetermined_reason(factor * std, at_limit, other + assumed),
         significant=bool(
             not at_limit
             and np.isnan(other)
-            and (axes or abs(common) > by_chance * common_std)
-            and blocks.predicted(basis) < before.predicted(basis[:, :p])
+            and abs(shift) > by_chance * std
+            and blocks.predicted() < unshifted.predicted(with_delay=False)
         ),
     )
-
-
-def _basis(p: int, n: int, axes: Sequence[int] = ()) -> Array:
-    """Return parameters and delays (p + n, k) by p parameters, common delay, deviations."""
-    return np.column_stack(
-        [np.eye(p + n, p), np.repeat([0.0, 1.0], [p, n]), np.eye(p + n)[:, p + np.array(axes, int)]]
-    )
-
-
-def _descend(
-    reader: _Reader, shift: Array, values: Array, basis: Array, ends: tuple[float, float]
-) -> tuple[Array, _Blocks]:
-    """Refine shifts (n,) by Gauss-Newton; returns the linear problem there, too."""
-    p = reader.model.n_parameters
-    for _ in range(_ITERATIONS):
-        blocks = reader.linearised(shift, values)
-        solution = blocks.solution(basis)
-        values = solution.values[:p]
-        step = np.clip(basis[p:, p:] @ solution.values[p:], -_PROFILE_STEP, _PROFILE_STEP)
-        before, shift = shift, np.clip(shift + step, *ends)
-        small = max(_CONVERGED, _OF_STD * float(np.sqrt(solution.inverse[p, p])))
-        if np.all(np.abs(shift - before) <= small):
-            break
-    return shift, blocks
-
-
-def _deviating(blocks: _Blocks, p: int, n: int) -> list[int]:
-    """Return axes with a significant own delay that predicts better; never all."""
-    axes: list[int] = []
-    left = [axis for axis in range(n) if blocks.gram[:, p + axis, p + axis].any()]
-    error = blocks.predicted(_basis(p, n))
-    while len(left) > 1:
-        errors = {axis: blocks.predicted(_basis(p, n, [*axes, axis])) for axis in left}
-        axis = min(left, key=lambda one: errors[one])
-        basis = _basis(p, n, [*axes, axis])
-        solution = blocks.solution(basis)
-        covariance, limit = blocks.covariance(basis, solution, _CHANCE / n)
-        far = abs(solution.values[-1]) > limit * np.sqrt(covariance[-1, -1])
-        if errors[axis] >= (1.0 - _WORTHWHILE) * error or not far:
-            break
-        axes.append(axis)
-        left.remove(axis)
-        error = errors[axis]
-    return axes
 
 
 def _other_minimum(grid: Array, heights: Array, shift: float, height: float) -> float:
@@ -354,41 +236,35 @@ def _undetermined_reason(half_interval: float, at_limit: bool, other: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _Blocks:
-    """Weighted normal equations of p parameters and n delay steps, by B blocks of time."""
+    """Weighted normal equations of p parameters and a delay step, by B blocks of time."""
 
-    gram: Array  # (B, p + n + 1, p + n + 1)
+    gram: Array  # (B, p + 2, p + 2)
     weights: Array  # (n,)
     rows: int
 
-    def solution(self, basis: Array) -> Solution:
-        """Solve by least squares in the coordinates of a basis (p + n, k)."""
-        return _solved(_reduced(self.gram.sum(axis=0), basis))
+    def solution(self) -> Solution:
+        """Solve by least squares."""
+        return _solved(self.gram.sum(axis=0))
 
-    def covariance(
-        self, basis: Array, solution: Solution, share: float = 0.025
-    ) -> tuple[Array, float]:
-        """Return the cluster-robust covariance (k, k), and the quantile of `share`."""
-        gram = _reduced(self.gram[self.gram[:, -1, -1] > 0.0], basis)
+    def delay_std(self, solution: Solution) -> tuple[float, int]:
+        """Return the standard deviation of the delay, infinite if undetermined, and the blocks."""
+        gram = self.gram[self.gram[:, -1, -1] > 0.0]
         augmented = np.append(-solution.values, 1.0)
         gram = merged(gram, block_length(gram[:, :-1] @ augmented))
-        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)
-        return np.asarray(moved.T @ moved), float(student_limit(share, max(1, len(gram) - 1)))
+        moved = spread(gram[:, :-1, :-1], gram[:, :-1] @ augmented, solution.root)[:, -1]
+        std = float(np.linalg.norm(moved)) if solution.determined[-1] else np.inf
+        return std, max(2, len(gram))
 
-    def predicted(self, basis: Array) -> float:
+    def predicted(self, *, with_delay: bool = True) -> float:
         """Return the mean weighted squared error of each fifth predicted from the others."""
-        parts = np.array_split(_reduced(self.gram, basis), _FOLDS)
+        used = np.arange(self.gram.shape[1]) != (-1 if with_delay else self.gram.shape[1] - 2)
+        parts = np.array_split(self.gram[:, used][:, :, used], _FOLDS)
         folds = np.array([part.sum(axis=0) for part in parts])
         error = 0.0
         for own in folds:
             augmented = np.append(-_solved(folds.sum(axis=0) - own).values, 1.0)
             error += float(augmented @ own @ augmented)
         return error / self.rows
-
-
-def _reduced(gram: Array, basis: Array) -> Array:
-    """Transform Grams (..., q + 1, q + 1) of [W | y] to a basis (q, k) of W."""
-    wide = scipy.linalg.block_diag(basis, 1.0)
-    return np.asarray(wide.T @ (gram @ wide))
 
 
 def _solved(gram: Array) -> Solution:
@@ -472,25 +348,25 @@ class _Reader:
             raise IdentificationError(no_rows_message(self.model))
         return heights, best
 
-    def linearised(self, shift: Array, values: Array, weights: Array | None = None) -> _Blocks:
-        """Return normal equations of p parameters and n delay steps at shifts (n,), by blocks."""
-        n, p, model = self.model.n_joints, self.model.n_parameters, self.model
-        rows, tables = np.zeros_like(self.clear), [np.empty((0, 0))] * n
-        for value in np.unique(shift).tolist():
-            samples = self.at(value)
-            blocks, columns = samples.regressor(model)
-            load = samples.known_torque(model)
-            for j in np.flatnonzero(shift == value):
-                rate = predicted_rate(samples, load[:, j] + blocks[j] @ values[columns[j]])
-                table = np.column_stack([blocks[j], -rate, samples.torque[:, j]])
-                rows[:, j] = samples.usable[:, j]
-                tables[j] = np.where(rows[:, j], table.T, 0.0)
-        index = np.arange(len(rows)) * _BLOCKS // max(1, len(rows))
-        own = tuple(np.append(used, p + j) for j, used in enumerate(model.plan.columns))
-        names = model.parameter_names + tuple(f"delay of {name}" for name in model.joint_names)
-        phase = PhaseFactor.of_rows(index, rows, own, names, [(slice(None), tables)])
+    def linearised(self, shift: float, values: Array, weights: Array | None = None) -> _Blocks:
+        """Return normal equations of p parameters and a delay step at a shift, by blocks."""
+        p, model, samples = self.model.n_parameters, self.model, self.at(shift)
+        blocks, columns = samples.regressor(model)
+        load = samples.known_torque(model)
+        tables = []
+        for j, (block, used) in enumerate(zip(blocks, columns, strict=True)):
+            rate = predicted_rate(samples, load[:, j] + block @ values[used])
+            table = np.column_stack([block, -rate, samples.torque[:, j]])
+            tables.append(np.where(samples.usable[:, j], table.T, 0.0))
+        index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
+        own = tuple(np.append(used, p) for used in columns)
+        names = (*model.parameter_names, "delay")
+        whole = [(slice(None), tables)]
+        phase = PhaseFactor.of_rows(index, samples.usable, own, names, whole)
         if weights is None:
-            here, nothing = np.append(values, np.zeros(n)), np.zeros((p + n, 0))
-            variance = residual_variance(phase.total, here, nothing, np.ones(n))
+            nothing = np.zeros((p + 1, 0))
+            variance = residual_variance(
+                phase.total, np.append(values, 0.0), nothing, np.ones(model.n_joints)
+            )
             weights = inverse_variance(variance)
         return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))

@@ -209,7 +209,7 @@ class CellContext:
     motor_from_joint: Array | None = None  # motor angle per joint angle (n, n)
     controller: PredictionError | None = None  # error of its dynamic model on the unseen motion
     delays: DelayEstimate | None = None  # of the recorded torque relative to the position
-    assumed_delay: float | Array = 0.0  # in the fit, of all axes or each (n,) [s]
+    assumed_delay: float = 0.0  # in the fit [s]
     nominal_scale: NominalScale | None = None  # measured torque over that of nominal inertias
     jumps: tuple[PositionJump, ...] = ()  # impossible steps of measured positions
     controller_inertia: InertiaRatio | None = None  # its diagonal inertia over the identified one

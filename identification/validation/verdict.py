@@ -217,19 +217,17 @@ def _context_facts(evidence: Evidence, limit: Thresholds) -> Facts:
         full = share > limit.saturated
         facts |= {"saturated": share, "full": full, "unsaturated": not full.any()}
     if (delays := context.delays) is not None:
-        assumed = np.broadcast_to(context.assumed_delay, delays.applied.shape)
-        same = delays.significant and delays.agree and np.array_equal(assumed, delays.applied)
+        assumed = context.assumed_delay
+        same = delays.significant and assumed == delays.applied
         # With a poor motion a delay cannot be separated from the parameters.
         poor = bool(evidence.estimate.undetermined) or evidence.estimate.condition > limit.condition
-        beyond = np.maximum(limit.delay * delays.cycle, SIGMAS * delays.std)
-        late = delays.determined & (np.abs(delays.delays - assumed) > beyond)
+        beyond = max(limit.delay * delays.cycle, SIGMAS * delays.std)
+        late = delays.determined and abs(delays.delay - assumed) > beyond
         facts |= {
-            "compensated": same, "common": 1e3 * delays.common, "stated": 1e3 * delays.assumed,
-            "common_half": 1e3 * delays.interval_factor * delays.common_std,
-            "assumed": 1e3 * assumed,
-            "delay": 1e3 * delays.delays, "half": 1e3 * delays.interval_factor * delays.std,
-            "late": late & (not same) & (not poor),
-            "on_time": delays.determined and not (late.any() or same or poor),
+            "compensated": same, "stated": 1e3 * delays.assumed, "assumed": 1e3 * assumed,
+            "delay": 1e3 * delays.delay, "half": 1e3 * delays.half_interval,
+            "late": late and not (same or poor),
+            "on_time": delays.determined and not (late or same or poor),
         }  # fmt: skip
     return facts
 
@@ -540,15 +538,15 @@ _ROWS: Final[tuple[_Row | Callable[[Facts, Sequence[str]], Iterator[Finding]], .
     _Row("against the controller's inertia", {"good": "inertia_same"},
          "the controller's inertia agrees with the identified one: ratio <{inertia:.2f}>"),
     _Row("delay", {"doubtful": "compensated"},
-         "the torque lags the position by {common:.3g} ± {common_half:.2g} ms ({stated:.3g} ms"
+         "the torque lags the position by {delay:.3g} ± {half:.2g} ms ({stated:.3g} ms"
          " stated); this was compensated",
          "state it (`hil identify --delay SECONDS`), or correct it at its source"),
     _Row("delay", {"doubtful": "late"},
-         "the delay of the torque differs from the assumed one:"
-         " <{delay:.3g} ± {half:.2g} ms ({assumed:.3g} ms assumed)>",
+         "the delay of the torque differs from the assumed one: {delay:.3g} ± {half:.2g} ms"
+         " ({assumed:.3g} ms assumed)",
          "compare with `hil identify --delay auto`, or correct the delay in the cell", "cause"),
     _Row("delay", {"good": "on_time"},
-         "the delay of the torque is as assumed: {common:.3g} ± {common_half:.2g} ms"
+         "the delay of the torque is as assumed: {delay:.3g} ± {half:.2g} ms"
          " ({stated:.3g} ms assumed)"),
     _corrections,
     _Row("saturation", {"good": "unsaturated"}, "no torque or current was at its limit"),

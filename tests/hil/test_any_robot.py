@@ -289,7 +289,7 @@ class TestFixedOptions:
         def never(*_: object, **__: object) -> None:
             raise AssertionError("something was asked")
 
-        for name in ("choose_settings", "estimate_delays", "possible_low_passes"):
+        for name in ("choose_settings", "estimate_delay", "possible_low_passes"):
             monkeypatch.setattr(f"hil.identify.settings.{name}", never)
         found = prepared(tmp_path, 2, causal=True, options=FIXED)
         assert found.settings == stated_settings(found.sources.cell, FIXED)

@@ -214,7 +214,6 @@ def test_digest_of_settings_ignores_those_of_the_estimate() -> None:
         replace(stated, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
         replace(stated, noise_variance=None),
         replace(stated, friction={"presliding": 1e-4}),
-        replace(stated, axis_delays=(0.001,) * 6),
         replace(stated, delay_variance=1e-9),
     ]
     assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)

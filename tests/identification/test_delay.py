@@ -9,8 +9,7 @@ from hil.cell import Cell
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
-    compensate,
-    estimate_delays,
+    estimate_delay,
     rate_products,
     with_uncertain_delay,
 )
@@ -98,7 +97,7 @@ def simulated():
     return recording, controller.current_delay_cycles * STEP
 
 
-class TestCommonDelay:
+class TestDelay:
     @pytest.mark.parametrize(
         ("planted", "near", "options"),
         [
@@ -112,41 +111,41 @@ class TestCommonDelay:
     )
     def test_it_is_found(self, planted, near, options):
         options = {"model": MODEL} | options
-        found = estimate_delays(a_recording(delays=planted, **options), options["model"])
-        assert found.common == pytest.approx(planted, abs=near)
-        np.testing.assert_array_equal(found.applied, found.common)
+        found = estimate_delay(a_recording(delays=planted, **options), options["model"])
+        assert found.delay == pytest.approx(planted, abs=near)
+        assert found.applied == found.delay
 
     def test_it_is_found_in_a_filtered_torque(self):
         time = np.arange(0.0, 8.0, 0.004)
         recording = a_recording(delays=0.003, time=time, torque_noise=0.3)
         filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
-        found = estimate_delays(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
-        assert found.common == pytest.approx(0.003, abs=4e-4)
+        found = estimate_delay(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
+        assert found.delay == pytest.approx(0.003, abs=4e-4)
 
     def test_noise_does_not_bias_it_and_the_interval_covers(self):
         """Mean within its standard error, scatter over seeds as estimated."""
-        found = [estimate_delays(a_recording(1.6e-3, seed=seed), MODEL) for seed in range(12)]
-        error = np.array([one.common - 1.6e-3 for one in found])
-        claimed = np.sqrt(np.mean([one.common_std**2 for one in found]))
+        found = [estimate_delay(a_recording(1.6e-3, seed=seed), MODEL) for seed in range(12)]
+        error = np.array([one.delay - 1.6e-3 for one in found])
+        claimed = np.sqrt(np.mean([one.std**2 for one in found]))
         scatter = error.std(ddof=1)
         assert abs(error.mean()) < 3.0 * scatter / np.sqrt(len(found)) + 5e-6
         # The standard deviation of 12 samples has an error of 21 %.
         assert abs(np.log(claimed / scatter)) < 3 * 0.21
-        assert all(one.agree and one.significant for one in found)
+        assert all(one.significant for one in found)
 
     def test_a_delay_beyond_the_range_is_undetermined(self):
-        found = estimate_delays(a_recording(0.06), MODEL)
+        found = estimate_delay(a_recording(0.06), MODEL)
         assert found.reason == "the residual decreases up to the longest delay tested"
-        np.testing.assert_array_equal(found.applied, 0.0)
+        assert found.applied == 0.0
 
     def test_it_is_found_beside_an_assumed_delay(self):
         recording = a_recording(0.004)
-        found = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.003))
-        assert found.common == pytest.approx(0.004, abs=3e-4)
+        found = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.003))
+        assert found.delay == pytest.approx(0.004, abs=3e-4)
         assert found.significant
-        right = estimate_delays(recording, MODEL, options=Preprocessing(torque_delay=0.004))
+        right = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.004))
         assert not right.significant
-        np.testing.assert_array_equal(right.applied, 0.004)
+        assert right.applied == 0.004
 
     def test_presliding_friction_is_read_at_the_same_time(self):
         law = FrictionLaw(third=None, presliding=1e-3)
@@ -157,69 +156,15 @@ class TestCommonDelay:
         recording = replace(
             a_recording(0.0, model=model), torque=model.torque(TRUTH, *late, direction)
         )
-        assert estimate_delays(recording, model).common == pytest.approx(0.005, abs=5e-5)
+        assert estimate_delay(recording, model).delay == pytest.approx(0.005, abs=5e-5)
 
     def test_encoder_noise_in_a_servo_loop_biases_it_little(self, simulated):
         """Simulated cell in closed loop: within 0.05 ms of the true 0.2 ms."""
         recording, planted = simulated
-        found = estimate_delays(recording, ns16_model())
-        assert found.agree
-        assert found.common == pytest.approx(planted, abs=5e-5)
+        found = estimate_delay(recording, ns16_model())
+        assert found.delay == pytest.approx(planted, abs=5e-5)
 
-
-class TestUndeterminedDelay:
-    def test_a_slow_motion_does_not_determine_it(self):
-        slow = estimate_delays(a_recording(0.0, speed=0.05), MODEL)
-        assert not slow.determined
-        assert np.isnan(slow.delays).all()
-        assert np.isinf(slow.std).all()
-        np.testing.assert_array_equal(slow.applied, 0.0)
-        (line,) = slow.describe()
-        assert line.startswith("all axes: not determined; 95 % interval of ± ")
-        assert line.endswith("the torques change too slowly, or are too noisy")
-        unknown = replace(slow, common_std=np.inf)
-        assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
-        assert replace(slow, common_std=1e-4).variance == pytest.approx(1e-8)
-
-    def test_an_uncertain_significant_delay_is_applied(self):
-        found = estimate_delays(a_recording(0.045, speed=0.2, seed=2), MODEL)
-        assert found.reason is not None and found.significant
-        np.testing.assert_array_equal(found.applied, found.common)
-        (line,) = found.describe()
-        assert line.endswith("cycles), significantly different from the 0 ms assumed")
-
-    def test_a_recording_without_motion_raises(self):
-        still = a_recording(0.0, speed=0.0)
-        with pytest.raises(IdentificationError, match="not one usable sample"):
-            estimate_delays(still, MODEL)
-
-    @pytest.mark.slow
-    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data):
-        """The effort of a real UR10 is filtered at 2 Hz."""
-        model, recording = ur10(shared_data)
-        found = estimate_delays(recording, model)
-        assert not found.determined
-        np.testing.assert_array_equal(found.applied, 0.0)
-
-
-class TestDeviatingAxes:
-    @pytest.mark.parametrize("planted", [[3.7e-4, -1.3e-3], [0.004, 0.0], [-0.045, 0.045]])
-    def test_an_axis_with_another_delay_is_found(self, planted):
-        found = estimate_delays(a_recording(np.array(planted)), MODEL)
-        assert not found.agree and found.significant
-        assert found.applied == pytest.approx(planted, abs=3e-4)
-        assert any("predicts better than the common delay" in s for s in found.describe())
-
-    def test_one_axis_of_six_leaves_the_common_delay(self, simulated):
-        recording, planted = simulated
-        torque = recording.torque.copy()
-        torque[6:, 2] = torque[:-6, 2]
-        found = estimate_delays(replace(recording, torque=torque), ns16_model())
-        np.testing.assert_array_equal(np.flatnonzero(found.deviations), [2])
-        assert found.deviations[2] == pytest.approx(0.006, abs=1e-4)
-        assert found.common == pytest.approx(planted, abs=5e-5)
-
-    def test_a_resting_axis_has_the_common_delay(self):
+    def test_a_resting_axis_does_not_matter(self):
         time = np.arange(6000) * STEP
         keep = np.array([1.0, 0.0])
         rng = np.random.default_rng(1)
@@ -231,34 +176,40 @@ class TestDeviatingAxes:
             joint_names=MODEL.joint_names,
             torque=MODEL.torque(TRUTH, *late) + 0.1 * rng.standard_normal(q.shape),
         )
-        assert estimate_delays(recording, MODEL).applied == pytest.approx([7e-4, 7e-4], abs=1e-4)
+        assert estimate_delay(recording, MODEL).applied == pytest.approx(7e-4, abs=1e-4)
 
 
-PLANTED = np.array([0.37e-3, -1.3e-3])  # s
+class TestUndeterminedDelay:
+    def test_a_slow_motion_does_not_determine_it(self):
+        slow = estimate_delay(a_recording(0.0, speed=0.05), MODEL)
+        assert not slow.determined
+        assert slow.applied == 0.0
+        line = slow.describe()
+        assert line.startswith("all axes: not determined; 95 % interval of ± ")
+        assert line.endswith("the torques change too slowly, or are too noisy")
+        unknown = replace(slow, std=np.inf)
+        assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
+        assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
 
+    def test_an_uncertain_significant_delay_is_applied(self):
+        found = estimate_delay(a_recording(0.045, speed=0.2, seed=2), MODEL)
+        assert found.reason is not None and found.significant
+        assert found.applied == found.delay
+        line = found.describe()
+        assert line.endswith("cycles), significantly different from the 0 ms assumed")
 
-class TestCompensation:
-    def test_torques_are_shifted_to_their_positions(self):
-        late = a_recording(PLANTED, torque_noise=0.0, position_noise=0.0)
-        time = late.time
-        gap = np.zeros(len(time), dtype=np.bool_)
-        gap[2500] = True
-        gapped = replace(late, gap_before=gap)
-        there = compensate(gapped, PLANTED)
-        exact = MODEL.torque(TRUTH, *motion(there.time))
-        clear = np.abs(motion(there.time)[1]) > 0.1  # Coulomb friction jumps between samples
-        assert np.abs(there.torque - exact)[clear].max() < 2e-3
-        assert len(there.segments()) == 2
-        # No interpolation across the gap: samples beside it are dropped.
-        assert there.n_samples == gapped.n_samples - 2 * 3
+    def test_a_recording_without_motion_raises(self):
+        still = a_recording(0.0, speed=0.0)
+        with pytest.raises(IdentificationError, match="not one usable sample"):
+            estimate_delay(still, MODEL)
 
-    def test_zero_delays_change_nothing_and_long_ones_raise(self):
-        recording = a_recording(0.0)
-        same = compensate(recording, [0.0, 0.0])
-        np.testing.assert_array_equal(same.torque, recording.torque)
-        np.testing.assert_array_equal(same.time, recording.time)
-        with pytest.raises(IdentificationError, match="shorter than the delay"):
-            compensate(recording, [100.0, 0.0])
+    @pytest.mark.slow
+    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data):
+        """The effort of a real UR10 is filtered at 2 Hz."""
+        model, recording = ur10(shared_data)
+        found = estimate_delay(recording, model)
+        assert not found.determined
+        assert found.applied == 0.0
 
 
 class TestDelayUncertainty:

@@ -245,8 +245,7 @@ def caused(kind, *joints, ratio=0.4):
 
 
 LATE = DelayEstimate(
-    joint_names=AXES, common=0.003, common_std=1e-4, deviations=np.zeros(2),
-    deviation_std=np.zeros(2), assumed=0.0, cycle=0.001, interval_factor=2.0, reason=None,
+    delay=0.003, std=1e-4, assumed=0.0, cycle=0.001, interval_factor=2.0, reason=None,
     significant=True,
 )  # fmt: skip
 # Torque 10 ± 0.3 (constant gravity), error 0.5: 5 % of the torque, no variance explained.
