@@ -32,7 +32,7 @@ from planner import JointLimits, PiecewiseCubic, TrajectoryPlayer, plan
 from planner.arrays import Array
 from planner.interpolator import Interpolator
 from planner.limits import position_rounding
-from planner.moves import FlyPercent, MotionPlan, Move, plan_chunk, plan_moves
+from planner.moves import MotionPlan, Move, plan_chunk, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 
 POINTS = 6
@@ -228,7 +228,7 @@ def _row(limits: JointLimits, sets: Sequence[Array], fly: float) -> NarrowRow:
 
 
 def _planned(points: Array, limits: JointLimits, fly: float, speed: Array) -> MotionPlan:
-    moves = [Move(point, joint_speed=speed, fly=FlyPercent(100.0 * fly)) for point in points[1:]]
+    moves = [Move(point, joint_speed=speed, fly_percent=100.0 * fly) for point in points[1:]]
     return plan_moves(points[0], moves, limits)
 
 

@@ -25,12 +25,9 @@ from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import Interpolator
 from planner.limits import JointLimits
 from planner.moves import (
-    FlyDistance,
-    FlyPercent,
     MotionPlan,
     Move,
     Overrides,
-    Stop,
     TargetPassage,
     plan,
     plan_chunk,
@@ -46,9 +43,6 @@ __all__ = [
     "plan",
     "plan_moves",
     "Move",
-    "FlyPercent",
-    "FlyDistance",
-    "Stop",
     "Overrides",
     "MotionPlan",
     "TargetPassage",

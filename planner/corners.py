@@ -43,10 +43,6 @@ FULL: Final = 0.999
 REFUSALS: Final = (ruckig.RuckigError, ValueError)
 # Jerk limit in the units passed to ruckig.
 SOLVER_JERK: Final = 64.0
-# Search for a distance: shares of it that are aimed at and accepted, most corners tried.
-_AIM: Final = 0.95
-_NEAR_ENOUGH: Final = 0.9
-_SEARCH: Final = 12
 # Largest error of a join's end, as a share of the tolerance on jumps.
 _MISS: Final = 0.1
 # Pieces of a ruckig profile: two to brake into the limits (of zero length here), seven to move.
@@ -114,36 +110,6 @@ class Corner(NamedTuple):
 
 
 STOP: Final = Corner(0.0, 0.0, None)
-
-
-def round_within(moves: StraightMoves, bounds: Allowance, distance: float) -> Corner:
-    """Round the corner between two moves such that the path stays within `distance` [rad] of it.
-
-    The path passes at 0.9 to 1 times the distance, or nearer where the ramps are too short or the
-    bounds (1, n) do not allow more; else it stops.
-    """
-    best, saving = STOP, 0.0
-    low, share, high = 0.0, 1.0, 1.0
-    first, second = np.arange(2)[:, None]
-    for _ in range(_SEARCH if distance > 0.0 else 0):
-        (corner,) = round_corners(moves, first, second, bounds, np.array([share]))
-        if corner.join is None:
-            break
-        passed = passing(corner.join, moves.start[1]).distance
-        if passed <= distance:
-            if corner.leave + corner.enter - corner.join.duration >= saving:
-                best = corner._replace(how="flown")
-                saving = corner.leave + corner.enter - corner.join.duration
-            if share == high or passed >= _NEAR_ENOUGH * distance:
-                break
-            low = share
-        else:
-            high = share
-        # The distance grows with the cube of small shares and with the square of larger ones.
-        share = corner.share * (_AIM * distance / passed) ** 0.4 if passed > 0.0 else high
-        if not low < share < high:
-            share = 0.5 * (low + high)
-    return best
 
 
 def round_corners(

@@ -19,13 +19,9 @@ from planner.corners import STOP, Corner
 from planner.errors import InvalidSetting, PlannerError
 from planner.limits import JointLimits, position_rounding
 from planner.moves import (
-    Fly,
-    FlyDistance,
-    FlyPercent,
     Legs,
     Move,
     Overrides,
-    Stop,
     checked_shares,
     legs_through,
     passage,
@@ -49,19 +45,17 @@ from planner.worker import in_child
 
 # Tolerance on motion times [s], and on times as a share of a period.
 _ROUNDING: Final = 1e-9
-# Largest fly-by distance [rad].
-_WIDEST: Final = 1e9
-# COMAU's defaults are 100 % and 5 mm; the distance in joint space is 5 mrad here.
-_FLYBY = {FlybyCriterion.PERCENT: 100.0, FlybyCriterion.DISTANCE: 5e-3}
+# COMAU's default of FLY_PER.
+_FLY_PERCENT: Final = 100.0
 
 
-def corner(legs: Legs, fly: Fly) -> Corner:
-    """Plan the corner between two legs."""
+def corner(legs: Legs, fly: float) -> Corner:
+    """Plan the corner between two legs, `fly` a share as of `Legs.corners`."""
     first, second = np.arange(2)[:, None]
-    return legs.corners(first, second, [fly])[0]
+    return legs.corners(first, second, np.array([fly]))[0]
 
 
-def _isolated_corner(legs: Legs, fly: Fly) -> Corner:
+def _isolated_corner(legs: Legs, fly: float) -> Corner:
     return in_child(corner, legs, fly)
 
 
@@ -94,13 +88,13 @@ class MotionQueue:
     """
 
     def __init__(
-        self, start: Array, limits: JointLimits, corner: Callable[[Legs, Fly], Corner]
+        self, start: Array, limits: JointLimits, corner: Callable[[Legs, float], Corner]
     ) -> None:
         self._limits, self._corner = limits, corner
         self._stretches: list[_Stretch] = []
         self._reading = 0
         self._point = start
-        self._last: tuple[Legs, Fly] | None = None
+        self._last: tuple[Legs, float] | None = None
         self.ahead: deque[_Passage] = deque()
 
     @property
@@ -148,7 +142,7 @@ class MotionQueue:
         enter = np.array([turn.enter])
         (part,) = new.moves.tables(enter, np.maximum(enter, new.moves.durations))
         self._extend(part)
-        self._point, self._last = move.target, (new, move.fly)
+        self._point, self._last = move.target, (new, move.fly_percent / 100.0)
         self.ahead.append(_Passage(target_id, self.end))
 
     def _extend(self, part: PiecewiseCubic) -> None:
@@ -161,34 +155,28 @@ class MotionQueue:
 class MoveSettings:
     """Settings of the next targets.
 
-    `speed`, `acceleration` and `jerk` are shares of the limits of each joint (n,); `flyby` has a
-    percentage and a distance [rad]; `motion_time` is that of the next move [s], 0 for the shortest;
-    `advance` is the number of targets that should be known beyond the next one.
+    `speed`, `acceleration` and `jerk` are shares of the limits of each joint (n,); `motion_time` is
+    that of the next move [s], 0 for the shortest; `advance` is the number of targets that should be
+    known beyond the next one.
     """
 
     speed: Array
     acceleration: Array
     jerk: Array
     flying: bool = False
-    criterion: FlybyCriterion = FlybyCriterion.PERCENT
-    flyby: dict[FlybyCriterion, float] = field(default_factory=lambda: dict(_FLYBY))
-    accuracy: PointAccuracy = PointAccuracy.NOSETTLE
+    fly_percent: float = _FLY_PERCENT
     overrides: Overrides = field(default_factory=Overrides)
     motion_time: float = 0.0
     advance: int = 1
 
     def move_to(self, target: Array, speed: float = 1.0) -> Move:
         """Return a move to a target (n,) [rad] without `motion_time`."""
-        value = self.flyby[self.criterion]
-        percent = self.criterion is FlybyCriterion.PERCENT
-        fly = FlyPercent(value) if percent else FlyDistance(value)
         return Move(
             target,
             speed=speed,
             joint_speed=self.speed,
             joint_acceleration=self.acceleration,
-            fly=fly if self.flying and value > 0.0 else Stop(),
-            termination=self.accuracy.name.lower().removeprefix("jnt_"),  # type: ignore[arg-type]
+            fly_percent=self.fly_percent if self.flying else 0.0,
             joint_jerk=self.jerk,
         )
 
@@ -384,32 +372,28 @@ class Interpolator:
 
     @_service
     def select_flyby_criteria(self, criterion: int) -> None:
-        """Select the `FlybyCriterion` of the size of corners."""
-        self._set(criterion=FlybyCriterion(criterion))
+        """Select the criterion of the size of corners; only PERCENT is implemented."""
+        self._require_percent(criterion)
 
     @_service
     def set_flyby_criteria_parameter(self, criterion: int, value: float) -> None:
-        """Set the size of corners: FLY_PER in 0..100 %, or a distance in joint space [rad]."""
-        self._set_flyby(FlybyCriterion(criterion), value)
+        """Set the size of corners: FLY_PER in 0..100 %."""
+        self._set_flyby(criterion, value)
 
     @_service
     def set_point_accuracy_parameter(self, criterion: int, value: float) -> None:
-        """Set the size of corners and select its criterion, as COMAU maps this service."""
-        named = FlybyCriterion(criterion)
-        self._set_flyby(named, value)
-        self._set(criterion=named)
+        """Set the size of corners, as COMAU maps this service."""
+        self._set_flyby(criterion, value)
 
     @_service
     def cancel_flyby_criteria(self, criterion: int) -> None:
-        """Reset the value of a criterion; if it is selected, select the percentage."""
-        cancelled, selected = FlybyCriterion(criterion), self._settings.criterion
-        self._set_flyby(cancelled, _FLYBY[cancelled])
-        self._set(criterion=FlybyCriterion.PERCENT if selected is cancelled else selected)
+        """Reset the value of a criterion."""
+        self._set_flyby(criterion, _FLY_PERCENT)
 
     @_service
     def select_point_accuracy(self, accuracy: int) -> None:
         """Select the `PointAccuracy` of later targets; it does not change set-points."""
-        self._set(accuracy=PointAccuracy(accuracy))
+        PointAccuracy(accuracy)
 
     @_service
     def set_motion_time(self, seconds: float) -> None:
@@ -566,10 +550,14 @@ class Interpolator:
     def _set(self, **changes: Any) -> None:
         self._settings = replace(self._settings, **changes)
 
-    def _set_flyby(self, criterion: FlybyCriterion, value: float) -> None:
-        largest = 100.0 if criterion is FlybyCriterion.PERCENT else _WIDEST
-        self._require(0.0 <= value <= largest, f"fly-by criterion {criterion} of {value}")
-        self._set(flyby={**self._settings.flyby, criterion: float(value)})
+    def _require_percent(self, criterion: int) -> None:
+        percent = FlybyCriterion(criterion) is FlybyCriterion.PERCENT
+        self._require(percent, "only percentages of the deceleration are implemented")
+
+    def _set_flyby(self, criterion: int, value: float) -> None:
+        self._require_percent(criterion)
+        self._require(0.0 <= value <= 100.0, f"fly-by of {value} %")
+        self._set(fly_percent=float(value))
 
     def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> None:
         shares = np.array(getattr(self._settings, name))

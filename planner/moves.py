@@ -11,61 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from math import isfinite
-from typing import Any, Final, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
-from planner.corners import STOP, Corner, How, passing, round_corners, round_within
+from planner.corners import STOP, Corner, How, passing, round_corners
 from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
 from planner.limits import Allowance, JointLimits
 from planner.piecewise_cubic import Block, PiecewiseCubic, Rows
 from planner.straight import StraightMoves
 from planner.verify import check_limits, check_smooth
-
-Termination = Literal["fine", "coarse", "nosettle"]
-"""Accuracy with which the arm has to reach a target at which it stops.
-
-It changes no set-point; whoever executes the motion may wait for the arm accordingly.
-"""
-
-
-@dataclass(frozen=True)
-class FlyPercent:
-    """Fly-by in which the next move begins during the last `percent` of the deceleration (0..100).
-
-    0 is a stop; at 100 the corner begins with the deceleration. It is rounder at higher speed.
-    """
-
-    percent: float
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.percent <= 100.0:
-            raise InvalidSetting("fly percentage", self.percent, "a number from 0 to 100")
-
-
-@dataclass(frozen=True)
-class FlyDistance:
-    """Widest fly-by whose path stays within `distance` [rad] of the target.
-
-    The distance is Euclidean in joint space, from the target to the nearest point of the path.
-    """
-
-    distance: float
-
-    def __post_init__(self) -> None:
-        if not (isfinite(self.distance) and self.distance >= 0.0):
-            raise InvalidSetting("fly distance", self.distance, "a finite number >= 0 rad")
-
-
-@dataclass(frozen=True)
-class Stop:
-    """Stop at the target."""
-
-
-Fly: TypeAlias = FlyPercent | FlyDistance | Stop
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +30,10 @@ class Move:
     """Straight joint-space move to a target (n,) [rad], all joints in phase.
 
     Shares of limits lie in (0, 1] and multiply, with each other and with the overrides; those named
-    after a joint are (n,), None for 1. The slowest joint determines the time. The last target of a
-    motion is a stop, whatever its `fly` is.
+    after a joint are (n,), None for 1. The slowest joint determines the time.
+
+    The next move begins during the last `fly_percent` (0..100) of the deceleration: 0 is a stop, at
+    100 the corner begins with the deceleration. The last target of a motion is a stop.
 
     Raises:
         InvalidSetting: a value is outside its range or of the wrong shape.
@@ -85,8 +44,7 @@ class Move:
     acceleration: float = 1.0
     joint_speed: Array | None = None
     joint_acceleration: Array | None = None
-    fly: Fly = Stop()
-    termination: Termination = "nosettle"
+    fly_percent: float = 0.0
     joint_jerk: Array | None = None
 
     def __post_init__(self) -> None:
@@ -99,10 +57,8 @@ class Move:
         for name in ("joint_speed", "joint_acceleration", "joint_jerk"):
             if (shares := getattr(self, name)) is not None:
                 object.__setattr__(self, name, checked_shares(name, shares, target.size))
-        if not isinstance(self.fly, FlyPercent | FlyDistance | Stop):
-            raise InvalidSetting("fly", self.fly, "FlyPercent, FlyDistance or Stop")
-        if self.termination not in get_args(Termination):
-            raise InvalidSetting("termination", self.termination, "fine, coarse or nosettle")
+        if not 0.0 <= self.fly_percent <= 100.0:
+            raise InvalidSetting("fly percentage", self.fly_percent, "a number from 0 to 100")
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +141,10 @@ class Legs(NamedTuple):
         deceleration = np.concatenate((self.deceleration, other.deceleration))
         return Legs(StraightMoves(*moves), Allowance(*bounds), deceleration)
 
-    def corners(self, before: Rows, after: Rows, flies: Sequence[Fly]) -> list[Corner]:
+    def corners(self, before: Rows, after: Rows, fly: Array) -> list[Corner]:
         """Plan the corners at the targets of legs `before` (c,), towards those of `after`.
+
+        `fly` (c,) is the share of the deceleration that the next acceleration overlaps.
 
         Limits within a corner are the larger ones of the two moves; those of acceleration are the
         deceleration before and the acceleration after it.
@@ -197,14 +155,7 @@ class Legs(NamedTuple):
             acceleration=np.maximum(self.deceleration[before], second.acceleration),
             jerk=np.maximum(first.jerk, second.jerk),
         )
-        shares = [fly.percent / 100.0 if isinstance(fly, FlyPercent) else 0.0 for fly in flies]
-        corners = round_corners(self.moves, before, after, bounds, np.array(shares))
-        for index, fly in enumerate(flies):
-            if isinstance(fly, FlyDistance):
-                pair = self.moves.take(np.array([before[index], after[index]]))
-                own = bounds.take(np.array([index]))
-                corners[index] = round_within(pair, own, fly.distance)
-        return corners
+        return round_corners(self.moves, before, after, bounds, fly)
 
     def motions(self, corners: Sequence[Corner], count: int) -> list[PiecewiseCubic]:
         """Assemble legs and corners to `count` motions.
@@ -366,9 +317,7 @@ class MotionPlan:
     def stopped_corners(self) -> int:
         """Number of targets at which the motion stops although a fly-by was requested."""
         return sum(
-            corner.how == "stopped"
-            and move.fly not in (Stop(), FlyPercent(0.0), FlyDistance(0.0))
-            and min(durations) > 0.0
+            corner.how == "stopped" and move.fly_percent > 0.0 and min(durations) > 0.0
             for corner, move, durations in zip(
                 self.corners, self.moves, pairwise(self.durations), strict=False
             )
@@ -450,7 +399,8 @@ def plan_moves(
     points = checked_via_points([start, *(move.target for move in moves)], limits)
     legs = legs_through(points, moves, limits, overrides)
     rows = np.arange(len(moves))
-    corners = legs.corners(rows[:-1], rows[1:], [move.fly for move in moves[:-1]])
+    fly = np.array([move.fly_percent for move in moves[:-1]]) / 100.0
+    corners = legs.corners(rows[:-1], rows[1:], fly)
     (motion,) = legs.motions(corners, 1)
     return MotionPlan(
         start=read_only(points[0]),
@@ -504,7 +454,6 @@ def plan_chunk(
             planned[index] = error
         else:
             alike.setdefault(len(points), []).append((index, points))
-    passing_by = FlyPercent(100.0 * fly)
     for group in alike.values():
         rows = [index for index, _ in group]
         through = np.array([points for _, points in group])
@@ -522,6 +471,6 @@ def plan_chunk(
         )
         each = np.arange(len(velocity)).reshape(count, -1)
         before, after = each[:, :-1].ravel(), each[:, 1:].ravel()
-        corners = legs.corners(before, after, [passing_by] * len(before))
+        corners = legs.corners(before, after, np.full(len(before), 100.0 * fly / 100.0))
         planned |= dict(zip(rows, legs.checked_motions(corners, count), strict=True))
     return [planned[index] for index in range(len(individuals))]

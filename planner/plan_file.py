@@ -20,13 +20,9 @@ from planner.checked_data import DAMAGED
 from planner.errors import InvalidPlanFile, InvalidSetting, PlannerError
 from planner.limits import JointLimits
 from planner.moves import (
-    FlyDistance,
-    FlyPercent,
     MotionPlan,
     Move,
     Overrides,
-    Stop,
-    Termination,
     plan_moves,
 )
 from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
@@ -46,40 +42,20 @@ class _Data(BaseModel):
 
 class _MoveData(_Data):
     target: list[float]
-    fly_percent: float | None = None
-    fly_distance: float | None = None
+    fly_percent: float = 0.0
     speed: float = 1.0
     acceleration: float = 1.0
     joint_speed: float | list[float] | None = None
     joint_acceleration: float | list[float] | None = None
     joint_jerk: float | list[float] | None = None
-    termination: Termination | None = None
 
     @classmethod
     def of(cls, move: Move) -> _MoveData:
-        shares = {
-            name: np.asarray(value).tolist()
-            for name in ("joint_speed", "joint_acceleration", "joint_jerk")
-            if (value := getattr(move, name)) is not None
-        }
-        return cls(
-            target=move.target.tolist(),
-            fly_percent=move.fly.percent if isinstance(move.fly, FlyPercent) else None,
-            fly_distance=move.fly.distance if isinstance(move.fly, FlyDistance) else None,
-            speed=move.speed,
-            acceleration=move.acceleration,
-            termination=None if move.termination == "nosettle" else move.termination,
-            **shares,
-        )
+        given = {name: value for name, value in vars(move).items() if value is not None}
+        return cls(**{name: np.asarray(value).tolist() for name, value in given.items()})
 
     def move(self) -> Move:
-        fields = self.model_dump(exclude_none=True)
-        percent, distance = fields.pop("fly_percent", None), fields.pop("fly_distance", None)
-        if None not in (percent, distance):
-            raise InvalidPlanFile("a move has fly_percent or fly_distance, not both")
-        if percent is not None:
-            return Move(fly=FlyPercent(percent), **fields)
-        return Move(fly=Stop() if distance is None else FlyDistance(distance), **fields)
+        return Move(**self.model_dump(exclude_none=True))
 
 
 class _LimitsData(_Data):

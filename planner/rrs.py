@@ -52,7 +52,10 @@ class PointAccuracy(IntEnum):
 
 
 class FlybyCriterion(IntEnum):
-    """Criterion for the size of a fly-by corner (the numbers are not from ORL)."""
+    """Criterion for the size of a fly-by corner (the numbers are not from ORL).
+
+    A distance is one of the tool, which a joint interpolator does not know.
+    """
 
     PERCENT = 1
     DISTANCE = 2

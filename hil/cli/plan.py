@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from json import dumps as json_text
-from math import isfinite, radians
+from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -29,7 +29,7 @@ from planner.errors import (
     PlanningError,
     PlanningTimedOut,
 )
-from planner.moves import Fly, FlyDistance, FlyPercent, MotionPlan, Move, plan_moves
+from planner.moves import MotionPlan, Move, plan_moves
 from planner.plan_file import PlanFile, to_csv
 from planner.worker import in_child
 
@@ -124,7 +124,6 @@ def plan(
     speed: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
     acceleration: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
     fly: Annotated[float, typer.Option(min=0.0, max=100.0)] = 50.0,
-    fly_distance: Annotated[float | None, typer.Option(min=0.0)] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     csv: Path | None = None,
     rate: float | None = None,
@@ -148,7 +147,6 @@ def plan(
         speed: Percent of the joint speed limits.
         acceleration: Percent of the joint acceleration limits.
         fly: Fly in percent (FLY_NORM); 0 stops at each point.
-        fly_distance: Largest distance to a via point in joint space, degrees; in place of --fly.
         output: Write a plan file (*.json).
         csv: Write a table of time, position, velocity, acceleration.
         rate: Rows per second of that table. Default: one per cycle of the cell.
@@ -172,9 +170,8 @@ def plan(
             if via is None
             else read_via_points(via, frame)
         )
-        asked: Fly = FlyPercent(fly) if fly_distance is None else FlyDistance(radians(fly_distance))
         moves = [
-            Move(target=point, speed=speed / 100, acceleration=acceleration / 100, fly=asked)
+            Move(target=point, speed=speed / 100, acceleration=acceleration / 100, fly_percent=fly)
             for point in points[1:]
         ]
         planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)

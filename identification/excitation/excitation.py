@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.criteria import Criteria
-from planner import FlyPercent, FourierSeries, Move, PiecewiseCubic
+from planner import FourierSeries, Move, PiecewiseCubic
 from planner.checked_data import DAMAGED, Whole, numbers, strict
 
 Array = NDArray[np.float64]
@@ -33,8 +33,8 @@ class ViaPointMotion:
 
 def moves_through(via_points: Array, speed: Array, fly: float) -> tuple[Move, ...]:
     """Return one move to each via point after the first, as `planner.plan` makes them."""
-    passing = FlyPercent(100.0 * fly)
-    return tuple(Move(point, joint_speed=speed, fly=passing) for point in via_points[1:])
+    percent = 100.0 * fly
+    return tuple(Move(point, joint_speed=speed, fly_percent=percent) for point in via_points[1:])
 
 
 @dataclass(frozen=True, eq=False)

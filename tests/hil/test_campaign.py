@@ -43,7 +43,6 @@ from hil.motion_checks import MotionChecks
 from hil.progress import Silent, Task
 from hil.simulation import simulated_controller, simulated_link
 from planner import (
-    FlyPercent,
     Move,
     PiecewiseCubic,
     PlanFile,
@@ -358,7 +357,7 @@ class TestPlan:
         file, _ = stored_plan(campaign, "validation_000_a1.mcap")
         settings = campaign.cell.campaign
         assert len(file.moves) == settings.n_via + 1
-        assert {move.fly for move in file.moves} == {FlyPercent(100.0 * settings.fly)}
+        assert {move.fly_percent for move in file.moves} == {100.0 * settings.fly}
         speeds = {tuple(np.asarray(move.joint_speed)) for move in file.moves}
         assert len(speeds) == 1 and len(set(speeds.pop())) == campaign.cell.joint_limits.n_joints
 

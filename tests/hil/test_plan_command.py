@@ -16,7 +16,7 @@ from hil.cli.plan import plan, read_plan_file
 from hil.errors import InputError
 from hil.plots import draw_plan
 from hil.plots.plan_picture import corner_times
-from planner.moves import FlyPercent, Move, plan_moves
+from planner.moves import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.motion_table import MotionTable
 
@@ -78,9 +78,8 @@ def test_targets_are_in_the_angles_of_the_controller(run, via):
     np.testing.assert_allclose(out["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
 
 
-def test_fly_by_distance_and_slower_moves(run, via):
-    out = json.loads(run("--via", via, "--json", "--fly-distance", 1.5))
-    assert 0.0 < out["targets"][0]["distance_deg"] <= 1.5
+def test_slower_moves(run, via):
+    out = json.loads(run("--via", via, "--json"))
     slow = json.loads(run("--via", via, "--json", "--speed", 20, "--acceleration", 30))
     assert slow["duration"] > 2.0 * out["duration"]
 
@@ -98,7 +97,7 @@ def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
     out = run("--via", via, "--fly", 75, "--output", path)
     assert run("--via", path) == out
     file = read_plan_file(path)
-    assert file.moves[0].fly == FlyPercent(75.0)
+    assert file.moves[0].fly_percent == 75.0
     assert file.plan().trajectory.duration == pytest.approx(
         float(out.splitlines()[-2].split()[0]), abs=1e-3
     )
@@ -233,7 +232,7 @@ def planned(cell: Cell, count: int, fly: float = 50.0):
     limits = cell.joint_limits
     random = np.random.default_rng(4)
     points = limits.lower + random.random((count, 6)) * (limits.upper - limits.lower)
-    return plan_moves(points[0], [Move(p, fly=FlyPercent(fly)) for p in points[1:]], limits)
+    return plan_moves(points[0], [Move(p, fly_percent=fly) for p in points[1:]], limits)
 
 
 def test_shaded_corners_are_where_the_motion_is_curved(cell):

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner import FlyDistance, FlyPercent, JointLimits, PiecewiseCubic, plan
+from planner import JointLimits, PiecewiseCubic, plan
 from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, ranked, solve_many
 from planner.errors import UnsupportedSolver
 from planner.interpolator import corner
@@ -131,7 +131,7 @@ class TestRestToRest:
 
 def flown(points, limits, share=0.5):
     """The corner at the middle one of three points."""
-    return corner(legs_between(points, limits), FlyPercent(100.0 * share))
+    return corner(legs_between(points, limits), share)
 
 
 def cut(points, limits, share):
@@ -226,21 +226,6 @@ def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch,
 )
 def test_the_requested_corner_comes_first_among_equals(savings, order):
     assert ranked(np.array(savings)).tolist() == order
-
-
-@pytest.mark.parametrize("distance", [1e-6, 1e-3, 0.05, 0.3, 10.0])
-def test_a_corner_within_a_distance_uses_most_of_it(distance):
-    used = []
-    for seed in range(25):
-        points = random_points(seed, 3)
-        passed = corner(legs_between(points, SIX_AXES), FlyDistance(distance))
-        whole = flown(points, SIX_AXES, 1.0)
-        assert passed.join is not None and whole.join is not None
-        q = passed.join.sample(np.linspace(0.0, passed.join.duration, 20001))[0]
-        nearest = np.linalg.norm(q - points[1], axis=1).min()
-        assert nearest <= distance * (1 + 1e-6)
-        used.append(nearest / min(distance, passing(whole.join, points[1]).distance))
-    assert np.median(used) >= 0.9
 
 
 @pytest.mark.parametrize("version", ["0.20.1", "0.1.9", "unknown", "0.19.9"])

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from planner import JointLimits
 from planner.errors import InvalidSetting, PlannerCrashed, PlannerNotStarted
 from planner.interpolator import Interpolator, corner
-from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
+from planner.moves import Move, Overrides, plan_moves
 from planner.rrs import (
     AccelerationKind,
     EventKind,
@@ -83,7 +83,7 @@ def test_targets_queued_at_once_are_the_plan_of_the_same_moves(seed, fly, count)
     interpolator = ready(SIX_AXES, points[0], fly=fly)
     queue(interpolator, points[1:])
     steps = steps_to_rest(interpolator)
-    moves = [Move(point, fly=FlyPercent(fly)) for point in points[1:]]
+    moves = [Move(point, fly_percent=fly) for point in points[1:]]
     plan = plan_moves(points[0], moves, SIX_AXES)
     q, _, _ = plan.trajectory.sample(PERIOD * np.arange(1, len(steps) + 1))
     np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
@@ -105,7 +105,7 @@ def test_every_setting_reaches_the_plan():
     interpolator.set_override_acceleration(70.0, AccelerationKind.ACCELERATION)
     interpolator.set_override_acceleration(60.0, AccelerationKind.DECELERATION)
     interpolator.select_flyby_mode(True)
-    interpolator.set_point_accuracy_parameter(FlybyCriterion.DISTANCE, 0.05)
+    interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, 60.0)
     queue(interpolator, points[1:])
     shares = {
         "joint_speed": np.array([0.8, 0.8, 0.35, 0.8, 0.8, 0.8]),
@@ -114,7 +114,7 @@ def test_every_setting_reaches_the_plan():
     }
     plan = plan_moves(
         points[0],
-        [Move(point, fly=FlyDistance(0.05), **shares) for point in points[1:]],
+        [Move(point, fly_percent=60.0, **shares) for point in points[1:]],
         SIX_AXES,
         Overrides(speed=0.9, acceleration=0.7, deceleration=0.6),
     )
@@ -144,7 +144,7 @@ def test_targets_set_on_request_give_the_same_motion(fly):
 @settings(max_examples=15, deadline=None)
 def test_a_late_target_finds_the_arm_stopping(seed, late):
     a, b, c = random_points(seed, 3)
-    plan = plan_moves(a, [Move(b, fly=FlyPercent(50.0)), Move(c)], SIX_AXES)
+    plan = plan_moves(a, [Move(b, fly_percent=50.0), Move(c)], SIX_AXES)
     alone = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
     assume(plan.targets[0].how != "stopped")
     interpolator = ready(SIX_AXES, a, fly=50.0)
@@ -157,7 +157,7 @@ def test_a_late_target_finds_the_arm_stopping(seed, late):
     assume(steps[-1].status != Status.FINAL_STEP)
     assert interpolator.set_next_target(2, c) >= 0
     steps += steps_to_rest(interpolator)
-    stopping = plan_moves(a, [Move(b, fly=Stop()), Move(c)], SIX_AXES).trajectory
+    stopping = plan_moves(a, [Move(b, fly_percent=0.0), Move(c)], SIX_AXES).trajectory
     q, _, _ = stopping.sample(PERIOD * np.arange(1, len(steps) + 1))
     np.testing.assert_allclose(positions(steps), q, rtol=0, atol=1e-12)
     assert events(steps) == [(EventKind.VIA_POINT_PASSED, 1), (EventKind.MOTION_ENDED, 2)]
@@ -242,7 +242,7 @@ def points():
 
 @pytest.fixture(scope="module")
 def flown(points):
-    moves = [Move(point, fly=FlyPercent(50.0)) for point in points[1:]]
+    moves = [Move(point, fly_percent=50.0) for point in points[1:]]
     return plan_moves(points[0], moves, SIX_AXES).trajectory
 
 
@@ -438,7 +438,7 @@ REFUSED = {
     "set_override_speed": [("50",), (-1.0,), (50.0, 7), (0.0, SpeedCorrection.PROGRAM)],
     "set_override_acceleration": [(50.0, 9), (0.0,)],
     "select_flyby_mode": [("off",)],
-    "select_flyby_criteria": [([],), (7,)],
+    "select_flyby_criteria": [([],), (7,), (FlybyCriterion.DISTANCE,)],
     "set_flyby_criteria_parameter": [(3, 10.0), (FlybyCriterion.PERCENT, "x"),
                                      (FlybyCriterion.PERCENT, 100.5)],
     "cancel_flyby_criteria": [(3,)],
@@ -683,14 +683,11 @@ class AnyServices(RuleBasedStateMachine):
         else:
             self.cancelled = True
 
-    @rule(on=st.booleans(), percent=st.floats(0.0, 100.0), distance=st.floats(1e-6, 0.5))
-    def fly(self, on, percent, distance):
+    @rule(on=st.booleans(), percent=st.floats(0.0, 100.0))
+    def fly(self, on, percent):
         interpolator = self.interpolator
         assert interpolator.select_flyby_mode(on) == Status.OK
-        if percent < 50.0:
-            status = interpolator.set_point_accuracy_parameter(FlybyCriterion.DISTANCE, distance)
-        else:
-            status = interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, percent)
+        status = interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, percent)
         assert status == Status.OK
 
     @rule(a=PERCENT, b=PERCENT, c=PERCENT, joint=st.integers(0, 2))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from planner import InvalidSetting, JointLimits, plan, to_csv
 from planner.errors import InvalidPlanFile
-from planner.moves import FlyDistance, FlyPercent, Move, Overrides, Stop, plan_moves
+from planner.moves import Move, Overrides, plan_moves
 from planner.plan_file import PlanFile
 from planner.toml_text import degrees_text, radians_of, toml_key, toml_value
 from tests.motion_table import MotionTable
@@ -28,11 +28,6 @@ positions = st.floats(-1.0, 1.0)
 @st.composite
 def moves(draw, n: int):
     some = st.none() | st.lists(shares, min_size=n, max_size=n)
-    fly = draw(
-        st.just(Stop())
-        | st.floats(0.0, 100.0).map(FlyPercent)
-        | st.floats(0.0, 3.0).map(FlyDistance)
-    )
     return Move(
         target=draw(st.lists(positions, min_size=n, max_size=n)),
         speed=draw(shares),
@@ -40,8 +35,7 @@ def moves(draw, n: int):
         joint_speed=draw(some),
         joint_acceleration=draw(some),
         joint_jerk=draw(some),
-        fly=fly,
-        termination=draw(st.sampled_from(["fine", "coarse", "nosettle"])),
+        fly_percent=draw(st.floats(0.0, 100.0)),
     )
 
 
@@ -87,10 +81,13 @@ def test_degrees_restore_every_bit(angle):
 @pytest.fixture
 def planned():
     points = random_points(3)
-    flies = [FlyPercent(50.0), FlyPercent(100.0), Stop(), FlyDistance(0.05), Stop()]
+    flies = [50.0, 100.0, 0.0, 25.0, 0.0]
     return plan_moves(
         points[0],
-        [Move(target, speed=0.8, fly=fly) for target, fly in zip(points[1:], flies, strict=True)],
+        [
+            Move(target, speed=0.8, fly_percent=fly)
+            for target, fly in zip(points[1:], flies, strict=True)
+        ],
         SIX_AXES,
         Overrides(deceleration=0.7),
     )
@@ -143,7 +140,7 @@ HAND_WRITTEN = {
     },
     "moves": [
         {"target": [0.5, 1], "fly_percent": 50},
-        {"target": [0.5, -1], "fly_distance": 0.03, "speed": 0.5},
+        {"target": [0.5, -1], "fly_percent": 25, "speed": 0.5},
         {"target": [0, 0]},
     ],
 }
@@ -151,7 +148,7 @@ HAND_WRITTEN = {
 
 def test_a_file_can_be_written_by_hand_without_limits():
     complete = PlanFile.from_dict(HAND_WRITTEN)
-    assert complete.moves[1].fly == FlyDistance(0.03)
+    assert [move.fly_percent for move in complete.moves] == [50.0, 25.0, 0.0]
     targets = complete.plan().targets
     assert targets[-1].how == "stopped" and targets[0].distance > 0.0
     file = replace(complete, limits=None)
@@ -171,8 +168,7 @@ DAMAGE = [
     ({"moves": [{"target": [1]}]}, "joints are named"),
     ({"moves": [{"target": [1, np.nan]}]}, "finite"),
     ({"moves": [{"target": [1, 1], "speed": 10**400}]}, "speed"),
-    ({"moves": [{"target": [1, 1], "fly_distance": True}]}, "fly_distance"),
-    ({"moves": [{"target": [1, 1], "fly_distance": 0.1, "fly_percent": 50}]}, "not both"),
+    ({"moves": [{"target": [1, 1], "fly_percent": True}]}, "fly_percent"),
     ({"moves": [{"target": [1, 1], "fly_percent": 150}]}, "fly percentage"),
     ({"moves": [{"target": [1, 1], "flyby": 50}]}, "flyby: Extra"),
     ({"overrides": {"joint": ["1", 1]}}, "overrides"),
