@@ -35,8 +35,9 @@ from hil.errors import HilError
 from hil.identify import Options, identify_archives
 from hil.importers import Robot
 from hil.progress import Silent
-from hil.results import FindingResult, Results
+from hil.results import Results
 from identification.errors import IdentificationError
+from identification.validation.finding import Finding
 
 DATA: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIMULATED: Final = "simulated"
@@ -211,9 +212,8 @@ def degraded_row(name: str, case: str, whole: Identified, found: Identified | st
     }
 
 
-def suspicious(results: Results) -> list[FindingResult]:
+def suspicious(results: Results) -> list[Finding]:
     """Findings that are neither good nor mere information."""
-    assert results.judgement is not None
     return [one for one in results.judgement.findings if one.level not in ("good", "information")]
 
 

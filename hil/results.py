@@ -6,25 +6,19 @@ per joint are in the order of `joint_names`, lists per parameter in that of `par
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterator
-from io import StringIO
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from pydantic import (
-    AliasChoices,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    ValidationError,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from hil.errors import InputError
 from hil.reading import parse_json, read_text
+from identification.excitation.criteria import Criteria
+from identification.selection.essential import BlindChoice, EliminationStep
+from identification.selection.inner_prediction import Choice
+from identification.validation.finding import Finding
 
 
 class Frozen(BaseModel):
@@ -89,8 +83,7 @@ class RecordedResult(Frozen):
     cycles: int
     missed: int  #: Packets that did not arrive
     late: int  #: Late replies
-    not_accepted: int = Field(validation_alias=AliasChoices("not_accepted", "not_taken"))
-    """Replies that the controller did not accept."""
+    not_accepted: int  #: Replies that the controller did not accept
     lost: int  #: Cycles that were not archived
     outcome: str
     why: str  #: Reason of the outcome
@@ -113,15 +106,6 @@ class ConductResult(Frozen):
     steps: list[StepResult]
     warm_up: WarmUpResult | None
     recorded: list[RecordedResult]  #: Archives of the manifest, in chronological order
-
-
-class FindingResult(Frozen):
-    """One check of the verdict."""
-
-    check: str
-    level: Literal["good", "information", "doubtful", "wrong"]
-    words: str  #: Result of the check
-    next_step: str  #: Remedy; empty if none is needed
 
 
 class JointJudgement(Frozen):
@@ -158,19 +142,14 @@ class JudgementResult(Frozen):
 
     in_sample: bool = False  #: Whether nothing was held out; errors are those of the fit then
     nominal: str | None = None  #: Description of the nominal model
-    findings: list[FindingResult]
+    findings: list[Finding]
     next_steps: list[str]
     joints: list[JointJudgement]
     speed: list[ProfileResult]  #: Over rad/s or m/s
     position: list[ProfileResult]  #: Over rad or m
-    lag: list[float]  #: Of `autocorrelation`, s
-    autocorrelation: list[list[Known]]  #: Of each joint's residual
-    effective_rows: list[float]  #: Effective number of independent samples per joint
-    friction_over_time: list[list[Known]] | None
-    """Relative deviation of friction from its estimate, per joint, in chronological order."""
 
     @property
-    def worst_first(self) -> list[FindingResult]:
+    def worst_first(self) -> list[Finding]:
         """Findings in descending order of severity."""
         levels = ("wrong", "doubtful", "information", "good")
         return sorted(self.findings, key=lambda finding: levels.index(finding.level))
@@ -178,17 +157,6 @@ class JudgementResult(Frozen):
     def any_joint(self, figure: str) -> bool:
         """Whether a field of :class:`JointJudgement` is known for any joint."""
         return any(getattr(joint, figure) is not None for joint in self.joints)
-
-
-class EliminationStepResult(Frozen):
-    """One step of the backward elimination."""
-
-    removed: str | None  #: None for the full model
-    left: int
-    spread: float  #: Largest over smallest relative standard deviation
-    in_sample: float  #: Relative torque error on the fitted motion
-    held_out: float  #: Relative torque error on the held-out motion
-    largest_relative_std: float
 
 
 class EssentialParameter(Frozen):
@@ -205,27 +173,19 @@ class EssentialParameter(Frozen):
         return self.std / abs(self.estimate) if self.estimate else math.inf
 
 
-class BlindResult(Frozen):
-    """Essential parameters chosen on the fitted motion only."""
-
-    left: int  #: Number of parameters
-    essential: float  #: Their relative torque error on the held-out motion
-    full: float  #: That of all parameters
-
-
 class EssentialResult(Frozen):
     """Essential parameters."""
 
     reason: str  #: Criterion of the choice
     cut: int  #: Index of the chosen step
-    steps: list[EliminationStepResult]  #: Down to one parameter
+    steps: list[EliminationStep]  #: Down to one parameter
     refused: list[str]
     """Parameters with a large relative standard deviation that the held-out motion needs."""
     parameters: list[EssentialParameter]
     by_spread_left: int
     """Number of parameters by relative standard deviation alone (Pham and Gautier)."""
     by_spread_held_out: float  #: Held-out error of these
-    blind: BlindResult | None
+    blind: BlindChoice | None
 
 
 class LinkResult(Frozen):
@@ -264,19 +224,7 @@ class ExportResult(Frozen):
     withheld: dict[str, str]  #: Files that were not written, with the reason
 
 
-SCHEMA_VERSION: Final = 2
-
-
-class CriteriaResult(Frozen):
-    """Excitation criteria of one trajectory (paper eqs. 5, 7, 9); log det in SI units."""
-
-    log10_det: float
-    coupling_index: float
-    coupling_index_max: float
-    fitness: float
-    n_samples: int
-    condition: float | None
-    scaled_condition: float | None
+SCHEMA_VERSION: Final = 3
 
 
 class ExcitationResult(Frozen):
@@ -287,8 +235,9 @@ class ExcitationResult(Frozen):
     n_via: int | None
     fly: float | None
     n_sines: int | None = None  #: Sines per joint of a sum of sines
-    planned: CriteriaResult | None
-    executed: CriteriaResult
+    coupling_index_max: float
+    planned: Criteria | None
+    executed: Criteria
 
 
 def outside_mark(z: float | None) -> str:
@@ -370,8 +319,7 @@ class ValidationResult(Frozen):
     overall_relative_error: float  #: ||e|| / ||tau|| over all joints, rows in which the joint moves
     all_rows_relative_error: float
     """As above over all rows, including standstill and the first and last rows."""
-    all_rows_joint_errors: list[float] = Field(default_factory=list)
-    """As above per joint; empty in files of older versions."""
+    all_rows_joint_errors: list[float]  #: As above per joint
 
 
 class FittedResult(Frozen):
@@ -382,8 +330,7 @@ class FittedResult(Frozen):
     overall_relative_error: float
     all_rows_relative_error: float
     """As above over all rows, including standstill and the first and last rows."""
-    all_rows_joint_errors: list[float] = Field(default_factory=list)
-    """As above per joint; empty in files of older versions."""
+    all_rows_joint_errors: list[float]  #: As above per joint
     smoothed_relative_error: list[float] | None = None
     """All rows, of the smoothed torque if that was fitted."""
     smoothed_overall_relative_error: float | None = None
@@ -430,16 +377,6 @@ class DelaysResult(Frozen):
     applied: list[float]  #: Used by the fit
 
 
-class ChoiceResult(Frozen):
-    """A setting that was chosen by inner prediction."""
-
-    name: str
-    candidates: list[str]
-    errors: list[float | None]
-    """||e|| / ||tau|| of the predictions, all joints and rows; null if unknown."""
-    chosen: int  #: Index of the candidate
-
-
 class CoverageResult(Frozen):
     """Number of parameters within 2 and 3 standard deviations of their true value."""
 
@@ -454,8 +391,7 @@ class VerdictResult(Frozen):
     good: bool
     line: str  #: Summary
     reasons: list[str]  #: Why the model is not good
-    warnings: list[str] = Field(validation_alias=AliasChoices("warnings", "doubts"))
-    """Problems that do not make the model bad."""
+    warnings: list[str]  #: Problems that do not make the model bad
 
 
 class EstimatorResult(Frozen):
@@ -469,23 +405,10 @@ class EstimatorResult(Frozen):
 
 
 class UncertaintyResult(Frozen):
-    """Standard deviation of each parameter by several methods."""
+    """Standard deviation of the parameters."""
 
-    reported: Literal[
-        "least_squares",
-        "independent_repetitions",
-        "phase_clustered",
-        "scatter_of_mean",
-        "posterior",
-    ]
-    """Method of `ParameterResult.std`."""
-    method: str  #: Description of estimate and reported standard deviation
+    method: str  #: Description of estimate and standard deviation
     interval_factor: float  #: Half width of a 95 % interval in standard deviations
-    least_squares: list[float]
-    independent_repetitions: list[float] | None
-    phase_clustered: list[float] | None
-    scatter_of_mean: list[float] | None
-    posterior: list[float] | None = None
 
 
 class Results(Frozen):
@@ -511,17 +434,16 @@ class Results(Frozen):
     correlation: list[list[float]]
     """Normalised Ψ of eq. 5 (signed), friction included, from the executed motion."""
     validation: list[ValidationResult]  #: Empty if nothing was held out
-    fitted: FittedResult | None = None
+    fitted: FittedResult
     calibration: CalibrationResult | None = None  #: Null without enough data
     delays: DelaysResult | None = None  #: Null if they could not be estimated
-    choices: list[ChoiceResult] = Field(default_factory=list)
-    """Automatic choices, in order."""
+    choices: list[Choice]  #: Settings chosen by inner prediction, in order
     coverage: CoverageResult | None
     verdict: VerdictResult
     essential: EssentialResult | None = None
     consistency: ConsistencyResult | None = None
     exports: ExportResult | None = None
-    judgement: JudgementResult | None = None
+    judgement: JudgementResult
     conduct: ConductResult | None = None  #: Null without a campaign folder
 
     @property
@@ -557,47 +479,3 @@ class Results(Frozen):
             first = error.errors()[0]
             problem = f"{first['msg'].lower()}; found {str(first['input'])[:80]!r}"
             raise refusal(problem, ".".join(str(part) for part in first["loc"])) from error
-
-
-def csv_tables(results: Results) -> dict[str, str]:
-    """Return the tables of results as CSV in full precision, by file name (path of the field).
-
-    Lists per joint become columns `field.joint`; columns of a matrix with one column per parameter
-    have the names of the parameters.
-    """
-    fields = results.model_dump(mode="json")
-    names = [parameter["name"] for parameter in fields["parameters"]]
-    tables = {}
-    for path, rows in _tables(fields, ""):
-        if isinstance(rows[0], dict):
-            records = [dict(_cells(row, fields["joint_names"])) for row in rows]
-        else:
-            heads = names if len(rows[0]) == len(names) else range(len(rows[0]))
-            records = [dict(zip(map(str, heads), row, strict=True)) for row in rows]
-        text = StringIO()
-        columns = dict.fromkeys(key for row in records for key in row)
-        writer = csv.DictWriter(text, list(columns), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(records)
-        tables[f"{path}.csv"] = text.getvalue()
-    return tables
-
-
-def _tables(value: dict[str, Any], path: str) -> Iterator[tuple[str, list[Any]]]:
-    """Yield path and rows of all lists of records and of all matrices."""
-    for name, item in value.items():
-        if isinstance(item, dict):
-            yield from _tables(item, f"{path}{name}.")
-        elif isinstance(item, list) and item:
-            records = all(isinstance(row, dict) for row in item)
-            matrix = all(isinstance(row, list) and len(row) == len(item[0]) > 0 for row in item)
-            if records or matrix:
-                yield f"{path}{name}", item
-
-
-def _cells(record: dict[str, Any], joints: list[str]) -> Iterator[tuple[str, Any]]:
-    for name, item in record.items():
-        if not isinstance(item, list | dict):
-            yield name, item
-        elif isinstance(item, list) and len(item) == len(joints):
-            yield from ((f"{name}.{joint}", cell) for joint, cell in zip(joints, item, strict=True))

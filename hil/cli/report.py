@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import typer
 
 from hil.campaign import Campaign
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
-from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
-from hil.results import Results, csv_tables
+from hil.results import Results
 
 
 def report(
     campaign: CampaignArgument,
-    csv: Path | None = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
@@ -23,15 +19,9 @@ def report(
 
     Uses the existing results without a new estimate. If archives were added since, or there are no
     results yet, identifies first as `hil identify` does.
-
-    Options:
-        csv: Folder for all tables of the results as CSV.
     """
     opened = Campaign.open(campaign)
     page = opened.report(reporter=make_reporter(quiet=quiet or json))
-    if csv is not None:
-        make_folder(csv)
-        write_files(csv, csv_tables(Results.load(opened.folder.results)))
     if not json:
         typer.echo(page)
         return

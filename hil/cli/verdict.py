@@ -25,12 +25,12 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
         typer.echo(as_json(results))
     else:
         lines = sentences(results, quiet=quiet)
-        if results.calibration is not None and not quiet:
-            lines.insert(0, results.calibration.words)
-        if results.fitted is not None and not quiet:
+        if not quiet:
+            if results.calibration is not None:
+                lines.insert(0, results.calibration.words)
             lines.insert(0, results.fitted.words)
-        for line in [] if quiet else table(results):
-            typer.echo(line, err=True)
+            for line in table(results):
+                typer.echo(line, err=True)
         for line in lines:
             say(line, err=True)
         say(results.verdict.line)
@@ -41,12 +41,8 @@ def finish(results: Results, *, json: bool, quiet: bool = False) -> None:
 def as_json(results: Results) -> str:
     """Return the verdict, its findings and the errors per joint as JSON."""
     fields = results.model_dump(mode="json")
-    judgement = fields["judgement"] or {}
-    found = fields["verdict"] | {
-        key: judgement[key]
-        for key in ("next_steps", "findings", "joints", "in_sample")
-        if key in judgement
-    }
+    keys = ("next_steps", "findings", "joints", "in_sample")
+    found = fields["verdict"] | {key: fields["judgement"][key] for key in keys}
     found["undetermined"] = [one.name for one in results.parameters if one.undetermined]
     found |= {key: fields[key] for key in ("delays", "fitted", "calibration", "exports")}
     return json_module.dumps(found)
@@ -54,8 +50,6 @@ def as_json(results: Results) -> str:
 
 def table(results: Results) -> list[str]:
     """Format one row per joint: errors on held-out motion, with references."""
-    if results.judgement is None:
-        return []
     joints, in_sample = results.judgement.joints, results.judgement.in_sample
     columns: list[tuple[str, Callable[[JointJudgement], str]]] = [
         ("joint", lambda joint: joint.joint),
@@ -80,7 +74,7 @@ def table(results: Results) -> list[str]:
 def sentences(results: Results, *, quiet: bool = False) -> list[str]:
     """Format the findings, from good to wrong, and the next steps."""
     judgement = results.judgement
-    if judgement is None or quiet:
+    if quiet:
         return [f"note: {warning}" for warning in results.verdict.warnings]
     findings = {finding.words for finding in judgement.findings}
     lines = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,8 +41,6 @@ from .prepared import Prepared
 from .sources import Source, Sources
 
 Array = NDArray[np.float64]
-
-_LAGS: Final = 150  # points of an autocorrelation figure
 
 
 def summarise(
@@ -88,7 +85,7 @@ def summarise(
         notes=list(prepared.notes),
         parameters=_parameters(cell, estimation, truth),
         n_base=len(model.base.names),
-        uncertainty=uncertainty_result(estimation),
+        uncertainty=results.UncertaintyResult.of(pooled),
         repetitions=[source.name for source in sources.training],
         repetition_values=[one.values.tolist() for one in estimate.repetitions],
         noise_std=pooled.noise_std.tolist(),
@@ -97,12 +94,7 @@ def summarise(
         fitted=_fitted(prepared, pooled.values),
         calibration=_calibration(prepared, estimation),
         delays=_delays(prepared),
-        choices=[
-            results.ChoiceResult.of(
-                choice, errors=[error if np.isfinite(error) else None for error in choice.errors]
-            )
-            for choice in prepared.settings.choices
-        ],
+        choices=[*prepared.settings.choices],
         coverage=None if truth is None else _coverage(pooled.values, pooled.std, truth),
         verdict=results.VerdictResult.of(verdict, warnings=[*verdict.warnings, *sources.warnings]),
         essential=None if isinstance(essential, str) else essential_result(essential),
@@ -180,24 +172,6 @@ def essential_result(choice: EssentialChoice) -> results.EssentialResult:
     )
 
 
-def uncertainty_result(estimation: Estimation) -> results.UncertaintyResult:
-    """Return the standard deviations by each method."""
-    result = estimation.result
-    pooled, many = result.pooled, len(result.repetitions) > 1
-    by_posterior = estimation.estimator == "prior"
-    reported = pooled.std.tolist()
-    return results.UncertaintyResult(
-        reported="posterior" if by_posterior else "phase_clustered",
-        method=pooled.method,
-        interval_factor=pooled.interval_factor,
-        least_squares=result.classical_std.tolist(),
-        independent_repetitions=result.independent_std.tolist() if many else None,
-        phase_clustered=None if by_posterior else reported,
-        scatter_of_mean=result.scatter_std.tolist() if many else None,
-        posterior=reported if by_posterior else None,
-    )
-
-
 def true_values(cell: Cell, header: ArchiveHeader) -> Array | None:
     """Return the parameters (p,) of the simulated arm, NaN of a torque ripple; None if unknown."""
     model, planted = cell.model, header.planted
@@ -229,13 +203,17 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
         factor = factor + Factor.from_samples(model, motion, samples.torque[part])
     gram = information(factor)
     most = coupling_index_max(len(gram))
-    criteria = Criteria.of_gram(gram, sum(lengths))
-    executed = results.CriteriaResult.of(criteria, coupling_index_max=most)
+    executed = Criteria.of_gram(gram, sum(lengths))
     planned = _planned(prepared.sources)
     if planned is None:
         duration = lengths[0] * _period(prepared.training[0])
         return results.ExcitationResult(
-            duration=duration, n_via=None, fly=None, planned=None, executed=executed
+            duration=duration,
+            n_via=None,
+            fly=None,
+            coupling_index_max=most,
+            planned=None,
+            executed=executed,
         ), gram
     trajectory, via_points = planned.trajectory, planned.via_points
     n_via = None
@@ -247,7 +225,8 @@ def _excitation(prepared: Prepared) -> tuple[results.ExcitationResult, Array]:
         n_via=n_via,
         fly=planned.fly,
         n_sines=trajectory.amplitude.shape[1] if isinstance(trajectory, FourierSeries) else None,
-        planned=results.CriteriaResult.of(planned.criteria, coupling_index_max=most),
+        coupling_index_max=most,
+        planned=planned.criteria,
         executed=executed,
     ), gram
 
@@ -381,9 +360,8 @@ def _judgement(
 
     checks, context, error = evidence.residuals, evidence.context, evidence.held_out
     assert checks is not None
-    correlation, drift, inertia = checks.autocorrelation, checks.drift, context.controller_inertia
+    inertia = context.controller_inertia
     limit = context.torque_limit
-    step = max(1, -(-len(correlation.lag) // _LAGS))
     joints = results.JointJudgement.rows(
         joint=joint_names,
         unit=["N·m" if evidence.revolute(j) else "N" for j in range(len(joint_names))],
@@ -407,8 +385,4 @@ def _judgement(
         joints=joints,
         speed=profile(checks.speed),
         position=profile(checks.position),
-        lag=correlation.lag[::step],
-        autocorrelation=correlation.correlation[::step].T,
-        effective_rows=np.nan_to_num(correlation.effective_rows),
-        friction_over_time=None if drift is None else drift.share.T,
     )

@@ -4,6 +4,5 @@ from __future__ import annotations
 
 from hil.report.page import report_bytes
 from hil.report.series import ReportSeries, SeriesError
-from hil.results import csv_tables
 
-__all__ = ["report_bytes", "ReportSeries", "SeriesError", "csv_tables"]
+__all__ = ["report_bytes", "ReportSeries", "SeriesError"]

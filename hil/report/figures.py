@@ -51,24 +51,17 @@ class Joint(NamedTuple):
 
 def joints_of(results: Results) -> list[Joint]:
     """Return the joints with their errors on the first run, or else on the fitted recording."""
-    units = [joint.unit for joint in results.judgement.joints] if results.judgement else []
-    example: ValidationResult | FittedResult | None = None
+    example: ValidationResult | FittedResult = results.fitted
     if results.validation:
         example = results.validation[0]
-    elif len(results.repetitions) == 1:
-        example = results.fitted
-
-    def error(j: int) -> str:
-        if example is None:
-            return ""
-        text = f"error {percent(example.relative_error[j])} %"
-        if example.all_rows_joint_errors:
-            text += f", all rows {percent(example.all_rows_joint_errors[j])} %"
-        return text
-
+    elif len(results.repetitions) > 1:
+        return [Joint(j, one.joint, one.unit, "") for j, one in enumerate(results.judgement.joints)]
+    errors = zip(example.relative_error, example.all_rows_joint_errors, strict=True)
     return [
-        Joint(j, name, units[j] if units else "N·m", error(j))
-        for j, name in enumerate(results.joint_names)
+        Joint(j, one.joint, one.unit, f"error {percent(moving)} %, all rows {percent(every)} %")
+        for j, (one, (moving, every)) in enumerate(
+            zip(results.judgement.joints, errors, strict=True)
+        )
     ]
 
 
@@ -147,8 +140,6 @@ def residual_panels(results: Results) -> dict[str, list[Panel]]:
     """Draw the mean residual of each joint over speed and over position."""
     judgement = results.judgement
     found: dict[str, list[Panel]] = {"speed_panels": [], "position_panels": []}
-    if judgement is None:
-        return found
     for what, per, profiles in (
         ("speed", "/s", judgement.speed),
         ("position", "", judgement.position),

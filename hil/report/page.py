@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -12,7 +11,8 @@ from hil.archive.header import ArchiveName
 from hil.report import figures
 from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
-from hil.results import ChoiceResult, RecordedResult, Results, outside_mark
+from hil.results import RecordedResult, Results, outside_mark
+from identification.selection.inner_prediction import Choice
 
 _MOST_CANDIDATES: Final = 6
 """Candidates shown of one choice: the first, and the best of the others."""
@@ -52,21 +52,19 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
 
 
 def every_row_errors(results: Results) -> list[float]:
-    """Return the median error of each joint over all rows; [] for older results."""
-    known = [run.all_rows_joint_errors for run in results.validation]
-    if not known and results.fitted is not None:
-        known = [results.fitted.all_rows_joint_errors]
-    return np.median(np.array(known), axis=0).tolist() if known and all(known) else []
+    """Return the median error of each joint over all rows."""
+    runs = results.validation
+    known = [run.all_rows_joint_errors for run in runs] or [results.fitted.all_rows_joint_errors]
+    return list(np.median(np.array(known), axis=0).tolist())
 
 
-def shown_candidates(choice: ChoiceResult) -> list[int]:
+def shown_candidates(choice: Choice) -> list[int]:
     """Return the indices of the candidates to show, the first one first."""
-    errors = [math.inf if error is None else error for error in choice.errors]
-    shown = list(range(len(errors)))
+    shown = list(range(len(choice.errors)))
     if len(shown) <= _MOST_CANDIDATES:
         return shown
     # The first is the default, with which the others were compared.
-    best = sorted(shown[1:], key=lambda k: (k != choice.chosen, errors[k]))
+    best = sorted(shown[1:], key=lambda k: (k != choice.chosen, choice.errors[k]))
     return [0, *best[: _MOST_CANDIDATES - 1]]
 
 

@@ -57,7 +57,8 @@ class CutRule:
 _BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
 
 
-class EliminationStep(NamedTuple):
+@dataclass(frozen=True)
+class EliminationStep:
     """Model after the removal of one more parameter."""
 
     removed: str | None  # None for the full model
@@ -92,7 +93,8 @@ class Elimination:
         return self.steps[self.cut]
 
 
-class BlindChoice(NamedTuple):
+@dataclass(frozen=True)
+class BlindChoice:
     """Parameters chosen within the fitted motion, evaluated on the held-out motion."""
 
     left: int  # parameters
