@@ -14,7 +14,6 @@ from types import FrameType
 from typing import Final, Literal
 
 from drivers.errors import DriverError
-from drivers.transports.faults import FaultyLink
 from hil.errors import ControllerFault, InputError
 from hil.reading import parse_port
 from sim_fixtures import ControllerSettings, SimulatedController, serve
@@ -144,16 +143,15 @@ def serve_session(
     link: serve.ControllerLink,
     pressed: Buttons,
     *,
-    faults: FaultyLink | None = None,
     patience: float = serve.PATIENCE,
     stretch: float = 0.0,
     watch: Callable[[SimulatedController, serve.ServeCounts], None] = lambda *_: None,
 ) -> Served:
     """Serve until a session has ended; a start aborted by the PC is repeated after a second.
 
-    `build` creates a controller that was just switched on; `faults` are of the link, by cycle of
-    each start; `patience` is the time for the arm to come to rest at the end, s; `stretch` the
-    longest extension of a cycle to wait for its reply, s; `watch` is called every cycle.
+    `build` creates a controller that was just switched on; `patience` is the time for the arm to
+    come to rest at the end, s; `stretch` the longest extension of a cycle to wait for its reply, s;
+    `watch` is called every cycle.
 
     Raises:
         InputError: the link cannot carry the session.
@@ -177,7 +175,7 @@ def serve_session(
 
         try:
             summary = serve.serve(
-                controller, link, faults=faults, request=pressed.request, watch=observe,
+                controller, link, request=pressed.request, watch=observe,
                 patience=patience, stretch=stretch,
             )  # fmt: skip
         except DriverError as error:

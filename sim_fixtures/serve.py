@@ -16,11 +16,10 @@ import socket
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
-from heapq import heappop, heappush
 from math import inf
 from select import select
 from typing import Final, Protocol
@@ -34,7 +33,6 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from drivers.transports.faults import FaultyLink
 from drivers.transports.simulated import Peer
 from sim_fixtures.errors import SimulationError
 
@@ -230,9 +228,6 @@ class ServeCounts:
             self.rejected += 1
 
 
-Delayed = tuple[float, int, bytes]
-
-
 class Clock(Protocol):
     """Clock and sleep functions, as of the module `time`."""
 
@@ -243,77 +238,10 @@ class Clock(Protocol):
         """Wait."""
 
 
-class Wire:
-    """A link with simulated faults; delayed packets are sent in `receive` and `sleep_until`."""
-
-    def __init__(self, link: ControllerLink, faults: FaultyLink | None, clock: Clock) -> None:
-        self._link = link
-        self._faults: Final = faults
-        self._clock = clock
-        self._leaving: list[Delayed] = []
-        self._arriving: list[Delayed] = []
-        self._order = 0
-
-    def send(self, cycle: int, packet: bytes) -> None:
-        """Send the packet of a cycle."""
-        if self._faults is None:
-            self._link.send(packet)
-            return
-        self._hold(self._leaving, self._faults.carry(cycle, "to_pc", packet))
-        self._release()
-
-    def receive(self, cycle: int, until: float) -> bytes | None:
-        """Return the next packet by the time `until`, or None; poll at least once."""
-        if self._faults is None:
-            return self._link.receive(max(0.0, until - self._clock.monotonic()))
-        while True:
-            now = self._release()
-            if self._arriving and self._arriving[0][0] <= now:
-                return heappop(self._arriving)[2]
-            next_event = min(until, _due(self._leaving), _due(self._arriving))
-            packet = self._link.receive(max(0.0, next_event - now))
-            if packet is not None:
-                self._hold(self._arriving, self._faults.carry(cycle, "to_controller", packet))
-            elif now >= until:
-                return None
-
-    @property
-    def waited(self) -> float:
-        """Time of the last packet in the kernel's queue [s]; 0 if unknown."""
-        return 0.0 if self._faults is not None else float(getattr(self._link, "waited", 0.0))
-
-    def sleep_until(self, moment: float) -> None:
-        """Wait, and send delayed packets meanwhile."""
-        while True:
-            now = self._release()
-            if now >= moment:
-                return
-            self._clock.sleep(min(moment, _due(self._leaving)) - now)
-
-    def _hold(self, queue: list[Delayed], deliveries: Sequence[tuple[float, bytes]]) -> None:
-        now = self._clock.monotonic()
-        for delay, packet in deliveries:
-            heappush(queue, (now + delay, self._order, packet))
-            self._order += 1
-
-    def _release(self) -> float:
-        """Send the packets that are due; return the time."""
-        now = self._clock.monotonic()
-        while self._leaving and self._leaving[0][0] <= now:
-            self._link.send(heappop(self._leaving)[2])
-        return now
-
-
-def _due(queue: list[Delayed]) -> float:
-    return queue[0][0] if queue else inf
-
-
 KNOCK_INTERVAL: Final = 1.0
 """Seconds between two first packets while no PC answers."""
 PATIENCE: Final = 3.0
 """Time for the arm to stop when the session is to end [s]."""
-_NO_CYCLE: Final = -1
-"""Cycle of repetitions of the first packet: a fault of cycle 0 occurs once."""
 _MOST_STRAY: Final = 100
 """Stray packets read after the end of a cycle, so that a flood cannot delay the next one."""
 
@@ -342,7 +270,6 @@ def serve(
     peer: ServedPeer,
     link: ControllerLink,
     *,
-    faults: FaultyLink | None = None,
     request: Callable[[], Request] = lambda: Request.CONTINUE,
     watch: Callable[[ServeCounts], None] = lambda _: None,
     clock: Clock = time,
@@ -352,7 +279,7 @@ def serve(
     """Run a controller on a real link until its session has ended; the link stays open.
 
     The first packet is repeated once a second until a PC answers, so that either program may be
-    started first. Cycle 0 of `faults` is that of the first packet.
+    started first.
 
     `request` is called every cycle. At `END` the controller ends its session; if the arm does not
     stop within `patience` s, its drive is switched off. At `ABORT` it stops at once. `watch` is
@@ -362,7 +289,7 @@ def serve(
     cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer within an
     extension is not waited for until it answers again.
     """
-    server = _Server(peer, Wire(link, faults, clock), clock, watch, stretch)
+    server = _Server(peer, link, clock, watch, stretch)
     if server.await_pc(request):
         server.run(request, patience)
     return server.counts
@@ -374,14 +301,14 @@ class _Server:
     def __init__(
         self,
         peer: ServedPeer,
-        wire: Wire,
+        link: ControllerLink,
         clock: Clock,
         watch: Callable[[ServeCounts], None],
         stretch: float,
     ) -> None:
         self.counts = ServeCounts()
         self._peer = peer
-        self._wire = wire
+        self._link = link
         self._clock = clock
         self._watch = watch
         self._period = peer.period
@@ -399,7 +326,7 @@ class _Server:
             return False
         while request() is Request.CONTINUE:
             sent = self._clock.monotonic()
-            self._wire.send(0 if self.counts.knocks == 0 else _NO_CYCLE, packet)
+            self._link.send(packet)
             self.counts.knocks += 1
             reply = self._first_reply(packet, sent + KNOCK_INTERVAL, request)
             if reply is not None:
@@ -426,7 +353,7 @@ class _Server:
         while True:
             if not self._apply(request(), patience):
                 return
-            self._wire.sleep_until(self._due)
+            self._sleep_until(self._due)
             self._count_lateness(excused=late_by_missing)
             packet = self._peer.next_packet()
             if packet is None:
@@ -442,7 +369,7 @@ class _Server:
         """Run one cycle with a packet; return whether it was answered."""
         sent = self._clock.monotonic()
         self.counts.cycles += 1
-        self._wire.send(self.counts.cycles - 1, packet)
+        self._link.send(packet)
         reply = self._reply(packet, sent + self._period)
         ending = self._finish_by is not None
         if reply is None and self._stretch and not (self._unanswered and ending):
@@ -452,9 +379,14 @@ class _Server:
         self._unanswered = reply is None
         if reply is not None:
             # By the kernel's time stamp: the time in the queue is not the PC's.
-            self.counts.answer.add(max(0.0, self._clock.monotonic() - sent - self._wire.waited))
+            waited = getattr(self._link, "waited", 0.0)
+            self.counts.answer.add(max(0.0, self._clock.monotonic() - sent - waited))
         self._hand_over(packet, reply)
         return reply is not None
+
+    def _sleep_until(self, moment: float) -> None:
+        while (now := self._clock.monotonic()) < moment:
+            self._clock.sleep(moment - now)
 
     def _stay_silent(self) -> bool:
         """Run one cycle of a booting controller, without a packet."""
@@ -491,7 +423,7 @@ class _Server:
         wanted = next_number(packet_number(packet))
         stray = 0
         while stray < _MOST_STRAY:
-            answer = self._wire.receive(self.counts.cycles - 1, until)
+            answer = self._link.receive(max(0.0, until - self._clock.monotonic()))
             if answer is None:
                 return None
             number = _number(answer)

@@ -10,7 +10,6 @@ from typing import Annotated, Final, Literal
 
 import typer
 
-from drivers.transports.faults import FaultyLink
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
@@ -168,7 +167,7 @@ def simulate(
         own_motion: In mode 0 the controller's own program moves the arm.
         own_speed: Speed of that motion, as a fraction of full speed.
         effects: Simulate effects that the identified model does not contain.
-        fault: Fault to inject (repeatable).
+        fault: Fault of the controller to inject (repeatable).
         seed: Seed of noise and model errors.
         duration: Time after which the session is ended, s.
         priority: Real-time priority (SCHED_FIFO) to request.
@@ -193,6 +192,9 @@ def simulate(
         own_speed=own_speed,
     )
     on_link, in_controller = split_faults(map(parse_fault, fault or ()))
+    if on_link:
+        remedy = "disturb the network instead, with `tc qdisc add ... netem`"
+        raise InputError(None, "faults of the link", field="--fault", remedy=remedy)
 
     def build() -> SimulatedController:
         return simulated_controller(
@@ -208,7 +210,6 @@ def simulate(
                 build,
                 link,
                 pressed,
-                faults=FaultyLink(on_link, settings.period) if on_link else None,
                 # The controller's own program stops at the next posture only.
                 patience=OWN_MOVE if own_motion else PATIENCE,
                 stretch=patience,

@@ -283,14 +283,10 @@ def test_a_missing_pc_and_an_interrupt_have_an_exit_status():
 def test_scripted_faults_strike_over_real_sockets():
     ours, theirs = session(
         ["--cycle", "2", *SLOW_MACHINE,
-         "--fault", "lose@60x5", "--fault", "lose@70x4:to_controller", "--fault", "duplicate@80",
-         "--fault", "delay@90:5ms:to_controller", "--fault", "e-stop@400"],
+         "--fault", "e-stop@400"],
         ["--exit-after", "0"],
         until=[opened(), OFF],
     )  # fmt: skip
-    assert ours["missed"] >= 10
-    assert ours["late"] >= 1
-    assert ours["surplus"] >= 1
     assert ours["reason"] == "emergency stop"
     assert [state for state in theirs["story"] if state in (OFF, ENDED)][-2:] == [OFF, ENDED]
 
@@ -388,6 +384,7 @@ def invoke(*options: str) -> Any:
         (["--can", "socketcan"], "INTERFACE:CHANNEL"),
         (["--udp", "127.0.0.1:2001", "--mode", "3"], "open_mode"),
         (["--udp", "127.0.0.1:2001", "--fault", "lose"], "lose@1200x3"),
+        (["--udp", "127.0.0.1:2001", "--fault", "lose@1200x3"], "netem"),
         (["--udp", "127.0.0.1:2001", "--fault", "explode@3"], "explode"),
         (["--udp", "127.0.0.1:2001", "--fault", "saturate@3:axis=9"], "axes 1..6"),
     ],

@@ -93,18 +93,6 @@ class TestViaPoints:
         assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
         assert np.all((speed >= genome.slowest) & (speed <= 1.0))
 
-    def test_each_gene_moves_one_coordinate_or_one_speed(self):
-        genes = some_genes(OPEN, 1)
-        points, speed = OPEN.decode(genes)
-        for index in range(OPEN.n_genes):
-            moved = genes.copy()
-            moved[0, index] = 1.0 - moved[0, index]
-            other_points, other_speed = OPEN.decode(moved)
-            changed = np.concatenate(
-                ((other_points != points).ravel(), (other_speed != speed).ravel())
-            )
-            assert np.flatnonzero(changed).tolist() == [index]
-
     @pytest.mark.parametrize("genome", [OPEN, CLOSED])
     def test_motions_are_those_of_the_planner(self, genome):
         genes = some_genes(genome, 6)
@@ -134,16 +122,6 @@ class TestObstacles:
                 steps = int(np.ceil(np.max(np.abs(end - start)) / 0.1)) + 1
                 assert checker.clear(np.linspace(start, end, steps + 1)).all()
 
-    def test_a_population_covers_the_free_range(self, checker):
-        genome = ViaPointGenome(LIMITS, n_via=6, home=HOME, checker=checker)
-        genes = genome.sample(np.random.default_rng(4), 30)
-        np.testing.assert_array_equal(genome.sample(np.random.default_rng(4), 30), genes)
-        coordinates = genes[:, :36].reshape(-1, 6)
-        assert kstest(coordinates[:, 5], "uniform").pvalue > 0.001  # the flange turns in place
-        postures = np.random.default_rng(5).random((500, 6))
-        clear = checker.clear(LIMITS.lower + postures * (LIMITS.upper - LIMITS.lower))
-        assert np.all(np.ptp(coordinates, axis=0) > 0.9 * np.ptp(postures[clear], axis=0))
-
     def test_a_population_without_free_space(self, checker):
         everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
         blocked = CollisionChecker(urdf_text(), everywhere)
@@ -171,14 +149,6 @@ class TestSines:
         np.testing.assert_allclose(frequency[0], np.tile(largest[:, None], 3), rtol=1e-15)
         np.testing.assert_allclose(BARE.frequency_range[0], 0.314, atol=5e-4)  # Table 1, for 20 s
         assert not np.any(RAMPED.motions(np.full((1, RAMPED.n_genes), 0.5))[0].amplitude)
-
-    @given(genes=genes_of(BARE))
-    @settings(max_examples=25, deadline=None)
-    def test_bare_sines_keep_the_limits_of_position_and_acceleration(self, genes):
-        (motion,) = BARE.motions(genes)
-        q, _, qdd = motion.sample(np.linspace(0.0, 20.0, 4001))
-        assert np.all((q >= LIMITS.lower - 1e-12) & (q <= LIMITS.upper + 1e-12))
-        assert np.all(np.abs(qdd) <= LIMITS.acceleration * (1.0 + 1e-12))
 
     @pytest.mark.parametrize(
         ("name", "setting"),

@@ -118,17 +118,6 @@ class TestWriting:
         journal.close()
         assert known(io.BytesIO(file.getvalue())) == 5
 
-    def test_the_file_is_synced_at_intervals_and_at_the_end(self, tmp_path, monkeypatch):
-        synced = []
-        monkeypatch.setattr(os, "fsync", synced.append)
-        with (tmp_path / "journal").open("x+b", buffering=0) as file:
-            journal = Journal(file, SEARCH)
-            for seed in range(20):
-                journal.record(*generation(seed))
-            assert len(synced) <= 1
-            journal.close()
-            assert len(synced) >= 1
-
 
 FIRST_LINE = b"hil search journal 2\n"
 

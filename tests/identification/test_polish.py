@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification.excitation import KINDS, Scale, Scores
-from identification.excitation.searches.run import dominating, generation_size, polish
+from identification.excitation.searches.run import dominating, polish
 from identification.excitation.searches.scores import unplanned
 
 N = 12
@@ -96,13 +96,6 @@ class TestPolish:
         np.testing.assert_allclose(genes, TARGET, atol=1e-3)
         assert scores.rows.tobytes() == Bowl().score(genes[None].copy()).rows.tobytes()
 
-    @pytest.mark.parametrize("evaluations", [1, 7, 40, 333])
-    def test_complete_generations_are_scored(self, evaluations):
-        population = Bowl()
-        polished(population, START, evaluations=evaluations)
-        size = generation_size(N)
-        assert [len(genes) for genes in population.scored] == [size] * (evaluations // size)
-
     @pytest.mark.parametrize(
         ("score", "start", "fitness"),
         [
@@ -176,18 +169,6 @@ class TestPolish:
         largest = TwoGoals().score(TARGET[None])
         found, _ = polished(TwoGoals(), TARGET, dominating(largest), evaluations=500)
         assert found.tobytes() == TARGET.tobytes()
-
-    @given(st.floats(50, 150), st.floats(30, 300), st.sampled_from([None, SPREADS]))
-    def test_fitness_is_positive_only_for_dominating_motions(
-        self, log10_det, coupling_index, scale
-    ):
-        fitness = dominating(scores_of([100.0], [80.0]), scale)
-        merit = fitness(scores_of([log10_det], [coupling_index]))[0]
-        assert fitness(scores_of([100.0], [80.0]))[0] == 0.0
-        if log10_det < 100.0 or coupling_index > 80.0:
-            assert merit < 0.0
-        elif log10_det > 100.0 or coupling_index < 80.0:
-            assert merit > 0.0
 
     @pytest.mark.slow
     def test_the_threads_of_linear_algebra_change_nothing(self):

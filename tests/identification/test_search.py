@@ -1,7 +1,6 @@
 import io
 import os
 import signal
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -322,21 +321,6 @@ class TestScores:
         assert scorers.score(rows[order]).rows.tobytes() == expected.rows[order].tobytes()
         alone = [scorers.score(rows[k : k + 1]).rows for k in range(3)]
         assert np.concatenate(alone).tobytes() == expected.rows[:3].tobytes()
-
-    @pytest.mark.slow
-    def test_a_timeout_applies_to_a_motion_alone(self, scorers):
-        """The other motions of its batch are scored."""
-        rows = genes(8, seed=4) * 0.9
-        rows[5, 0] = 1.0
-        with Population(problem(faulty(hang=(0.99, 1.0))), timeout=5.0) as slow:
-            begin = time.monotonic()
-            scores = slow.score(rows)
-            assert (
-                time.monotonic() - begin > 10.0
-            )  # once in company, once with all the time for itself
-        others = np.arange(8) != 5
-        np.testing.assert_array_equal(scores.feasible, others)
-        assert scores.rows[others].tobytes() == scorers.score(rows[others]).rows.tobytes()
 
     def test_unplannable_genes_are_worst_with_a_violation(self, scorers):
         rows = genes(3)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from planner import JointLimits, PiecewiseCubic, plan
+from planner import JointLimits, PiecewiseCubic
 from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, ranked, solve_many
 from planner.errors import UnsupportedSolver
 from planner.interpolator import corner
@@ -50,19 +50,6 @@ def test_the_line_is_straight_for_any_slowest_joint():
     extrema = motion.extrema()
     assert np.all(extrema.acceleration <= limits.acceleration * (1 + 1e-12))
     assert np.all(extrema.jerk <= limits.jerk * (1 + 1e-12))
-
-
-def test_states_and_parts_are_those_of_the_complete_motion():
-    moves = straight(*random_points(4, 2), SIX_AXES)
-    motion, duration = straight_table(moves), float(moves.durations[0])
-    for t in (0.0, 0.05, 0.4, duration):
-        state = np.stack(motion.sample_one(t), axis=1)
-        np.testing.assert_allclose(moves.states(np.array([t]))[0], state, atol=1e-12)
-    part = straight_table(moves, 0.1, 0.7 * duration)
-    assert part.duration == pytest.approx(0.7 * duration - 0.1)
-    times = np.linspace(0.0, part.duration, 23)[1:-1]
-    for ours, whole in zip(part.sample(times), motion.sample(times + 0.1), strict=True):
-        np.testing.assert_allclose(ours, whole, atol=1e-12)
 
 
 def test_deceleration_limits_the_second_ramp():
@@ -255,18 +242,6 @@ class TestPassing:
         assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
         assert passed.distance == pytest.approx(0.5, abs=1e-12)
 
-    def test_a_point_on_the_path_is_met(self):
-        # As long as a join, at rest at one end, at both, or at neither.
-        points = random_points(1, 3)
-        joined = flown(points, SIX_AXES).join
-        start, stop = (plan(points[k : k + 2], SIX_AXES) for k in (0, 1))
-        for motion in (joined, start, stop):
-            for time in np.linspace(0.01, 0.99, 37) * motion.duration:
-                here = motion.sample_one(time)[0]
-                passed = passing(motion, here)
-                assert passed.distance < 1e-8
-                assert motion.sample_one(passed.time)[0] == pytest.approx(here, abs=1e-7)
-
     @given(
         arrays(np.float64, (2, 3), elements=numbers),
         arrays(np.float64, (2, 4), elements=numbers),
@@ -284,7 +259,3 @@ class TestPassing:
         # The path has this distance at this time.
         reached = motion.sample_one(passed.time)[0]
         assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
-
-    def test_a_motion_of_no_length_is_where_it_is(self):
-        still = PiecewiseCubic((np.zeros(2),), (np.zeros((1, 4)),))
-        assert passing(still, np.array([0.25])) == (0.0, 0.25)

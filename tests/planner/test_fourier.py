@@ -213,15 +213,6 @@ def test_the_papers_bounds_limit_position_and_acceleration(seed, harmonics):
     assert np.all(extrema.acceleration <= limits.acceleration)
 
 
-def test_the_papers_bounds_are_the_largest_of_their_kind():
-    bounds = harmonic_bounds(SIX_AXES, np.zeros(6), 1)
-    on_bounds = FourierSeries(np.zeros(6), bounds.amplitude[:, None], bounds.frequency[:, None], 60)
-    extrema = on_bounds.extrema()
-    room = np.minimum(SIX_AXES.upper, -SIX_AXES.lower)
-    np.testing.assert_allclose(extrema.upper, room, rtol=1e-9)
-    np.testing.assert_allclose(extrema.acceleration, SIX_AXES.acceleration, rtol=1e-9)
-
-
 def test_the_papers_bounds_need_an_offset_inside_the_limits():
     for offset in (SIX_AXES.upper, SIX_AXES.lower - 1.0, [0.0], [np.nan] * 6):
         with pytest.raises(InvalidSetting):

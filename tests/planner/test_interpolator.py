@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from scipy.spatial import cKDTree
 
 from planner import JointLimits
-from planner.errors import InvalidSetting, PlannerCrashed, PlannerNotStarted
+from planner.errors import PlannerCrashed, PlannerNotStarted
 from planner.interpolator import Interpolator, corner
 from planner.moves import Move, Overrides, plan_moves
 from planner.rrs import (
@@ -320,23 +320,6 @@ def test_stop_and_continue_stay_on_the_path(points, off_path, when, pause, perce
     assert kinds.count(EventKind.MOTION_STOPPED) == int(rested)
 
 
-@pytest.mark.parametrize("after", [20, 60, 120, 180, 199])
-def test_an_unchanged_override_does_not_change_the_motion(points, after):
-    """The arm accelerates so fast that within the bounds of an override it would overshoot."""
-
-    def continued(*, again):
-        interpolator = ready(SIX_AXES, points[0], fly=50.0)
-        queue(interpolator, points[1:])
-        commands = {
-            200: [interpolator.stop_motion],
-            400: [interpolator.continue_motion],
-            400 + after: [lambda: interpolator.set_override_speed(100.0)] if again else [],
-        }
-        return positions(run(interpolator, commands))
-
-    np.testing.assert_allclose(continued(again=True), continued(again=False), rtol=0, atol=1e-12)
-
-
 def test_a_stopped_arm_rests_until_continued(points):
     interpolator = ready(SIX_AXES, points[0], fly=50.0)
     queue(interpolator, points[1:])
@@ -523,19 +506,6 @@ def test_a_corner_with_a_jump_is_refused(monkeypatch):
     steps = steps_to_rest(interpolator)
     assert events(steps) == [(EventKind.MOTION_ENDED, 1)]
     assert max(worst_ratios(points[0], positions(steps), SIX_AXES)) <= 1.0 + 1e-5
-
-
-@pytest.mark.parametrize(
-    ("period", "options"),
-    [
-        (np.nan, {}),
-        (PERIOD, {"override_bounds": (1.0, 1.7)}),
-        (PERIOD, {"stop_bounds": (1.2, 3.0)}),
-    ],
-)
-def test_impossible_periods_and_bounds_are_refused(period, options):
-    with pytest.raises(InvalidSetting):
-        Interpolator(SIX_AXES, period, **options)
 
 
 def test_joints_at_an_end_of_their_range_are_flagged():

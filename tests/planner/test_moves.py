@@ -289,46 +289,6 @@ class TestCorners:
         assert fast < slow
 
 
-def speedings(limits, count):
-    """Via points far and near, some in a corner of the range, each with rising speeds."""
-    random = np.random.default_rng(5)
-    half, centre = (limits.upper - limits.lower) / 2.0, (limits.upper + limits.lower) / 2.0
-    for _ in range(count):
-        shares = random.uniform(-1.0, 1.0, (random.integers(3, 6), limits.n_joints))
-        points = centre + half * shares * random.choice([1.0, 0.2, 0.03, 1e-4])
-        if random.random() < 0.2:
-            on = random.random(limits.n_joints) < 0.5
-            points[1] = np.where(on, limits.lower, limits.upper)
-        yield points, np.sort(random.uniform(0.05, 1.0, 4))
-
-
-def lengthened(limits, percent: float, count: int) -> list[float]:
-    """Relative increases of the duration with more speed, where there are any."""
-    grown = []
-    for points, speeds in speedings(limits, count):
-        durations = [
-            plan_moves(
-                points[0], [Move(p, speed=s, fly_percent=percent) for p in points[1:]], limits
-            ).duration
-            for s in speeds
-        ]
-        grown += [fast / slow - 1.0 for slow, fast in pairwise(durations)]
-    return [share for share in grown if share > 1e-9]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("percent", "most"), [(25.0, 0), (50.0, 0), (75.0, 30)])
-def test_more_speed_lengthens_few_of_ten_thousand_motions(percent, most):
-    """None to half of the ramps, though the solver can miss the fastest join (`docs/motion.md`).
-
-    Beyond, a joint can be unable to take a certain time from one moving state to another: too fast
-    to stop on the way, too slow without. A higher speed can bring a corner into such a gap.
-    """
-    increases = lengthened(SIX_AXES, percent, 3400)
-    assert len(increases) <= most
-    assert max(increases, default=0.0) < 0.1
-
-
 BAD_MOVES = (
     *({"target": target} for target in ([], [[1.0]], ["north"])),
     *({"speed": speed} for speed in (0.0, 1.1, float("nan"), None)),

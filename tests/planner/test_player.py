@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -11,8 +10,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from drivers.exchange.motion_transfer import pack, unpack
-from drivers.execution import MotionExecution
 from drivers.guard import Guard, GuardLimits
 from planner import (
     FourierSeries,
@@ -117,40 +114,6 @@ def test_a_stop_stays_on_the_path_and_within_its_bounds(motions, which, share, p
     q = motion.sample(np.array(times))[0] + offset
     assert np.all(np.diff(times) >= 0.0)
     np.testing.assert_allclose(positions[1 + played :], q[1 + played :], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("moved", [False, True])
-def test_a_copy_in_another_process_plays_the_same_with_read_only_tables(motions, moved):
-    player = TrajectoryPlayer(motions[0], PERIOD, SIX_AXES)
-    if moved:
-        player.begin(player.start)
-        for _ in range(200):
-            player.advance()
-        player.override(0.4)
-        player.advance()
-    descriptor = pack(player)
-    try:
-        copy = unpack(descriptor)
-    finally:
-        os.close(descriptor)
-    runs = []
-    for each in (player, copy):
-        if not moved:
-            each.begin(each.start)
-        given = [each.advance() for _ in range(100)]
-        each.hold()
-        given += [each.advance() for _ in range(30)]
-        each.resume()
-        each.override(0.7)
-        given += [each.advance() for _ in range(300)]
-        each.stop()
-        while not each.finished:
-            given.append(each.advance())
-        runs.append(given)
-    np.testing.assert_array_equal(*runs)
-    # Tables and cubics are mapped; what is copied of them would be read from the pickle.
-    assert not copy._table.position.flags.writeable
-    assert not copy._path._pieces.flags.writeable
 
 
 def test_a_start_that_moves_the_motion_out_of_its_range_is_refused():
@@ -551,22 +514,6 @@ def test_an_override_out_of_range_changes_nothing(live_motions, fraction):
         arm.player.override(fraction)
     arm.run(100)
     assert arm.player.rate == 1.0
-
-
-def test_the_session_overrides_and_stops_it(live_motions):
-    player = TrajectoryPlayer(live_motions[0], PERIOD, SIX_AXES)
-    stop_cycles = int(0.5 / PERIOD)
-    execution = MotionExecution(player, 6, settle_cycles=3, stop_cycles=stop_cycles)
-    assert execution.override(0.9) is None  # before it begins, as after
-    execution.begin(player.start, 0)
-    bounds = [execution.advance(cycle)[2] for cycle in range(200)]
-    assert execution.override(0.1) is None
-    bounds += [execution.advance(cycle)[2] for cycle in range(200, 300)]
-    execution.stop("enough", 300)
-    bounds += [execution.advance(cycle)[2] for cycle in range(300, 300 + stop_cycles)]
-    assert bounds == ["plan"] * 200 + ["override"] * 100 + ["stop"] * stop_cycles
-    assert execution.settled
-    assert execution.override(1.5) is not None
 
 
 def test_a_motion_that_ends_during_a_hold_has_ended(live_motions):

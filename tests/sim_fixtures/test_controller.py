@@ -24,7 +24,6 @@ from drivers.packets import (
 from sim_fixtures import (
     ControllerSettings,
     Phase,
-    PlantTruth,
     SettingError,
     SimulatedController,
     SimulatedDrive,
@@ -144,14 +143,6 @@ class TestStart:
         # each axis enters open mode in a cycle of its own
         assert [modes.count(4) for _, modes in seen[3:]] == [1, 2, 3, 4, 5, 6]
         assert all(status == 5 for status, _ in seen[1:])
-
-    def test_before_the_drive_is_on_only_the_measurement_is_filled(self) -> None:
-        controller = make(encoder_noise=0.0)
-        run_to(controller, Phase.DRIVE_OFF)
-        d = step(controller).axes["d"]
-        np.testing.assert_array_equal(d[:, [0, 1, 3, 4]], 0.0)
-        measured = np.array(DRIVE.motor_revolutions(HOME.tolist()))
-        np.testing.assert_allclose(d[:, 2], measured, atol=1.0 / DRIVE.encoder_counts)
 
     def test_the_first_target_is_where_the_motors_stand(self) -> None:
         controller = make()
@@ -366,12 +357,6 @@ class TestCurrentsAreTorques:
         assert (wrong / right).max() > 50.0
 
 
-def test_truth_and_drive_must_have_as_many_axes() -> None:
-    truth = PlantTruth.frictionless(np.ones(5))
-    with pytest.raises(SettingError, match="6 axes"):
-        SimulatedController(ns16.urdf_text(), DRIVE, truth, ControllerSettings(), seed=1)
-
-
 def axes_at(controller: SimulatedController, phase: Phase, n: int) -> NDArray[np.void]:
     """Axis blocks of the first packet of a phase, with everything echoed until then."""
     run_to(controller, phase)
@@ -459,11 +444,6 @@ def test_long_packets_have_732_bytes_and_a_tail_that_one_seed_repeats() -> None:
     assert long != packets(long_packets=True, seed=2)
 
 
-def test_an_unknown_open_mode_is_refused() -> None:
-    with pytest.raises(SettingError, match="open_mode"):
-        small_cell.controller(open_mode=3)
-
-
 PERIOD = 0.002
 SPEED = np.array([2.0, 3.0])
 angles = st.floats(-2.0, 2.0)
@@ -506,15 +486,6 @@ def test_speed_and_acceleration_keep_their_bounds(
     assert np.all(np.abs(np.diff(qd, axis=0)) / PERIOD <= SPEED / RUN_UP * (1.0 + 1e-6))
 
 
-def test_end_finishes_the_present_move_of_an_own_motion() -> None:
-    made = motion((0.5, 0.5), (1.0, 1.0))
-    while made.at_rest:
-        made.advance()
-    made.end()
-    q, _ = played(made)
-    np.testing.assert_array_equal(q[-1], (0.5, 0.5))
-
-
 def test_a_repeated_own_motion_moves_back_and_forth() -> None:
     a, b, c = stops = [(0.5, -0.3), (-0.2, 0.4), (0.1, 0.1)]
     for postures, expected in ((stops, [a, b, c, b, a, b, c, b]), ([a], [a])):
@@ -527,12 +498,6 @@ def test_a_repeated_own_motion_moves_back_and_forth() -> None:
             if moved and made.at_rest:
                 visited.append(tuple(made.position.tolist()))
         assert visited[:8] == expected
-
-
-@pytest.mark.parametrize("speed", [0.0, np.inf, np.nan])
-def test_an_own_motion_needs_velocity_limits(speed: float) -> None:
-    with pytest.raises(SettingError, match="velocity limits"):
-        OwnMotion([(0.0, 0.0)], speed=[1.0, speed], period=PERIOD)
 
 
 AXES = small_cell.N
@@ -633,22 +598,6 @@ class TestFields:
         without = receive(unchanged).axes["d"][:, 4]
         np.testing.assert_allclose(with_it - without, extra, atol=1e-6)
 
-    def test_in_mode_1_d4_takes_the_place_of_d2_in_the_speed_loop(self) -> None:
-        def current_after(d2: float, d4: float) -> Any:
-            controller = opened(open_mode=1)
-            target = np.array(controller.servo.target)
-            for k in range(3):
-                step(controller, {1: target + d2 * (k + 1), 2: d2, 4: d4})
-            return receive(controller).axes["d"][:, 4]
-
-        with_it, without = current_after(1e-3, 1e-3), current_after(1e-3, 0.0)
-        as_mode_4 = opened()
-        target = np.array(as_mode_4.servo.target)
-        for k in range(3):
-            step(as_mode_4, {1: target + 1e-3 * (k + 1), 2: 1e-3})
-        np.testing.assert_array_equal(with_it, receive(as_mode_4).axes["d"][:, 4])
-        assert np.all(with_it > without)
-
     def test_a_current_cannot_be_added_beyond_the_limit(self) -> None:
         controller = opened(open_mode=9)
         step(controller, {5: 100.0})
@@ -663,15 +612,6 @@ class TestFields:
 
 
 class TestWithoutAnAnswer:
-    def test_hold_keeps_the_last_target(self) -> None:
-        controller = opened(missed_replies=10)
-        target = drive_at_speed(controller, speed=0.002)
-        for _ in range(3):
-            receive(controller)
-            controller.accept(None)
-        assert controller.phase is Phase.OPEN
-        np.testing.assert_allclose(controller.servo.target, np.float32(target))
-
     def test_continue_extrapolates_then_ramps_down(self) -> None:
         controller = opened(missed_replies=4, while_silent="continue", ramp_time=0.1)
         target = drive_at_speed(controller)
@@ -689,20 +629,6 @@ class TestWithoutAnAnswer:
         assert reasons[2:5] == ["", *["no valid reply in 4 cycles of open mode"] * 2]
         # 0.2 s after the ramp the integral parts still unwind
         assert np.abs(controller.plant.velocity).max() < 1e-3 * small_cell.SPEED[0]
-
-    def test_axes_open_again_only_once_the_ramp_is_over(self) -> None:
-        controller = opened(while_silent="continue", ramp_time=0.2)
-        drive_at_speed(controller)
-        receive(controller)
-        controller.accept(None)
-        closed = 0
-        while controller.phase is Phase.CLOSED:
-            receive(controller)
-            controller.accept(None)
-            closed += 1
-        assert controller.phase is Phase.OPENING
-        assert closed >= 200
-        assert not any(controller.servo.delta)
 
     def test_drive_off_takes_the_drive_away_with_the_last_missing_answer(self) -> None:
         controller = opened(missed_replies=3, while_silent="drive_off")
@@ -745,15 +671,6 @@ class TestLeaving:
             seen.append(tuple(CyclicPacket.decode(packet, AXES).axes["mode"].tolist()))
         assert seen == sorted(seen[:7], reverse=True) + sorted(seen[7:])
         assert seen[-1] == (4, 4)
-
-
-class TestPauses:
-    def test_without_a_drive_there_is_nothing_to_pause(self) -> None:
-        controller = opened()
-        controller.lose_drive("emergency stop")
-        controller.pause(502, 5)
-        assert step(controller).axes["mode"].tolist() == [4, 4]
-        assert controller.phase is Phase.TRIPPED
 
 
 FINE = Answer(valid=True)
@@ -826,17 +743,6 @@ def lose_opening(loop: LoopProgram) -> None:
         advance(loop, answer=MISSING)
 
 
-def test_after_a_lost_opening_the_axes_stay_closed_for_a_while() -> None:
-    loop = program(reopening_time=0.05)
-    advance_to(loop, Phase.OPENING)
-    assert loop.openings_lost == 0
-    lose_opening(loop)
-    assert phases_to(loop, Phase.OPENING) == [Phase.CLOSED] * 50
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=Answer(valid=True, exit=True))
-    assert phases_to(loop, Phase.OPENING) == [Phase.CLOSING] * 2 + [Phase.CLOSED] * 2
-
-
 @pytest.mark.parametrize(
     ("lost_by", "reason"),
     [
@@ -857,42 +763,6 @@ def test_the_session_ends_after_some_lost_openings_in_a_row(lost_by: Answer, rea
     assert loop.gave_up
     advance_to(loop, Phase.ENDED)
     assert loop.reason == f"open mode was lost 3 times in a row: {reason}"
-
-
-def test_an_opening_that_the_pc_ends_resets_the_count_of_lost_ones() -> None:
-    loop = program(lost_openings=2)
-    for _ in range(5):
-        lose_opening(loop)
-        advance_to(loop, Phase.OPEN)
-        advance(loop, answer=Answer(valid=True, exit=True))
-        assert loop.openings_lost == 0
-    assert not loop.gave_up
-
-
-def test_finish_does_not_wait_for_the_next_opening() -> None:
-    loop = program(reopening_time=1.0)
-    lose_opening(loop)
-    loop.finish()
-    advance(loop, 3)
-    assert loop.phase is Phase.SHUTDOWN
-
-
-def test_an_emergency_stop_while_giving_up_still_ends_the_session() -> None:
-    loop = program(lost_openings=1)
-    lose_opening(loop)
-    loop.trip("emergency stop")
-    advance_to(loop, Phase.ENDED)
-    assert loop.gave_up
-
-
-def test_the_reason_distinguishes_replies_missed_before_open_mode() -> None:
-    loop = program(missed_replies=5)
-    advance_to(loop, Phase.CLOSED)
-    while loop.phase is not Phase.OPENING:
-        advance(loop, answer=MISSING)
-    while loop.phase is Phase.OPENING:
-        advance(loop, answer=MISSING)
-    assert loop.reason == "no valid reply in 5 cycles in a row, the last 3 of them in open mode"
 
 
 def test_long_silence_ends_the_session() -> None:
@@ -938,19 +808,3 @@ def test_finish_waits_until_the_arm_is_at_rest() -> None:
     assert loop.phase is Phase.CLOSING
     phases = phases_to(loop, Phase.ENDED)
     assert phases[-3:] == [Phase.SHUTDOWN, Phase.SHUTDOWN, Phase.ENDING]
-
-
-def test_the_program_ends_after_its_intervals() -> None:
-    loop = program(open_intervals=1)
-    advance_to(loop, Phase.OPEN)
-    advance(loop, answer=Answer(valid=True, exit=True))
-    advance_to(loop, Phase.ENDED)
-    assert loop.intervals == 1
-
-
-def test_finish_in_drive_off_ends_without_driving_on() -> None:
-    loop = program()
-    advance_to(loop, Phase.DRIVE_OFF)
-    loop.finish()
-    advance(loop, 3)
-    assert loop.phase is Phase.ENDED

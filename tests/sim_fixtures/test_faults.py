@@ -209,11 +209,6 @@ def test_a_load_raises_the_current_while_it_lasts() -> None:
     assert np.abs(current[-50:]).max() < 0.5 * limit
 
 
-def test_closed_brakes_bear_the_load() -> None:
-    pc = run(300, "saturate@20x200:axis=1", drive_off_cycles=250)
-    np.testing.assert_array_equal(pc.controller.plant.position, small_cell.HOME)
-
-
 def test_an_axis_beyond_those_of_the_arm_is_refused() -> None:
     with pytest.raises(SettingError, match=r"axes 1\.\.2"):
         run(1, "axis-leaves@100:axis=3")
@@ -234,19 +229,6 @@ class TestOwnMotion:
         target, measured = (np.array([row.axes["d"][:, k] for row in on]) for k in (0, 2))
         assert np.ptp(target[:, 0]) > 5.0
         assert np.abs(target - measured).max() < 0.3 * small_cell.FOLLOWING_ERROR
-
-    def test_a_repeated_one_continues_until_the_session_ends(self) -> None:
-        changes = {"own_motion": self.POSTURES, "own_speed": 1.0, "own_motion_repeats": True}
-        pc = run(5000, **changes)  # once through the list takes less than half of that
-        assert pc.controller.phase is Phase.MOVING
-        pc.controller.finish()
-        pc.run_to_end()
-
-    def test_replies_of_the_pc_have_no_effect(self) -> None:
-        def last(step: float) -> bytes:
-            return run(900, own_motion=self.POSTURES, step=step).packets[-1]
-
-        assert last(0.0) == last(0.01)
 
     def test_it_ends_with_a_trip(self) -> None:
         pc = run(600, "e-stop@300", own_motion=self.POSTURES)

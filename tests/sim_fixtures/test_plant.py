@@ -163,14 +163,6 @@ def test_closed_brakes_stop_and_hold_the_arm() -> None:
     assert plant.velocity.any()
 
 
-def test_warm_friction_is_scaled() -> None:
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
-    plant.set_state(START, np.ones(6))
-    plant.scale_friction(np.full(6, 0.5))
-    plant.step(gravity_torque(plant), 1e-6)
-    np.testing.assert_allclose(plant.friction_torque, 0.5 * TRUTH.friction(np.ones(6)), rtol=1e-6)
-
-
 def test_a_state_that_is_not_finite_is_an_error() -> None:
     plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     with pytest.raises(PlantDiverged):
@@ -228,16 +220,6 @@ def test_springs_carry_gravity_from_the_start() -> None:
     for _ in range(200):
         plant.step(gravity, STEP)
     np.testing.assert_allclose(plant.position, START, atol=1e-9)
-
-
-def test_only_elastic_axes_deflect() -> None:
-    plant = elastic(TRUTH)
-    rng = np.random.default_rng(1)
-    for _ in range(300):
-        plant.step(rng.normal(size=6) * 300.0, STEP)
-    stretch = plant.motor_position - plant.position
-    np.testing.assert_array_equal(stretch[3:], 0.0)
-    assert np.all(np.abs(stretch[:3]) > 1e-6)
 
 
 def test_a_stiff_gear_is_a_rigid_one() -> None:
@@ -348,14 +330,6 @@ def test_a_position_error_raises_the_current_and_its_integral() -> None:
     assert np.all(np.diff(steady, axis=0) > 0.0)
 
 
-def test_within_the_deadband_nothing_is_integrated() -> None:
-    servo = make_servo()
-    target = [p + 2.0 / DRIVE.encoder_counts for p in servo.measured]
-    currents = [servo.advance(target, [0.0] * 6) for _ in range(50)]
-    # By then the gains are those of the new posture.
-    np.testing.assert_allclose(currents[-1], currents[INERTIA_CYCLES + 1], rtol=1e-12)
-
-
 def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
     servo = make_servo()
     home = list(servo.measured)
@@ -367,12 +341,6 @@ def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
     servo.advance(home, [0.0] * 6)
     back = np.array(servo.advance(home, [0.0] * 6))
     assert np.all(back < 0.5 * np.array(DRIVE.current_limit))
-
-
-def test_target_currents_come_in_steps() -> None:
-    servo = make_servo(resolution=0.005)
-    steps = np.array(hold(servo)) / 0.005
-    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
 def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
