@@ -25,7 +25,7 @@ class Frozen(BaseModel):
     """A section of the file: immutable, without unknown fields."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", ser_json_inf_nan="strings", from_attributes=True
+        frozen=True, extra="ignore", ser_json_inf_nan="strings", from_attributes=True
     )
 
     @classmethod

@@ -174,7 +174,7 @@ class WorkerProcess:
     def begin(self, function: Callable[P, object], /, *args: P.args, **kwargs: P.kwargs) -> None:
         """Begin a call, in a new child if the last one died; `receive` returns its result."""
         message = pack((self._timeout, function, args, kwargs))
-        if self._process is None or self._process.poll() is not None:
+        if self._process is None or (self._ready and self.connection.poll()):  # its end is closed
             self.close()
             self._start()
         self.deadline = monotonic() + self._timeout + (0.0 if self._ready else _START_TIMEOUT)

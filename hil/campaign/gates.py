@@ -18,7 +18,7 @@ from .rehearsal import Rehearsal
 if TYPE_CHECKING:
     from .run import Run
 
-_ADDRESS: Final = {"transport", "host", "port", "bind", "can", "packets"}
+_ADDRESS: Final = {"transport", "host", "port", "bind", "can"}
 """Keys of `[controller]` with its address, which do not affect what is exchanged."""
 
 

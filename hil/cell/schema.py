@@ -111,7 +111,6 @@ class SimulationTable(Table):
         "a table of gears of the simulated robot",
         SimulatedDriveTable(),
     )
-    payload: PayloadTable | None = field("a table of earlier versions, not used", None)
 
 
 ArmAxis = tuple[Annotated[Whole, Field(ge=1, le=4)], Annotated[Whole, Field(ge=1, le=10)]]
@@ -370,7 +369,6 @@ class ControllerTable(Table):
     current_delay_cycles: Number = field(
         "cycles by which the target current of a packet lags its position", 0.0
     )
-    packets: bool = field("a key of earlier versions, not used", False)
 
     @model_validator(mode="after")
     def _adapter_named(self) -> ControllerTable:
@@ -429,6 +427,10 @@ class CampaignTable(Table):
     seed: Whole = field("seed of the search and of the validation motions", 1, ge=0)
 
 
+REMOVED: Final = {("simulation", "payload"), ("controller", "packets")}
+"""Table and key of settings that earlier versions had."""
+
+
 class CellFile(Table):
     """Cell file; tables that are not needed may be omitted."""
 
@@ -442,3 +444,16 @@ class CellFile(Table):
     workspace: WorkspaceTable = WorkspaceTable()
     campaign: CampaignTable | None = None
     simulation: SimulationTable | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_removed(cls, data: Any) -> Any:
+        """Ignore what cell files of earlier versions, and those in archives, may have."""
+        if not isinstance(data, dict):
+            return data
+        return {
+            name: {key: entry for key, entry in table.items() if (name, key) not in REMOVED}
+            if isinstance(table, dict)
+            else table
+            for name, table in data.items()
+        }

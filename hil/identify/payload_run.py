@@ -91,7 +91,7 @@ class PayloadFound:
         ]
         if estimate.undetermined:
             lines.append(
-                f"The motion does not determine {', '.join(estimate.undetermined)}: taken as zero"
+                f"The motion does not determine {', '.join(estimate.undetermined)}: set to zero"
                 " where the other figures allow it."
             )
         return lines

@@ -164,6 +164,13 @@ def test_a_missing_file_and_a_missing_table_are_named(folder: Path) -> None:
         _ = bare.drive_train
 
 
+def test_settings_of_earlier_versions_are_ignored(folder: Path) -> None:
+    """Archives contain the cell files of their time."""
+    removed = "\n[simulation.payload]\nmass = 2.0\ncentre = [0.0, 0.0, 0.1]\n"
+    cell = loaded(folder, (r"\[controller\]", "[controller]\npackets = true"), ("$", removed))
+    assert cell.joint_names == Cell.load(CELL_PATH).joint_names
+
+
 def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folder: Path) -> None:
     urdf = folder / "ns16.urdf"
     again = '<transmission name="t"><joint name="joint_2"/></transmission></robot>'

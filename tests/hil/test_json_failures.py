@@ -37,7 +37,6 @@ FAILING = {
     "reidentify": ("reidentify", NOWHERE, "--workers", "1"),
     "gains": ("gains", NOWHERE, NOWHERE, "--mass", "1"),
     "payload": ("payload", NOWHERE, "--loaded", NOWHERE),
-    "replay": ("replay", NOWHERE),
     "export": ("export", NOWHERE, "--to", "mjcf"),
     "plan": ("plan", NOWHERE, "--cell", NOWHERE),
     "record": ("record", NOWHERE),
