@@ -23,7 +23,6 @@ from hil.identify.settings import (
     decide,
     samples_of,
     validation_samples,
-    with_noise,
 )
 from hil.identify.sources import Source, all_fitted, known_warnings, source_of
 from hil.progress import Silent
@@ -189,9 +188,8 @@ def decide_settings(
             broken.append(Unused(ref.location, reason_of(error)))
     if not fitted:
         return None, broken
-    sources, _ = with_noise(
-        all_fitted(cell_in(fitted[0][0]), fitted, None if rest is None else rest.recording)
-    )
+    standstill = None if rest is None else rest.recording
+    sources = all_fitted(cell_in(fitted[0][0]), fitted, standstill)
     if arms is None:
         settings = decide(sources, options, Silent()).settings
     else:

@@ -18,7 +18,7 @@ from identification.signals.samples import Samples
 from planner.checked_data import numbers
 
 from .options import Options
-from .settings import Settings, decide, samples_of, validation_samples, with_noise
+from .settings import Settings, decide, samples_of, validation_samples
 from .sources import Sources
 
 Array = NDArray[np.float64]
@@ -61,8 +61,10 @@ def prepare_sources(sources: Sources, options: Options, reporter: Reporter) -> P
         base = time_base(source.recording.time, source.recording.gap_before)
         if not base.uniform or base.gaps:
             notes.append(f"{source.name}: {'; '.join(base.describe())}")
-    sources, noise = with_noise(sources)
     _require_torques(sources)
+    noise = "the noise of the positions was estimated from their high-frequency part"
+    if sources.noise_variance is not None:
+        noise = "the noise of the positions was measured at standstill"
     decided = decide(sources, options, reporter)
     settings, cell = decided.settings, decided.settings.with_friction_law(sources.cell)
     sources = replace(sources, cell=cell)

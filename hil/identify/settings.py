@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
@@ -21,7 +20,6 @@ from identification.model.elements import TorqueRipple
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Choice, Question, choose_settings
 from identification.selection.inner_prediction import Settings as Candidate
-from identification.signals.noise import repetition_noise
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
 from identification.validation.finding import Thresholds
 
@@ -132,23 +130,6 @@ class Decided(NamedTuple):
     settings: Settings
     delays: DelayEstimate | None  #: in the longest recording; None if it cannot be determined
     notes: tuple[str, ...]  #: about delays, one sentence each
-
-
-def with_noise(sources: Sources) -> tuple[Sources, str]:
-    """Return the sources with position noise from standstill or repetitions, and its origin."""
-    recordings = [source.recording for source in sources.training[:MAX_RECORDINGS]]
-    noise = "the noise of the positions was"
-    if sources.noise_variance is not None:
-        return sources, f"{noise} measured at standstill"
-    if sources.same_motion and len(recordings) > 1:
-        with suppress(IdentificationError):  # no two comparable repetitions
-            found = repetition_noise(recordings)
-            known = replace(sources, noise_variance=found.position, torque_variance=found.torque)
-            return known, (
-                f"no standstill was recorded: {noise} estimated from the differences between"
-                f" {len(recordings)} repetitions"
-            )
-    return sources, f"{noise} estimated from their high-frequency part"
 
 
 def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.errors import IdentificationError
-from identification.signals.recording import Recording, RecordingError
+from identification.signals.recording import RecordingError
 
 Array = NDArray[np.float64]
 
@@ -83,78 +81,6 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
     weights /= np.linalg.norm(weights, axis=1, keepdims=True)
     stacked = np.lib.stride_tricks.sliding_window_view(values, order + 1, axis=0)
     return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
-
-
-# Standstill noise lacks quantisation steps, ripple and current noise under load, which the
-# differences between repetitions contain.
-
-_SHORTEST_RUN: Final = 64  # samples
-
-
-class RepetitionNoise(NamedTuple):
-    """Variances of the differences between repetitions: white noise, without friction drift."""
-
-    position: Array  # (n,) [rad² or m²]
-    torque: Array | None  # (n,) [N²·m² or N²], None where no torque was recorded
-
-
-def repetition_noise(recordings: Sequence[Recording]) -> RepetitionNoise:
-    """Return variances from two or more repetitions, aligned at the commanded start.
-
-    Times are rounded to the sampling interval; the remaining shift is smooth and does not count.
-
-    Raises:
-        IdentificationError: other joints or rates, or no common segment.
-    """
-    first = recordings[0]
-    step = float(np.median(np.diff(first.time)))
-    for one in recordings[1:]:
-        own = float(np.median(np.diff(one.time)))
-        if one.joint_names != first.joint_names or abs(own - step) > 0.01 * step:
-            raise IdentificationError("not repetitions: joints or sampling rates differ")
-    indices = [np.rint((one.time - one.motion_start) / step).astype(np.int64) for one in recordings]
-    common, runs = _common_runs(recordings, indices)
-    # First of the samples with the same index.
-    rows = [np.searchsorted(index, common) for index in indices]
-    time: Array = common.astype(np.float64) * step
-
-    def white(channels: Sequence[Array]) -> Array:
-        stacked = np.stack([channel[row] for channel, row in zip(channels, rows, strict=True)])
-        # The mean of R repetitions removes a share of 1/R of the variance.
-        lost = np.sqrt(len(channels) / (len(channels) - 1.0))
-        apart = (stacked - stacked.mean(axis=0)) * lost
-        parts = [(a, b, one[a:b]) for a, b in runs for one in apart]
-        total = sum(difference_variance(time[a:b], own) * (b - a) for a, b, own in parts)
-        return np.asarray(total / sum(b - a for a, b, _ in parts))
-
-    torques = [one.torque for one in recordings if one.torque is not None]
-    return RepetitionNoise(
-        position=white([one.position for one in recordings]),
-        torque=white(torques) if len(torques) == len(recordings) else None,
-    )
-
-
-def _common_runs(
-    recordings: Sequence[Recording], indices: Sequence[NDArray[np.int64]]
-) -> tuple[NDArray[np.int64], list[tuple[int, int]]]:
-    """Return indices common to all repetitions, and runs of them without gap."""
-    common = indices[0]
-    for index in indices[1:]:
-        common = np.intersect1d(common, index)
-    common = np.unique(common)
-    gap = np.diff(common) > 1
-    for one, index in zip(recordings, indices, strict=True):
-        for segment in one.segments()[1:]:
-            gap[: len(gap)] |= (common[:-1] < index[segment.start]) & (
-                common[1:] >= index[segment.start]
-            )
-    edges = [0, *(np.flatnonzero(gap) + 1).tolist(), len(common)]
-    runs = [(a, b) for a, b in pairwise(edges) if b - a >= _SHORTEST_RUN]
-    if not runs:
-        raise IdentificationError(
-            f"the repetitions have no {_SHORTEST_RUN} consecutive samples in common"
-        )
-    return common, runs
 
 
 _STRETCH: Final = 4.0  # s; resolution 0.25 Hz

@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,9 +6,6 @@ from scipy.integrate import quad
 from scipy.interpolate import BSpline
 from scipy.signal import butter, sosfiltfilt
 
-from identification.errors import IdentificationError
-from identification.signals.noise import repetition_noise, standstill_variance
-from identification.signals.recording import Recording
 from identification.signals.smoothing import fit_smoothing_spline, low_pass
 
 
@@ -127,82 +122,3 @@ class TestSmoothingSpline:
         spline = fit_smoothing_spline(time, values, np.array([1e-8]))
         assert spline.spacing < 3e-3
         assert np.mean((values - spline(time)) ** 2) <= 1.001e-8
-
-
-STEP = 1e-3
-POSITION_NOISE = np.array([2e-5, 5e-5])
-TORQUE_NOISE = np.array([3.0, 0.5])
-
-
-def repetition(seed, *, start=0.0, drift=0.0, gap=None):
-    """Return 0.5 s of rest, then the motion, with commands."""
-    rng = np.random.default_rng(seed)
-    time = start + np.arange(5000) * STEP
-    since = np.maximum(np.arange(5000) * STEP - 0.5, 0.0)[:, None]
-    command = np.sin(np.array([3.0, 5.0]) * since)
-    torque = 40.0 * np.cos(np.array([3.0, 5.0]) * since) * (1.0 + drift)
-    flags = None
-    if gap is not None:
-        flags = np.zeros(5000, dtype=np.bool_)
-        flags[gap] = True
-    return Recording(
-        time=time,
-        position=command + POSITION_NOISE * rng.standard_normal(command.shape),
-        joint_names=("a", "b"),
-        torque=torque + TORQUE_NOISE * rng.standard_normal(command.shape),
-        commanded_position=command,
-        gap_before=flags,
-    )
-
-
-def within(variance, expected, freedom):
-    """Return whether a chi-squared estimate lies within four standard deviations."""
-    return bool(np.all(np.abs(variance / expected - 1.0) < 4.0 * np.sqrt(2.0 / freedom)))
-
-
-class TestRepetitionNoise:
-    @pytest.mark.parametrize("count", [2, 5])
-    def test_it_is_measured_during_motion(self, count):
-        noise = repetition_noise([repetition(seed, start=7.0 * seed) for seed in range(count)])
-        freedom = 4500.0 * (count - 1)
-        # differences of neighbours hold fewer degrees of freedom
-        assert within(noise.position, POSITION_NOISE**2, freedom / 3.0)
-        assert within(noise.torque, TORQUE_NOISE**2, freedom / 3.0)
-
-    def test_noise_absent_at_standstill_is_found(self):
-        """A coarse reading is constant at rest."""
-        resolution = 1e-3
-
-        def read(seed):
-            one = repetition(seed)
-            shifted = one.position + 1e-5 * np.random.default_rng(seed).standard_normal()
-            return replace(one, position=np.round(shifted / resolution) * resolution)
-
-        moving = repetition_noise([read(1), read(2)])
-        resting = standstill_variance(STEP * np.arange(400), read(1).position[:400])
-        assert np.all(resting == 0.0)
-        assert np.all(moving.position > 1e-3 * resolution**2)
-
-    @pytest.mark.parametrize(
-        "other",
-        [
-            repetition(2, drift=0.1),
-            repetition(2, start=3.0).between(200, 5000),
-            repetition(2, gap=2000),
-        ],
-        ids=["friction drift", "other start", "gap"],
-    )
-    def test_drift_starts_and_gaps_are_not_noise(self, other):
-        noise = repetition_noise([repetition(1), other])
-        assert within(noise.position, POSITION_NOISE**2, 1500.0)
-        assert within(noise.torque, TORQUE_NOISE**2, 1500.0)
-
-    def test_other_recordings_raise(self):
-        one = repetition(1)
-        for runs, words in (
-            ([one, replace(one, joint_names=("a", "c"))], "not repetitions"),
-            ([one, replace(one, time=2.0 * one.time)], "not repetitions"),
-            ([one.between(0, 2000), one.between(4950, 5000)], "in common"),
-        ):
-            with pytest.raises(IdentificationError, match=words):
-                repetition_noise(runs)
