@@ -44,7 +44,6 @@ _PASSES: Final = 2
 # Condition beyond which combinations of standard parameters count as undetermined.
 _WORST_CONDITION: Final = 10.0**4.5
 _GROWN: Final = 4.0  # power ratio beyond which a joint's error exceeds that of the fit
-_POSTURES: Final = 40
 _MOST_RECORDINGS: Final = 3  # enough recordings to determine gravity and load
 _PLAUSIBLE: Final = Implausible((), ())
 
@@ -281,8 +280,6 @@ def gather(
     """
     values = result.pooled.values
     velocity = np.concatenate([run.motion.velocity for run in held_out])
-    position = np.concatenate([run.motion.position for run in held_out])
-    postures = position[:: max(1, len(position) // _POSTURES)]
     unseen = sum((Factor.of(model, run) for run in held_out), Factor.zero(model))
     error = pooled_error(prediction_error(model, values, held_out))
     few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
@@ -305,7 +302,6 @@ def gather(
             result.pooled,
             unseen,
             error.rms,
-            position=postures,
             speed=np.abs(velocity).max(axis=0),
         ),
         residuals=check_residuals(

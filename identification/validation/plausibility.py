@@ -16,7 +16,6 @@ from identification.model.robot import RobotModel
 Array = NDArray[np.float64]
 
 _SIGMAS: Final = 3.0  # standard deviations of a significant wrong sign
-_SEARCHED: Final = 2.0  # added where the worst of many directions and postures is tested
 # Masses, rotor inertias, moments of inertia about an axis.
 _NEVER_NEGATIVE: Final = re.compile(r"m\d+|I\d+(m|xx|yy|zz)")
 
@@ -34,13 +33,12 @@ def implausibilities(
     motion: Factor,
     error_rms: Array,
     *,
-    position: Array,
     speed: Array,
 ) -> Implausible:
     """Return messages on what is physically impossible in an estimate.
 
-    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,). The
-    inertia matrix is evaluated at positions (k, n), friction up to the highest speeds (n,).
+    The torque of wrong signs on a `motion` is compared with the error of its prediction (n,);
+    friction is evaluated up to the highest speeds (n,).
     """
     impossible: list[str] = []
     doubtful: list[str] = []
@@ -49,18 +47,17 @@ def implausibilities(
         squares = np.einsum("i,jik,k->j", own, motion.gram[:, :-1, :-1], own)
         torque = np.sqrt(np.maximum(squares, 0.0) / np.maximum(motion.samples, 1))
         (impossible if np.any(torque > error_rms) else doubtful).append(words)
-    impossible += _inertia_matrix(model, estimate, position)
     return Implausible(tuple(impossible), tuple(doubtful))
 
 
-def _is_negative(estimate: Estimate, direction: Array, sigmas: float = _SIGMAS) -> bool:
+def _is_negative(estimate: Estimate, direction: Array) -> bool:
     """Return whether direction · parameters is significantly below zero."""
     known = np.isfinite(np.diag(estimate.covariance))
     if np.any(direction[~known]):
         return False
     part = direction[known]
     variance = float(part @ estimate.covariance[np.ix_(known, known)] @ part)
-    return float(direction @ estimate.values) < -sigmas * float(np.sqrt(variance))
+    return float(direction @ estimate.values) < -_SIGMAS * float(np.sqrt(variance))
 
 
 def _wrong_signs(
@@ -100,29 +97,6 @@ def _wrong_signs(
         if _is_negative(estimate, direction.astype(np.float64)):
             figures = f"{values[k]:.3g} ± {estimate.std[k]:.2g} {estimate.units[k]}"
             yield f"{name} is negative: {figures}", direction
-
-
-def _inertia_matrix(model: RobotModel, estimate: Estimate, position: Array) -> list[str]:
-    """Return a message on a posture with a negative direction of the inertia matrix."""
-    matrices = inertia_matrices(model, estimate.values, position)
-    eigenvalues, vectors = np.linalg.eigh(0.5 * (matrices + matrices.transpose(0, 2, 1)))
-    worst = int(np.argmin(eigenvalues[:, 0]))
-    posture, along, still = (
-        position[worst][None],
-        vectors[worst, :, 0],
-        np.zeros((1, model.n_joints)),
-    )
-    moved, rest = (
-        model.regressor(posture, still, one).dense(model.n_parameters)[0]
-        for one in (along[None], still)
-    )
-    if not _is_negative(estimate, along @ (moved - rest), _SIGMAS + _SEARCHED):
-        return []
-    joint = model.joint_names[int(np.argmax(np.abs(along)))]
-    return [
-        f"the inertia seen by {joint} is negative ({eigenvalues[worst, 0]:.3g}) in a posture of"
-        " the unseen motion: a torque or a direction has the wrong sign"
-    ]
 
 
 def inertia_matrices(model: RobotModel, values: Array, position: Array) -> Array:

@@ -59,7 +59,6 @@ def signs(found, model=MODEL, *, error=0.1):
         found,
         Factor.from_samples(model, motion, np.zeros((2000, 2))),
         np.full(2, error),
-        position=motion.position[::100],
         speed=np.abs(motion.velocity).max(axis=0),
     )
 
@@ -71,8 +70,6 @@ class TestSigns:
             (with_value("f0_1", -4.0), "Coulomb friction of shoulder is negative"),
             (with_value("f1_2", -1.0), "friction of elbow is"),
             (with_value("I2m", -0.1), "I2m is negative"),
-            # Inertia about the shoulder, a group that no rule on single parameters covers.
-            (with_value("I1yy", -3.0), "inertia seen by shoulder is negative"),
         ],
     )
     def test_impossible_signs_are_named(self, found, words):
