@@ -25,7 +25,7 @@ from planner.moves import (
     Overrides,
     plan_moves,
 )
-from planner.piecewise_cubic import PiecewiseCubic, Trajectory, pieces_from
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory
 from planner.verify import check_limits, check_smooth
 
 FORMAT: Final = "joint motion plan"
@@ -187,12 +187,14 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
         check_smooth(stored, limits)
     except PlannerError as error:
         raise InvalidPlanFile(f"the stored motion: {error}") from error
-    extrema = _difference(stored, other).extrema()
-    apart = float(max(np.max(-extrema.lower), np.max(extrema.upper)))
-    rates = max(
-        float(np.max(extrema.velocity / limits.velocity)),
-        float(np.max(extrema.acceleration / limits.acceleration)),
+    end = min(stored.duration, other.duration)
+    knots = np.unique(np.minimum(np.concatenate((*stored.knots, *other.knots)), end))
+    apart, fast, steep = (
+        np.abs(one - two).max(axis=0)
+        for one, two in zip(stored.sample(knots), other.sample(knots), strict=True)
     )
+    apart = float(apart.max())
+    rates = float(max(np.max(fast / limits.velocity), np.max(steep / limits.acceleration)))
     late = abs(stored.duration - other.duration)
     if not (apart <= _SAME and late <= _SAME and rates <= _SAME_RATES):
         raise InvalidPlanFile(
@@ -200,20 +202,6 @@ def _check_motion(stored: PiecewiseCubic, planned: MotionPlan) -> None:
             f"the moves ({other.duration:.6f} s) by up to {apart:.3g} rad: the moves were edited, "
             "or planned by another version; delete the motion to plan again"
         )
-
-
-def _difference(one: PiecewiseCubic, other: PiecewiseCubic) -> PiecewiseCubic:
-    """Return the difference of two motions, up to the end of the shorter one."""
-    end = min(one.duration, other.duration)
-    knots, coefficients = [], []
-    for joint in range(one.n_joints):
-        times = np.unique(np.minimum(np.concatenate((one.knots[joint], other.knots[joint])), end))
-        times = times if len(times) > 1 else np.zeros(2)
-        knots.append(times)
-        coefficients.append(
-            pieces_from(one, joint, times[:-1]) - pieces_from(other, joint, times[:-1])
-        )
-    return PiecewiseCubic(tuple(knots), tuple(coefficients))
 
 
 _QUANTITIES: Final = ("position [rad]", "velocity [rad/s]", "acceleration [rad/s^2]")

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.collision.checker import CollisionChecker, Contact
-from identification.excitation.joint_limits import limit_violations, rest_violations
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
-from planner import FourierSeries, JointLimits, PiecewiseCubic, Trajectory
+from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic, Trajectory, check_rest
+from planner.limits import position_rounding
+from planner.piecewise_cubic import Extrema
 
 # Checks sample both ends of a motion, criteria the middles of the steps: at rest at an end
 # sgn(qd) is 0 or, after rounding, ±1. From 1 to 8 ms log det of random motions of the NS 16 changes
@@ -44,6 +45,83 @@ def _steps(trajectory: Trajectory, period: float) -> int:
 
 
 Array = NDArray[np.float64]
+
+
+_RATES = ("velocity", "acceleration", "jerk")
+
+
+def limit_violations(
+    trajectory: PiecewiseCubic | FourierSeries, limits: JointLimits, motion: Motion
+) -> list[Violation]:
+    """Return the largest violation of each quantity and joint.
+
+    Its time is that of one of the samples of the motion, which include both ends.
+    """
+    return _beyond_limits(trajectory.extrema(), limits, motion)
+
+
+def rest_violations(
+    trajectory: PiecewiseCubic | FourierSeries, limits: JointLimits
+) -> list[Violation]:
+    """Return the largest rate at the start or end of a motion, if it is not zero."""
+    try:
+        check_rest(trajectory, limits)
+    except NotSmooth as jump:
+        end = "end" if jump.time > 0.0 else "start"
+        bare = isinstance(trajectory, FourierSeries) and trajectory.ramp == 0.0
+        return [
+            Violation(
+                "joint limit",
+                f"{jump.quantity} of joint {jump.joint} at the {end}",
+                jump.jump,
+                0.0,
+                jump.time,
+                scale=float(getattr(limits, jump.quantity)[jump.joint]),
+                remedy="a sum of sines without a ramp starts and ends at speed; set a ramp"
+                if bare
+                else "a motion must start and end at rest",
+            )
+        ]
+    return []
+
+
+def _beyond_limits(extrema: Extrema, limits: JointLimits, motion: Motion) -> list[Violation]:
+    rounding, span = position_rounding(limits), limits.upper - limits.lower
+    # Quantity, extremum, bound, sign of an excess, tolerance, scale.
+    rows = [
+        ("position", extrema.lower, limits.lower, -1.0, rounding, span),
+        ("position", extrema.upper, limits.upper, 1.0, rounding, span),
+    ]
+    for name in _RATES:
+        bound = getattr(limits, name)
+        rows.append((name, getattr(extrema, name), bound, 1.0, 0.0 * bound, bound))
+    found = []
+    for quantity, value, bound, sign, tolerance, scale in rows:
+        broken = np.flatnonzero(~(sign * value <= sign * bound + tolerance)).tolist()  # NaN as well
+        for joint in broken:
+            if quantity == "position":
+                size = sign * motion.position
+            else:
+                size = _rates(motion)[_RATES.index(quantity)]
+            k = int(np.argmax(size[:, joint]))
+            found.append(
+                Violation(
+                    "joint limit",
+                    f"{quantity} of joint {joint}",
+                    float(value[joint]),
+                    float(bound[joint]),
+                    float(motion.time[k]),
+                    tuple(motion.position[k].tolist()),
+                    scale=float(scale[joint]),
+                )
+            )
+    return found
+
+
+def _rates(motion: Motion) -> tuple[Array, Array, Array]:
+    """Return |qd|, |qdd| at the samples and the mean |jerk| between them."""
+    jerk = np.diff(motion.acceleration, axis=0) / np.diff(motion.time)[:, None]
+    return np.abs(motion.velocity), np.abs(motion.acceleration), np.abs(jerk)
 
 
 @dataclass(frozen=True, eq=False)

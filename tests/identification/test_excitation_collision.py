@@ -20,8 +20,7 @@ from identification.excitation import (
     Workspace,
     WorkspaceError,
 )
-from identification.excitation.collision.bodies import link_bodies
-from identification.excitation.collision.hulls import joint_poses
+from identification.excitation.collision.bodies import joint_poses, link_bodies
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text

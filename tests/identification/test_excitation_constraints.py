@@ -8,8 +8,13 @@ from hypothesis import strategies as st
 from identification import FrictionLaw, RobotModel
 from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.constraints import Constraints, CurrentModel, check_motion, sampled
-from identification.excitation.joint_limits import limit_violations
+from identification.excitation.constraints import (
+    Constraints,
+    CurrentModel,
+    check_motion,
+    limit_violations,
+    sampled,
+)
 from identification.excitation.violation import KINDS, excess_by_kind
 from planner import FourierSeries, JointLimits, plan
 from tests.identification.robots import joint, link, robot

@@ -24,8 +24,7 @@ from identification.excitation import (
     most_evaluations,
     search,
 )
-from identification.excitation.searches.run import Evolution
-from identification.excitation.searches.scores import ROW, unplanned
+from identification.excitation.searches.scores import unplanned
 from identification.excitation.violation import excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
@@ -115,24 +114,6 @@ def _room_under(front):
     return float(size @ np.diff(coupled, append=30.0))
 
 
-class FinePopulation(RecordingPopulation):
-    """At a millisecond all motions but one are worse in a measure, or the same without one."""
-
-    def __init__(self, best, measure):
-        super().__init__(problem())
-        self._best, self._measure = best, measure
-
-    def evaluate(self, genes, period):
-        if self._measure is None:
-            return super().evaluate(self._best, period)
-        trajectory, criteria = super().evaluate(genes, period)
-        _, best = super().evaluate(self._best, period)
-        if genes.tobytes() != self._best.tobytes():
-            worse = {"log10_det": best.log10_det - 0.01, "coupling_index": best.coupling_index + 1}
-            criteria = replace(criteria, **{self._measure: worse[self._measure]})
-        return trajectory, criteria
-
-
 class TestChoice:
     @pytest.mark.parametrize("method", ["a", "b", "balanced"])
     @pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
@@ -195,21 +176,6 @@ class TestChoice:
         assert isinstance(design.excitation.trajectory, FourierSeries)
         assert design.excitation.method == "a"
         assert not check_motion(design.excitation.trajectory, LIMITS)
-
-    @pytest.mark.parametrize(
-        ("method", "measure"),
-        [("a", "log10_det"), ("front", "log10_det"), ("front", "coupling_index"), ("front", None)],
-    )
-    def test_a_polish_must_be_better_at_a_millisecond(self, population, method, measure):
-        unpolished = search(population, settings(method))
-        assert search(population.begin(), settings(method, polish=60)).chosen is None
-        with FinePopulation(unpolished.genes, measure) as finer:
-            design = search(finer, settings(method, polish=60))
-        assert design.genes.tobytes() == unpolished.genes.tobytes()
-        assert design.chosen == design.origin == unpolished.chosen
-        assert (
-            design.excitation.criteria == design.origin_criteria == unpolished.excitation.criteria
-        )
 
 
 def opened(file, chosen):
@@ -376,13 +342,6 @@ class TestScores:
         np.testing.assert_array_equal(scores.measures, scorers.score(rows).measures)
 
 
-def scored(log10_det, coupling_index, excess):
-    row = np.zeros(ROW)
-    row[:3] = log10_det, coupling_index, 10.0
-    row[3 + 1] = excess
-    return row
-
-
 class TestInfeasibleMotions:
     def test_a_search_gets_from_them_to_feasible_ones(self, population):
         """Infeasible motions are ranked by their excess."""
@@ -446,27 +405,3 @@ class TestInfeasibleMotions:
                     search(population, settings(method, generations=2))
                 assert caught.value.unexciting == caught.value.tried
                 assert caught.value.rejected == {}
-
-    @pytest.mark.parametrize(("method", "n_objectives"), [("b", 1), ("front", 2)])
-    def test_unexciting_and_unplannable_motions_rank_last(self, method, n_objectives):
-        rows = np.array(
-            [
-                unplanned(),
-                scored(-np.inf, np.inf, 0.0),  # satisfies everything, and leaves a parameter out
-                scored(-np.inf, np.inf, 0.3),
-                scored(80.0, 90.0, 40.0),  # far beyond a limit
-                scored(81.0, 90.0, 0.2),
-                scored(70.0, 100.0, 0.0),
-            ]
-        )
-        first = np.linspace(0.1, 0.9, len(rows))[:, None] * np.ones(4)
-        settings = SearchSettings(method=method, population=len(rows), generations=2)
-        evolution = Evolution(settings, first, n_objectives)
-        asked = evolution.ask()
-        scores = Scores.of_rows(rows)
-        evolution.tell(scores, scores.measures[:, :n_objectives] * [-1.0, 1.0][:n_objectives])
-        children = evolution.ask()
-        without_motion = np.tile(unplanned(), (len(children), 1))
-        evolution.tell(Scores.of_rows(without_motion), np.zeros((len(children), n_objectives)))
-        ranked = evolution._algorithm.pop.get("X")
-        np.testing.assert_array_equal(ranked[:5], asked[[5, 4, 3, 1, 2]])

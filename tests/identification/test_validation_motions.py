@@ -16,7 +16,7 @@ from identification.excitation import (
     random_validation_motions,
     validation_motions,
 )
-from identification.excitation.collision.hulls import joint_poses
+from identification.excitation.collision.bodies import joint_poses
 from planner import PlannerCrashed, plan, plan_moves
 from sim_fixtures.ns16 import load_truth, urdf_text
 from tests.identification.searching import NS16_HOME as HOME

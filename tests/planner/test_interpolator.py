@@ -14,16 +14,17 @@ from scipy.spatial import cKDTree
 
 from planner import JointLimits
 from planner.errors import PlannerCrashed, PlannerNotStarted
-from planner.interpolator import Interpolator, corner
-from planner.moves import Move, Overrides, plan_moves
-from planner.rrs import (
+from planner.interpolator import (
     AccelerationKind,
     EventKind,
     FlybyCriterion,
+    Interpolator,
     OutputFormat,
     SpeedCorrection,
     Status,
+    corner,
 )
+from planner.moves import Move, Overrides, plan_moves
 from tests.planner.six_axes import SIX_AXES, random_points
 
 PERIOD = 0.002
@@ -320,25 +321,6 @@ def test_stop_and_continue_stay_on_the_path(points, off_path, when, pause, perce
     assert kinds.count(EventKind.MOTION_STOPPED) == int(rested)
 
 
-def test_a_stopped_arm_rests_until_continued(points):
-    interpolator = ready(SIX_AXES, points[0], fly=50.0)
-    queue(interpolator, points[1:])
-    for _ in range(200):
-        interpolator.get_next_step()
-    target = interpolator.get_current_target_id()
-    interpolator.stop_motion()
-    stopping = steps_to_rest(interpolator)
-    assert events(stopping)[-1] == (EventKind.MOTION_STOPPED, target)
-    interpolator.set_override_speed(50.0)  # for later
-    resting = [interpolator.get_next_step() for _ in range(50)]
-    assert {step.status for step in resting} == {Status.FINAL_STEP}
-    assert len({step.position.tobytes() for step in [stopping[-1], *resting]}) == 1
-    assert not events(resting)
-    assert interpolator.stop_motion() == Status.OK
-    interpolator.continue_motion()
-    assert events(steps_to_rest(interpolator))[-1] == (EventKind.MOTION_ENDED, 3)
-
-
 def test_a_stop_lasts_beyond_the_end_of_the_motion(points):
     """A stopped arm does not start towards a target that is set later."""
     interpolator = ready(SIX_AXES, points[0])
@@ -357,58 +339,7 @@ def test_a_stop_lasts_beyond_the_end_of_the_motion(points):
     assert events(steps_to_rest(interpolator)) == [(EventKind.MOTION_ENDED, 2)]
 
 
-@given(st.integers(1, 1000), st.booleans())
-@settings(max_examples=20, deadline=None)
-def test_a_cancelled_motion_leaves_the_arm_on_its_path(points, off_path, when, stopped):
-    interpolator = ready(SIX_AXES, points[0], fly=50.0)
-    queue(interpolator, points[1:])
-    steps = [interpolator.get_next_step() for _ in range(when)]
-    assume(not any(kind is EventKind.MOTION_ENDED for kind, _ in events(steps)))
-    if stopped:
-        interpolator.stop_motion()
-        steps += [interpolator.get_next_step() for _ in range(300)]
-        assume(interpolator.get_current_target_id() is not None)  # else the end came first
-    interpolator.cancel_motion()
-    if not stopped:
-        assert interpolator.set_next_target(9, points[0]) == Status.INCONSISTENT
-        steps += steps_to_rest(interpolator)
-    assert off_path(positions(steps)) <= 1e-9
-    assert interpolator.get_next_step().status == Status.NO_TARGET
-    assert interpolator.get_current_target_id() is None
-    queue(interpolator, points[:1], first=9)
-    back = steps_to_rest(interpolator)
-    q = positions(steps + back)
-    assert np.all(worst_ratios(points[0], q, SIX_AXES) <= STOP)
-    np.testing.assert_array_equal(q[-1], points[0])
-    assert events(back) == [(EventKind.MOTION_ENDED, 9)]
-
-
 # -- refusals -----------------------------------------------------------------------------
-
-
-def test_services_are_refused_before_initialize_and_after_terminate():
-    a, b = random_points(50, 2)
-    interpolator = Interpolator(SIX_AXES, PERIOD)
-    for _ in range(2):
-        for status in (
-            interpolator.set_initial_position(a),
-            interpolator.set_next_target(1, b),
-            interpolator.stop_motion(),
-            interpolator.select_flyby_mode(True),
-            interpolator.reset(),
-            interpolator.terminate(),
-        ):
-            assert status == Status.INCONSISTENT
-        step = interpolator.get_next_step()
-        assert step.status == Status.INCONSISTENT
-        assert np.all(np.isnan(step.position))
-        interpolator.initialize()
-        assert interpolator.set_next_target(1, b) == Status.INCONSISTENT  # no position yet
-        interpolator.set_initial_position(a)
-        assert interpolator.get_next_step().status == Status.NO_TARGET == -42
-        queue(interpolator, [b])
-        steps_to_rest(interpolator)
-        assert interpolator.terminate() == Status.OK
 
 
 REFUSED = {

@@ -464,17 +464,6 @@ def test_bounds_are_those_that_each_set_point_satisfies(live_motions):
     assert arm.player.bounds == "stop"
 
 
-def test_an_override_while_resuming_has_wider_bounds_only_if_necessary(live_motions):
-    gentle = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("hold").run(500).ask("resume")
-    gentle.run(3).ask("override", 0.4).run(1000)
-    assert gentle.bounds[-1] == "plan"
-    assert gentle.bounds[803] == "override"  # hardly gathering speed yet
-    steep = Arm(live_motions[0], SIX_AXES).begin().run(300).ask("hold").run(500).ask("resume")
-    steep.run(80).ask("override", 0.4).run(1000)
-    assert steep.bounds[880] == "stop"
-    assert steep.player.rate == gentle.player.rate == 0.4
-
-
 def test_nothing_resumes_after_a_stop(live_motions):
     arm = Arm(live_motions[1], SIX_AXES).begin().run(500).ask("hold").run(20).ask("stop")
     arm.ask("resume").ask("override", 1.0).ask("hold").ask("resume").run(1000)

@@ -311,11 +311,3 @@ class TestStreamInChildren:
             assert next(results) == (0, 0)
             assert requested == [0, 1]
             assert sorted(results) == [(index, index) for index in range(1, 50)]
-
-    def test_an_early_end_closes_no_idle_child(self):
-        with workers(2) as children:
-            results = stream_in_children(children, list, [[0]], lambda chunk: (chunk,))
-            assert next(results) == (0, 0)
-            pids = [child.pid for child in children]
-            results.close()
-            assert [child.pid for child in children] == pids

@@ -785,19 +785,6 @@ def test_a_trip_in_open_mode_drops_the_drive_before_the_modes() -> None:
     assert not any(loop.open_axes)
 
 
-def test_leaving_while_axes_are_opening_opens_no_further_axis() -> None:
-    for leave in ("trip", "exit"):
-        loop = program()
-        advance_to(loop, Phase.OPENING)
-        if leave == "trip":
-            loop.trip("test")
-        else:
-            advance(loop, answer=Answer(valid=True, exit=True))
-        assert loop.open_axes == [True, False, False]
-        advance(loop, 2)
-        assert not any(loop.open_axes)
-
-
 def test_finish_waits_until_the_arm_is_at_rest() -> None:
     loop = program()
     advance_to(loop, Phase.OPEN)

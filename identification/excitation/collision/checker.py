@@ -16,17 +16,19 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import Workspace, floor_at, link_bodies, obstacles
-from identification.excitation.collision.hulls import (
+from identification.excitation.collision.bodies import (
     Bodies,
     Frames,
     Indices,
     Separation,
+    Workspace,
+    floor_at,
     frames,
+    link_bodies,
+    obstacles,
     placed,
     reaches,
 )
-from identification.excitation.joint_limits import acceleration_bound
 from identification.model.kinematics import Chain, chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic
 
@@ -439,3 +441,16 @@ def _length(chain: Chain) -> float:
     for joint, parent in enumerate(chain.parents):
         reach[joint + 1] = reach[parent + 1] + np.linalg.norm(chain.translation[joint])
     return float(reach.max()) or 1.0
+
+
+def acceleration_bound(
+    trajectory: PiecewiseCubic | FourierSeries, start: Array, stop: Array
+) -> Array:
+    """Return an upper bound of |qdd| in parts of a motion from `start` to `stop` [s], (n, g)."""
+    if isinstance(trajectory, FourierSeries):
+        ramp, length = trajectory.ramp, trajectory.length
+        between_ramps = (start >= ramp) & (stop <= length - ramp)
+        without = trajectory.derivative_bound(2, ramps=False)[:, None]
+        return np.where(between_ramps, without, trajectory.derivative_bound(2)[:, None])
+    largest = trajectory.extrema().acceleration
+    return np.broadcast_to(largest[:, None], (len(largest), len(start)))
