@@ -228,6 +228,18 @@ class TestExcitation:
             again = plan_moves(restored.via_points[0], restored.moves, ROOMY)
             assert again.trajectory.to_dict() == excitation.trajectory.to_dict()
 
+    def test_data_without_method_are_restored(self):
+        excitation = planned(5)
+        old = excitation.to_dict()
+        del old["method"]
+        for name in ("condition", "scaled_condition"):
+            del old["criteria"][name]
+        restored = Excitation.from_dict(old)
+        assert restored.method == "random"
+        assert (restored.criteria.condition, restored.criteria.scaled_condition) == (None, None)
+        assert restored.criteria.log10_det == excitation.criteria.log10_det
+        np.testing.assert_array_equal(restored.via_points, excitation.via_points)
+
     @pytest.mark.parametrize(
         "damage",
         [
