@@ -26,8 +26,8 @@ from identification.factor.factor import joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
-from identification.validation.consistency import ConsistencyCheck, check_consistency
 from identification.validation.evidence import gather
+from identification.validation.plausibility import ConsistencyCheck, check_consistency
 from identification.validation.prediction import for_figure
 from identification.validation.verdict import Verdict, judge
 

@@ -27,8 +27,8 @@ from identification.model.elements import TorqueRipple
 from identification.selection.essential import EssentialChoice
 from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate
-from identification.validation.consistency import ConsistencyCheck
 from identification.validation.evidence import Evidence
+from identification.validation.plausibility import ConsistencyCheck
 from identification.validation.prediction import PredictionError, pooled_error, prediction_error
 from identification.validation.residuals import BLOCK, Profile
 from identification.validation.verdict import Verdict

@@ -22,11 +22,10 @@ from numpy.typing import NDArray
 
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
-from identification.estimators.covariance import block_length, spread, with_block_covariance
+from identification.estimators.covariance import block_length, spread
 from identification.factor.factor import (
     WORST_CONDITION,
     Estimate,
-    estimate,
     estimate_of,
     inverse_variance,
     joint_weights,
@@ -152,11 +151,9 @@ _PARTICIPATION: Final = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class InstrumentalEstimate:
-    """Estimate by instrumental variables, and by least squares on the same rows."""
+    """Estimate by instrumental variables."""
 
     estimate: Estimate  #: with cluster-robust covariance
-    least_squares: Estimate  #: with the same rows and weights
-    weights: Array  #: per joint (n,)
     weak: tuple[str, ...]  #: parameters with weak instruments
 
 
@@ -204,8 +201,7 @@ def estimate_instrumental(
     p, names = model.n_parameters, model.parameter_names
     if not factor.samples.any():
         raise IdentificationError("no row in which samples and instruments move")
-    measured = measured_part(factor)
-    rows = measured.total
+    rows = measured_part(factor).total
     if weights is None:
         first = joint_weights(rows)
         values = solve_cross(factor.weighted(first).sum(axis=0)).values
@@ -235,8 +231,6 @@ def estimate_instrumental(
     )
     return InstrumentalEstimate(
         estimate=found,
-        least_squares=with_block_covariance(estimate(model, rows, weights), measured, weights),
-        weights=weights,
         weak=tuple(name for name, f in zip(names, first_stage, strict=True) if f < WEAK),
     )
 

@@ -22,8 +22,12 @@ from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
 from identification.validation.causes import Cause, find_causes
 from identification.validation.finding import Finding, Thresholds
-from identification.validation.nominal_scale import InertiaRatio, NominalScale
-from identification.validation.plausibility import Implausible, implausibilities
+from identification.validation.plausibility import (
+    Implausible,
+    InertiaRatio,
+    NominalScale,
+    implausibilities,
+)
 from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
     PredictionError,

@@ -21,7 +21,7 @@ from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
 from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
-from identification.validation.consistency import ConsistencyCheck
+from identification.validation.plausibility import ConsistencyCheck
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,14 @@ from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
-from identification.validation.consistency import check_consistency
-from identification.validation.nominal_scale import inertia_ratio, nominal_scale
-from identification.validation.plausibility import Implausible, implausibilities, inertia_matrices
+from identification.validation.plausibility import (
+    Implausible,
+    check_consistency,
+    implausibilities,
+    inertia_matrices,
+    inertia_ratio,
+    nominal_scale,
+)
 from identification.validation.position_jumps import position_jumps
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
