@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,7 +14,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from drivers.packets import DRIVE_ON
-from drivers.states import State
 from hil.archive import Archive, open_archive
 from hil.archive.check import Overview, read_overview
 from hil.cell import AngleFrame, Cell
@@ -29,21 +27,13 @@ from identification.model.kinematics import chain_from_urdf
 
 Array = NDArray[np.float64]
 
-_SAMPLES: Final = 30_000
-"""Samples in memory at a time."""
 _BINS: Final = 4000
 """Intervals of a picture, each with its minimum and maximum."""
 _LEAP: Final = 10.0  # Missing samples that interrupt a line
-_TITLES: Final = {
-    "position": "position [deg]",
-    "velocity": "speed [deg/s]",
-    "current": "motor current [A]",
-    "torque": "torque at the joint [N·m]",
-    "following": "following error [{}]",
-}
+_GAP: Final = (np.array([np.nan]), np.array([np.nan]))
 _FIELDS: Final = (
     "position", "velocity", "torque", "target_current", "motor_current", "target_position",
-    "state", "status", "gap",
+    "status", "gap",
 )  # fmt: skip
 _SECONDS: Final = "time since the first sample [s]"
 _COLOURS: Final = {
@@ -89,17 +79,15 @@ class ArchiveView:
     start: float  #: s since the first sample
     stop: float  #: s since the first sample
     quantities: tuple[Quantity, ...]  #: those in the archive
-    #: (start [s], end [s], name) of session states; none in an imported recording
-    states: tuple[tuple[float, float, str], ...] = ()
     #: (time [s], name, text, whether a warning or worse)
     events: tuple[tuple[float, str, str, bool], ...] = ()
-    gaps: Array = field(default_factory=lambda: np.zeros(0))  #: times of missed packets [s]
+    gaps: Array | None = None  #: times of missed packets [s]; None in an imported recording
     frame: str = ""  #: description of the angle frame
 
     @property
     def missed(self) -> str:
         """Text on missed packets; "" for imported recordings."""
-        if not self.states:
+        if self.gaps is None:
             return ""
         return f"missed at {plural(len(self.gaps), 'place')}" if len(self.gaps) else "none missed"
 
@@ -131,39 +119,26 @@ def view_of(
         raise ArchiveError(path, problem, remedy="correct --start and --stop")
     shown = _wanted(head.joint_names, joints)
     scales = _Scales.of(head)
-    lines: dict[str, list[list[tuple[Array, Array]]]] = {
-        name: [[] for _ in shown] for name in _TITLES
-    }
-    states, gaps = list[tuple[float, float, str]](), list[float]()
-    for archive in _windows(path, stamp * 1e-9, origin + begin, origin + end):
-        if not archive.n_samples:
-            continue
-        columns, time = archive.columns, archive.columns["stamp"] * 1e-9 - origin
-        share = (time[-1] - time[0]) / max(end - begin, 1e-9)
-        _collect(lines, scales, columns, time, shown, max(2, round(_BINS * share)))
-        if "state" in columns:
-            _add_states(states, time, columns["state"])
-            gaps += time[columns["gap"] > 0].tolist()
+    archive = open_archive(path, fields=_FIELDS, start=origin + begin, stop=origin + end + 1e-6)
+    columns, time = archive.columns, archive.columns["stamp"] * 1e-9 - origin
+    quantities = []
+    # Values that overflow in degrees are missing in the plot.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for title, values, limits in scales.shown(columns):
+            bounds = np.zeros((0, len(head.joint_names))) if limits is None else limits
+            traces = (Trace(*_reduced(time, values[:, j]), tuple(bounds[:, j])) for j in shown)
+            quantities.append(Quantity(title, tuple(traces)))
     events = [(one.time - origin, one.name, one.text, one.level >= 30) for one in head.events]
     return ArchiveView(
         facts=read_overview(path),
         joint_names=tuple(head.joint_names[j] + " [mm]" * bool(scales.slides[j]) for j in shown),
         start=begin,
         stop=end,
-        quantities=tuple(_quantities(lines, scales, shown)),
-        states=tuple(states),
+        quantities=tuple(quantities),
         events=tuple(one for one in events if begin <= one[0] <= end),
-        gaps=np.array(gaps),
+        gaps=time[columns["gap"] > 0] if "gap" in columns else None,
         frame=scales.words,
     )
-
-
-def _windows(path: Path, time: Array, begin: float, end: float) -> Iterator[Archive]:
-    """Yield windows of a recording with samples at `time` (m,), from `begin` to `end`."""
-    first, last = np.searchsorted(time, (begin, end))
-    edges = [begin, *time[first + _SAMPLES : last : _SAMPLES], end + 1e-6]  # the last sample too
-    for a, b in pairwise(edges):
-        yield open_archive(path, fields=_FIELDS, start=float(a), stop=float(b))
 
 
 def _wanted(names: Sequence[str], joints: Sequence[str]) -> list[int]:
@@ -218,30 +193,36 @@ class _Scales:
         whose = "as on the teach pendant" if pendant else "of the URDF"
         return f"angles, speeds and torques {whose}"
 
-    def shown(self, columns: Mapping[str, NDArray[Any]]) -> Iterator[tuple[str, Array]]:
-        """Yield quantities (m, n) of a window in displayed units; torque signs follow the angles.
+    def shown(
+        self, columns: Mapping[str, NDArray[Any]]
+    ) -> Iterator[tuple[str, Array, Array | None]]:
+        """Yield title, values (m, n) in displayed units, and limits (2, n) of each quantity.
 
+        Torque signs follow the angles.
         Following errors are in motor revolutions if the drive train is known.
         """
-        position = columns.get("position")
+        limits, position = self.limits, columns.get("position")
         if position is not None:
-            yield "position", np.where(self.slides, 1e3 * position, self.frame.shown(position))
+            shown = np.where(self.slides, 1e3 * position, self.frame.shown(position))
+            yield "position [deg]", shown, limits.get("position")
         if "velocity" in columns:
-            yield "velocity", self._rate(columns["velocity"])
+            yield "speed [deg/s]", self._rate(columns["velocity"]), limits.get("velocity")
         current = columns.get("target_current", columns.get("motor_current"))
         if current is not None:
-            yield "current", current
+            yield "motor current [A]", current, limits.get("current")
         if "torque" in columns:
-            yield "torque", columns["torque"] * np.where(self.slides, 1.0, self.frame.sign)
+            torque = columns["torque"] * np.where(self.slides, 1.0, self.frame.sign)
+            yield "torque at the joint [N·m]", torque, limits.get("torque")
         if "target_position" in columns and position is not None:
-            error = columns["target_position"] - position
+            error, unit = columns["target_position"] - position, "motor rev"
             if self.motor_from_joint is None:
-                error = self._rate(error)
+                error, unit = self._rate(error), "deg"
             else:
                 error = error @ self.motor_from_joint.T / (2.0 * np.pi)
             # The controller reports no target with the drive off.
             driven = columns["status"] == DRIVE_ON
-            yield "following", np.where(driven[:, np.newaxis], error, np.nan)
+            error = np.where(driven[:, np.newaxis], error, np.nan)
+            yield f"following error [{unit}]", error, limits.get("following")
 
     def _rate(self, rate: Array) -> Array:
         return np.where(self.slides, 1e3 * rate, self.frame.shown_rate(rate))
@@ -274,65 +255,19 @@ def _slides(archive: Archive, n: int) -> NDArray[np.bool_]:
     return np.array([not turns.get(name, True) for name in archive.joint_names])
 
 
-def _runs(time: Array, values: Array, bins: int) -> Iterator[tuple[Array, Array]]:
-    """Yield intervals of finite values (m,), each thinned, with `bins` bins in total."""
-    edges = np.flatnonzero(np.diff(np.isfinite(values), prepend=False, append=False))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        yield thinned(time[a:b], values[a:b], max(2, round(bins * (b - a) / len(values))))
-
-
-def _collect(
-    lines: Mapping[str, list[list[tuple[Array, Array]]]],
-    scales: _Scales,
-    columns: Mapping[str, NDArray[Any]],
-    time: Array,
-    joints: Sequence[int],
-    bins: int,
-) -> None:
-    """Add a window of a recording, reduced, to the lines of each quantity and joint."""
+def _reduced(time: Array, values: Array) -> tuple[Array, Array]:
+    """Return minimum and maximum per interval of samples (m,); NaN where nothing was recorded."""
     leap = _LEAP * float(np.median(np.diff(time))) if len(time) > 1 else np.inf
-    gaps = np.flatnonzero(np.diff(time) > leap) + 1
-    unbroken = np.insert(time, gaps, time[gaps])
-    # Values that overflow in degrees are missing in the plot.
-    with np.errstate(over="ignore", invalid="ignore"):
-        for name, values in scales.shown(columns):
-            for line, joint in zip(lines[name], joints, strict=True):
-                for t, v in _runs(unbroken, np.insert(values[:, joint], gaps, np.nan), bins):
-                    if line and t[0] - line[-1][0][-1] > leap:
-                        line.append((np.array([np.nan]), np.array([np.nan])))
-                    line.append((t, v))
-
-
-def _quantities(
-    lines: Mapping[str, list[list[tuple[Array, Array]]]], scales: _Scales, joints: Sequence[int]
-) -> Iterator[Quantity]:
-    unit = "deg" if scales.motor_from_joint is None else "motor rev"
-    empty = np.zeros(0), np.zeros(0)
-    for name, found in lines.items():
-        if any(found):
-            limits, traces = scales.limits.get(name), []
-            for line, joint in zip(found, joints, strict=True):
-                t, v = (np.concatenate(parts) for parts in zip(empty, *line, strict=True))
-                bounds = () if limits is None else limits[:, joint].tolist()
-                traces.append(Trace(t, v, tuple(bounds)))
-            yield Quantity(_TITLES[name].format(unit), tuple(traces))
-
-
-def _add_states(
-    states: list[tuple[float, float, str]], time: Array, state: NDArray[np.uint8]
-) -> None:
-    edges = [0, *(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state) - 1]
-    for edge, until in pairwise(edges):
-        name, begin = _state_name(int(state[edge])), float(time[edge])
-        if states and states[-1][2] == name:
-            begin = states.pop()[0]
-        states.append((begin, float(time[until]), name))
-
-
-def _state_name(number: int) -> str:
-    """Return the name of a session state; an untrusted archive may contain unknown numbers."""
-    known = number in State.__members__.values()
-    return State(number).name.lower().replace("_", " ") if known else f"state {number}"
+    known = np.flatnonzero(np.isfinite(values))
+    ends = np.flatnonzero((np.diff(known) > 1) | (np.diff(time[known]) > leap)) + 1
+    parts = list[tuple[Array, Array]]()
+    for rows in np.split(known, ends) if known.size else []:
+        bins = max(2, round(_BINS * len(rows) / len(values)))
+        parts += [_GAP] * bool(parts) + [thinned(time[rows], values[rows], bins)]
+    if not parts:
+        return np.zeros(0), np.zeros(0)
+    reduced_time, reduced = map(np.concatenate, zip(*parts, strict=True))
+    return reduced_time, reduced
 
 
 def _share(recorded: Trace) -> str:
@@ -345,7 +280,8 @@ def draw_archive(view: ArchiveView) -> Figure:
     rows, columns, facts = len(view.joint_names), max(1, len(view.quantities)), view.facts
     width, height = 0.95 + 3.1 * columns, 1.6 + 1.15 * rows
     marks = [(at, style.LIMIT if warns else style.MUTED) for at, _, _, warns in view.events]
-    marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MOST_GAPS]]
+    if view.gaps is not None:
+        marks += [(float(gap), style.MUTED) for gap in view.gaps[:_MOST_GAPS]]
     with style.page():
         figure = Figure(figsize=(width, height))
         grid = figure.add_gridspec(

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, InitPacket
-from drivers.states import State
 from drivers.transports.can.ends import ControllerEnd
 from drivers.transports.can.layout import BusRates
 from hil.archive import Samples, write_samples
@@ -23,7 +22,7 @@ from hil.design.result import DesignResult
 from hil.errors import ArchiveError, InputError, SourceError
 from hil.importers import ColumnMap, import_log, import_rosbag2
 from hil.new import from_archive
-from hil.plots.archive_view import _state_name, view_of
+from hil.plots.archive_view import view_of
 from identification.errors import ModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.payload import Payload
@@ -209,8 +208,3 @@ def test_signalling_nan_is_sent_over_can() -> None:
     packet = CyclicPacket.zeros(11, 1)
     packet.axes.view(np.int32)[1] = 0x7F800001
     assert len(end.packet(packet.encode())) == 2
-
-
-def test_archive_with_an_unknown_state_is_shown() -> None:
-    assert _state_name(State.OPEN) == "open"
-    assert _state_name(105) == "state 105"
