@@ -160,8 +160,7 @@ def plan_around(
     problem = checks.refusal(excitation.trajectory)
     if problem is not None:
         raise MotionRefusedError("the excitation", problem, "design another motion")
-    # A design may be judged by some parameters only, or with earlier archives; the plan has the
-    # criteria of the motion alone, over all parameters.
+    # A design may be judged by some parameters only; the plan has the criteria over all of them.
     criteria = Objective(cell.model).criteria(excitation.trajectory, RESCORE_PERIOD)
     excitation = replace(excitation, criteria=criteria)
     validation = _validation_motions(cell, checks)

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
@@ -20,7 +20,6 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, criteria_text, margins, weakest
-from hil.design.earlier import estimate_earlier
 from hil.design.result import references
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
@@ -81,8 +80,6 @@ def _draw(
     done: Designed,
     cell: Cell,
     beside: dict[str, tuple[float, ...]],
-    *,
-    together: bool,
 ) -> None:
     """Draw the picture; a failure is only reported."""
     from hil.plots.design_picture import draw_design  # matplotlib is slow to import
@@ -92,7 +89,6 @@ def _draw(
         cell,
         references=beside,
         unchecked=done.result.settings.unchecked,
-        together=together,
         margins=margins(cell, done.problem, done.design.excitation.trajectory),
     )
     try:
@@ -112,8 +108,6 @@ def design(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
     kinematic: bool = False,
-    purpose: Annotated[Literal["arm", "payload"], typer.Option("--for")] = "arm",
-    earlier: list[Path] | None = None,
     compare: list[Path] | None = None,
     resume: bool = False,
     force: bool = False,
@@ -140,9 +134,6 @@ def design(
 
     - `hil design cell.toml -o runs/mine`
     - `hil design --show-settings front > my.toml`, then `hil design cell.toml --settings my.toml`
-    - `hil design cell.toml --earlier runs/demo -o runs/second`: a motion that complements a
-      campaign
-    - `hil design cell.toml --for payload -o runs/load`: a short motion for `hil payload`
 
     Options:
         cell: The cell file.
@@ -160,12 +151,7 @@ def design(
         workers: Number of processes; the result does not depend on it. Default: one per processor.
         kinematic: Check joint limits only and do not return to the home posture; for comparison
             with the paper, not for a robot.
-        purpose: arm: all parameters of the arm. payload: the payload only, with the arm known, by a
-            motion of at most 10 s (`hil payload`).
-        earlier: Campaign folder or archives (repeatable); the new motion reduces the uncertainty
-            that they leave.
-        compare: Earlier results to plot beside the front, of the same robot and parameters; not
-            with --earlier.
+        compare: Earlier results to plot beside the front, of the same robot and parameters.
         resume: Continue an interrupted search in OUTPUT.
         force: Replace an earlier design in OUTPUT.
     """
@@ -190,10 +176,7 @@ def design(
         asked = asked.replaced(seed=seed)
     if kinematic:
         asked = asked.kinematic()
-    if purpose == "payload":
-        asked = asked.for_payload()
-    beside = references(compare or [], loaded, asked, together=bool(earlier))
-    estimate = estimate_earlier(earlier, loaded, reporter) if earlier else None
+    beside = references(compare or [], loaded, asked)
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
@@ -225,7 +208,7 @@ def design(
                     f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
-        _draw(folder, done, loaded, beside, together=estimate is not None)
+        _draw(folder, done, loaded, beside)
 
     with stop_on_interrupt() as stop:
         done = run_design(
@@ -234,7 +217,6 @@ def design(
             asked,
             reporter,
             workers=workers or len(os.sched_getaffinity(0)),
-            earlier=estimate,
             stop=lambda: stop.requested,
             resume=resume,
             force=force,

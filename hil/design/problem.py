@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from hil.cell import AngleFrame, Cell
@@ -29,38 +27,8 @@ from .settings import DesignSettings, SettingsError
 
 Array = NDArray[np.float64]
 
-# Random states, and smallest pivot of an independent parameter relative to the largest.
-_STATES: Final = 300
-_SEED: Final = 20140901
-_INDEPENDENT: Final = 1e-6
 
-
-@dataclass(frozen=True, eq=False)
-class EarlierEstimate:
-    """An earlier estimate and its information."""
-
-    names: tuple[str, ...]  #: of the model's parameters (p,)
-    values: Array  #: estimates (p,)
-    std: Array  #: standard deviations (p,), infinite if undetermined
-    joint_weights: Array  #: 1 / variance of each joint's torque residual (n,)
-    #: information (p, p) of all motions with these weights, at one sample per
-    #: `identification.excitation.SAMPLE_PERIOD`
-    gram: Array
-    samples: int  #: time samples in it
-    repetitions: int  #: planned runs of the new motion
-    archives: tuple[tuple[str, str], ...] = ()  #: name and SHA-256 of each file
-
-    @property
-    def relative_std(self) -> Array:
-        """Standard deviation relative to the absolute value (p,), infinite for 0."""
-        size = np.abs(self.values)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(size > 0.0, self.std / size, np.inf)
-
-
-def problem_of(
-    cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None = None
-) -> Problem:
+def problem_of(cell: Cell, settings: DesignSettings) -> Problem:
     """Return genome, objective and constraints of a search.
 
     Raises:
@@ -75,7 +43,7 @@ def problem_of(
     _require_start(cell, genome, checker, currents)
     return Problem(
         genome=genome,
-        objective=_objective(cell, settings, earlier),
+        objective=Objective(cell.model, parameters=_judged(cell, settings)),
         constraints=Constraints(
             limits=cell.joint_limits,
             min_duration=constraints.min_duration,
@@ -185,60 +153,9 @@ def _inside(cell: Cell, asked: list[float], shown: Array) -> Array:
     return np.asarray(angles)
 
 
-def _objective(cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None) -> Objective:
-    if settings.objective.parameters == "payload":
-        return _payload_objective(cell, earlier)
-    chosen = _essential(cell, settings, earlier)
-    if earlier is None:
-        return Objective(cell.model, parameters=chosen)
-    return Objective(
-        cell.model,
-        parameters=chosen,
-        joint_weights=earlier.joint_weights,
-        earlier=earlier.gram,
-        earlier_samples=earlier.samples,
-        repetitions=earlier.repetitions,
-    )
-
-
-def _payload_objective(cell: Cell, earlier: EarlierEstimate | None) -> Objective:
-    """Return the objective of a payload, with its identifiable parameters."""
-    if earlier is not None:
-        raise SettingsError(
-            None,
-            "assumes the arm's parameters as known, so that earlier archives have no effect",
-            field='objective.parameters = "payload"',
-            remedy="leave out --earlier",
-        )
-    model = cell.model.of_payload()
-    states = np.random.default_rng(_SEED).uniform(-2.0, 2.0, (3, _STATES, model.n_joints))
-    rows = model.regressor(*states).dense(model.n_parameters).reshape(-1, model.n_parameters)
-    length = np.linalg.norm(rows, axis=0)
-    _, triangle, order = scipy.linalg.qr(
-        rows / np.where(length > 0.0, length, 1.0), mode="economic", pivoting=True
-    )
-    size = np.abs(np.diag(triangle))
-    chosen = np.sort(order[: np.count_nonzero(size > _INDEPENDENT * size[0])])
-    return Objective(model, parameters=chosen)
-
-
-def _essential(
-    cell: Cell, settings: DesignSettings, earlier: EarlierEstimate | None
-) -> NDArray[np.intp] | None:
+def _judged(cell: Cell, settings: DesignSettings) -> NDArray[np.intp] | None:
     """Return the indices of the parameters in the criteria, None for all."""
     names, named = cell.model.parameter_names, settings.objective.named
-    percent = settings.objective.max_relative_std
-    if percent is not None:
-        field = f"objective.max_relative_std = {percent:g}"
-        if earlier is None:
-            problem, remedy = "needs an earlier estimate", "name archives with --earlier"
-            raise SettingsError(None, problem, field=field, remedy=remedy)
-        chosen = np.flatnonzero(earlier.relative_std <= percent / 100.0)
-        if len(chosen) < 2:
-            problem = f"leaves {len(chosen)} parameters, a design needs two"
-            remedy = f"at {100.0 * np.sort(earlier.relative_std)[1]:.3g} % two would be left"
-            raise SettingsError(None, problem, field=field, remedy=remedy)
-        return np.asarray(chosen, dtype=np.intp)
     if named is None:
         return None
     for name in named:

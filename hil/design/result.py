@@ -63,7 +63,6 @@ _COMMENTS: Final = {
     "cell": "Name of the cell, and digests of its parts.",
     "plan": "The motion: planning these moves gives it bit for bit.",
     "sines": "The motion: offset + ramp x sum of amplitude x sin(frequency x t), rad/s.",
-    "earlier": "Archives whose information was added.",
     "seal": "Digests of the lines above and of the motion.",
 }
 
@@ -100,15 +99,8 @@ class DesignResult:
         return bool(self.data["complete"])
 
     @classmethod
-    def of(
-        cls,
-        cell: Cell,
-        settings: DesignSettings,
-        design: Design,
-        objective: Objective,
-        archives: tuple[tuple[str, str], ...] = (),
-    ) -> Self:
-        """Return the result of a design; `archives` are names and SHA-256 of earlier archives."""
+    def of(cls, cell: Cell, settings: DesignSettings, design: Design, objective: Objective) -> Self:
+        """Return the result of a design."""
         names, chosen, front = objective.model.parameter_names, objective.parameters, design.front
         excitation, origin = design.excitation, design.origin_criteria
         data: dict[str, Any] = {
@@ -137,8 +129,6 @@ class DesignResult:
             measures = dict(zip(CRITERIA, origin.measures, strict=True))
             data["polished_from"] = {"point": design.origin, **measures}
         data["settings"] = settings.to_dict()
-        if archives:
-            data["earlier"] = {"archives": [list(one) for one in archives]}
         data["cell"] = {"name": cell.name, **fingerprint(cell)}
         data["software"] = software()
         return cls(data | _motion_data(excitation, cell), settings, excitation)
@@ -304,34 +294,27 @@ def _seal(text: str) -> str:
 
 
 def references(
-    paths: Sequence[Path], cell: Cell, settings: DesignSettings, *, together: bool
+    paths: Sequence[Path], cell: Cell, settings: DesignSettings
 ) -> dict[str, tuple[float, ...]]:
-    """Return the `CRITERIA` of designs by name, for comparison with a new one.
+    """Return the `CRITERIA` of designs by name, for comparison with a new one of these settings.
 
-    Those without all checks are marked as kinematic. The new design has `cell` and `settings`, and
-    with `together` adds to earlier archives.
+    Those without all checks are marked as kinematic.
 
     Raises:
         InputError: a file cannot be read, or its criteria are not comparable.
     """
-
-    def parameters_of(asked: DesignSettings, named: Sequence[str] | None) -> set[str]:
-        if asked.objective.parameters == "payload":
-            return {"payload"}
-        return set(named or cell.model.parameter_names)
-
     found: dict[str, tuple[float, ...]] = {}
-    new = parameters_of(settings, settings.objective.named)
+    everything = cell.model.parameter_names
+    judged = set(settings.objective.named or everything)
     for path in paths:
         result = DesignResult.load(path)
         result.require_cell(cell, path, ("urdf", "robot"))
-        old = parameters_of(result.settings, result.data["search"].get("parameters"))
-        if together or "earlier" in result.data or new != old:
+        if set(result.data["search"].get("parameters") or everything) != judged:
             raise InputError(
                 path,
-                "has criteria of other parameters, or one of the two includes earlier archives",
+                "has criteria of other parameters",
                 field="--compare",
-                remedy="name designs with the same [objective], none of them with --earlier",
+                remedy="name designs with the same [objective]",
             )
         method = result.excitation.method
         name = f"method {method.upper()}" if len(method) == 1 else method

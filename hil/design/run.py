@@ -19,7 +19,7 @@ from identification import excitation
 from planner.toml_text import to_text
 
 from .advice import criteria_text, infeasible_text, no_excitation
-from .problem import EarlierEstimate, problem_of, search_settings
+from .problem import problem_of, search_settings
 from .result import RESULT, DesignResult, fingerprint
 from .settings import DesignSettings, SettingsError, load_settings
 
@@ -130,7 +130,6 @@ def run_design(
     reporter: Reporter,
     *,
     workers: int = 2,
-    earlier: EarlierEstimate | None = None,
     stop: Callable[[], bool] = lambda: False,
     resume: bool = False,
     force: bool = False,
@@ -147,8 +146,7 @@ def run_design(
         UnsafeError: the motion does not pass the final check.
         HilError: see :func:`run_search`.
     """
-    problem = problem_of(cell, settings, earlier)  # before anything is replaced
-    archives = () if earlier is None else earlier.archives
+    problem = problem_of(cell, settings)  # before anything is replaced
     with lock_folder(folder.root, "search", "-o"):
         if resume:
             if settings != folder.resumed_settings():
@@ -159,8 +157,7 @@ def run_design(
                 )
         else:
             folder.create(settings, force=force)
-        added = {} if earlier is None else dict(archives) | {"repetitions": earlier.repetitions}
-        identity = {"settings": _flat(settings), "cell": fingerprint(cell), "earlier": added}
+        identity = {"settings": _flat(settings), "cell": fingerprint(cell)}
         with folder.opened_journal() as file:
             journal = _journal(file, identity, reporter)
             try:
@@ -185,7 +182,7 @@ def run_design(
         if broken:
             reason = violation_text(broken[0], AngleFrame.of(cell))
             raise UnsafeError(f"the motion does not pass the final check: {reason}")
-        result = DesignResult.of(cell, settings, design, problem.objective, archives)
+        result = DesignResult.of(cell, settings, design, problem.objective)
         result.save(folder.result)
         done = Designed(problem, design, result)
         then(done)
@@ -267,7 +264,7 @@ def _journal(file: BinaryIO, identity: Mapping[str, Any], reporter: Reporter) ->
     try:
         journal = excitation.Journal(file, identity)
     except excitation.JournalError as error:
-        remedy = "resume with the same cell, settings and archives, or start again (--force)"
+        remedy = "resume with the same cell and settings, or start again (--force)"
         raise InputError(file.name, str(error), remedy=remedy) from error
     except OSError as error:
         problem = f"cannot be read or written ({error.strerror})"

@@ -39,10 +39,6 @@ Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
 _MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
 RESULT_FORMAT: Final = "designed excitation"
 """Key `format` of a result file, which has a table of the settings."""
-PAYLOAD_DURATION: Final = 10.0
-"""Longest motion for a payload, s."""
-PAYLOAD_POINTS: Final = 5
-"""Largest number of via points of such a motion."""
 SHORTEST_RAMP: Final = 0.05
 """Shortest ramp of sines, s; a shorter one is a jerk whose contacts cannot be determined."""
 
@@ -180,29 +176,16 @@ class ConstraintTable(_Table):
 class ObjectiveTable(_Table):
     """`[objective]`: parameters in the criteria."""
 
-    parameters: Literal["all", "payload"] | Annotated[list[str], Field(min_length=2)] = Field(
+    parameters: Literal["all"] | Annotated[list[str], Field(min_length=2)] = Field(
         default="all",
-        description='"all"; "payload", a body on the last link of a known arm; or a list of at '
-        "least two names of parameters as `hil identify` reports them",
-    )
-    max_relative_std: Annotated[Number, Field(gt=0)] | None = Field(
-        default=None,
-        description="the largest relative standard deviation of a parameter in the earlier "
-        "estimate in percent; others are left out; needs --earlier",
+        description='"all", or a list of at least two names of parameters as `hil identify` '
+        "reports them",
     )
 
     @property
     def named(self) -> list[str] | None:
         """Names of the parameters, None if they are not listed."""
         return None if isinstance(self.parameters, str) else self.parameters
-
-    @model_validator(mode="after")
-    def _one_choice(self) -> ObjectiveTable:
-        if self.max_relative_std is not None and self.parameters != "all":
-            raise ValueError(
-                "both parameters and max_relative_std select parameters; leave one of them out"
-            )
-        return self
 
 
 class DesignSettings(_Table):
@@ -238,18 +221,6 @@ class DesignSettings(_Table):
             SettingsError: names field, value and remedy.
         """
         return _validated(None, _merged(self.to_dict(), changes))
-
-    def for_payload(self) -> DesignSettings:
-        """Return the settings for a short motion to identify a payload."""
-        changes: dict[str, dict[str, object]] = {
-            "objective": {"parameters": "payload"},
-            "constraints": {"max_duration": min(self.constraints.max_duration, PAYLOAD_DURATION)},
-        }
-        if self.sines is not None:
-            changes["sines"] = {"length": min(self.sines.length, PAYLOAD_DURATION)}
-        if self.via_points is not None:
-            changes["via_points"] = {"n_via": min(self.via_points.n_via, PAYLOAD_POINTS)}
-        return self.replaced(**changes)
 
     def kinematic(self) -> DesignSettings:
         """Return the settings with only joint limits and durations as constraints."""

@@ -116,14 +116,12 @@ def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> N
 
 
 def _heading(
-    design: Design, cell: Cell, unchecked: Sequence[str], margins: str, *, together: bool
+    design: Design, cell: Cell, unchecked: Sequence[str], margins: str
 ) -> Iterator[tuple[str, float, str]]:
     """Yield the lines of the heading with size in points and colour."""
     excitation = design.excitation
     log10_det, index = excitation.criteria.measures
     figures = f"log₁₀(det ΦᵀΦ / Nᵖ) {log10_det:.2f}, I_c {index:.1f}"
-    if together:
-        figures += " with earlier archives, not comparable with those of a single motion"
     duration = f"{excitation.trajectory.duration:.2f} s"
     parts = (label(cell.name), f"method {excitation.method}", duration, figures)
     for text, size, colour in (
@@ -151,7 +149,6 @@ def draw_design(
     *,
     references: Mapping[str, Measures] = _NO_REFERENCES,
     unchecked: Sequence[str] = (),
-    together: bool = False,
     margins: str = "",
 ) -> Figure:
     """Draw a designed motion.
@@ -161,11 +158,10 @@ def draw_design(
         cell: the cell to run it on.
         references: (log10 det, I_c) of other motions to compare with, by name.
         unchecked: what the search did not check ("floor", "the arm itself", ...).
-        together: whether the criteria include earlier archives.
         margins: text on the distance to the limits.
     """
     model, trajectory = cell.model, design.excitation.trajectory
-    lines = list(_heading(design, cell, unchecked, margins, together=together))
+    lines = list(_heading(design, cell, unchecked, margins))
     side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
     beside = _FRONT + _LEGEND_LINE * (len(references) + 3)
     head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT

@@ -144,9 +144,7 @@ class Criteria:
     log10_det: float  #: log10 of det(Phi^T Phi) / N^p; depends on units
     coupling_index: float  #: I_c, to be minimised
     fitness: float  #: eq. 7 with the paper's weights 0.7 and 0.3
-    #: N of eq. 9: time samples of the motion; if it adds to earlier archives, theirs, one every
-    #: 8 ms (see :class:`~identification.excitation.Objective`)
-    n_samples: int
+    n_samples: int  #: N of eq. 9: time samples of the motion
     condition: float | None = None  #: condition number of Phi; depends on units; None: unknown
     scaled_condition: float | None = None  #: the same with columns of unit length
 

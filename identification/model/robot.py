@@ -231,15 +231,6 @@ class RobotModel:
         parts = self.chain, self.gravity, self.layout, self.base
         return replace(self, **_parameters(*parts, friction, elements))
 
-    def of_payload(self) -> RobotModel:
-        """Return the model of a payload alone: ten parameters in the last joint's frame."""
-        return replace(
-            self,
-            parameter_names=LINK_SYMBOLS,
-            units=tuple(self.layout.units[k] for k in self.layout.links[-1]),
-            plan=RegressorPlan.of_bodies(self.chain, self.gravity, self.n_joints - 1),
-        )
-
     @property
     def friction_columns(self) -> NDArray[np.bool_]:
         """Which of the p parameters are friction (p,), without offsets."""

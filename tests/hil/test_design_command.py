@@ -263,7 +263,6 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         ([CELL_PATH, "--settings", "NOWHERE"], "cannot be read"),
         (["NOWHERE"], "cannot be read"),
         ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
-        ([CELL_PATH, "--earlier", "NOWHERE"], "nowhere"),
         ([CELL_PATH, "-o", "SETTINGS"], "cannot be created"),
     ],
 )
@@ -315,7 +314,7 @@ def test_unchecked_constraints_are_in_picture_json_and_stderr(invoke, bare, copi
     assert list(seen.arguments["unchecked"]) == unchecked
     assert f"warning: not checked: {', '.join(unchecked)}" in result.stderr
     assert json.loads(bare[1])["unchecked"] == unchecked
-    assert seen.arguments["margins"] == "" and not seen.arguments["together"]
+    assert seen.arguments["margins"] == ""
     (copied / "excitation.toml").unlink()
     invoke(CELL_PATH, "--resume", "-o", copied)
     files = (folder / "excitation.toml" for folder in (bare[0], copied))

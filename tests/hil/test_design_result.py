@@ -1,36 +1,23 @@
-"""Result files of designs, comparison of designs, and sequential design."""
+"""Result files of designs, and comparison of designs."""
 
 from __future__ import annotations
 
 import os
 import re
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import typer
-from matplotlib.figure import Figure
-from typer.testing import CliRunner
 
-from hil.archive import open_archive
-from hil.campaign import plan_around
 from hil.cell import Cell
-from hil.cli.design import design
 from hil.design import DesignResult, load_design, preset, problem_of
-from hil.design.earlier import estimate_earlier
-from hil.design.problem import EarlierEstimate
 from hil.design.result import _seal, fingerprint, references
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
-from hil.identify import identify_archives
-from hil.identify.options import FIXED
-from hil.plots import design_picture
 from hil.progress import Silent
-from identification.excitation import Criteria, Excitation, Objective, midpoints
-from planner import FourierSeries
+from identification.excitation import Objective
 from sim_fixtures.ns16 import CELL_PATH
 
 TINY = {"population": 8, "generations": 2, "polish": 0}
@@ -224,18 +211,18 @@ def changed(result: DesignResult, **tables: Any) -> DesignResult:
 
 def test_designs_without_all_checks_are_marked(ns16, result, saved):
     path = saved(result)
-    found = references([path, path], ns16, preset("b"), together=False)
+    found = references([path, path], ns16, preset("b"))
     name, measures = "method A (kinematic)", result.excitation.criteria.measures
     assert found == {name: measures, f"{name} ({path})": measures}
     whole = changed(result, settings=preset("a").to_dict())
-    assert set(references([saved(whole)], ns16, preset("b"), together=False)) == {"method A"}
+    assert set(references([saved(whole)], ns16, preset("b"))) == {"method A"}
 
 
 def test_another_robot_is_refused(ns16, result, saved):
     heavier = ns16.with_values({"robot.gravity": [0.0, 0.0, -1.62]})
     words = r"excitation\.toml: cell: was designed for the cell .*, which differs from .* in robot"
     with pytest.raises(InputError, match=words):
-        references([saved(result)], heavier, preset("b"), together=False)
+        references([saved(result)], heavier, preset("b"))
 
 
 def test_only_criteria_of_the_same_parameters_are_compared(ns16, result, saved):
@@ -246,144 +233,8 @@ def test_only_criteria_of_the_same_parameters_are_compared(ns16, result, saved):
     )
     search = result.data["search"] | {"parameters": names[:3], "n_parameters": 3}
     subset = changed(result, search=search)
-    archives = changed(result, earlier={"archives": [["a.mcap", "0" * 64]]})
-    for one, settings, together in (
-        (archives, preset("b"), False),
-        (result, preset("b"), True),
-        (result, some, False),
-        (subset, others, False),
-    ):
+    for one, settings in ((result, some), (subset, others)):
         with pytest.raises(InputError, match=r"\.toml: --compare: has criteria of other"):
-            references([saved(one)], ns16, settings, together=together)
-    assert references([saved(subset)], ns16, some, together=False)
-    assert references([saved(result)], ns16, everything, together=False)
-
-
-@pytest.fixture(scope="module")
-def known(campaign, cell) -> EarlierEstimate:
-    return estimate_earlier([campaign.folder.root], cell, Silent())
-
-
-@pytest.mark.slow
-def test_joints_are_weighted_by_their_torque_noise(known, campaign):
-    kinds = ("excitation", "validation", "standstill")
-    paths = [path for kind in kinds for path in campaign.folder.completed(kind)]
-    options = replace(FIXED, in_sample=True)
-    pooled = identify_archives(paths, Silent(), options).estimate.pooled
-    np.testing.assert_allclose(known.joint_weights, 1.0 / pooled.noise_std**2)
-    np.testing.assert_array_equal(known.values, pooled.values)
-    np.testing.assert_array_equal(known.std, pooled.std)
-
-
-def test_a_repeated_motion_adds_about_the_same_information(excitations, cell, plan):
-    # The archives have one sample per ms, the search one every 8 ms. A fit also leaves out rows
-    # near reversals: up to 5 % of those in which a joint accelerates.
-    known = estimate_earlier(excitations, cell, Silent())
-    objective = problem_of(cell, preset("b").kinematic(), known).objective
-    assert objective.repetitions == len(excitations) == 3
-    both = objective.information(midpoints(plan.excitation.trajectory))
-    np.testing.assert_allclose(np.diag(known.gram) / np.diag(both), 0.5, atol=0.03)
-
-
-@pytest.fixture(scope="module")
-def excitations(campaign) -> list[Path]:
-    return campaign.folder.completed("excitation")
-
-
-def rows(found: EarlierEstimate) -> np.ndarray:
-    """Return sums of squares of each joint's friction columns, without weights."""
-    of_friction = [k for k, name in enumerate(found.names) if name.startswith("f")]
-    joints = [int(found.names[k].rpartition("_")[2]) - 1 for k in of_friction]
-    return np.diag(found.gram)[of_friction] / found.joint_weights[joints]
-
-
-@pytest.mark.slow
-def test_fitted_and_held_out_motions_are_used(known, excitations, campaign, cell):
-    """Excitations and validation motions count, in any split."""
-    three = estimate_earlier(excitations, cell, Silent())
-    one = estimate_earlier(excitations[:1], cell, Silent())
-    assert one.samples == pytest.approx(three.samples / 3.0, rel=0.01)
-    np.testing.assert_allclose(rows(one), rows(three) / 3.0, rtol=0.02)
-    assert [name for name, _ in one.archives] == [excitations[0].name]
-    validation = campaign.folder.completed("validation")
-    assert {name for name, _ in known.archives} == {p.name for p in [*excitations, *validation]}
-    whole = estimate_earlier([*excitations, *validation[:1]], cell, Silent())
-    assert np.all(rows(whole) > 1.05 * rows(three))
-    assert np.all(rows(known) > 1.05 * rows(whole))
-
-
-class Listening(Silent):
-    def __init__(self) -> None:
-        self.messages: list[str] = []
-
-    def say(self, text: str) -> None:
-        self.messages.append(text)
-
-
-@pytest.mark.slow
-def test_a_joint_at_rest_is_weighted_like_the_others(tmp_path, cell, run):
-    short = cell.with_campaign(repetitions=1, validation_runs=1)
-    limits, random = cell.joint_limits, np.random.default_rng(12)
-    amplitude = random.uniform(-0.5, 0.5, (6, 3))
-    amplitude[5] *= 1e-3  # its peak speed is below standstill
-    series = FourierSeries(
-        offset=0.5 * (limits.lower + limits.upper),
-        amplitude=amplitude,
-        frequency=random.uniform(0.8, 3.2, (6, 3)),
-        length=8.0,
-        ramp=2.0,
-    )
-    unknown = Criteria(log10_det=0.0, coupling_index=0.0, fitness=0.0, n_samples=1)
-    excitation = Excitation(series, unknown, method="a", seed=7, tried=1, rejected={})
-    folder = run(tmp_path / "campaign", short, plan_around(short, excitation)).folder
-    reporter = Listening()
-    known = estimate_earlier(folder.completed("excitation"), cell, reporter)
-    (warning,) = (text for text in reporter.messages if text.startswith("warning: "))
-    assert f"{cell.joint_names[5]} never moved" in warning
-    assert not any(name in warning for name in cell.joint_names[:5])
-    drives = cell.drive_train
-    strength = np.abs(drives.motor_from_joint.T) @ (drives.torque_constant * drives.current_limit)
-    share = known.joint_weights**-0.5 / strength
-    assert share[5] == pytest.approx(np.median(share[:5]))
-    # A design with it excites the sixth joint.
-    assert np.isinf(known.std[known.names.index("f0_6")])
-    assert known.gram[known.names.index("f0_6")].tolist() == [0.0] * len(known.names)
-    problem = problem_of(cell, preset("b").kinematic(), known)
-    genes = problem.genome.sample(np.random.default_rng(1), 3)
-    assert np.all(np.isfinite(problem.score(genes).measures))
-
-
-def test_archives_of_another_robot_are_refused(campaign, cell):
-    text = cell.text.replace('third = "quadratic"', 'third = "cubic"')
-    other = Cell.from_texts(text, cell.urdf, cell.path)
-    with pytest.raises(InputError, match="whose robot is not that of"):
-        estimate_earlier([campaign.folder.root], other, Silent())
-
-
-@pytest.mark.slow
-def test_a_sequential_design_lists_its_archives(campaign, tmp_path, monkeypatch):
-    shown = {}
-
-    def draw(*_, **asked):
-        shown.update(asked)
-        return Figure()
-
-    monkeypatch.setattr(design_picture, "draw_design", draw)
-    app = typer.Typer()
-    app.command()(design)
-    (tmp_path / "my.toml").write_text(
-        'method = "b"\n[search]\npopulation = 8\ngenerations = 1\n'
-        "[objective]\nmax_relative_std = 50.0\n"
-    )
-    arguments = [campaign.folder.cell, "--settings", tmp_path / "my.toml", "--kinematic"]
-    arguments += ["--earlier", campaign.folder.root, "-o", tmp_path / "out", "--workers", "1"]
-    result = CliRunner().invoke(app, list(map(str, arguments)), catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert shown["together"]
-    data = tomllib.loads((tmp_path / "out" / "excitation.toml").read_text())
-    names = [name for name, _ in data["earlier"]["archives"]]
-    assert campaign.folder.completed("excitation")[0].name in names
-    judged = data["search"]["parameters"]
-    assert 2 <= len(judged) == data["search"]["n_parameters"] < 58
-    for path in campaign.folder.completed("excitation"):
-        assert open_archive(path).path.name in names
+            references([saved(one)], ns16, settings)
+    assert references([saved(subset)], ns16, some)
+    assert references([saved(result)], ns16, everything)

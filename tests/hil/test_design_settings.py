@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import time
 import tomllib
@@ -15,7 +14,6 @@ from hypothesis import strategies as st
 from hil.cell import AngleFrame, Cell
 from hil.design import METHODS, load_settings, preset, problem_of, search_settings
 from hil.design.advice import NoExcitationError, margins, no_excitation, weakest
-from hil.design.problem import EarlierEstimate
 from hil.design.settings import SettingsError, preset_text, settings_of
 from hil.motion_checks import MotionChecks
 from identification.excitation import (
@@ -24,11 +22,9 @@ from identification.excitation import (
     Violation,
     check_motion,
 )
-from identification.model.payload import Load, Payload
 from planner import FourierSeries
 from planner.toml_text import Angles, from_text, to_text
 from sim_fixtures.ns16 import CELL_PATH
-from tests.docs.typed import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -102,10 +98,6 @@ def test_missing_settings_are_those_of_the_preset():
         (
             '[objective]\nparameters = ["mc2y"]',
             ["objective.parameters", "a list of at least two names"],
-        ),
-        (
-            '[objective]\nparameters = ["mc2y", "mc2z"]\nmax_relative_std = 30.0',
-            ["objective", "leave one of them out"],
         ),
         ("[search\n", ["is not TOML", "--show-settings"]),
     ],
@@ -181,27 +173,6 @@ def test_a_cell_without_drive_train_has_torque_limits_only():
         problem_of(without, preset("b"))
 
 
-def known_of(names: tuple[str, ...], values: np.ndarray, std: np.ndarray) -> EarlierEstimate:
-    p = len(names)
-    return EarlierEstimate(names, values, std, np.ones(6), np.eye(p), samples=100, repetitions=30)
-
-
-def test_parameters_with_a_large_deviation_are_left_out(cell):
-    names, p = cell.model.parameter_names, cell.model.n_parameters
-    known = known_of(names, np.full(p, -2.0), np.linspace(0.01, 3.0, p))
-    settings = preset("b").kinematic().replaced(objective={"max_relative_std": 30.0})
-    objective = problem_of(cell, settings, known).objective
-    np.testing.assert_array_equal(objective.parameters, np.flatnonzero(known.std <= 0.6))
-    assert objective.repetitions == 30 and objective.earlier_samples == 100
-    with pytest.raises(SettingsError, match=r"max_relative_std = 30.*--earlier"):
-        problem_of(cell, settings)
-    too_good = settings.replaced(objective={"max_relative_std": 0.1})
-    with pytest.raises(SettingsError, match="leaves 0 parameters"):
-        problem_of(cell, too_good, known)
-    nothing = known_of(("a", "b"), np.array([0.0, 1.0]), np.array([0.1, math.inf]))
-    assert np.all(np.isinf(nothing.relative_std))
-
-
 @given(
     angles=st.lists(st.floats(-1e3, 1e3), max_size=8),
     numbers=st.lists(st.floats(allow_nan=False), max_size=4),
@@ -227,40 +198,6 @@ def test_text_restores_every_bit(angles, numbers, words, key):
     assert [row["name"] for row in back["many"]] == [words] * len(angles)
     with pytest.raises(ValueError, match=r"turn_deg.*'far'"):
         from_text('turn_deg = [1.0, "far"]')
-
-
-class TestPayload:
-    @pytest.mark.parametrize("method", METHODS)
-    def test_a_motion_for_a_payload_takes_ten_seconds(self, method):
-        asked = preset(method).for_payload()
-        assert asked.objective.parameters == "payload"
-        assert asked.constraints.max_duration == 10.0
-        assert asked.sines is None or asked.sines.length <= 10.0
-
-    def test_the_objective_has_ten_parameters_of_the_payload(self, cell):
-        """The regressor is that of the load alone."""
-        objective = problem_of(cell, preset("front").for_payload()).objective
-        assert objective.n_parameters == 10
-        rng = np.random.default_rng(2)
-        q, qd, qdd = rng.uniform(-1.0, 1.0, (3, 5, 6))
-        load = Payload(3.0, (0.1, -0.05, 0.2), (0.02, 0.001, 0.0, 0.03, 0.002, 0.04))
-        expected = Load(cell.model.chain, cell.model.gravity, load).torque(q, qd, qdd)
-        torque = objective.model.torque(load.parameters, q, qd, qdd)
-        np.testing.assert_allclose(torque, expected, atol=1e-9)
-
-    def test_parameters_that_no_motion_separates_are_left_out(self):
-        """Mass, moments in the plane and Iyy act on two joints about y."""
-        flat = Cell.load(ROOT / "examples" / "two_joints" / "cell.toml")
-        objective = problem_of(flat, preset("front").for_payload()).objective
-        assert objective.parameters is not None
-        names = [objective.model.parameter_names[k] for k in objective.parameters]
-        assert names == ["Iyy", "mcx", "mcz", "m"]
-
-    def test_earlier_archives_are_refused(self, cell):
-        names = cell.model.parameter_names
-        known = known_of(names, np.ones(len(names)), np.ones(len(names)))
-        with pytest.raises(SettingsError, match=r"known.*leave out --earlier"):
-            problem_of(cell, preset("front").for_payload(), known)
 
 
 VIA, SINES = preset("b"), preset("a")

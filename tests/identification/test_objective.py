@@ -40,14 +40,9 @@ def some_motion(seed, n_via=5):
     return plan(via, LIMITS, fly=0.5)
 
 
-def rows_of(motion, *, moving=False):
-    """Phi of one motion: a row per sample and joint, of all or of those that move."""
-    rows = MODEL.regressor(*motion[1:]).dense(P).reshape(-1, P)
-    return rows[MODEL.moving(motion.velocity).ravel()] if moving else rows
-
-
-def share_of_period(motion):
-    return float(motion.time[1] - motion.time[0]) / SAMPLE_PERIOD
+def rows_of(motion):
+    """Phi of one motion: a row per sample and joint."""
+    return MODEL.regressor(*motion[1:]).dense(P).reshape(-1, P)
 
 
 def assert_measures(found, columns, n_samples):
@@ -60,78 +55,6 @@ def assert_measures(found, columns, n_samples):
     index = np.abs(np.triu(psi / deviation / deviation[:, None], 1)).sum()
     assert found["log10_det"] == pytest.approx(determinant, abs=1e-8)
     assert found["coupling_index"] == pytest.approx(index, rel=1e-8, abs=1e-12)
-
-
-# Sequential design.
-
-
-def earlier_of(trajectory):
-    """Information of a motion sampled every SAMPLE_PERIOD, to the last digit."""
-    motion = midpoints(trajectory)
-    columns = rows_of(motion, moving=True)
-    gram = share_of_period(motion) * columns.T @ columns
-    return {"earlier": gram, "earlier_samples": motion.n_samples}
-
-
-def assert_more(gram, other):
-    """Check that no combination of parameters has less information."""
-    scale = np.sqrt(np.diag(gram))
-    assert np.linalg.eigvalsh((gram - other) / scale / scale[:, None])[0] >= -1e-12
-
-
-class TestSequentialDesign:
-    @given(seed=seeds, repetitions=st.integers(1, 30))
-    @settings(max_examples=20, deadline=None)
-    def test_earlier_archives_and_repetitions_add_up(self, seed, repetitions):
-        earlier = earlier_of(some_motion(seed))
-        before, after = midpoints(some_motion(seed)), midpoints(some_motion(seed + 1000))
-        objective = Objective(MODEL, **earlier, repetitions=repetitions)
-        stacked = np.concatenate(
-            [
-                np.sqrt(share_of_period(part)) * rows_of(part, moving=True)
-                for part in (before, *[after] * repetitions)
-            ]
-        )
-        assert_measures(objective.measures(after), stacked, earlier["earlier_samples"])
-
-    @given(seed=seeds, share=st.floats(0.05, 0.95), repetitions=st.integers(1, 30))
-    @settings(max_examples=40, deadline=None)
-    def test_additional_information_never_lowers_the_criterion(self, seed, share, repetitions):
-        """A motion and its beginning, which may have more information per second."""
-        known = earlier_of(some_motion(seed))
-        known = {name: 30 * value for name, value in known.items()}
-        motion = midpoints(some_motion(seed + 1000))
-        beginning = motion.rows(slice(max(2, round(share * motion.n_samples))))
-        objective = Objective(MODEL, **known, repetitions=repetitions)
-        assert_more(objective.information(motion), objective.information(beginning))
-        assert_more(objective.information(beginning), known["earlier"])
-        nothing = log10_det(known["earlier"], known["earlier_samples"])
-        less, more = (objective.measures(m)["log10_det"] for m in (beginning, motion))
-        assert nothing - 1e-9 <= less <= more + 1e-9
-        often = Objective(MODEL, **known, repetitions=repetitions + 1)
-        assert often.measures(motion)["log10_det"] > more
-
-    def test_rows_at_rest_are_left_out_here_only(self):
-        motion = midpoints(plan([[0.0, 0.5], [1.0, 0.5], [-1.0, 0.5]], LIMITS))  # the elbow rests
-        alone = Objective(MODEL).information(motion)
-        beside = Objective(MODEL, earlier=np.zeros((P, P)), earlier_samples=1).information(motion)
-        columns = rows_of(motion, moving=True)
-        assert len(columns) <= motion.n_samples
-        expected = share_of_period(motion) * columns.T @ columns
-        np.testing.assert_allclose(beside, expected, rtol=1e-9, atol=1e-9)
-        assert np.trace(alone) > np.trace(beside) / share_of_period(motion)
-
-    def test_the_sample_period_does_not_change_the_weight(self):
-        trajectory = some_motion(7, n_via=12)
-        known = earlier_of(trajectory)
-        n_earlier = known["earlier_samples"]
-        alone = log10_det(known["earlier"], n_earlier)
-        for period in (SAMPLE_PERIOD, 0.001):
-            both = Objective(MODEL, **known).criteria(trajectory, period)
-            assert both.n_samples == n_earlier
-            # Both rates see the same motion, but for the last sample and some at each reversal.
-            room = P * 4.0 / n_earlier
-            assert both.log10_det == pytest.approx(alone + P * math.log10(2.0), abs=room)
 
 
 class TestSamples:
@@ -229,16 +152,14 @@ class TestCriteria:
 class TestMeasures:
     @given(seed=seeds, chosen=st.sets(st.integers(0, P - 1), min_size=1))
     @settings(max_examples=20, deadline=None)
-    def test_they_are_of_the_chosen_weighted_columns(self, seed, chosen):
+    def test_they_are_of_the_chosen_columns(self, seed, chosen):
         motion, random = midpoints(some_motion(seed)), np.random.default_rng(seed)
-        order, weights = random.permutation(sorted(chosen)), random.uniform(0.1, 4.0, 2)
+        order = random.permutation(sorted(chosen))
         columns = rows_of(motion)
         objective = Objective(MODEL, parameters=order)
         assert objective.n_parameters == len(chosen)
         assert_measures(objective.measures(motion), columns[:, order], motion.n_samples)
-        weighted = np.tile(np.sqrt(weights), motion.n_samples)[:, None] * columns
-        found = Objective(MODEL, joint_weights=weights).measures(motion)
-        assert_measures(found, weighted, motion.n_samples)
+        assert_measures(Objective(MODEL).measures(motion), columns, motion.n_samples)
 
     def test_criteria_are_the_measures_and_more(self):
         trajectory = some_motion(3)
