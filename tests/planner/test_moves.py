@@ -249,26 +249,6 @@ class TestCorners:
             reduced += motion.reduced_corners
         assert reduced > 0
 
-    def test_more_fly_is_faster_and_rounder(self):
-        # Ranges, times relative to stops and passing distances as measured elsewhere.
-        narrow = np.pi / 180.0 * np.array([[180, 92, 78, 200, 125, 200], [0, 33, -87, 0, 0, 0]])
-        limits = replace(SIX_AXES, lower=narrow[1] - narrow[0], upper=narrow[1] + narrow[0])
-        draws = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 6, 6))
-        sets = narrow[1] + draws * narrow[0]
-        durations, distances = [], []
-        for fly in (0.0, 10.0, 25.0, 50.0, 75.0, 100.0):
-            plans = [
-                plan_moves(p[0], [Move(q, fly_percent=fly) for q in p[1:]], limits) for p in sets
-            ]
-            durations.append(np.mean([each.duration for each in plans]))
-            passed = [target.distance for each in plans for target in each.targets[:-1]]
-            distances.append(np.rad2deg(np.mean(passed)))
-        np.testing.assert_allclose(
-            np.array(durations[1:]) / durations[0], [0.99, 0.96, 0.93, 0.915, 0.90], atol=0.012
-        )
-        assert distances == sorted(distances)
-        np.testing.assert_allclose(distances[3:], [2.6, 8.0, 16.0], rtol=0.3)
-
     def test_a_miss_at_three_neighbouring_shares_is_avoided(self):
         # Speeds 0.07 % apart: at the second, full, 0.999 and 0.97 of the corner fall on a miss.
         limits = JointLimits(

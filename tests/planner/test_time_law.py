@@ -9,7 +9,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from planner import JointLimits, plan
-from planner.piecewise_cubic import Extrema
 from planner.time_law import (
     RateBounds,
     TimeLaw,
@@ -113,16 +112,6 @@ def test_a_state_outside_its_bounds_is_not_admitted(state, rising):
     assert not admits(bounds, 0.75 if rising else 0.25, too_steep if rising else -too_steep)
 
 
-def test_narrower_bounds_end_a_state_that_they_do_not_admit():
-    steep, gentle = RateBounds(4.0, 40.0), RateBounds(1.0, 10.0)
-    _, rate, slope = ramp(0.0, 0.0, 1.0, steep).sample(0.15)
-    assert not admits(gentle, rate, slope)
-    way = ramp(rate, slope, 0.3, gentle)  # the slope must not grow further
-    slopes = [way.sample(t)[2] for t in np.linspace(0.0, way.duration, 100)]
-    assert max(slopes) <= slope
-    assert way.sample(way.duration)[1:] == (0.3, 0.0)
-
-
 def test_motion_time_follows_the_ramp_and_settles():
     bounds, period = RateBounds(2.0, 20.0), 0.002
     law = TimeLaw(period)
@@ -162,26 +151,6 @@ def test_the_worst_path_just_satisfies_the_bounds(joints, more, much_more):
     assert np.all(used_acceleration <= (1.0 + more) * (1 + 1e-9))
     # At least one joint uses all its jerk, or there would be a faster change.
     assert np.max(used_jerk) == pytest.approx(1.0 + much_more)
-
-
-@given(joints, st.tuples(shares, shares, shares), rates, rates)
-@example([(1.0, 1.0, 1.0)], (0.0, 2.2250738585e-313, 0.0), 1.0, 1.0)
-def test_a_path_below_its_limits_may_slow_faster(joints, used, more, much_more):
-    velocity, acceleration, jerk = np.array(joints).T
-    limits = limits_of(velocity, acceleration, jerk)
-    # Above 1 a path breaks its limits.
-    v, a, j = (share * q for share, q in zip(used, (velocity, acceleration, jerk), strict=True))
-    extrema = Extrema(limits.lower, limits.upper, v, a, j)
-    bounds = slowing_bounds(limits, 1.0 + more, 1.0 + much_more, extrema)
-    assert np.isfinite(bounds).all()
-    v, a, j = np.minimum(v, velocity), np.minimum(a, acceleration), np.minimum(j, jerk)
-    assert np.all(a + v * bounds.slope <= (1.0 + more) * acceleration * (1 + 1e-9))
-    assert np.all(
-        j + 3 * a * bounds.slope + v * bounds.change <= (1.0 + much_more) * jerk * (1 + 1e-9)
-    )
-    general = slowing_bounds(limits, 1.0 + more, 1.0 + much_more)
-    duration = ramp(1.0, 0.0, 0.0, bounds).duration
-    assert duration <= 1.02 * ramp(1.0, 0.0, 0.0, general).duration
 
 
 @pytest.fixture(scope="module")

@@ -365,13 +365,6 @@ def axes_at(controller: SimulatedController, phase: Phase, n: int) -> NDArray[np
     return CyclicPacket.decode(packet, n).axes
 
 
-def test_axes_are_in_the_slots_of_the_settings() -> None:
-    in_order = axes_at(small_cell.controller(), Phase.CLOSED, 2)
-    turned = small_cell.controller(slots=(1, 0), cold_start=False)
-    assert [(a.arm, a.axis, a.slot) for a in init_of(turned).open_axes()] == [(1, 1, 0), (1, 0, 1)]
-    np.testing.assert_array_equal(axes_at(turned, Phase.CLOSED, 2), in_order[::-1])
-
-
 @pytest.mark.parametrize(
     ("arm", "slots", "foreign", "expected"),
     [
@@ -562,16 +555,6 @@ class TestFields:
         np.testing.assert_allclose(controller.servo.target, own + 0.2, atol=1e-7)
         np.testing.assert_allclose(controller.servo.measured, own + 0.2, atol=0.01)
 
-    def test_mode_4_without_a_feed_forward_ignores_d4_and_d5(self) -> None:
-        def run(fields: Fields) -> bytes:
-            controller = opened()
-            target = np.array(controller.servo.target)
-            for _ in range(20):
-                step(controller, {1: target} | fields)
-            return receive(controller).axes.tobytes()
-
-        assert run({}) == run({4: 0.01, 5: 1.0})
-
     @pytest.mark.parametrize("mode", [2, 8])
     def test_modes_2_and_8_add_d4_to_the_speed_demanded(self, mode: int) -> None:
         controller = opened(open_mode=mode)
@@ -597,12 +580,6 @@ class TestFields:
         step(unchanged, target)
         without = receive(unchanged).axes["d"][:, 4]
         np.testing.assert_allclose(with_it - without, extra, atol=1e-6)
-
-    def test_a_current_cannot_be_added_beyond_the_limit(self) -> None:
-        controller = opened(open_mode=9)
-        step(controller, {5: 100.0})
-        limit = small_cell.TABLE["current_limit"]
-        np.testing.assert_allclose(receive(controller).axes["d"][:, 4], limit, rtol=1e-6)
 
     @pytest.mark.parametrize("field", [1, 2])
     def test_a_number_that_is_not_finite_trips_the_drive(self, field: int) -> None:

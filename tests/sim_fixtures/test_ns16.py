@@ -180,21 +180,6 @@ class TestNominal:
         assert share.min() < 1.0 < share.max()
 
 
-def test_nothing_of_the_drive_train_is_trivial() -> None:
-    """Zeros would hide errors in coupling and calibration."""
-    train = CELL["drive_train"]
-    assert all(train[k] for k in ("k54", "k64", "k65"))
-    assert all(train["calibration"])
-    assert len({np.sign(ratio) for ratio in train["gear_ratio"]}) == 2
-
-
-def test_unpublished_values_of_the_drives_are_marked_assumed() -> None:
-    assumed = {*CELL["cell"]["assumed"]}
-    published = {"joint_sign", "joint_offset_deg"}
-    assert assumed >= {f"drive_train.{name}" for name in {*CELL["drive_train"]} - published}
-    assert all(name in CELL[table] for table, name in (path.split(".") for path in assumed))
-
-
 def test_the_stated_current_delay_is_that_of_the_default_servo() -> None:
     settings = ControllerSettings()
     assert CELL["controller"]["cycle_ms"] == 1000.0 * settings.period

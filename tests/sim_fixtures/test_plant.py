@@ -25,7 +25,7 @@ from sim_fixtures import (
 )
 from sim_fixtures.arm import FrictionDrift, TorqueRipple
 from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
-from sim_fixtures.servo import INERTIA_CYCLES, CurrentLoop, NominalModel, Servo
+from sim_fixtures.servo import CurrentLoop, NominalModel, Servo
 from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, motor_matrix
 
 Array = NDArray[np.float64]
@@ -139,15 +139,6 @@ def test_a_pushed_arm_comes_to_rest_and_stays_there() -> None:
     for _ in range(100):
         plant.step(gravity_torque(plant), STEP)
     np.testing.assert_array_equal(plant.position, at_rest)
-
-
-@pytest.mark.parametrize("law", ["quadratic", "cubic"])
-def test_the_third_term_bends_friction_as_stated(law: str) -> None:
-    third = np.full(6, -0.5)
-    bent = PlantTruth(TRUTH.rotor_inertia, TRUTH.coulomb, TRUTH.viscous, third, law)
-    v = np.array([2.0, -2.0, 1.0, -1.0, 0.5, 0.0])
-    shape = np.sign(v) * v**2 if law == "quadratic" else v**3
-    np.testing.assert_allclose(bent.friction(v), TRUTH.friction(v) + third * shape)
 
 
 def test_closed_brakes_stop_and_hold_the_arm() -> None:
@@ -319,15 +310,6 @@ def test_the_current_of_a_servo_at_rest_is_that_of_the_model() -> None:
     servo = make_servo()
     assert hold(servo) == servo.model_current
     assert servo.model_current[1] != 0.0  # gravity
-
-
-def test_a_position_error_raises_the_current_and_its_integral() -> None:
-    servo = make_servo()
-    target = [p + 0.01 for p in servo.measured]
-    currents = np.array([servo.advance(target, [0.0] * 6) for _ in range(50)])
-    steady = currents[INERTIA_CYCLES + 1 :]  # with the gains of the new posture
-    assert np.all(steady[0] > servo.model_current)  # positive current turns a motor forward
-    assert np.all(np.diff(steady, axis=0) > 0.0)
 
 
 def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
