@@ -17,8 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from planner.arrays import Array, read_only
-from planner.checked_data import DAMAGED, numbers, strict
+from planner.arrays import DAMAGED, Array, numbers, read_only, strict
 from planner.errors import InvalidSetting, InvalidTrajectory
 from planner.limits import JointLimits
 from planner.piecewise_cubic import Extrema

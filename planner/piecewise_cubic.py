@@ -11,8 +11,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from planner.arrays import Array
-from planner.checked_data import DAMAGED, numbers
+from planner.arrays import DAMAGED, Array, numbers
 from planner.errors import InvalidTrajectory
 from planner.limits import Allowance, jump_rounding, position_rounding
 

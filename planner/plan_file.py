@@ -15,8 +15,7 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from planner.arrays import Array, read_only
-from planner.checked_data import DAMAGED
+from planner.arrays import DAMAGED, Array, read_only
 from planner.errors import InvalidPlanFile, InvalidSetting, PlannerError
 from planner.limits import JointLimits
 from planner.moves import (

@@ -9,10 +9,15 @@ from __future__ import annotations
 from sim_fixtures.arm import UnmodelledEffects
 from sim_fixtures.controller import SimulatedController
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.errors import PlantDiverged, SettingError, SimulationError
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
 from sim_fixtures.program import Phase
-from sim_fixtures.settings import ControllerSettings, ServoSettings
+from sim_fixtures.settings import (
+    ControllerSettings,
+    PlantDiverged,
+    ServoSettings,
+    SettingError,
+    SimulationError,
+)
 
 __all__ = [
     "SimulatedController",

@@ -44,12 +44,11 @@ from drivers.packets import (
 )
 from sim_fixtures.arm import DisturbanceKind, SimulatedArm, UnmodelledEffects
 from sim_fixtures.drive import SimulatedDrive
-from sim_fixtures.errors import SettingError
 from sim_fixtures.faults import ControllerFault
 from sim_fixtures.plant import PlantTruth
 from sim_fixtures.program import MISSING, Answer, LoopProgram, Phase, StartStep
 from sim_fixtures.servo import NominalModel, Servo
-from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings
+from sim_fixtures.settings import AXES_PER_ARM, ControllerSettings, SettingError
 
 _PC_TARGETS = (1, 4, 5)
 _FOREIGN = {

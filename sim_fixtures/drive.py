@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import pi
 
-from sim_fixtures.errors import SettingError
+from sim_fixtures.settings import SettingError
 
 _PER_AXIS = (
     "gear_ratio",

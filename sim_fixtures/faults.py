@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from drivers.transports import faults as link
-from sim_fixtures.errors import SimulationError
+from sim_fixtures.settings import SimulationError
 
 if TYPE_CHECKING:
     from sim_fixtures.controller import SimulatedController

@@ -21,7 +21,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from sim_fixtures.errors import PlantDiverged, SettingError
+from sim_fixtures.settings import PlantDiverged, SettingError
 
 Array = NDArray[np.float64]
 

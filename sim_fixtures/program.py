@@ -19,8 +19,7 @@ from enum import IntEnum, auto
 from math import ceil
 from typing import NamedTuple
 
-from sim_fixtures.errors import SettingError
-from sim_fixtures.settings import ControllerSettings
+from sim_fixtures.settings import ControllerSettings, SettingError
 
 
 class Phase(IntEnum):

@@ -34,7 +34,7 @@ from drivers.packets import (
     packet_number,
 )
 from drivers.transports.simulated import Peer
-from sim_fixtures.errors import SimulationError
+from sim_fixtures.settings import SimulationError
 
 LARGEST_DATAGRAM: Final = 65536
 _SO_TIMESTAMPNS: Final = 35  # of asm-generic/socket.h, which the socket module does not name

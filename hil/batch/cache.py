@@ -37,7 +37,7 @@ from identification.factor.phases import PhaseFactor
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
-from planner.checked_data import DAMAGED
+from planner.arrays import DAMAGED
 
 from .types import ArchiveRef, Bundle, CacheError, Summary
 

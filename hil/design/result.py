@@ -26,7 +26,7 @@ from identification.excitation import (
     coupling_index_max,
 )
 from planner import FourierSeries, PiecewiseCubic, PlanFile, PlannerError, in_child
-from planner.checked_data import DAMAGED, Whole, numbers, strict
+from planner.arrays import DAMAGED, Whole, numbers, strict
 from planner.toml_text import Angles, from_text, to_text
 
 from .settings import RESULT_FORMAT, DesignSettings, settings_of

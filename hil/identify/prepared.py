@@ -15,7 +15,7 @@ from identification.estimators.delay import DelayEstimate
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
 from identification.signals.samples import Samples
-from planner.checked_data import numbers
+from planner.arrays import numbers
 
 from .options import Options
 from .settings import Settings, decide, samples_of, validation_samples

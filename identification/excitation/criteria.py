@@ -14,7 +14,7 @@ import scipy
 from numpy.typing import NDArray
 
 from identification.factor.factor import Factor
-from planner.checked_data import Whole, strict
+from planner.arrays import Whole, strict
 
 Array = NDArray[np.float64]
 

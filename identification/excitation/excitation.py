@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from identification.excitation.criteria import Criteria
 from planner import FourierSeries, Move, PiecewiseCubic
-from planner.checked_data import DAMAGED, Whole, numbers, strict
+from planner.arrays import DAMAGED, Whole, numbers, strict
 
 Array = NDArray[np.float64]
 
