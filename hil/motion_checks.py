@@ -20,7 +20,7 @@ from identification.excitation import (
     check_motion,
 )
 from planner import FourierSeries, JointLimits, NotSmooth, PiecewiseCubic
-from planner.verify import check_rest, check_smooth
+from planner.piecewise_cubic import check_rest, check_smooth
 
 _JOINT_LIMIT: Final = re.compile(r"(position|velocity|acceleration|jerk) of joint (\d+)(.*)")
 _UNITS: Final = {

@@ -33,10 +33,9 @@ from planner.moves import (
     plan_chunk,
     plan_moves,
 )
-from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory
+from planner.piecewise_cubic import Extrema, PiecewiseCubic, Trajectory, check_limits, check_rest
 from planner.plan_file import PlanFile, to_csv
 from planner.player import TrajectoryPlayer
-from planner.verify import check_limits, check_rest
 from planner.worker import WorkerProcess, in_child, plan_in_child
 
 __all__ = [

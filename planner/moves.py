@@ -20,9 +20,8 @@ from planner.arrays import Array, read_only
 from planner.corners import STOP, Corner, How, passing, round_corners
 from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
 from planner.limits import Allowance, JointLimits
-from planner.piecewise_cubic import Block, PiecewiseCubic, Rows
+from planner.piecewise_cubic import Block, PiecewiseCubic, Rows, check_limits, check_smooth
 from planner.straight import StraightMoves
-from planner.verify import check_limits, check_smooth
 
 
 @dataclass(frozen=True, eq=False)

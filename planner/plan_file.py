@@ -24,8 +24,7 @@ from planner.moves import (
     Overrides,
     plan_moves,
 )
-from planner.piecewise_cubic import PiecewiseCubic, Trajectory
-from planner.verify import check_limits, check_smooth
+from planner.piecewise_cubic import PiecewiseCubic, Trajectory, check_limits, check_smooth
 
 FORMAT: Final = "joint motion plan"
 VERSION: Final = 1

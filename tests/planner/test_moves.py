@@ -23,9 +23,8 @@ from planner import (
     plan_chunk,
 )
 from planner.moves import Move, Overrides, plan_moves
-from planner.piecewise_cubic import Block
+from planner.piecewise_cubic import Block, check_smooth
 from planner.straight import StraightMoves
-from planner.verify import check_smooth
 from tests.planner.six_axes import SIX_AXES, random_points, rows_of
 
 

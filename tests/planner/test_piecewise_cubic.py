@@ -18,8 +18,7 @@ from planner import (
     NotSmooth,
     PiecewiseCubic,
 )
-from planner.piecewise_cubic import Block
-from planner.verify import check_rest
+from planner.piecewise_cubic import Block, check_rest
 from tests.planner.six_axes import SIX_AXES
 
 numbers = st.floats(-10.0, 10.0)
