@@ -156,16 +156,21 @@ class Population:
         return found
 
     def _call(self, method: str, *arguments: object) -> Any:
-        """Call a method of the problem in a child."""
-        return self._children[0].call(_apply, self._packed, method, *arguments)
+        """Call a method of the problem in a child, again if another process killed the child."""
+        (result,) = map_in_children(
+            self._children[:1], _apply, [[0]], lambda _: (self._packed, method, *arguments)
+        )
+        if isinstance(result, PlannerCrashed | PlanningTimedOut):
+            raise result
+        return result
 
 
 def _score(packed: bytes, genes: Array) -> Array:
     return _problem(packed).score(genes).rows
 
 
-def _apply(packed: bytes, method: str, *arguments: Any) -> Any:
-    return getattr(_problem(packed), method)(*arguments)
+def _apply(packed: bytes, method: str, *arguments: Any) -> list[Any]:
+    return [getattr(_problem(packed), method)(*arguments)]
 
 
 @lru_cache(maxsize=1)
