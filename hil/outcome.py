@@ -21,7 +21,7 @@ from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, Results
 from identification import Estimate, IdentificationError, RobotModel
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import friction_source, friction_text
+from identification.export.friction import friction_source
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.export.urdf import write_urdf
 
@@ -99,8 +99,8 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
 URDF = "identified.urdf"
 PARAMETERS_JSON, PARAMETERS_CSV = "parameters.json", "parameters.csv"
 STANDARD_CSV = "standard.csv"
-FRICTION_TEXT, FRICTION_SOURCE = "friction.txt", "friction.py"
-FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_TEXT, FRICTION_SOURCE, STANDARD_CSV, URDF)
+FRICTION_SOURCE = "friction.py"
+FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_SOURCE, STANDARD_CSV, URDF)
 """Exports of an identification."""
 
 
@@ -143,7 +143,7 @@ def exports_of(
             model, estimate, consistent=possible, essential=essential, provenance=origin
         ),
         PARAMETERS_CSV: parameters_csv(model, estimate, provenance=origin),
-        **_friction(model, estimate, possible, origin),
+        FRICTION_SOURCE: _friction(model, estimate, possible, origin),
     }
     withheld = {}
     if possible is None:
@@ -175,8 +175,8 @@ def _friction(
     estimate: Estimate,
     consistent: ConsistentEstimate | None,
     origin: Mapping[str, str],
-) -> dict[str, str | None]:
-    """The friction law in words and as source: that of the URDF beside it, if there is one."""
+) -> str:
+    """Return the friction law as source: that of the URDF, if there is one."""
     if consistent is None:
         values, whose = estimate.values[model.friction_part], "least squares"
     else:
@@ -187,10 +187,7 @@ def _friction(
         remarks.append(f"NOT DETERMINED by the data, what stands for them is no figure: {unknown}")
     remarks += [f"{key}: {value}" for key, value in origin.items()]
     header = "".join(f"# {line}\n" for line in remarks)
-    return {
-        FRICTION_TEXT: header + "\n" + friction_text(model, values),
-        FRICTION_SOURCE: header + friction_source(model, values),
-    }
+    return header + friction_source(model, values)
 
 
 def _urdf(

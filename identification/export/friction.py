@@ -1,27 +1,19 @@
-"""The identified friction as curve, as text, and as Python source without dependencies."""
+"""The identified friction as a curve, and as Python source without dependencies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.model.friction import TANH, FrictionLaw, FrictionTerm
+from identification.model.friction import TANH, FrictionTerm
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
-
-# Texts about speeds below standstill.
-_ZONES = {
-    "exclude": "Below the standstill speed nothing was fitted: static friction can have any value"
-    " up to the Coulomb friction, in both directions.",
-    "linear": "Below the standstill speed of a linear zone sgn(v) is v / standstill, as fitted.",
-}
-
 
 SPEEDS: Final = 120
 """Points of a curve in each direction."""
@@ -55,47 +47,6 @@ def friction_torque(model: RobotModel, values: Array, samples: Samples) -> Array
     without = values.copy()
     without[model.friction_part] *= [term.motor for term in model.friction.terms]
     return samples.torque - samples.predicted_torque(model, without)
-
-
-def friction_text(model: RobotModel, coefficients: Array) -> str:
-    """Return the friction law and its coefficients (k,) as text, a line per joint.
-
-    Raises:
-        ShapeError: `coefficients` is not (k,), see `RobotModel.friction_part`.
-    """
-    friction, n = model.friction, model.n_joints
-    table, kinds = friction.table(coefficients), friction.kinds
-    if not friction.terms:
-        return "The joints have no friction.\n"
-    names = model.joint_names
-    lines = [
-        f"Friction torque at the speed v of a joint: {_formula(kinds)}",
-        f"with {_joined([kind.description for kind in kinds])}.",
-        *(text for zone, text in _ZONES.items() if zone in {law.zone for law in friction.laws}),
-        "",
-    ]
-    for name, law, row, revolute in zip(
-        names, friction.laws, table, friction.revolute, strict=False
-    ):
-        unit = "rad/s" if revolute else "m/s"
-        values = _values(law, row, revolute)
-        values += [f"{t.speed_symbol} = {t.speed:g} {unit}" for t in law.terms if t.speed_symbol]
-        zone = " (linear zone)" if law.zone == "linear" else ""
-        lines.append(
-            f"{name}: {', '.join(values) or 'no friction'}; "
-            f"standstill below {law.standstill:g} {unit}{zone}"
-        )
-    for motor, row, share in zip(friction.motors, table[n:], friction.motor_speeds(), strict=True):
-        speed_sum = " + ".join(
-            ("" if share[j] == 1.0 else f"{share[j]:.5g} ") + f"v({names[j]})"
-            for j in np.flatnonzero(share)
-        )
-        numbers = _values(friction.laws[motor], row, friction.revolute[motor])
-        lines.append(
-            f"motor {motor + 1}, at v = {speed_sum}: {', '.join(numbers)}; this torque times its"
-            " factor acts on each of these joints"
-        )
-    return "\n".join(lines) + "\n"
 
 
 _FUNCTIONS = '''
@@ -165,21 +116,8 @@ def friction_source(model: RobotModel, coefficients: Array) -> str:
     return "\n".join(lines) + "\n" + functions
 
 
-def _values(law: FrictionLaw, coefficients: Mapping[str, float], revolute: bool) -> list[str]:
-    """Return the given coefficients with their units."""
-    return [
-        f"{term.symbol} = {coefficients[term.symbol]:.5g} {term.unit(revolute=revolute)}"
-        for term in law.terms
-        if term.symbol in coefficients
-    ]
-
-
 def _formula(kinds: Sequence[FrictionTerm]) -> str:
     return " + ".join(kind.formula for kind in kinds)
-
-
-def _joined(parts: list[str]) -> str:
-    return ", ".join(parts[:-1]) + " and " + parts[-1] if len(parts) > 1 else parts[0]
 
 
 def _numbers(values: Array) -> str:

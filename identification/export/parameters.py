@@ -13,7 +13,6 @@ from typing import Any, Final
 
 from identification.errors import IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import friction_text
 from identification.export.urdf import not_in_urdf
 from identification.factor.factor import Estimate
 from identification.model.regressor import LINK_SYMBOLS
@@ -63,7 +62,6 @@ def parameters_json(
         "noise_std": estimate.noise_std.tolist(),
         "samples": estimate.samples.tolist(),
         "undetermined": list(estimate.undetermined),
-        "friction_law": friction_text(model, estimate.values[model.friction_part]),
         "parameters": [
             {
                 "name": name,

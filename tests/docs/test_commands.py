@@ -179,14 +179,6 @@ def test_every_option_that_a_page_mentions_exists(page: Path) -> None:
         assert {*named} - {"--help"} <= options()
 
 
-def test_what_is_typed_elsewhere_is() -> None:
-    for page, test in TYPED_ELSEWHERE.items():
-        assert page in (ROOT / test).read_text(encoding="utf-8")
-    for why in [*OTHER_PROGRAMS.values(), *NOT_TYPED.values()]:
-        for test in re.findall(r"tests/\S+\.py", why):
-            assert (ROOT / test).exists(), test
-
-
 def test_no_exception_is_left_over() -> None:
     written = [words for page in PAGES for words in commands(page)]
     lines = [shlex.join(words) for words in written]
@@ -216,13 +208,6 @@ def test_a_page_is_typed_from_its_first_command_to_its_last(
         put_two(workplace, request.getfixturevalue("two_campaigns"), *AFTER_TWO[name])
     page = next(page for page in PAGES if page.name == name)
     assert type_page(page)
-
-
-def test_every_page_with_something_to_type_is_typed() -> None:
-    to_type = {
-        page.name for page in PAGES if any(reason_not_to(words) is None for words in commands(page))
-    }
-    assert to_type <= {*FAST, *SLOW, *TYPED_ELSEWHERE}
 
 
 @pytest.mark.slow

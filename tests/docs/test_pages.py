@@ -41,35 +41,11 @@ def test_every_name_of_the_packages_exists(page: Path) -> None:
             found(name)
 
 
-def test_a_name_that_does_not_exist_is_found_out() -> None:
-    with pytest.raises(LookupError):
-        found("identification.no_such_thing")
-
-
-def test_the_theory_links_each_section_to_code() -> None:
-    sections = (ROOT / "docs" / "theory.md").read_text("utf-8").split("\n## ")[1:]
-    assert len(sections) == 6
-    assert all(len(NAME.findall(section)) >= 3 for section in sections)
-
-
-def test_the_theory_has_the_equations_of_the_paper() -> None:
-    text = (ROOT / "docs" / "theory.md").read_text("utf-8")
-    named = {int(n) for n in re.findall(r"eqs?\. (\d)", text)}
-    named |= {int(n) for pair in re.findall(r"eqs\. (\d) and (\d)", text) for n in pair}
-    named |= {int(n) for three in re.findall(r"eqs\. (\d), (\d), (\d)", text) for n in three}
-    assert named == set(range(1, 10))
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_every_link_to_a_file_leads_to_one(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text("utf-8")):
         if not target.startswith(("http:", "https:")):
             assert (page.parent / target).exists(), target
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_no_diagram_needs_a_script(page: Path) -> None:
-    assert "```mermaid" not in page.read_text("utf-8")
 
 
 def test_every_page_is_in_the_table_of_contents() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import shlex
@@ -215,16 +214,6 @@ class TestFirstHour:
         assert open_archive("archives/standstill_000_a1.mcap").complete
         assert Path("standstill.png").exists() and Path("first_move.png").exists()
 
-    def test_the_copied_cell_reaches_the_controller_of_the_page(self, workplace: Path) -> None:
-        (copy,) = (step for step in self.STEPS if step[0] == "cp")
-        for name in copy[1:-1]:
-            shutil.copy(name, workplace)
-        self.edit(Path("cell.toml"))
-        cell = Cell.load("cell.toml")
-        assert cell.only_simulated
-        (simulate,) = (step for step in self.STEPS if step[1] == "simulate")
-        assert simulate[-1] == f"{cell.controller.host}:{cell.controller.port}"
-
     def test_the_list_names_every_field_that_hil_new_leaves_open(self) -> None:
         items = re.findall(r"(?m)^- (`.*?):", self.TEXT)
         printed = {field for item in items for field in re.findall(r"`(\w+)`", item)}
@@ -249,31 +238,6 @@ LAST_LINE = {
     "06": "N·m",
     "07": "packets",
 }  # Something that stands in what it prints
-
-
-def code_lines(source: str) -> int:
-    """Lines without blank ones, comments and docstrings."""
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            source = source.replace(f'"""{ast.get_docstring(node, clean=False)}"""', "")
-    lines = source.splitlines()
-    return sum(bool(line.strip()) and not line.lstrip().startswith("#") for line in lines)
-
-
-def test_they_are_numbered_from_one() -> None:
-    assert [path.name[:2] for path in EXAMPLES] == [f"{n:02d}" for n in range(1, 8)]
-
-
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_it_is_short_and_has_a_picture(path: Path) -> None:
-    source = path.read_text("utf-8")
-    assert ast.get_docstring(ast.parse(source))
-    assert code_lines(source) <= 60
-    assert (PICTURES / f"{path.stem}.png").is_file()
-
-
-def test_the_pictures_are_small() -> None:
-    assert sum(path.stat().st_size for path in PICTURES.iterdir()) < 1_000_000
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 import re
 import subprocess
@@ -12,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -23,8 +21,8 @@ from typer.testing import CliRunner
 
 from hil.cli import app
 from hil.importers import ColumnMap, Robot, import_log
-from hil.outcome import FILES, Exports, provenance_of
-from hil.results import Results, VerdictResult
+from hil.outcome import FILES, Exports
+from hil.results import Results
 from identification.export.parameters import parameters_json
 from identification.model.kinematics import chain_from_urdf
 
@@ -36,7 +34,6 @@ from .identified_arm import (
     packaged_urdf,
     write_exports,
 )
-from .test_report import make_results
 
 Array = NDArray[np.float64]
 
@@ -50,7 +47,7 @@ SLIDER = """<robot name="slider"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0.01 -0.3"/><mass value="1.5"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
 """
-ALL = {"parameters.json", "parameters.csv", "standard.csv", "friction.txt", "friction.py",
+ALL = {"parameters.json", "parameters.csv", "standard.csv", "friction.py",
        "identified.urdf"}  # fmt: skip
 PROVENANCE = {"robot": "arm", "archives": "run_1.mcap sha256 0a1b", "verdict": "good: 1.1%"}
 BARE = "import json, runpy, sys; f = runpy.run_path(sys.argv[1]); " + (
@@ -83,7 +80,7 @@ def command(*words: object) -> Any:
     return result
 
 
-def test_six_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -> None:
+def test_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -> None:
     found = exported(arm, tmp_path)
     assert ALL == set(FILES) == {path.name for path in tmp_path.iterdir()}
     assert not found.withheld
@@ -189,7 +186,6 @@ def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
     assert chain_from_urdf((tmp_path / "identified.urdf").read_text()).n_joints == model.n_joints
     assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
     assert len(table(tmp_path / "parameters.csv")) == model.n_parameters
-    assert "€" in (tmp_path / "friction.txt").read_text(encoding="utf-8")
     evil = "a---&gt;'&quot;&quot;&quot; &lt;script&gt;alert(1)&lt;/script&gt;#"
     urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
     arm = identified_arm(urdf)
@@ -199,16 +195,6 @@ def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
     assert chain.joint_names == arm.cell.joint_names
     assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
     assert len(table(tmp_path / "standard.csv")) == 2
-
-
-def test_provenance_has_digests_and_the_verdict(tmp_path: Path) -> None:
-    verdict = VerdictResult(good=False, line="why", reasons=[], warnings=[])
-    results = make_results(verdict=verdict.model_dump())
-    (tmp_path / "a.mcap").write_bytes(b"abc")
-    found = provenance_of(results, [tmp_path / "a.mcap"])
-    assert found["verdict"] == "NOT GOOD: why"
-    assert found["archives"] == f"a.mcap sha256 {hashlib.sha256(b'abc').hexdigest()}"
-    assert found["robot"] == results.cell
 
 
 def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
@@ -284,30 +270,6 @@ def test_the_python_example_predicts_the_torque_of_the_model(
     values = arm.consistency.consistent.estimate.values
     (expected,) = arm.cell.model.torque(values, zero, speed, zero)
     np.testing.assert_allclose(shown, expected, rtol=1e-6)
-
-
-def test_the_formula_for_the_centre_of_mass_is_that_of_the_urdf(
-    arm: IdentifiedArm, tmp_path: Path
-) -> None:
-    """standard.csv with the documented formula gives the inertial of the written URDF."""
-    write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent)
-    root = ElementTree.parse(tmp_path / "identified.urdf").getroot()
-    joints = {joint.get("name"): joint for joint in root.findall("joint")}
-    for cells in table(tmp_path / "standard.csv"):
-        row = {name: float(cells[name]) for name in cells if name not in ("joint", "reference")}
-        child = joints[cells["joint"]].find("child")
-        inertial = root.find(f"link[@name='{child.get('link')}']/inertial")
-        centre = np.array([row["mcx"], row["mcy"], row["mcz"]]) / row["m"]
-        about = np.array([[row["Ixx"], row["Ixy"], row["Ixz"]],
-                          [row["Ixy"], row["Iyy"], row["Iyz"]],
-                          [row["Ixz"], row["Iyz"], row["Izz"]]], float)  # fmt: skip
-        about -= row["m"] * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-        origin, tensor = inertial.find("origin"), inertial.find("inertia")
-        assert (origin.get("rpy") or "0 0 0").split() == ["0", "0", "0"]
-        written = [float(x) for x in str(origin.get("xyz")).split()]
-        np.testing.assert_allclose(written, centre, atol=1e-12)
-        assert float(str(tensor.get("iyy"))) == pytest.approx(about[1, 1], rel=1e-9)
-        assert float(str(tensor.get("ixz"))) == pytest.approx(about[0, 2], abs=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +21,10 @@ from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
-from hil.identify.cell_context import cell_context_of, controller_error, nominal_of, torque_limits
+from hil.identify.cell_context import cell_context_of, controller_error, torque_limits
 from hil.identify.estimating import (
-    MIN_IV_BANDWIDTH,
     Estimation,
     estimate_with,
-    smoothed_for_instruments,
 )
 from hil.identify.options import ESTIMATORS, FIXED, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
@@ -34,8 +32,7 @@ from hil.identify.sources import gather_sources
 from hil.importers import Robot
 from hil.outcome import rewrite_report, write_outcome
 from hil.progress import Silent
-from hil.report import ReportSeries, report_bytes
-from hil.report.figures import residual_panels
+from hil.report import ReportSeries
 from hil.results import SCHEMA_VERSION, JudgementResult, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
@@ -246,11 +243,6 @@ class TestSources:
         with pytest.raises(ArchiveError, match=r"other\.mcap.*has another"):
             identify_archives([first, other], Silent())
 
-    def test_without_repetitions_are_not_tested_for_noise(self, campaign: Campaign) -> None:
-        one = [campaign.folder.completed("excitation")[0], *campaign.folder.completed("validation")]
-        found = identify_archives(one, Silent())
-        assert any("cannot be distinguished from noise" in one for one in found.verdict.warnings)
-
     def test_at_rest_are_no_test(self, campaign: Campaign) -> None:
         """At the end of a recording the arm rests for 0.2 s."""
         found = identify_archives([paths(campaign)[0]], Silent(), Options(split=0.985))
@@ -373,15 +365,6 @@ class TestJudgement:
         assert good or left.value.exit_code == NOT_GOOD
         assert capsys.readouterr().out == verdict.line + "\n"
 
-    def test_shows_the_worst_first_and_a_figure_per_joint(
-        self, found: Identification, judgement: JudgementResult
-    ) -> None:
-        context = residual_panels(found.results)
-        levels = [finding.level for finding in judgement.worst_first]
-        assert levels == sorted(levels, key=["wrong", "doubtful", "information", "good"].index)
-        for kind in ("speed_panels", "position_panels"):
-            assert [panel.title for panel in context[kind]] == found.results.joint_names
-
 
 # Estimators
 
@@ -426,18 +409,6 @@ class TestEstimators:
         without = replace(prepared, sources=replace(sources, training=training))
         with pytest.raises(InputError, match=r"--estimator iv.*no commanded positions.*use --est"):
             estimate_with(without, Options(estimator="iv"), Silent())
-
-    def test_with_instruments_smooth_noisy_positions_wider(self, prepared: Prepared) -> None:
-        def smoothed(bandwidth: float) -> Prepared:
-            fitted = (
-                replace(one, position_bandwidth=np.full(6, bandwidth)) for one in prepared.fitted
-            )
-            return replace(prepared, fitted=tuple(fitted))
-
-        model, wide = prepared.sources.cell.model, smoothed(40.0)
-        for samples in smoothed_for_instruments(model, smoothed(8.0)):
-            np.testing.assert_allclose(samples.position_bandwidth, MIN_IV_BANDWIDTH, rtol=0.05)
-        assert smoothed_for_instruments(model, wide) == wide.fitted
 
     def test_without_a_consistent_solution_are_least_squares(
         self,
@@ -538,21 +509,6 @@ class TestInSample:
         assert "in-sample" in table(results)[0] and "relative" not in table(results)[0]
 
 
-class TestCalibration:
-    """Held-out means of torque and their 95 % intervals."""
-
-    def test_is_on_the_terminal_and_in_the_report(
-        self, split: Identification, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        results = split.results
-        line = results.calibration.words
-        with suppress(typer.Exit):
-            finish(results, json=False)
-        assert line in " ".join(capsys.readouterr().err.split())
-        assert line in report_bytes(results, split.series).decode()
-        assert json.loads(as_json(results))["calibration"]["means"] == results.calibration.means
-
-
 class TestCellContext:
     """Delays, nominal masses, position jumps."""
 
@@ -570,14 +526,6 @@ class TestCellContext:
         assert prepared.assumed_delay == 0.0
         assert not any("delay" in note for note in prepared.notes)
         assert prepared.delays.delay > 0.01
-
-    def test_masses_of_a_urdf_are_a_nominal_model(self, split: Identification) -> None:
-        nominal, judgement = nominal_of(split.cell), split.results.judgement
-        assert judgement.nominal is not None and "without friction" in judgement.nominal
-        assert not nominal.values[split.cell.model.base.rank :].any()
-        for joint in judgement.joints:
-            assert joint.nominal_relative is not None and joint.relative is not None
-            assert joint.nominal_relative > 2.0 * joint.relative
 
     def test_a_jump_of_an_encoder_is_found(self, split: Identification) -> None:
         prepared = split.prepared

@@ -20,7 +20,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.image import imread
 
-from hil.identify.summary import consistency_result, essential_result
 from hil.report import (
     ReportSeries,
     SeriesError,
@@ -31,12 +30,9 @@ from hil.report import (
 )
 from hil.report.drawing import thinned
 from hil.report.rendering import environment
-from hil.results import ParameterResult, Results, outside_mark
-from identification.selection.essential import BlindChoice
+from hil.results import Results
 from identification.selection.inner_prediction import Choice
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2
-
-from .identified_arm import TWO_LINK, IdentifiedArm, identified_arm
 
 JOINTS = [f"joint_{j}" for j in range(1, 7)]
 TORQUE = np.array([496.0, 643.0, 158.0, 17.0, 23.0, 20.0])  # RMS of a fast motion, N·m
@@ -422,14 +418,6 @@ class TestEstimation:
         ):
             assert words in whole.text
 
-    def test_names_what_was_not_tested(self) -> None:
-        whole, recording = make_results(), real_recording()
-        estimator = whole.estimator.model_copy(update={"prior": "the URDF gives no inertia"})
-        parameters = [p.model_copy(update={"learned": None}) for p in recording.parameters]
-        update = {"estimator": estimator, "parameters": parameters}
-        text = rendered(recording.model_copy(update=update)).text
-        assert "None: the URDF gives no inertia." in text
-
     def test_shows_the_chosen_candidate_and_the_best(self, results: Results, whole: Page) -> None:
         estimator = results.choices[1]
         words = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
@@ -589,87 +577,47 @@ class TestNumbers:
         assert numbers.beside(value, std) == text
 
 
-# Which parameters can be trusted, and the nearest machine
-
-
-@pytest.fixture(scope="module")
-def arm() -> IdentifiedArm:
-    return identified_arm(TWO_LINK)
-
-
-class Sections:
-    """What the sections on trust and consistency read of `hil.results.Results`."""
-
-    def __init__(self, arm: IdentifiedArm, **changes: Any) -> None:
-        estimate = arm.estimate
-        columns = (estimate.names, estimate.units, estimate.values.tolist(), estimate.std.tolist())
-        unknown = dict.fromkeys(("table2_id", "repetition_std", "truth"))
-        self.parameters = [
-            ParameterResult(
-                name=name, expression=name, unit=unit, estimate=value, std=std,
-                repetition_mean=value, undetermined=name in estimate.undetermined, **unknown,
-            )
-            for name, unit, value, std in zip(*columns, strict=True)
-        ]  # fmt: skip
-        self.n_base = arm.cell.model.base.rank
-        self.joint_names = list(arm.cell.model.joint_names)
-        self.essential: Any = essential_result(arm.essential)
-        self.consistency: Any = consistency_result(arm.cell.model, arm.consistency)
-        for name, value in changes.items():
-            own = getattr(self, name)
-            both = value is not None and isinstance(value, dict)
-            setattr(self, name, own.model_copy(update=value) if both else value)
-
-    @property
-    def html(self) -> str:
-        source = (
-            '{% from "macros.html.j2" import panels, swatch, dot, table_open %}'
-            '{% include "trust.html.j2" %}{% include "consistency.html.j2" %}'
-        )
-        has_truth = any(one.truth is not None for one in self.parameters)
-        by_name = {one.name: one for one in self.parameters}
-        context = {"by_name": by_name, "outside_mark": outside_mark}
-        template = environment().from_string(source)
-        return template.render(**context, results=self, has_truth=has_truth)
+ESSENTIAL = {
+    "reason": "2 of 58 are essential", "cut": 1, "refused": ["f1_1"], "by_spread_left": 7,
+    "by_spread_held_out": 0.0412, "blind": {"left": 7, "essential": 0.0612, "full": 0.0534},
+    "steps": [{"removed": name, "left": 2, "spread": 3.0, "in_sample": 0.02, "held_out": 0.02,
+               "largest_relative_std": 0.1} for name in (None, "f0_2")],
+    "parameters": [{"name": "f1_1", "unit": "N·m·s/rad", "estimate": 8.0, "std": 0.1}],
+}  # fmt: skip
+CONSISTENCY = {
+    "sentence": "consistent parameters predict as well", "impossible": False, "costly": False,
+    "held_out": 0.02, "unconstrained_held_out": 0.02, "in_sample": 0.02, "shift": [0.0],
+    "unconstrained_in_sample": 0.02, "moved": ["mc2x", "f0_1"], "status": "solved",
+    "bounds": ["rotor inertia of elbow would be negative (-0.3)"],
+    "links": [{"joint": "<script>alert(1)", "mass": 12.34, "centre": [0.1, 0.2, 0.3],
+               "rotor_inertia": 0.5, "room": 0.5, "reference": "nominal"}],
+}  # fmt: skip
 
 
 class TestTrust:
-    def test_a_grade_is_by_relative_standard_deviation(self, arm: IdentifiedArm) -> None:
-        relative = arm.estimate.std / np.abs(arm.estimate.values)
-        for one, std in zip(Sections(arm).parameters, relative, strict=True):
-            assert one.grade == ("well" if std <= 0.1 else "roughly" if std <= 0.5 else "hardly")
-        html = Sections(identified_arm(TWO_LINK, still=(1,))).html
-        named = html.split("Not determined by these data")[1].split("</p>")[0]
-        assert "f0_2" in named and "I2m" in named
+    """Grades, essential parameters and the nearest consistent model."""
 
-    def test_names_why_parameters_are_essential(self, arm: IdentifiedArm) -> None:
-        sections = Sections(arm)
-        html, part = sections.html, sections.essential
-        text = re.sub(r"<[^>]*>", "", html)
-        for words in (part.reason, f"{part.by_spread_held_out:.2%}", f"{part.blind.essential:.2%}"):
-            assert words in text
-        for parameter in part.parameters:
-            assert f'<th scope="row">{parameter.name}</th>' in html
-        assert (
-            "too short for an independent selection"
-            in Sections(arm, essential={"blind": None}).html
-        )
-        blind = BlindChoice(left=7, essential=0.0612, full=0.0534)
-        words = "held-out motion with an error of 6.12%, all parameters with 5.34%"
-        assert words in Sections(arm, essential={"blind": blind}).html
-        html = Sections(arm, essential=None, consistency=None).html
-        assert 'id="trust"' in html
-        assert "Essential parameters" not in html and 'id="consistency"' not in html
+    @pytest.mark.parametrize(
+        ("std", "grade"),
+        [(0.1, "well"), (0.5, "roughly"), (0.6, "hardly"), (math.inf, "undetermined")],
+    )
+    def test_a_grade_is_by_relative_standard_deviation(self, std: float, grade: str) -> None:
+        parameter = make_results().parameters[0].model_copy(update={"estimate": 1.0, "std": std})
+        assert parameter.grade == grade
 
-    def test_names_links_bounds_and_moved_parameters(self, arm: IdentifiedArm) -> None:
-        bound = "rotor inertia of elbow would be negative (-0.3)"
-        html = Sections(arm, consistency={"bounds": [bound], "moved": ["mc2x", "f0_1"]}).html
-        assert bound in html
-        assert "by more than three standard deviations: mc2x, f0_1." in html
-        for joint in ("shoulder", "elbow"):
-            assert f'<th scope="row">{joint}</th>' in html
-        mass = arm.consistency.consistent.standard[arm.cell.model.layout.links[1, 9]]
-        assert f"<td>{mass:.2f}</td>" in html
-        assert "Moved by the constraints" not in Sections(arm, consistency={"moved": []}).html
-        link = Sections(arm).consistency.links[0].model_copy(update={"joint": "<script>alert(1)"})
-        assert "<script>" not in Sections(arm, consistency={"links": [link]}).html
+    def test_essential_and_consistent_parameters_are_explained(self) -> None:
+        page = rendered(make_results(essential=ESSENTIAL, consistency=CONSISTENCY))
+        for words in (
+            "2 of 58 are essential",
+            "7 parameters predict the held-out motion with an error of 6.12%",
+            "left out: f0_2",
+            "needed for held-out motion",
+            "by more than three standard deviations: mc2x, f0_1.",
+            *CONSISTENCY["bounds"],
+        ):
+            assert words in page.text
+        assert_inert(page)
+        (link,) = page.table("Link of")
+        assert link["Mass [kg]"] == "12.3" and link["Link of"] == "<script>alert(1)"
+        without = rendered(make_results()).text
+        assert "Essential parameters" not in without and "Physical consistency" not in without

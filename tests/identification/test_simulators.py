@@ -21,7 +21,7 @@ from identification.export.urdf import WriteBackError
 from identification.model.coupling import Coupling
 from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
 from identification.model.payload import Payload
-from identification.signals.noise import noiseless_above, spectrum
+from identification.signals.noise import noiseless_above
 from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
@@ -102,16 +102,6 @@ class TestReadBack:
         assert ("a term f2 with the speed squared" in left) == (form != "mjcf")
 
     @FORMS
-    def test_parts_left_out_have_their_own_torque(self, form):
-        arm = an_arm(urdf_text(), friction=FrictionLaw(offset=True), coupling=Coupling(WRIST))
-        motion, found = random_states(arm, 50), compared(form, arm, samples=50)
-        offset = arm.friction[0]["fo"]
-        np.testing.assert_allclose(found.left_out["a constant offset fo"][0], offset)
-        if form != "mjcf":
-            rms = np.sqrt(np.mean((motion.acceleration * np.diag(arm.rotors)) ** 2, axis=0))
-            np.testing.assert_allclose(found.left_out["rotor inertias"], rms)
-
-    @FORMS
     def test_a_changed_text_is_refused(self, form):
         arm = an_arm(urdf_text())
         compared(form, arm)
@@ -145,16 +135,6 @@ class TestTexts:
         where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
         found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
         assert found == f0
-
-    def test_a_link_does_not_share_its_name_with_a_joint(self):
-        urdf = urdf_text().replace('"link_2"', '"joint_2"')
-        root = ElementTree.fromstring(mjcf(an_arm(urdf), "arm"))
-        names = [
-            one.get("name")
-            for tag in ("body", "joint", "site")
-            for one in root.find("worldbody").iter(tag)
-        ]
-        assert len(names) == len(set(names))
 
 
 F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
@@ -195,14 +175,6 @@ class TestFrictionCurve:
         jump = curve.torque[middle] - curve.torque[middle - 1]
         assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
 
-    def test_of_an_arm_with_an_identified_spring(self):
-        """Parameters after those of friction are ignored."""
-        law = FrictionLaw(third=None, offset=True)
-        spring = TorsionSpring("shoulder", 0.2, identified=True)
-        model = RobotModel.from_urdf(URDF, friction=law, elements=[spring])
-        curve = friction_curve(model, np.append(planted(model_with()), 25.0), 0, -1.0, 1.0)
-        assert curve.torque[-1] == pytest.approx(F0[0] + F1[0] + FO[0])
-
     def test_agrees_with_the_data(self):
         """Torque minus the other parts is on the curve for a perfect model."""
         model = model_with()
@@ -213,36 +185,6 @@ class TestFrictionCurve:
         sliding = np.abs(speed) > 1e-3
         data = friction_torque(model, values, samples)[:, 0]
         np.testing.assert_allclose(data[sliding], on_it[sliding], atol=1e-6)
-
-
-class TestSpectrum:
-    """Amplitude spectral density of torques."""
-
-    def test_of_white_noise_is_flat_at_its_density(self):
-        rate, std = 500.0, 0.3
-        time = np.arange(20_000) / rate
-        noise = std * np.random.default_rng(1).standard_normal((20_000, 1))
-        frequency, density = spectrum(time, noise, [slice(0, 20_000)])
-        expected = std / np.sqrt(rate / 2.0)
-        level = np.sqrt(np.mean(density[frequency > 5.0] ** 2))
-        assert level == pytest.approx(expected, rel=0.05)
-
-    def test_has_its_peak_at_the_sine(self):
-        """Uneven time stamps are used as times."""
-        rng = np.random.default_rng(2)
-        time = np.sort(np.arange(4000) * 0.01 + rng.uniform(0.0, 0.003, 4000))
-        frequency, density = spectrum(
-            time, np.sin(2.0 * np.pi * 7.0 * time)[:, None], [slice(0, 4000)]
-        )
-        assert frequency[np.argmax(density)] == pytest.approx(7.0, rel=0.03)
-
-    def test_reads_the_longest_segment_and_none_that_is_short(self):
-        time = np.arange(300) * 0.01
-        signals = np.where(np.arange(300) < 40, 9.0, np.sin(time))[:, None]
-        both = spectrum(time, signals, [slice(0, 40), slice(40, 300)])
-        alone = spectrum(time[40:], signals[40:], [slice(0, 260)])
-        np.testing.assert_array_equal(both.density, alone.density)
-        assert spectrum(time, signals, [slice(0, 10)]).frequency.size == 0
 
 
 class TestNoise:
@@ -270,7 +212,3 @@ class TestNoise:
         torque = self.torque(0.1)
         torque[:, 1] = low_passed(self.TIME, torque[:, 1:], 5.0, self.SHAPE)[:, 0]
         assert self.above(torque) is None
-
-    def test_of_a_constant_or_a_few_samples_is_not_judged(self):
-        assert self.above(np.ones((4000, 2))) is None
-        assert self.above(self.torque(0.0)[:20]) is None

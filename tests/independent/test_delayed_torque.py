@@ -112,13 +112,3 @@ class TestDelayOfASlowMotion:
         found = estimate_delay(recorded(arm, 0, "coloured", 0.0, SLOW), model_of(arm))
         assert not found.determined
         assert found.applied == 0.0
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize("name", ARMS)
-    @pytest.mark.parametrize("noise", ["white", "coloured"])
-    def test_it_is_not_determined_in_any_run(self, name, noise):
-        arm = ARMS[name]()
-        model = model_of(arm)
-        for seed in range(SEEDS):
-            found = estimate_delay(recorded(arm, seed, noise, 0.01, SLOW), model)
-            assert not found.determined, (seed, found.describe())
