@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from hil import Campaign, Cell
 from hil.archive import open_archive
 from hil.campaign import design
-from hil.cell.errors import WHERE, UnknownFieldsError
+from hil.cell.errors import UnknownFieldsError
 from hil.cell.text import with_values
 from hil.cli import app
 from hil.demo_link import free_port
@@ -214,20 +214,9 @@ class TestFirstHour:
         assert open_archive("archives/standstill_000_a1.mcap").complete
         assert Path("standstill.png").exists() and Path("first_move.png").exists()
 
-    def test_the_list_names_every_field_that_hil_new_leaves_open(self) -> None:
-        items = re.findall(r"(?m)^- (`.*?):", self.TEXT)
-        printed = {field for item in items for field in re.findall(r"`(\w+)`", item)}
-        elsewhere = {  # from URDF and init packet
-            "lower_deg", "upper_deg", "velocity_deg", "gear_ratio", "calibration", "k54", "k64",
-            "k65", "current_limit", "following_error", "cycle_ms", "host", "mesh_folders",
-        }  # fmt: skip
-        assert len(printed) == 12
-        assert {name.partition(".")[2] for name in WHERE} - elsewhere == printed
-
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
-PICTURES = ROOT / "examples" / "pictures"
 SLOW = ("01", "03", "04", "06")
 LAST_LINE = {
     "01": "report.html",

@@ -13,15 +13,12 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-import hil.identify.cell_context
-from hil.archive import Archive, Samples, open_archive, write_samples
+from hil.archive import Samples, write_samples
 from hil.campaign import Campaign
-from hil.cell import Cell
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Identification, Options, identify_archives, identify_campaign
-from hil.identify.cell_context import cell_context_of, controller_error, torque_limits
 from hil.identify.estimating import (
     Estimation,
     estimate_with,
@@ -30,7 +27,7 @@ from hil.identify.options import ESTIMATORS, FIXED, Estimator
 from hil.identify.prepared import Prepared, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.importers import Robot
-from hil.outcome import rewrite_report, write_outcome
+from hil.outcome import write_outcome
 from hil.progress import Silent
 from hil.report import ReportSeries
 from hil.results import SCHEMA_VERSION, JudgementResult, Results
@@ -39,7 +36,6 @@ from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage, SolverError
 from sim_fixtures.ns16 import URDF_PATH
 
-from .identified_arm import TWO_LINK
 from .simulated_logs import archive_of, simulate
 
 PERIOD = 0.004
@@ -182,17 +178,6 @@ class TestOutcome:
         left = {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
         assert left == first
 
-    def test_with_inconsistent_lengths_is_refused(
-        self, found: Identification, tmp_path: Path
-    ) -> None:
-        write_outcome(tmp_path, found, Silent())
-        results = tmp_path / "results.json"
-        content = json.loads(results.read_text())
-        content["judgement"]["speed"].pop()
-        results.write_text(json.dumps(content))
-        with pytest.raises(InputError, match=r"results\.json: .*that a report cannot show"):
-            rewrite_report(tmp_path)
-
     @pytest.mark.parametrize(
         ("text", "sentence"),
         [
@@ -306,33 +291,6 @@ class TestJudgement:
             assert joint.nominal_relative is not None and joint.controller_relative is not None
             assert joint.nominal_relative > 2.0 * joint.relative
             assert 0.01 < joint.controller_relative < 0.15
-
-    def test_a_model_current_of_zeros_is_no_model(
-        self, found: Identification, cell: Cell, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        sources, samples = found.prepared.sources.held_out, found.prepared.held_out
-        assert controller_error(cell, sources, samples) is not None
-
-        def silent(path: Path, fields: tuple[str, ...]) -> Archive:
-            archive = open_archive(path, fields=fields)
-            zeros = np.zeros_like(archive.columns["model_current"])
-            return replace(archive, columns={**archive.columns, "model_current": zeros})
-
-        monkeypatch.setattr(hil.identify.cell_context, "open_archive", silent)
-        assert controller_error(cell, sources, samples) is None
-
-    def test_limits_are_of_the_drive_or_else_the_urdf(self, cell: Cell) -> None:
-        drive, limits = cell.drive_table, torque_limits(cell)
-        assert limits is not None
-        motor = np.array(drive.torque_constant) * np.array(drive.current_limit)
-        np.testing.assert_allclose(limits, np.abs(drive.gear_ratio) * motor)
-        for efforts, expected in ((("12", "0"), (12.0, np.nan)), (("0", "0"), None)):
-            urdf = TWO_LINK
-            for effort in efforts:
-                urdf = urdf.replace('effort="100"', f'effort="{effort}"', 1)
-            text = '[cell]\nname = "two"\nurdf = "two_link.urdf"\n'
-            own = torque_limits(Cell.from_texts(text, urdf, Path("two_link.urdf")))
-            np.testing.assert_array_equal(own, expected)  # type: ignore[arg-type]
 
     def test_is_a_table_and_a_sentence_for_each_finding(
         self, found: Identification, judgement: JudgementResult
@@ -448,15 +406,6 @@ class TestCommand:
         assert written.estimator.prior is not None
         assert "20 %" in written.estimator.prior
 
-    @pytest.mark.slow
-    def test_does_not_fit_what_is_to_be_predicted(self, campaign: Campaign, tmp_path: Path) -> None:
-        first, last, *_ = campaign.folder.completed("excitation")
-        command = ["identify", str(first), "--predict", str(last), "--output", str(tmp_path), "-q"]
-        CliRunner().invoke(app, command)
-        results = Results.load(tmp_path / "results.json")
-        assert results.repetitions == [first.name]
-        assert [run.archive for run in results.validation] == [last.name]
-
 
 # One imported recording: split, or all of it fitted
 
@@ -482,15 +431,6 @@ def whole(log: Path) -> Identification:
 
 class TestInSample:
     """Errors of the fit, with and without a prediction."""
-
-    def test_error_is_reported_with_that_of_the_prediction(self, split: Identification) -> None:
-        results = split.results
-        pairs = zip(results.judgement.joints, results.fitted.relative_error, strict=True)
-        for joint, fitted in pairs:
-            assert joint.fitted_relative == pytest.approx(fitted)
-            assert joint.fitted_relative != joint.relative
-        assert "fitted" in table(results)[0] and "in-sample" in results.fitted.words
-        assert json.loads(as_json(results))["fitted"]["overall_relative_error"] > 0.0
 
     def test_nothing_is_called_good(self, whole: Identification, split: Identification) -> None:
         results = whole.results
@@ -526,16 +466,6 @@ class TestCellContext:
         assert prepared.assumed_delay == 0.0
         assert not any("delay" in note for note in prepared.notes)
         assert prepared.delays.delay > 0.01
-
-    def test_a_jump_of_an_encoder_is_found(self, split: Identification) -> None:
-        prepared = split.prepared
-        source = prepared.sources.training[0]
-        position = source.recording.position.copy()
-        position[len(position) // 2 :, 2] += 0.02
-        slipped = replace(source, recording=replace(source.recording, position=position))
-        sources = replace(prepared.sources, training=(slipped,))
-        around = cell_context_of(replace(prepared, sources=sources), split.estimate.pooled)
-        assert [jump.joint for jump in around.jumps] == [source.recording.joint_names[2]]
 
 
 # The arm of the log starts without acceleration, which no rigid body does: slow rows are left out.
@@ -578,7 +508,3 @@ class TestSeries:
             speed, torque = series.friction_speed[known, j], series.friction_torque[known, j]
             law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
             assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise
-
-    def test_shows_the_fitted_motion_in_sample(self, rest_log: Path) -> None:
-        one = identify_archives([rest_log], Silent(), replace(SLOW, in_sample=True)).series
-        np.testing.assert_array_equal(one.example_time, one.excitation_time)

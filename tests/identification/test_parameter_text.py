@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from identification import (
-    Estimate,
     Factor,
     FrictionLaw,
     Motion,
     RobotModel,
 )
-from identification.estimators.consistent import ConsistentEstimate, consistent_estimate
+from identification.estimators.consistent import consistent_estimate
 from identification.export.friction import friction_source
 from identification.export.parameters import parameters_csv, parameters_json, standard_csv
 from identification.factor.factor import estimate
@@ -24,7 +23,6 @@ from tests.identification.two_link import URDF
 
 PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}
 DRY = FrictionLaw(third=None)
-Fit = tuple[RobotModel, Estimate, ConsistentEstimate]
 
 
 @pytest.fixture(scope="module")

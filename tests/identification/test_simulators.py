@@ -138,7 +138,6 @@ class TestTexts:
 
 
 F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
-PRESLIDING = 1e-3
 
 
 def model_with(**law):

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pinocchio as pin
@@ -18,7 +17,6 @@ import scipy
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Noise = Literal["white", "coloured"]
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -119,33 +117,13 @@ def motion(arm, seed, pace):
     return Sines(arm.centre, size / np.maximum(fastest, farthest), pace * rate, found.phase)
 
 
-@dataclass(frozen=True, eq=False)
-class Log:
-    """Logged time (m,), position and torque (m, n)."""
-
-    time: Array
-    position: Array
-    torque: Array
-
-
-def record(
-    arm,
-    seed,
-    *,
-    delay=0.0,
-    pace=1.0,
-    noise="white",
-    level=0.014,
-    duration=20.0,
-    rate=250.0,
-    moves=None,
-):
-    """Return a recording whose torque is logged a delay [s] after its position.
+def record(arm, seed, *, delay, pace, noise, duration, level=0.014, rate=250.0):
+    """Return time (m,), position and torque (m, n), the torque logged a delay [s] later.
 
     The noise of the torque has a standard deviation of `level` times that of the torque; it is
     white, or half of its power autoregressive with 50 ms. `duration` in s, `rate` in Hz.
     """
-    moves = motion(arm, seed, pace) if moves is None else moves
+    moves = motion(arm, seed, pace)
     rng = np.random.default_rng([seed, 2])
     time = np.arange(round(duration * rate)) / rate
     torque = arm.torque(*moves(time - delay))
@@ -158,4 +136,4 @@ def record(
         draw = np.sqrt(0.5) * (draw + slow)
     torque += level * torque.std(axis=0) * draw
     position = moves(time)[0] + 1e-5 * rng.standard_normal(torque.shape)
-    return Log(time, position, torque)
+    return time, position, torque

@@ -26,7 +26,7 @@ def model_of(arm):
 
 def recorded(arm, seed, noise, delay, pace):
     log = record(arm, seed, delay=delay, pace=pace, noise=noise, duration=30.0)
-    return Recording(log.time, log.position, arm.joint_names, torque=log.torque)
+    return Recording(*log[:2], arm.joint_names, torque=log[2])
 
 
 def coverage(arm, model, recording, found):
