@@ -86,14 +86,6 @@ class TestViaPoints:
             np.testing.assert_array_equal(speed, np.full((1, 6), share))
 
     @pytest.mark.parametrize("genome", [OPEN, CLOSED])
-    @given(data=st.data())
-    @settings(max_examples=50, deadline=None)
-    def test_points_and_speeds_are_within_their_range(self, genome, data):
-        points, speed = genome.decode(data.draw(genes_of(genome, rows=2)))
-        assert np.all((points >= LIMITS.lower) & (points <= LIMITS.upper))
-        assert np.all((speed >= genome.slowest) & (speed <= 1.0))
-
-    @pytest.mark.parametrize("genome", [OPEN, CLOSED])
     def test_motions_are_those_of_the_planner(self, genome):
         genes = some_genes(genome, 6)
         for motion, points, speed in zip(genome.motions(genes), *genome.decode(genes), strict=True):

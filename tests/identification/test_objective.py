@@ -298,16 +298,6 @@ class TestScale:
         worst = scale.fitness([[-np.inf, np.inf], [-1e4, 1653.0]], HALF)
         assert worst[0] == -np.inf < worst[1]
 
-    @given(st.floats(-300, 300), st.floats(0.0, 1.0))
-    def test_units_of_parameters_do_not_change_the_fitness(self, shift, first):
-        random = np.random.default_rng(4)
-        measures = np.column_stack((random.normal(19.0, 8.0, 60), random.normal(148.0, 25.0, 60)))
-        found = [
-            Scale.of(scores_of(*(measures + by).T)).fitness(measures + by, (first, 1.0 - first))
-            for by in ((0.0, 0.0), (shift, 0.0))
-        ]
-        np.testing.assert_allclose(*found, rtol=0, atol=1e-10)
-
     def test_it_uses_feasible_motions_if_there_are_enough(self, random_motions):
         size, coupled = random_motions
         expected = Scale.of(scores_of(size, coupled))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from planner import JointLimits, PiecewiseCubic
-from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, ranked, solve_many
+from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, solve_many
 from planner.errors import UnsupportedSolver
 from planner.interpolator import corner
 from planner.piecewise_cubic import Block
@@ -50,20 +50,6 @@ def test_the_line_is_straight_for_any_slowest_joint():
     extrema = motion.extrema()
     assert np.all(extrema.acceleration <= limits.acceleration * (1 + 1e-12))
     assert np.all(extrema.jerk <= limits.jerk * (1 + 1e-12))
-
-
-def test_deceleration_limits_the_second_ramp():
-    start, end = random_points(6, 2)
-    slowing = SIX_AXES.acceleration / np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    moves = straight(start, end, SIX_AXES, slowing)
-    assert moves.slowing_down > moves.speeding_up
-    up = straight_table(moves, 0.0, moves.speeding_up[0]).extrema().acceleration
-    down = straight_table(moves, moves.durations[0] - moves.slowing_down[0]).extrema().acceleration
-    # On a line the ratio between the joints is fixed: one of them reaches its bound.
-    assert np.max(up / SIX_AXES.acceleration) == pytest.approx(1.0)
-    assert np.max(down / slowing) == pytest.approx(1.0)
-    alike = straight(start, end, SIX_AXES)
-    assert alike.speeding_up == pytest.approx(moves.speeding_up)
 
 
 def scalar(distance, velocity, acceleration, deceleration, jerk):
@@ -200,19 +186,6 @@ def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch,
     passed = flown(random_points(1, 3), SIX_AXES)
     assert (passed.how, passed.share) == ("reduced", 0.5 * 0.9999)
     assert passed.join is not None
-
-
-@pytest.mark.parametrize(
-    ("savings", "order"),
-    [
-        ([0.5, 0.5 + 1e-12, 0.5], [0, 1, 2]),
-        ([0.5, 0.6, 0.55], [1, 2, 0]),
-        # Without the requested one, no other is preferred.
-        ([-np.inf, 0.5, 0.5 + 1e-12], [2, 1, 0]),
-    ],
-)
-def test_the_requested_corner_comes_first_among_equals(savings, order):
-    assert ranked(np.array(savings)).tolist() == order
 
 
 @pytest.mark.parametrize("version", ["0.20.1", "0.1.9", "unknown", "0.19.9"])

@@ -742,14 +742,6 @@ def test_the_session_ends_after_some_lost_openings_in_a_row(lost_by: Answer, rea
     assert loop.reason == f"open mode was lost 3 times in a row: {reason}"
 
 
-def test_long_silence_ends_the_session() -> None:
-    loop = program(silence_limit=20)
-    advance_to(loop, Phase.CLOSED)
-    for _ in range(30):
-        advance(loop, answer=MISSING)
-    assert loop.phase is Phase.ENDED
-
-
 def test_a_trip_in_open_mode_drops_the_drive_before_the_modes() -> None:
     loop = program()
     advance_to(loop, Phase.OPEN)

@@ -177,7 +177,7 @@ class CollisionChecker:
         return Path(at, placed(self._bodies, at))
 
     def reaches(self, largest: Array) -> Array:
-        """Return `hulls.reaches` of the pairs (p, n) for postures up to `largest` |q| (n,)."""
+        """Return `bodies.reaches` of the pairs (p, n) for postures up to `largest` |q| (n,)."""
         if np.all(self._chain.revolute):
             return self._turning_reaches
         return reaches(self._chain, self._bodies, self.separation, largest)
