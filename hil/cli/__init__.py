@@ -57,13 +57,13 @@ def exit_code_of(error: BaseException) -> int:
 def _comes_from_below(error: BaseException) -> bool:
     """Return whether the error is one of the packages below, without importing them."""
     below = {
-        "identification": "IdentificationError",
-        "planner": "PlannerError",
-        "sim_fixtures": "SimulationError",
+        "identification.errors": "IdentificationError",
+        "planner.errors": "PlannerError",
+        "sim_fixtures.settings": "SimulationError",
     }
     return any(
-        isinstance(error, getattr(sys.modules.get(f"{package}.errors"), name, ()))
-        for package, name in below.items()
+        isinstance(error, getattr(sys.modules.get(module), name, ()))
+        for module, name in below.items()
     )
 
 
