@@ -21,22 +21,21 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.cache import CacheLocation
 from hil.batch.run import reidentify
-from hil.batch.types import BatchResult, Unused
-from hil.batch.workers import ArchiveTask, Done, LocalWorkers, Workers, run_task
+from hil.batch.types import BatchResult
+from hil.batch.workers import LocalWorkers, Workers
 from hil.identify.options import FIXED
 from hil.progress import Silent
-
-T = TypeVar("T")
 
 _CAMPAIGN = 25  # repetitions
 
@@ -44,14 +43,8 @@ _CAMPAIGN = 25  # repetitions
 class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
-    local = True
-
-    def results(
-        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Unused]:
-        """See `hil.batch.workers.Workers`."""
-        del done
-        return map(run_task, tasks)
+    def __init__(self) -> None:
+        super().__init__(ThreadPoolExecutor(1))
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:
@@ -62,7 +55,8 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
     """
     with tempfile.TemporaryDirectory() as cache:
         start = time.process_time()
-        found = _run([str(path) for path in paths], Path(cache), "wls", InThisProcess())
+        with InThisProcess() as workers:
+            found = _run([str(path) for path in paths], Path(cache), "wls", workers)
         end = time.process_time()
     if found.broken or found.pooled[0].repetitions != len(paths):
         raise SystemExit(f"the archives were not all fitted: {found.broken}")
@@ -71,12 +65,12 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
 
 def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
     """A first and a second run on some folders."""
-    with tempfile.TemporaryDirectory() as cache, LocalWorkers(workers) as hands:
-        first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
-        hands.close()
+    with tempfile.TemporaryDirectory() as cache:
+        with LocalWorkers(workers) as hands:
+            first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
         first_cpu = first_own + _children()
-        second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
-        hands.close()
+        with LocalWorkers(workers) as hands:
+            second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
         second_cpu = first_own + second_own + _children() - first_cpu
         cached = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())
     count = first.read

@@ -11,7 +11,6 @@ import math
 import os
 import struct
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
@@ -73,7 +72,7 @@ class CacheLocation:
         if not self.keep:
             return Store(None)
         folder = location.rsplit("/", 1)[0]
-        if self.root is None and "://" not in location:
+        if self.root is None:
             beside = Path(folder) / BESIDE
             there = os.path.lexists(beside)
             usable = beside.is_dir() or not there
@@ -123,12 +122,6 @@ class Store:
             problem = f"cannot be written ({error.strerror})"
             remedy = "name another folder with --cache, or none"
             raise CacheError(path, problem, remedy=remedy) from error
-
-    def remove(self, key: str) -> None:
-        """Remove an entry, if it is there and can be removed."""
-        if self.folder is not None:
-            with suppress(OSError):
-                self._path(key).unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path:
         assert self.folder is not None
@@ -257,6 +250,6 @@ def decision_digest(options: Options, arms: Settings | None, refs: Sequence[Arch
     return json_digest([asked, known, [ref.sha256 for ref in refs], code_digest()])
 
 
-def sum_key(refs: Sequence[ArchiveRef], settings: str) -> str:
-    """Return the key of the sum over archives, added in this order; settings by their digest."""
-    return json_digest(["sum", [ref.sha256 for ref in refs], settings])
+def sum_key(refs: Sequence[ArchiveRef], settings: Settings) -> str:
+    """Return the key of the sum over archives, added in this order."""
+    return json_digest(["sum", [ref.sha256 for ref in refs], settings_digest(settings)])

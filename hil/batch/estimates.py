@@ -27,8 +27,6 @@ from identification.factor.factor import (
     solve,
 )
 from identification.factor.phases import PhaseFactor
-from identification.model.friction import VISCOUS
-from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 
 from .types import ArchiveRef, BatchEstimator, Bundle, Level, LevelEstimate, Summary
@@ -197,20 +195,16 @@ def sum_level(
     group: Group,
     centre: Array | None,
     warnings: Sequence[str] = (),
-    payload: Payload | None = None,
 ) -> LevelEstimate:
-    """Return the estimate of a campaign, or of all campaigns of an arm.
-
-    For the centre see `Estimator.centre`; `payload` is that stated by the cell.
+    """Return the estimate of a campaign, or of all campaigns of an arm, for its centre if any.
 
     Raises:
         IdentificationError: there is no estimate.
     """
     assert group.phase is not None
-    refs, total, model = group.refs, group.phase.total, estimator.model
-    found, setups = estimator.of_group(group, centre), {ref.setup for ref in refs}
-    unseen = None if group.unseen is None else group.unseen.total
-    left, torque = errors(unseen or Factor.zero(model), found.values)
+    refs, found = group.refs, estimator.of_group(group, centre)
+    setups = {ref.setup for ref in refs}
+    unseen = Factor.zero(estimator.model) if group.unseen is None else group.unseen.total
     if not found.undetermined and found.condition > QR_CONDITION:
         conditioning = (
             f"the scaled condition number is {found.condition:.2g}: the motion separates some"
@@ -228,22 +222,13 @@ def sum_level(
         repetitions=len(refs),
         **_figures(found),
         covariance=found.covariance,
-        torque_rms=_rms(total),
-        unseen_rms=left,
-        unseen_torque_rms=torque,
+        torque_rms=_rms(group.phase.total),
+        unseen_rms=_rms(unseen, unseen.squared_errors(found.values)),
+        unseen_torque_rms=_rms(unseen),
         settings=next(iter(group.settings)) if len(group.settings) == 1 else "",
         warnings=(*warnings, *warning_lines(group.warned)),
-        speed_rms=speed_rms(model, total),
-        information=total.weighted(joint_weights(total)).A,
         setup=setups.pop() if len(setups) == 1 else "",
-        payload=payload,
-        unseen=unseen,
     )
-
-
-def errors(factor: Factor, values: Array) -> tuple[Array, Array]:
-    """Return the RMS per joint (n,) of the residual of parameters (p,), and of the torque."""
-    return _rms(factor, factor.squared_errors(values)), _rms(factor)
 
 
 def _rms(factor: Factor, squares: Array | None = None) -> Array:
@@ -261,19 +246,6 @@ def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = 
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
     whole = float(count[known] @ torque[known] ** 2)
     return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
-
-
-def speed_rms(model: RobotModel, factor: Factor) -> Array:
-    """Return the RMS speed per axis (n,) [rad/s, m/s] from the columns of viscous friction.
-
-    It is that of the motor where only the coupled motor has friction; NaN without such a column.
-    """
-    squares = np.full(model.n_joints, np.nan)
-    for k, term in enumerate(model.friction.terms):
-        if term.term == VISCOUS and (not term.motor or np.isnan(squares[term.owner])):
-            column = model.base.rank + k
-            squares[term.owner] = factor.gram[term.owner, column, column]
-    return _rms(factor, squares)
 
 
 def _figures(found: Estimate) -> dict[str, Any]:

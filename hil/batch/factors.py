@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -34,8 +33,7 @@ from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-from .cache import CacheLocation, decision_digest, settings_digest, sum_key
-from .remote import local_file
+from .cache import CacheLocation, decision_digest, sum_key
 from .types import ArchiveRef, Bundle, Summary, Unused
 from .workers import reason_of
 
@@ -51,24 +49,27 @@ _FIELDS: Final = (
 # An archive
 
 
-@contextmanager
-def open_ref(ref: ArchiveRef) -> Iterator[Archive]:
+def open_ref(ref: ArchiveRef) -> Archive:
     """Open an archive with the columns that identification reads.
 
     Raises:
         ArchiveError: it cannot be read, is damaged, or has changed since it was found.
     """
-    with local_file(ref.location) as path:
+    path = Path(ref.location)
+    _require_same(path, ref)
+    try:
+        archive = open_archive(path, fields=_FIELDS)
+        if archive.header.by_controller_program:
+            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+    finally:  # an error may be due to a change
         _require_same(path, ref)
-        try:
-            archive = open_archive(path, fields=_FIELDS)
-            if archive.header.by_controller_program:
-                archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
-        finally:
-            if ref.stamp is not None:  # an error may be due to a change
-                _require_same(path, ref)
-        require_complete(archive, ref.location)
-        yield archive
+    require_complete(archive, ref.location)
+    return archive
+
+
+def open_only(ref: ArchiveRef) -> None:
+    """Open an archive, to find out whether that fails or ends this process."""
+    open_ref(ref)
 
 
 def require_complete(archive: Archive, location: str) -> None:
@@ -79,8 +80,7 @@ def require_complete(archive: Archive, location: str) -> None:
 
 
 def _require_same(path: Path, ref: ArchiveRef) -> None:
-    """Check that a file is unchanged; of a downloaded copy by its bytes."""
-    if (digest_of(path) != ref.sha256) if ref.stamp is None else (stamp_of(path) != ref.stamp):
+    if stamp_of(path) != ref.stamp:
         raise changed_error(ref.location)
 
 
@@ -130,8 +130,8 @@ def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Sourc
     Raises:
         HilError: it cannot be read, is damaged, was changed, or cannot be identified from.
     """
-    with open_ref(ref) as archive:
-        source = source_of(archive, cell_in(archive), to_fit=to_fit)
+    archive = open_ref(ref)
+    source = source_of(archive, cell_in(archive), to_fit=to_fit)
     if to_fit and source.recording.torque is None:
         raise ArchiveError(
             ref.location,
@@ -250,17 +250,13 @@ def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
 def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> Bundle:
     """Reduce archives of one campaign, and cache the result if all of them are usable.
 
-    The sum is added in the order of archives, so that a cached sum of the first ones is continued.
-
     Raises:
         CacheError: the cache cannot be written.
     """
-    counts = range(len(refs), 0, -1)
-    cached = (cached_bundle(refs[:count], settings, cache) for count in counts)
-    begun = next(filter(None, cached), Bundle())
-    left = refs[begun.cached :]
-    summaries, broken, phase = list(begun.summaries), list[Unused](), begun.phase
-    for ref in left:
+    if (known := cached_bundle(refs, settings, cache)) is not None:
+        return known
+    summaries, broken, phase = list[Summary](), list[Unused](), None
+    for ref in refs:
         try:
             summary, own = archive_factor(ref, settings)
         except Exception as error:
@@ -269,20 +265,17 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
             summaries.append(summary)
             if ref.use == "excitation":
                 phase = own if phase is None else phase + own
-    if left and not broken:
-        store, used = cache.store(refs[0].location), settings_digest(settings)
-        store.put(sum_key(refs, used), Bundle(tuple(summaries), phase))
-        if begun.cached:
-            store.remove(sum_key(refs[: begun.cached], used))  # part of a longer one now
-    return Bundle(tuple(summaries), phase, tuple(broken), len(left), begun.cached)
+    found = Bundle(tuple(summaries), phase)
+    if not broken:
+        cache.store(refs[0].location).put(sum_key(refs, settings), found)
+    return replace(found, broken=tuple(broken), read=len(refs))
 
 
 def cached_bundle(
     refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
 ) -> Bundle | None:
     """Return the cached bundle of these archives; None unless all are in the cache."""
-    store = cache.store(refs[0].location)
-    found = store.get(sum_key(refs, settings_digest(settings)), Bundle)
+    found = cache.store(refs[0].location).get(sum_key(refs, settings), Bundle)
     if found is None or len(found.summaries) != len(refs):
         return None
     pairs = zip(found.summaries, refs, strict=True)  # the archives may have been moved
@@ -292,4 +285,4 @@ def cached_bundle(
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:
     """Return whether there is a cache entry of these archives, intact or not."""
-    return cache.store(refs[0].location).has(sum_key(refs, settings_digest(settings)))
+    return cache.store(refs[0].location).has(sum_key(refs, settings))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -33,6 +33,7 @@ from .types import (
 from .workers import ArchiveTask, Workers
 
 T = TypeVar("T")
+Advance = Callable[[float, str], None]
 
 
 def reidentify(
@@ -49,8 +50,8 @@ def reidentify(
     The numbers are those of `hil identify` on the archives of a campaign with the same held out.
     They depend neither on the order in which archives are found nor on the workers.
 
-    The roots are folders, archives, or URLs of either. A single recording is never split. `check`
-    receives the archives found, before samples are read, and may raise.
+    The roots are folders or archives. A single recording is never split. `check` receives the
+    archives found, before samples are read, and may raise.
 
     Raises:
         InputError: a place does not exist, no archive can be fitted, or the estimator is not one of
@@ -69,17 +70,11 @@ def reidentify(
     return batch.result(campaigns, found.skipped)
 
 
-def try_open(ref: ArchiveRef) -> None:
-    """Open an archive, to find out whether that fails or ends this process."""
-    with factors.open_ref(ref):
-        pass
-
-
 @dataclass(eq=False)
 class _Campaign:
     """Archives of one group in progress."""
 
-    key: GroupKey  #: of the group
+    key: GroupKey
     refs: list[ArchiveRef]
     settings: Settings | None = None  #: None until decided
     #: archives of each bundle, and whether it is in the cache
@@ -111,7 +106,7 @@ class _Batch:
         """Decide the settings of campaigns; return those that have some.
 
         Those of an arm are decided on its first readable campaign; the others use them with their
-        own noise: comparisons in time need one friction law, and sums the same columns.
+        own noise: comparisons need one friction law, and sums the same columns.
         """
         arms: dict[str, Settings] = {}
         waiting = list(campaigns)
@@ -119,35 +114,31 @@ class _Batch:
             first = {one.key.arm: one for one in reversed(waiting) if one.key.arm not in arms}
             asked = list(first.values()) or waiting
             waiting = [one for one in waiting if one not in asked]
-            self._decide(asked, arms)
+            while asked:
+                asked = self._decide(asked, arms)
             arms |= {arm: one.settings for arm, one in first.items() if one.settings is not None}
         return [one for one in campaigns if one.settings is not None]
 
-    def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> None:
-        """Decide settings; repeat without archives that turn out to be unusable."""
-        asked: list[tuple[_Campaign, tuple[Any, ...]]] = []
+    def _decide(self, campaigns: Sequence[_Campaign], arms: dict[str, Settings]) -> list[_Campaign]:
+        """Decide settings; return the campaigns to repeat without archives that are unusable."""
+        asked = []
         for one in campaigns:
             own = arms.get(one.key.arm)
             refs = factors.archives_for_settings(one.refs, own)
             one.settings = factors.cached_settings(refs, self.options, own, self.cache)
             if one.settings is None:
                 asked.append((one, (refs, self.options, own, self.cache)))
-        tasks = [
-            ArchiveTask(one.key.campaign, factors.decide_settings, arguments)
-            for one, arguments in asked
-        ]
-        again: list[_Campaign] = []
-        for (one, arguments), found in zip(
-            asked, self._results(tasks, "deciding settings"), strict=True
-        ):
-            if isinstance(found, Unused):
-                alone = [ArchiveTask(ref.location, try_open, (ref,)) for ref in arguments[0]]
-                results = self._results(alone, "opening archives one by one")
-                broken = [other for other in results if other is not None]
-                reason = found.reason
+        tasks = [ArchiveTask(c.key.campaign, factors.decide_settings, own) for c, own in asked]
+        again = []
+        results = self._results(tasks, "deciding settings")
+        for (one, (refs, *_)), found in zip(asked, results, strict=True):
+            if isinstance(found, Unused):  # perhaps an archive ends its process
+                alone = [ArchiveTask(ref.location, factors.open_only, (ref,)) for ref in refs]
+                opened = self._results(alone, "opening archives one by one")
+                broken, reason = [other for other in opened if other is not None], found.reason
             else:
                 one.settings, broken = found
-                some = any(ref.use == "excitation" for ref in arguments[0])
+                some = any(ref.use == "excitation" for ref in refs)
                 reason = "" if some else "it holds no excitation"
             self.broken += broken
             paths = {other.path for other in broken}
@@ -156,11 +147,9 @@ class _Batch:
                 again.append(one)
             elif one.settings is None and reason:
                 self.broken.append(Unused(one.key.campaign, reason))
-        if again:
-            self._decide(again, arms)
+        return again
 
     def _results(self, tasks: Sequence[ArchiveTask[T]], title: str) -> list[T | Unused]:
-        """Return the results of tasks."""
         if not tasks:
             return []
         with self.reporter.task(title, len(tasks)) as progress:
@@ -198,49 +187,31 @@ class _Batch:
                 tasks += [] if known else [self._reducing(one, refs)]
         self.stream = self.workers.results(tasks)
         arms: dict[str, Arm] = {}
-        pooled: list[LevelEstimate] = []
-        estimated: list[LevelEstimate] = []
-        repetitions: list[LevelEstimate] = []
-        name = cast(BatchEstimator, self.options.estimator)
+        levels: list[LevelEstimate] = []
         archives = sum(len(refs) for one in campaigns for refs, _ in one.bundles)
         with self.reporter.task("reading archives and estimating", archives) as progress:
             for digest, own in groupby(campaigns, lambda one: one.key.arm):
                 members = list(own)
-                settings = members[0].ready
-                cell = settings.with_friction_law(self._cell(members[0].refs[0]))
+                cell = members[0].ready.with_friction_law(self._cell(members[0].refs[0]))
                 arms[digest] = Arm(digest, cell)
-                estimator = Estimator(name, arms[digest].cell.model, settings)
-                everything, levels = Group(), list[LevelEstimate]()
-                for one in members:
-                    group, found = self._campaign(one, estimator, progress.advance)
-                    levels += found
-                    if group.phase is not None:
-                        everything.add(group)
-                estimated += levels
-                repetitions += everything.repetitions
-                keys = {ref.key for ref in everything.refs}
-                if len(keys) == 1:
-                    pooled += [
-                        replace(one, level="pooled", campaign="", payload=None) for one in levels
-                    ]
-                elif everything.phase is not None:
-                    with self._failing(f"arm {digest[:8]}"):
-                        centre, apart = estimator.centre(everything.phase), _setups(keys)
-                        pooled.append(sum_level("pooled", estimator, everything, centre, apart))
+                levels += self._arm(arms[digest], members, progress.advance)
         # Some reasons begin with the path.
         reasons = (Unused(path, text.removeprefix(f"{path}: ")) for path, text in self.broken)
         broken = tuple(dict.fromkeys(reasons))
-        if not repetitions:
+        found = {
+            level: tuple(one for one in levels if one.level == level)
+            for level in ("repetition", "campaign", "pooled")
+        }
+        if not found["repetition"]:
             problem = "there is no excitation and no imported recording that can be fitted"
             first = [f"{path} could not be used: {reason}" for path, reason in broken[:1]]
-            problem = "; ".join([problem, *first])
-            raise InputError(None, problem)
+            raise InputError(None, "; ".join([problem, *first]))
         return BatchResult(
             estimator=self.options.estimator,
             arms=arms,
-            repetitions=tuple(repetitions),
-            campaigns=tuple(estimated),
-            pooled=tuple(pooled),
+            repetitions=found["repetition"],
+            campaigns=found["campaign"],
+            pooled=found["pooled"],
             broken=broken,
             skipped=skipped,
             read=self.read,
@@ -248,8 +219,31 @@ class _Batch:
             code=code_digest(),
         )
 
+    def _arm(self, arm: Arm, members: Sequence[_Campaign], advance: Advance) -> list[LevelEstimate]:
+        """Return the estimates of an arm: repetitions, campaigns, and the pooled one."""
+        name = cast(BatchEstimator, self.options.estimator)
+        estimator = Estimator(name, arm.cell.model, members[0].ready)
+        everything, campaigns = Group(), list[LevelEstimate]()
+        for one in members:
+            group, found = self._campaign(one, estimator, advance)
+            campaigns += found
+            if group.phase is not None:
+                everything.add(group)
+        levels = [*everything.repetitions, *campaigns]
+        keys = {ref.key for ref in everything.refs}
+        if len(keys) == 1:
+            levels += [replace(one, level="pooled", campaign="") for one in campaigns]
+        elif everything.phase is not None:
+            setups = sorted({key.setup or "nothing" for key in keys})
+            text = "pooled over campaigns whose cells state different payloads or delays, which are"
+            apart = [f"{text} compensated: {'; '.join(setups)}"] if len(setups) > 1 else []
+            with self._failing(f"arm {arm.digest[:8]}"):
+                centre = estimator.centre(everything.phase)
+                levels.append(sum_level("pooled", estimator, everything, centre, apart))
+        return levels
+
     def _campaign(
-        self, one: _Campaign, estimator: Estimator, advance: Callable[[float, str], None]
+        self, one: _Campaign, estimator: Estimator, advance: Advance
     ) -> tuple[Group, list[LevelEstimate]]:
         """Return the group of a campaign with its repetitions, and its estimate if any."""
         used = settings_digest(one.ready)
@@ -268,9 +262,7 @@ class _Batch:
                 group.repetitions = [
                     repetition_level(estimator, each, used, centre) for each in summaries
                 ]
-                payload = self._cell(group.refs[0]).model.payload
-                stated = payload if payload is not None and payload.parameters.any() else None
-                levels.append(sum_level("campaign", estimator, group, centre, (), stated))
+                levels.append(sum_level("campaign", estimator, group, centre))
         return group, levels
 
     @contextmanager
@@ -284,16 +276,6 @@ class _Batch:
     def _cell(self, ref: ArchiveRef) -> Cell:
         """Return the cell of an archive."""
         texts = self.cache.store(ref.location).get(ref.cell, list)
-        if texts is not None:
-            return factors.cell_from(*texts)
-        with factors.open_ref(ref) as archive:
-            return factors.cell_in(archive)
-
-
-def _setups(keys: Collection[GroupKey]) -> list[str]:
-    """Return a warning if the cells of campaigns state different setups."""
-    setups = sorted({key.setup or "nothing" for key in keys})
-    if len(setups) < 2:
-        return []
-    text = "pooled over campaigns whose cells state different payloads or delays, which are"
-    return [f"{text} compensated: {'; '.join(setups)}"]
+        if texts is None:
+            return factors.cell_in(factors.open_ref(ref))
+        return factors.cell_from(*texts)

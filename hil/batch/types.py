@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.errors import InputError
-from identification.factor.factor import Estimate, Factor
+from identification.factor.factor import Estimate
 from identification.factor.phases import PhaseFactor
-from identification.model.payload import Payload
 
 Array = NDArray[np.float64]
 
@@ -34,11 +33,21 @@ class GroupKey(NamedTuple):
     setup: str = ""  #: delay and payload stated by their cells, as text; "" for neither
 
 
+def name_of(location: str) -> str:
+    """Return the file name of a path."""
+    return location.rsplit("/", 1)[-1]
+
+
+def folder_of(location: str) -> str:
+    """Return the folder of a path."""
+    return location.rsplit("/", 1)[0]
+
+
 @dataclass(frozen=True, slots=True)
 class ArchiveRef:
     """Location and properties of an archive, without its samples."""
 
-    location: str  #: path or URL
+    location: str  #: path
     sha256: str  #: of all bytes
     #: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of an
     #: archive that a batch does not use, for which `arm` and `cell` are ""
@@ -51,8 +60,7 @@ class ArchiveRef:
     motion: str  #: digest of the planned motion, "" where unknown
     when: str = ""  #: time of recording, ISO 8601; "" in simulation
     setup: str = ""
-    #: size, times [ns] and inode of the file when it was hashed; None of a remote one
-    stamp: tuple[int, ...] | None = None
+    stamp: tuple[int, ...] = ()  #: size, times [ns] and inode of the file when it was hashed
     kind: str = ""  #: as in its metadata
     attempt: int = 0  #: 0 where the archive does not number them
     outcome: str = "completed"  #: how the recording ended
@@ -62,12 +70,12 @@ class ArchiveRef:
     @property
     def name(self) -> str:
         """File name."""
-        return self.location.rsplit("/", 1)[-1]
+        return name_of(self.location)
 
     @property
     def folder(self) -> str:
         """Folder of the file."""
-        return self.location.rsplit("/", 1)[0]
+        return folder_of(self.location)
 
     @property
     def key(self) -> GroupKey:
@@ -158,16 +166,9 @@ class LevelEstimate:
     method: str
     settings: str  #: digest of the settings; "" where campaigns with different ones are pooled
     warnings: tuple[str, ...] = ()  #: about the archives and the estimate
-    #: per axis (n,), see :func:`hil.batch.estimates.speed_rms`; None for a repetition
-    speed_rms: Array | None = None
-    #: weighted Gram matrix (p, p) of the fitted rows; None for a repetition
-    information: Array | None = None
     #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
     #: different ones are pooled
     setup: str = ""
-    payload: Payload | None = None  #: stated by the cell; None if not stated, or pooled
-    #: sum of the factors of the validation runs; None if there are none
-    unseen: Factor | None = None
 
 
 @dataclass(frozen=True, eq=False)

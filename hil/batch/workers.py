@@ -1,24 +1,27 @@
-"""Child processes that work on archives.
-
-A crash or a hang costs one archive only. Linear algebra has one thread in a child, so the bits do
-not depend on the number of parallel tasks.
-"""
+"""Workers that execute the tasks of a batch: child processes here, or those of a cluster."""
 
 from __future__ import annotations
 
 import os
 import signal
-from abc import ABC, abstractmethod
+import sys
+import threading
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
+from socket import gethostname
 from typing import Any, Final, Generic, Self, TypeVar
 
 from hil.errors import HilError
 from identification import IdentificationError
 from planner.errors import PlannerCrashed, PlanningTimedOut
-from planner.worker import WorkerProcess, stream_in_children
+from planner.worker import WorkerProcess
 
+from .cache import LIBRARIES, code_digest
 from .types import CacheError, Unused
 
 T = TypeVar("T")
@@ -26,27 +29,31 @@ T_co = TypeVar("T_co", covariant=True)
 Done = Callable[[int], None]
 
 TIMEOUT: Final = 300.0  # s, of one bundle of archives
-_START: Final = 60.0  # s, in which a new process imports its modules on a busy machine
+_AHEAD: Final = 4  # tasks submitted per worker
 
 
 @dataclass(frozen=True, eq=False)
 class ArchiveTask(Generic[T_co]):
     """A task on archives."""
 
-    path: str  #: file or URL that names the task in errors
-    function: Callable[..., T_co]  #: importable in the child
-    #: of the function; they are pickled with each task, so they should be small
-    arguments: tuple[Any, ...]
+    path: str  #: file or folder that names the task in errors
+    function: Callable[..., T_co]  #: importable in the worker
+    arguments: tuple[Any, ...]  #: of the function; pickled, so they should be small
 
 
 class WorkerSoftwareError(HilError):
     """A worker has other software than the client."""
 
 
-class Workers(ABC):
-    """Interface of workers."""
+class Workers:
+    """An executor, which runs at most `ahead` tasks before their results are used."""
 
-    local: bool  #: whether files they write are readable here under the same names
+    local = True  #: whether files they write are readable here under the same names
+    died: tuple[type[Exception], ...] = (PlannerCrashed,)  #: errors of a task whose worker ended
+    software = ""  #: `software_versions` that workers must have; "" for any
+
+    def __init__(self, executor: Executor, ahead: int = 1) -> None:
+        self._executor, self._ahead = executor, ahead
 
     def __enter__(self) -> Self:
         return self
@@ -54,109 +61,136 @@ class Workers(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def close(self) -> None:  # noqa: B027
+    def close(self) -> None:
         """End the workers."""
+        self._executor.shutdown(cancel_futures=True)
 
-    def require_folders(self, folders: Sequence[Path]) -> None:  # noqa: B027
+    def require_folders(self, folders: Sequence[Path]) -> None:
         """Check that workers on other machines have these folders under the same names."""
 
-    @abstractmethod
     def results(
         self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
     ) -> Iterator[T | Unused]:
         """Yield the results of tasks in their order; later ones are computed meanwhile.
 
-        A task that fails, ends its process or takes too long gives an `Unused`. `done` is called
-        with the number of tasks that were finished since the last call.
+        A task that fails, takes too long, or ends its process twice gives an `Unused`. `done` is
+        called with 1 for each result.
+
+        Raises:
+            CacheError: the cache cannot be written.
+            WorkerSoftwareError: a worker has other software.
         """
+        waiting, begun = iter(tasks), deque[tuple[ArchiveTask[T], Future[T | Unused]]]()
+        try:
+            while True:
+                for task in islice(waiting, self._ahead - len(begun)):
+                    begun.append((task, self._begin(task)))
+                if not begun:
+                    return
+                task, future = begun.popleft()
+                result = self._result(task, future)
+                if done is not None:
+                    done(1)
+                yield result
+        finally:
+            for _, future in begun:
+                future.cancel()
+
+    def _begin(self, task: ArchiveTask[T]) -> Future[T | Unused]:
+        return self._executor.submit(run_task, task, self.software)
+
+    def _result(self, task: ArchiveTask[T], future: Future[T | Unused]) -> T | Unused:
+        """Return a result; a task whose worker died is run once more, as another may be to blame.
+
+        Its own archives are reported if the worker dies again.
+        """
+        for last in (False, True):
+            try:
+                return future.result()
+            except PlanningTimedOut:
+                return Unused(task.path, "took too long, so that its process was ended")
+            except self.died as error:
+                if last:
+                    status = getattr(error, "status", "unknown")
+                    return Unused(task.path, f"ended its process, twice, with status {status}")
+                future = self._begin(task)
+        raise AssertionError
 
 
 class LocalWorkers(Workers):
     """Child processes of this one, started on demand.
 
     The default is one for each core that this process may use; a task may last for `timeout` [s].
+    Linear algebra has one thread in a child, so the bits do not depend on the number of processes.
     """
-
-    local = True
 
     def __init__(self, count: int | None = None, *, timeout: float = TIMEOUT) -> None:
         self.count = count or len(os.sched_getaffinity(0))
+        super().__init__(ChildExecutor(self.count, timeout), _AHEAD * self.count)
+
+
+class ChildExecutor(ThreadPoolExecutor):
+    """Threads with a child process each, which runs their calls for at most `timeout` [s].
+
+    Unlike in a `ProcessPoolExecutor` a process that ends fails one call, which is known.
+    """
+
+    def __init__(self, count: int, timeout: float) -> None:
+        super().__init__(count)
         self._timeout = timeout
+        self._own = threading.local()
         self._children: list[WorkerProcess] = []
-        self._idle: list[WorkerProcess] = []
 
-    def close(self) -> None:
-        """End the processes."""
-        self._idle.clear()
-        while self._children:
-            self._children.pop().close()
+    def submit(self, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Call a function in a child process."""
+        return super().submit(self._call, function, *args, **kwargs)
 
-    def results(
-        self, tasks: Sequence[ArchiveTask[T]], done: Done | None = None
-    ) -> Iterator[T | Unused]:
-        """See :class:`Workers`.
+    def _call(self, function: Callable[..., T], *args: Any, **kwargs: Any) -> T:
+        if not hasattr(self._own, "child"):
+            self._own.child = WorkerProcess(timeout=self._timeout)
+            self._children.append(self._own.child)
+        child: WorkerProcess = self._own.child
+        return child.call(function, *args, **kwargs)
 
-        Raises:
-            PlannerNotStarted: no child process can be started.
-            CacheError: the cache cannot be written.
-        """
-        children = [self._child() for _ in range(min(self.count, len(tasks)))]
-        found = stream_in_children(
-            children,
-            _run_tasks,
-            ([k] for k in range(len(tasks))),
-            lambda chunk: ([tasks[k] for k in chunk], self._timeout),
-            done=done,
-        )
-        early: dict[int, Any] = {}
-        try:
-            for k, task in enumerate(tasks):
-                while k not in early:
-                    other, result = next(found)
-                    early[other] = result
-                result = early.pop(k)
-                if isinstance(result, PlanningTimedOut):
-                    result = Unused(task.path, f"took longer than {self._timeout:g} s")
-                elif isinstance(result, PlannerCrashed):
-                    status = result.status
-                    end = f"signal {-status}" if status < 0 else f"status {status}"
-                    result = Unused(task.path, f"ended its process, twice, with {end}")
-                yield result
-        finally:
-            found.close()
-            self._idle += [child for child in children if child in self._children]
-
-    def _child(self) -> WorkerProcess:
-        if not self._idle:
-            self._idle.append(WorkerProcess(timeout=self._timeout + _START))
-            self._children += self._idle
-        return self._idle.pop()
+    def shutdown(self, *_: object, **__: object) -> None:
+        """End the processes, and the calls in them."""
+        super().shutdown(wait=False, cancel_futures=True)
+        for child in self._children:
+            if child.pid is not None:
+                os.kill(child.pid, signal.SIGKILL)
+        super().shutdown(wait=True)
+        for child in self._children:
+            child.close()
 
 
-def _run_tasks(tasks: Sequence[ArchiveTask[T]], timeout: float) -> list[T | Unused]:
-    """Run tasks in a child; one that takes too long ends the process."""
-    found = []
-    for task in tasks:
-        # Started here: imports of a new process do not count.
-        # `planner.worker` switches the alarm off when this returns.
-        signal.setitimer(signal.ITIMER_REAL, timeout)
-        found.append(run_task(task))
-    return found
+# In a worker
 
 
-def run_task(task: ArchiveTask[T]) -> T | Unused:
+def run_task(task: ArchiveTask[T], software: str = "") -> T | Unused:
     """Return the result of a task, or why there is none.
 
     Raises:
         CacheError: the cache cannot be written, which affects every task.
-        WorkerSoftwareError: the worker has other software.
+        WorkerSoftwareError: the worker has other software than `software`, if that is given.
     """
+    if software and software != (own := software_versions()):
+        raise WorkerSoftwareError(
+            f"the worker on {gethostname()} has other software than this machine ({own} instead of"
+            f" {software}); install the same hil and constraints.txt on both, and start it again"
+        )
     try:
         return task.function(*task.arguments)
-    except (CacheError, WorkerSoftwareError):
+    except CacheError:
         raise
     except Exception as error:
         return Unused(task.path, reason_of(error))
+
+
+def software_versions() -> str:
+    """Return the versions that determine the bits of a result: code, Python and libraries."""
+    libraries = [f"{name} {version(name)}" for name in LIBRARIES]
+    python = ".".join(str(part) for part in sys.version_info[:3])
+    return ", ".join([f"hil {code_digest():.12}", f"python {python}", *libraries])
 
 
 def reason_of(error: Exception) -> str:

@@ -25,7 +25,7 @@ def compare(
     quiet: QuietOption = False,
     json: JsonOption = False,
 ) -> None:
-    """Compare campaigns of one arm: friction of each axis, payload, torque constants.
+    """Compare campaigns of one arm: parameters of friction and inertia that changed, by axis.
 
     The reference is the earliest campaign, or the first one named if not all have a recording time.
     Archives are read as by `hil reidentify`. Exit status 0 for any result, unless --fail-on-change
@@ -49,8 +49,13 @@ def compare(
         print_json(found.document)
     else:
         if not quiet:
-            for one in found.findings:
-                typer.echo(printable(f"{one.words} {one.next_step}".rstrip()), err=True)
+            for one in found.changed:
+                line = (
+                    f"{one.parameter} in {one.campaign}:"
+                    f" {one.after:.4g} instead of {one.before:.4g} {one.unit}, change"
+                    f" {one.change:+.3g} ± {one.half:.2g} (95 %), p {one.p_value:.1g}"
+                )
+                typer.echo(printable(line), err=True)
             for warning in found.warnings:
                 typer.echo(printable(f"note: {warning}"), err=True)
         typer.echo(printable(f"{found.verdict}."))

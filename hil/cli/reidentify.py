@@ -13,14 +13,14 @@ import typer
 
 from hil.batch import run
 from hil.batch.cache import CacheLocation
+from hil.batch.cluster import DaskWorkers
 from hil.batch.estimates import relative_error
 from hil.batch.table import write_tables
 from hil.batch.types import BatchEstimator, BatchResult, LevelEstimate, Unused
-from hil.batch.workers import LocalWorkers, Workers
+from hil.batch.workers import LocalWorkers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
-from hil.compare.trend import ArmTrend, campaign_names, findings, summary, trends
-from hil.files import convert_write_errors, make_folder, write_atomically
+from hil.files import convert_write_errors, make_folder
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import plural, printable
 
@@ -53,8 +53,8 @@ def reidentify(
     stopped motions and copies, are skipped and counted by reason.
 
     Options:
-        places: Folders with archives at any depth, archives, or URLs of either.
-        output: Folder for the tables (CSV, Parquet) and the trend report. Default: none.
+        places: Folders with archives at any depth, or archives.
+        output: Folder for the tables (CSV, Parquet). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
         workers: Number of processes. Default: one per core.
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
@@ -66,22 +66,17 @@ def reidentify(
         make_folder(output)
     options, keep = how.options(estimator=estimator), cache != "none"
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
-    with _workers(dask, workers) as hands:
-        hands.require_folders([Path(place) for place in places if "://" not in place])
+    with LocalWorkers(workers) if dask is None else DaskWorkers(dask) as hands:
+        hands.require_folders([Path(place) for place in places])
         result = run.reidentify(places, options, hands, reporter, cache=location)
-    found = trends(result)
     written: list[Path] = []
     if output is not None:
-        from hil.report.changes import trend_page  # matplotlib is slow to import
-
-        page = output / "trend.html"
         with convert_write_errors(output):
-            written = [*write_tables(output, result), page]
-            write_atomically(page, trend_page(result, found))
+            written = write_tables(output, result)
     if json:
-        print_json(as_dict(result, found, written))
+        print_json(as_dict(result, written))
     else:
-        for line in alarm_lines(found) if quiet else result_lines(result, found):
+        for line in () if quiet else result_lines(result):
             typer.echo(printable(line))
         if written:
             names = ", ".join(path.name for path in written)
@@ -100,45 +95,24 @@ def reidentify(
         raise typer.Exit(SOME_BROKEN)
 
 
-def _workers(address: str | None, count: int | None) -> Workers:
-    if address is None:
-        return LocalWorkers(count)
-    from hil.batch.cluster import DaskWorkers  # an extra
-
-    return DaskWorkers(address)
-
-
-def result_lines(result: BatchResult, found: Sequence[ArmTrend]) -> Iterator[str]:
-    """Format each arm: its campaigns, changes and warnings."""
-    by_name = {one.name: one for one in found}
+def result_lines(result: BatchResult) -> Iterator[str]:
+    """Format each arm: its campaigns and warnings."""
     for digest, arm in result.arms.items():
-        trend = by_name.get(arm.name)
-        yield f"{arm.name}: {'no campaign could be estimated' if trend is None else summary(trend)}"
         campaigns = [one for one in result.campaigns if one.arm == digest]
-        names = campaign_names(campaigns)
-        yield from _last([_line(*one) for one in zip(names, campaigns, strict=True)])
+        yield f"{arm.name}: {plural(len(campaigns), 'campaign')}"
+        yield from _last([_line(one) for one in campaigns])
         pooled = [one for one in result.pooled if one.arm == digest]
         for warning in dict.fromkeys(text for one in pooled for text in one.warnings):
             yield f"  note: {warning}"
-        for finding in [] if trend is None else findings(trend):
-            mark = {"alarm": "! ", "past": "earlier: "}.get(finding.level, "")
-            yield f"  {mark}{finding.words} {finding.next_step}".rstrip()
 
 
-def _line(name: str, one: LevelEstimate) -> str:
+def _line(one: LevelEstimate) -> str:
     """Format a campaign."""
+    named = ", ".join(text for text in (one.campaign, one.setup, one.when[:10]) if text)
     error = relative_error(one.noise_std, one.torque_rms, one.samples)
     unseen = relative_error(one.unseen_rms, one.unseen_torque_rms)
     held_out = "" if math.isnan(unseen) else f", held out {unseen:.1%}"
-    return f"  {name}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
-
-
-def alarm_lines(found: Sequence[ArmTrend]) -> Iterator[str]:
-    """Format the alarms only."""
-    for arm in found:
-        for finding in findings(arm):
-            if finding.level == "alarm":
-                yield f"{arm.name}: {finding.words}"
+    return f"  {named}: {plural(one.repetitions, 'repetition')}, torque error {error:.1%}{held_out}"
 
 
 def _last(lines: Sequence[str]) -> Iterator[str]:
@@ -155,11 +129,8 @@ def skipped_line(skipped: Sequence[Unused]) -> str:
     return f"skipped, not for fitting: {reasons}"
 
 
-def as_dict(
-    result: BatchResult, found: Sequence[ArmTrend], written: Sequence[Path]
-) -> dict[str, Any]:
+def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
     """Return the content of `--json`; campaigns by folder, and by setup if one has several."""
-    trends = {one.name: _trend(one) for one in found}
     folders = Counter((one.arm, one.campaign) for one in result.campaigns)
     return {
         "estimator": result.estimator,
@@ -172,7 +143,6 @@ def as_dict(
                     if one.arm == digest
                 },
                 "pooled": next((_level(o) for o in result.pooled if o.arm == digest), None),
-                "trend": trends.get(arm.name),
             }
             for digest, arm in result.arms.items()
         },
@@ -195,16 +165,4 @@ def _level(one: LevelEstimate) -> dict[str, Any]:
             for name, value, std in zip(one.names, one.values, one.std, strict=True)
         },
         "warnings": list(one.warnings),
-    }
-
-
-def _trend(arm: ArmTrend) -> dict[str, Any]:
-    return {
-        "summary": summary(arm),
-        "dated": arm.dated,
-        "undated": list(arm.undated),
-        "findings": [
-            {"level": one.level, "words": one.words, "next_step": one.next_step}
-            for one in findings(arm)
-        ],
     }

@@ -1,30 +1,63 @@
-"""Results of a study: `results.json`.
+"""Results of a study: `results.json`, made from the archives of its campaigns.
 
 SI units; lists per joint follow `joint_names`, lists per parameter `parameters`. Torque errors are
-low-passed at 30 Hz unless stated otherwise.
+low-passed at 30 Hz as in the paper's Fig. 4, which removes the noise of the currents, unless stated
+otherwise. The low-passed error Phi pi - tau is linear in the parameters pi: its squared norm is
+y' G y with y = [-pi; 1] and G the Gram matrix of the low-passed [Phi | tau], so that one matrix per
+motion gives the error of any estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import pi
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
+from scipy import stats
 
+from hil.campaign import CampaignFolder
+from hil.cell import Cell
+from hil.errors import InputError
+from hil.identify.options import FIXED
+from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.sources import gather_sources
+from hil.identify.summary import executed_rows, moving_rows
+from hil.progress import Silent
+from hil.reading import read_text
 from hil.report.numbers import capitalised, fixed, significant
 from hil.results import Frozen
+from identification import Factor, RobotModel
+from identification.estimators.least_squares import estimate_repetitions
+from identification.excitation import correlation, coupling_index, information, log10_det
+from identification.signals.samples import Samples
+from identification.signals.smoothing import low_pass
+from identification.validation.prediction import FIGURE_BANDWIDTH, for_figure
+from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, URDF_PATH
 
-from .campaigns import AP, OWN_CLASS, A, B
-from .records import ExampleRecord, Fitted
-from .settings import StudySettings, load_json
+from .campaigns import LABELS, A, B
+from .settings import StudySettings
 
-SCHEMA_VERSION: Final = 1
-ALPHA: Final = 0.05  #: How often, at most, a table shows any difference where there is none
-SMALL: Final = 0.02  #: A difference of errors below this share exists and does not matter
-
-Quantity = Literal["error", "own", "parameter_error"]
+Array = NDArray[np.float64]
 Verdict = Literal["better", "slightly better", "none", "slightly worse", "worse", "too few"]
+
+SCHEMA_VERSION: Final = 2
+TRUE_VALUES: Final = "planted"  #: Key of the true parameters among the estimates
+SMALL: Final = 0.02  #: A difference of errors below this share exists and does not matter
+MIN_UNITS: Final = 3  #: Repetitions, or blocks of them, needed for their scatter
+TABLE1: Final = (
+    ("a", 2000, 90.5, 127.9, "W = 3, own frequencies; 100 individuals"),
+    ("b", 15996, 30.9, 101.2, "K = 6, λ1 = 0.7, λ2 = 0.3; 150 individuals"),
+)
+"""The paper's Table 1: method, N, log det (units not stated), I_c, notes."""
+
+_DRAWS, _SEED = 4000, 20140901
+_SHOWN: Final = 1200  # maximum number of rows of a series in a figure
+_MOVING: Final = 1e-3  # speed above which a joint moves, rad/s or m/s
 
 
 class StudyParameter(Frozen):
@@ -32,7 +65,7 @@ class StudyParameter(Frozen):
 
     name: str
     unit: str
-    truth: float  #: Planted value
+    truth: float  #: Of the simulated arm
     printed_id: int | None = None  #: Row of the paper's Table 2
     printed_symbol: str | None = None
     printed_factor: float = 1.0  #: What a value is multiplied with to compare it with the print
@@ -41,120 +74,68 @@ class StudyParameter(Frozen):
     printed_c: float | None = None
 
 
-class SearchResult(Frozen):
-    """One search and its motion; null figures if it found none."""
+class MotionRow(Frozen):
+    """A row of Table 1: a search of this study, or a row of the paper; null figures if none."""
 
     key: str
     words: str
-    chosen: bool  #: Whether its motion was executed in full
+    printed: bool = False
+    executed: bool = False  #: Whether it is the motion of a method in this study
     tried: int = 0
-    infeasible: dict[str, int] = Field(default_factory=dict)
+    n_samples: int | None = None
+    duration: float | None = None
     log10_det: float | None = None
     coupling_index: float | None = None
-    duration: float | None = None
-
-
-class MotionRow(Frozen):
-    """A row of Table 1."""
-
-    key: str
-    words: str
-    n_samples: int
-    log10_det: float
-    coupling_index: float
     executed_log10_det: float | None = None
     executed_coupling_index: float | None = None
-    duration: float | None = None
-    printed: bool = False
 
 
-class MethodResult(Fitted):
-    """Estimates of one excitation under one condition."""
+class MethodResult(Frozen):
+    """Estimates from the repetitions of one excitation under one condition (eq. 4)."""
 
     key: str
     label: str
-    repetitions: int
-    seconds: float  #: Of motion that was fitted, all repetitions
+    values: list[list[float]]  #: Of each repetition
     mean: list[float]  #: Over the repetitions' own estimates: the paper's Table 2
     std: list[float]  #: Over the repetitions, of one of them
+    pooled: list[float]
+    pooled_std: list[float]
+    undetermined: list[str]
+    log10_det: float  #: Of the executed motion
+    coupling_index: float  #: Of the executed motion
+    correlation: list[list[float]]  #: Of the executed motion
+    duration: float  #: Of one repetition
+    time: list[float]
+    position: list[list[float]]  #: Per joint, of the first repetition
 
 
-class ComparisonResult(Frozen):
-    """Two estimates on the same motions: errors with `second` over errors with `first`.
+class HeldOut(Frozen):
+    """Relative errors ||e|| / ||tau|| on the held-out motions, by estimate and motion."""
+
+    archives: list[str]
+    overall: dict[str, list[float]]  #: Of all joints together, over the rows that a fit uses
+    all_rows: dict[str, list[float]]  #: The same with rest, ends of motion and reversals
+    mean_abs: dict[str, list[list[float]]]
+    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
+    left_out: list[float]  #: Share of the moving samples that `overall` excludes, per joint
+    example: str  #: Archive of the motion of median error
+    time: list[float]  #: Of that motion
+    measured: list[list[float]]  #: Torque per joint
+    predicted: dict[str, list[list[float]]]
+
+
+class Comparison(Frozen):
+    """Errors with B over errors with A, motion by motion.
 
     The interval treats motions and repetitions as random samples; the verdict follows from it.
     """
 
-    motion_class: str
-    first: str
-    second: str
-    motions: int
-    repetitions: list[int]  #: Of `first` and `second`
     ratio: float  #: Geometric mean over the motions
-    wins: int  #: Motions that `second` predicts better
-    error: float | None
-    """Standard error of the log ratio; null with fewer than three repetitions, or one motion."""
-    freedom: float | None  #: Its degrees of freedom
-    level: float = 1.0 - ALPHA
-    """Of the interval by itself, such that all of its table hold at 95 % (Bonferroni)."""
+    wins: int  #: Motions that B predicts better
+    motions: int
     low: float | None = None
-    high: float | None = None  #: Interval of the ratio at that level
-    verdict: Verdict = "too few"  #: On `second`: whether the interval excludes 1
-
-    @property
-    def differs(self) -> bool:
-        """Whether the difference is significant."""
-        return self.verdict not in ("none", "too few")
-
-
-class ClassResult(Frozen):
-    """The motions of one class, and relative errors ||e|| / ||tau|| of every estimate on each.
-
-    They are low-passed at 30 Hz as in the paper's Fig. 4, which removes the noise of the currents.
-    """
-
-    motion_class: str
-    archives: list[str]
-    durations: list[float]
-    overall: dict[str, list[float]]  #: Of all joints together, for each estimate
-    own: dict[str, list[float]]
-    """||Phi (pi - planted)|| / ||tau||, errors of the estimates themselves, without effects."""
-    mean_abs: dict[str, list[list[float]]]
-    """Motion by motion, mean |e| per joint, N·m: the paper's Fig. 3."""
-    all_rows: dict[str, list[float]]
-    """As `overall`, over the whole motion: rows at rest, near ends and at reversals included."""
-    left_out: list[float]
-    """Share of the samples of the motions that all other errors leave out, per joint."""
-
-    @property
-    def left_out_share(self) -> float:
-        """Of all joints together."""
-        return sum(self.left_out) / len(self.left_out)
-
-
-class ClosenessResult(Frozen):
-    """Number of parameters of a group that are closer to a reference with the second estimate."""
-
-    group: str
-    reference: str
-    first: str
-    second: str
-    parameters: int
-    second_closer: int
-    printed_second_closer: int | None  #: Of the paper's own columns A and B
-
-
-class EqualDataResult(Frozen):
-    """Comparison of the first two methods with equal motion time: the longer one is shortened."""
-
-    cut: str  #: Key of the method of which only the first repetitions are used
-    name: str  #: Of that estimate in the cross table
-    repetitions: int
-    seconds: float
-    other: str
-    other_seconds: float
-    comparisons: list[ComparisonResult]
-    """Class by class, in the order of the methods; corrected among themselves."""
+    high: float | None = None  #: 95 % interval; null with too few repetitions or motions
+    verdict: Verdict = "too few"  #: On B: whether the interval excludes 1
 
 
 class ConditionResult(Frozen):
@@ -164,79 +145,8 @@ class ConditionResult(Frozen):
     words: str
     effects: list[str]
     methods: list[MethodResult]
-    classes: list[ClassResult]
-    comparisons: list[ComparisonResult]
-    own_comparisons: list[ComparisonResult]
-    """The first two, class by class, in the errors of the estimates themselves."""
-    equal_data: EqualDataResult | None  #: Null where both have as much motion anyway
-    closeness: list[ClosenessResult]
-    examples: list[ExampleRecord]
-
-    @property
-    def labels(self) -> dict[str, str]:
-        """Labels of the methods by key, in the order of the tables."""
-        return {one.key: one.label for one in self.methods}
-
-    def compared(self, motion_class: str, first: str, second: str) -> ComparisonResult | None:
-        """Return one pair of methods, in this order, on one class."""
-        wanted = (motion_class, first, second)
-        rows = (c for c in self.comparisons if (c.motion_class, c.first, c.second) == wanted)
-        return next(rows, None)
-
-
-class AblationPoint(Frozen):
-    """One setting of an ablation."""
-
-    value: float
-    label: str = ""  #: Where the setting is not a number, which `value` then only counts
-    method: str
-    base: bool  #: Whether it is the setting of the study itself
-    repetitions: int
-    log10_det: float | None
-    coupling_index: float | None
-    duration: float | None
-    parameter_error: float | None
-    """Geometric mean over the parameters of distance to the planted value, the study's B = 1."""
-    error: dict[str, float]  #: Median over the motions of each class of ||e|| / ||tau||
-    own: dict[str, float]  #: The same of the estimate itself
-
-    @property
-    def name(self) -> str:
-        """The setting as text."""
-        return self.label or f"{self.value:g}"
-
-
-class ChanceRange(Frozen):
-    """Range of a figure over subsets of the study's own repetitions of one method."""
-
-    method: str
-    repetitions: int  #: In each subset
-    quantity: Quantity
-    motion_class: str | None  #: Null for the parameters
-    low: float
-    high: float  #: 2.5 and 97.5 % of the subsets
-    subsets: int
-
-
-class AblationResult(Frozen):
-    """Results with one setting varied."""
-
-    key: str
-    title: str
-    variable: str
-    words: str
-    points: list[AblationPoint]
-    comparisons: list[ComparisonResult] = Field(default_factory=list)
-    """With B, where the settings are another method's."""
-
-
-class Paragraph(Frozen):
-    """One conclusion."""
-
-    key: str
-    heading: str
-    verdict: str = ""  #: The conclusion in one line, where the heading is a question
-    sentences: list[str]
+    held_out: HeldOut
+    comparison: Comparison
 
 
 class StudyResults(Frozen):
@@ -245,155 +155,310 @@ class StudyResults(Frozen):
     schema_version: int = SCHEMA_VERSION
     name: str
     cell: str
-    simulated: bool
+    simulated: bool = True
     quick: bool
     settings: StudySettings
     software: dict[str, str]
     joint_names: list[str]
     n_base: int
     parameters: list[StudyParameter]
-    searches: list[SearchResult]
     table1: list[MotionRow]
     conditions: list[ConditionResult]
-    ablations: list[AblationResult]
-    ranges: list[ChanceRange]
-    """Of as many repetitions as the ablations have; none where the study has no more itself."""
-    reading: list[Paragraph]
-    missing: list[str]  #: What of the paper's study is not in this one, and why
-    times: dict[str, float]  #: Wall time [s] of each stage in the last session
+    conclusion: list[str]  #: Sentences
+    times: dict[str, float] = Field(
+        default_factory=dict
+    )  #: Wall time [s] of each stage in the last session
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a study's `results.json`; InputError if it is not one."""
-        return load_json(cls, path, "is not the result of a study", "run the study again")
+        try:
+            return cls.model_validate_json(read_text(path))
+        except (OSError, ValueError) as error:
+            problem = f"is not the result of a study ({error})"
+            raise InputError(path, problem, remedy="run the study again") from error
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The conclusion as JSON data, with the ratios that it is based on."""
+        return {
+            "name": self.name,
+            "simulated": self.simulated,
+            "quick": self.quick,
+            "line": " ".join(self.conclusion),
+            "ratios": [{"condition": c.key} | c.comparison.model_dump() for c in self.conditions],
+        }
 
 
-_OUTCOMES: Final = {
-    "none": "No significant difference",
-    "too few": "Too few repetitions or motions for a conclusion",
-}
+# The paper's numbers
 
 
-def conclusions(results: StudyResults) -> list[Paragraph]:
-    """Return all paragraphs, the paper's question first."""
-    found = [_prediction(results), _classes(results), _effects(results)]
-    return [one for one in found if one is not None]
+def is_printed(cell: Cell) -> bool:
+    """Return whether a cell has the arm of the paper, the NS 16."""
+    return cell.urdf == URDF_PATH.read_text(encoding="utf-8")
 
 
-def summary_of(results: StudyResults) -> dict[str, Any]:
-    """Return the conclusions as JSON data: `line`, and the ratios that it is based on."""
-    fields = {"motion_class", "first", "second", "ratio", "level", "verdict"}
-    return {
-        "name": results.name,
-        "simulated": results.simulated,
-        "quick": results.quick,
-        "line": " ".join(f"{one.heading} {one.verdict}" for one in results.reading if one.verdict),
-        "ratios": [
-            {
-                "condition": condition.key,
-                **one.model_dump(include=fields),
-                "interval": None if one.low is None else [one.low, one.high],
-                "differs": one.differs,
-            }
-            for condition in results.conditions
-            for one in condition.comparisons
-        ],
-        "missing": results.missing,
-    }
-
-
-def _prediction(results: StudyResults) -> Paragraph:
-    """Compare the first two methods on the robot's own motions: the paper's Fig. 3."""
-    conditions = results.conditions
-    pairs = [(one, _main(one)) for one in conditions]
-    printed = [(one, row) for one in conditions if (row := one.compared("fly-by", AP, B))]
-    return Paragraph(
-        key="prediction",
-        heading="Does B predict fly-by motions better than A?",
-        verdict=_each(pairs),
-        sentences=[
-            f"{capitalised(one.words)}, the error with {one.labels[row.second]} is"
-            f" {fixed(row.ratio, 3)} times that with {one.labels[row.first]}"
-            f" (interval {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
-            f" smaller on {row.wins} of {row.motions} motions."
-            for one, row in (*pairs, *printed)
-        ],
-    )
-
-
-def _classes(results: StudyResults) -> Paragraph | None:
-    """Check whether estimates predict their own class of motion best: the paper's main argument."""
-    upheld = {
-        condition.words: [_best(condition, key, name) for key, name in OWN_CLASS.items()]
-        for condition in results.conditions
-        if len(condition.classes) == len(OWN_CLASS)
-    }
-    if not upheld:
-        return None
-    every = [one for own in upheld.values() for one in own]
-    counts = ", ".join(f"{sum(own)} of {len(own)} {words}" for words, own in upheld.items())
-    return Paragraph(
-        key="classes",
-        heading="Do estimates predict their own class of motion best?",
-        verdict=f"{'Yes' if all(every) else 'In part' if any(every) else 'No'}: {counts}.",
-        sentences=["Best means significantly better than every other estimate."],
-    )
-
-
-def _best(condition: ConditionResult, key: str, motion_class: str) -> bool:
-    """Return whether an estimate is significantly better on a class than all others."""
-    rows = [
-        one.verdict.endswith("better" if one.second == key else "worse")
-        for one in condition.comparisons
-        if one.motion_class == motion_class and key in (one.first, one.second)
+def printed_rows(cell: Cell) -> list[MotionRow]:
+    """Return the printed rows of Table 1; none for another arm than the NS 16."""
+    names = ("key", "n_samples", "log10_det", "coupling_index", "words")
+    return [
+        MotionRow.model_validate(dict(zip(names, row, strict=True)) | {"printed": True})
+        for row in (TABLE1 if is_printed(cell) else ())
     ]
-    return bool(rows) and all(rows)
 
 
-def _effects(results: StudyResults) -> Paragraph | None:
-    """Check whether the conclusion depends on the unmodelled effects."""
-    if len(results.conditions) < 2:
-        return None
-    rigid, effects = results.conditions
-    before, after = _main(rigid), _main(effects)
-    same = (before.differs, before.ratio < 1.0) == (after.differs, after.ratio < 1.0)
-    same = same or not (before.differs or after.differs)
-    return Paragraph(
-        key="effects",
-        heading="Does that depend on the unmodelled effects?",
-        verdict="No." if same else f"Yes: {_each([(effects, after)])}",
-        sentences=[
-            f"The effects change the ratio of the errors from {fixed(before.ratio, 3)} to"
-            f" {fixed(after.ratio, 3)} on {after.motion_class} motions.",
-            f"Effects: {'; '.join(effects.effects)}.",
-        ],
+def parameters_of(cell: Cell, truth: Array) -> list[StudyParameter]:
+    """Return the parameters with true values (p,) and the printed values of Table 2.
+
+    Rows 41 to 52 are interleaved. Viscous and third friction terms are assumed to be per degree and
+    per degree²: per radian the viscous friction would be negligible.
+    """
+    model, printed = cell.model, dict[str, dict[str, Any]]()
+    for row in TABLE2 if is_printed(cell) else ():
+        order = {"f1": 1, "f2": 2}.get(row.parameter[:2], 0) if row.id > N_ESSENTIAL else 0
+        printed[row.pivot or row.parameter] = {
+            "printed_id": row.id,
+            "printed_symbol": row.parameter,
+            "printed_factor": row.sign * (pi / 180.0) ** order,
+            "printed_a": row.pi_a,
+            "printed_b": row.pi_b,
+            "printed_c": row.pi_c,
+        }
+    return [
+        StudyParameter(name=name, unit=unit, truth=float(value), **printed.get(name, {}))
+        for name, unit, value in zip(model.parameter_names, model.units, truth, strict=True)
+    ]
+
+
+# Estimates and predictions
+
+
+def condition_result(
+    key: str, words: str, effects: Sequence[str], roots: Mapping[str, Path], truth: Array
+) -> ConditionResult:
+    """Estimate from the campaigns of A and B (by method), and predict the held-out motions of B.
+
+    `truth` are the true parameters (p,).
+    """
+    methods = [_method(name, _prepared(roots[name], "excitation")) for name in (A, B)]
+    estimates = {one.key: np.array(one.mean) for one in methods} | {TRUE_VALUES: truth}
+    prepared = _prepared(roots[B], "validation")
+    model = prepared.sources.cell.model
+    names = [source.name for source in prepared.sources.training]
+    forms = np.array([motion_form(model, run) for run in prepared.fitted])
+    values = [np.array(one.values) for one in methods]
+    return ConditionResult(
+        key=key,
+        words=words,
+        effects=list(effects),
+        methods=methods,
+        held_out=_held_out(model, dict(zip(names, prepared.fitted, strict=True)), forms, estimates),
+        comparison=compared(forms, values[0], values[1]),
     )
 
 
-def _main(condition: ConditionResult) -> ComparisonResult:
-    """Return the comparison of A and B on fly-by motions."""
-    row = condition.compared("fly-by", A, B)
-    assert row is not None  # every study has them
-    return row
+def _prepared(root: Path, kind: str) -> Prepared:
+    """Prepare all archives of a kind, with the standstill, for a fit."""
+    folder, options = CampaignFolder(root), replace(FIXED, in_sample=True)
+    paths = [*folder.completed(kind), *folder.completed("standstill")]
+    return prepare_sources(gather_sources(paths, options.split, in_sample=True), options, Silent())
 
 
-def _each(pairs: Sequence[tuple[ConditionResult, ComparisonResult]]) -> str:
-    """Format the conclusion of each condition; once if they are equal."""
-    texts = [_outcome(condition, row) for condition, row in pairs]
-    if len(set(texts)) > 1:
-        named = zip(pairs, texts, strict=True)
-        texts = [f"{capitalised(one.words)}: {text}" for (one, _), text in named]
-    return " ".join(f"{text}." for text in dict.fromkeys(texts))
+def _method(key: str, prepared: Prepared) -> MethodResult:
+    """Estimate from each repetition and from all."""
+    model, sources = prepared.sources.cell.model, prepared.sources.training
+    found = estimate_repetitions(model, prepared.fitted)
+    executed = Factor.zero(model)
+    parts = [executed_rows(own, one) for own, one in zip(sources, prepared.fitted, strict=True)]
+    for one, part in zip(prepared.fitted, parts, strict=True):
+        executed = executed + Factor.from_samples(model, one.motion.rows(part), one.torque[part])
+    gram, motion, rows = information(executed), prepared.fitted[0].motion, parts[0]
+    shown = motion.rows(_thinned(rows))
+    values = np.array([one.values for one in found.repetitions])
+    return MethodResult(
+        key=key,
+        label=LABELS[key],
+        values=values.tolist(),
+        mean=values.mean(axis=0).tolist(),
+        std=values.std(axis=0, ddof=1).tolist(),
+        pooled=found.pooled.values.tolist(),
+        pooled_std=found.pooled.std.tolist(),
+        undetermined=list(found.pooled.undetermined),
+        log10_det=log10_det(gram, (rows.stop - rows.start) * len(sources)),
+        coupling_index=coupling_index(gram),
+        correlation=correlation(gram).tolist(),
+        duration=float(motion.time[rows.stop - 1] - motion.time[rows.start]),
+        time=_rounded(shown.time - shown.time[0]),
+        position=[_rounded(column) for column in shown.position.T],
+    )
 
 
-def _outcome(condition: ConditionResult, row: ComparisonResult) -> str:
-    """Format whose error is smaller, by how much, and whether equal motion time changes that."""
-    if not row.differs:
-        return _OUTCOMES[row.verdict]
-    better = condition.labels[row.second if row.ratio < 1.0 else row.first]
+def motion_form(model: RobotModel, run: Samples) -> Array:
+    """Return the Gram matrix of the low-passed [Phi | tau] (p + 1, p + 1) over the usable rows.
+
+    It is divided by the sum of the squared torque, so that a quadratic form is a relative error.
+    """
+    n = model.n_parameters
+    found = np.zeros((n + 1, n + 1))
+    for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
+        usable = run.usable[:, j]
+        table = np.column_stack([block, run.torque[:, j]]) * usable[:, None]
+        passed, both = low_passed(run, table)[usable], [*used, n]
+        found[np.ix_(both, both)] += passed.T @ passed
+    return np.asarray(found / (np.where(run.usable, run.torque, 0.0) ** 2).sum())
+
+
+def relative_errors(forms: Array, values: Array) -> Array:
+    """Return ||e|| / ||tau|| (m, s) of s estimates (s, p) on m motions (m, p + 1, p + 1)."""
+    left = np.column_stack([-values, np.ones(len(values))])
+    squared = np.einsum("sp,mpq,sq->ms", left, forms, left, optimize=True)
+    return np.asarray(np.sqrt(np.maximum(squared, 0.0)))
+
+
+def _held_out(
+    model: RobotModel, runs: Mapping[str, Samples], forms: Array, estimates: Mapping[str, Array]
+) -> HeldOut:
+    """Predict motions by several estimates (p,); the series are of the motion of median error."""
+    table = np.array(list(estimates.values()))
+    overall = dict(zip(estimates, relative_errors(forms, table).T, strict=True))
+    errors = [_errors(model, table, run) for run in runs.values()]
+    usable = [run.usable[_motion_rows(run)] for run in runs.values()]
+    every = overall[A] + overall[B]
+    typical = list(runs)[int(np.argsort(every, kind="stable")[(len(every) - 1) // 2])]
+    run = runs[typical]
+    time, shown = run.motion.time, _thinned(moving_rows(run))
+
+    def joints(torque: Array) -> list[list[float]]:
+        return [_rounded(column) for column in for_figure(time, torque)[shown].T]
+
+    return HeldOut(
+        archives=list(runs),
+        overall={name: one.tolist() for name, one in overall.items()},
+        all_rows={n: [float(one[k]) for _, one in errors] for k, n in enumerate(estimates)},
+        mean_abs={n: [one[k].tolist() for one, _ in errors] for k, n in enumerate(estimates)},
+        left_out=(1.0 - np.mean(np.concatenate(usable), axis=0)).tolist(),
+        example=typical,
+        time=_rounded(time[shown] - time[shown.start]),
+        measured=joints(run.torque),
+        predicted={n: joints(run.predicted_torque(model, estimates[n])) for n in (A, B)},
+    )
+
+
+def _errors(model: RobotModel, table: Array, run: Samples) -> tuple[Array, Array]:
+    """Return low-passed errors of estimates on one motion.
+
+    These are mean |e| per joint over usable rows (k, n) and the relative error over all rows (k,).
+    """
+    left = np.zeros((*run.torque.shape, len(table)))
+    for j, (block, used) in enumerate(zip(*run.regressor(model), strict=True)):
+        left[:, j] = run.torque[:, j, None] - block @ table[:, used].T
+
+    def filtered(error: Array) -> Array:
+        return low_passed(run, error.reshape(len(error), -1)).reshape(error.shape)
+
+    whole = _motion_rows(run)
+    squared = (filtered(left)[whole] ** 2).sum(axis=(0, 1)) / (run.torque[whole] ** 2).sum()
+    left[~run.usable] = 0.0
+    slow = np.where(run.usable[..., None], filtered(left), 0.0)
+    rows = np.maximum(np.count_nonzero(run.usable, axis=0), 1)
+    return (np.abs(slow).sum(axis=0) / rows[:, None]).T, np.sqrt(squared)
+
+
+def low_passed(run: Samples, values: Array) -> Array:
+    """Low-pass values (m, c) as in the paper's Fig. 4, per segment; zero without usable rows."""
+    slow = np.zeros_like(values)
+    for part in run.segments:
+        if run.usable[part].any():
+            slow[part] = low_pass(run.motion.time[part], values[part], FIGURE_BANDWIDTH)
+    return slow
+
+
+def _motion_rows(run: Samples) -> slice:
+    """Return the samples from the first to the last at which a joint moves."""
+    moving = np.flatnonzero((np.abs(run.motion.velocity) > _MOVING).any(axis=1))
+    return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)
+
+
+def _thinned(rows: slice) -> slice:
+    return slice(rows.start, rows.stop, max(1, (rows.stop - rows.start) // _SHOWN))
+
+
+def _rounded(values: Array) -> list[float]:
+    return [float(f"{value:.5g}") for value in values.tolist()]
+
+
+# Comparison and conclusion
+
+
+def compared(forms: Array, first: Array, second: Array) -> Comparison:
+    """Compare the errors of the mean estimates of A (r, p) and B (s, p) on motions (see above).
+
+    The noise of an estimate acts on all motions that it predicts, so repetitions are resampled
+    together with the motions (hierarchical bootstrap), in blocks of successive ones, which share
+    their temperature. Of n units n - 1 are sampled, since a mean of n would scatter by (n - 1) / n
+    too little. The interval is Student's, with the degrees of freedom of the fewest units.
+    """
+    means = np.array([first.mean(axis=0), second.mean(axis=0)])
+    logs = np.log(np.divide(*relative_errors(forms, means).T[::-1]))
+    ratio, wins, motions = float(np.exp(logs.mean())), int((logs < 0.0).sum()), len(logs)
+    random, units = np.random.default_rng(_SEED), [_blocks(first), _blocks(second)]
+    fewest = min(len(one) for one in units)
+    low = high = None
+    if fewest >= MIN_UNITS and motions > 1:
+        before, after = (
+            np.log(relative_errors(forms, _weights(len(one), random) @ one)) for one in units
+        )
+        draws = ((after - before) * _weights(motions, random).T).sum(axis=0)
+        width = stats.t.ppf(0.975, min(fewest, motions) - 1) * draws.std(ddof=1)
+        low, high = (float(bound) for bound in ratio * np.exp([-width, width]))
+    verdict = verdict_of(ratio, low, high)
+    return Comparison(ratio=ratio, wins=wins, motions=motions, low=low, high=high, verdict=verdict)
+
+
+def _blocks(values: Array) -> Array:
+    """Return the means (u, p) of blocks of successive estimates (r, p), as long as r^(1/3)."""
+    length = max(1, int(len(values) ** (1.0 / 3.0) + 1e-9))
+    units = len(values) // length
+    return np.asarray(values[: units * length].reshape(units, length, -1).mean(axis=1))
+
+
+def _weights(count: int, random: np.random.Generator) -> Array:
+    """Return the weights (draws, count) of means over count - 1 units with replacement."""
+    return random.multinomial(count - 1, [1.0 / count] * count, _DRAWS) / (count - 1.0)
+
+
+def verdict_of(ratio: float, low: float | None, high: float | None) -> Verdict:
+    """Return the verdict on the second of two estimates: significant if the interval excludes 1."""
+    if low is None or high is None:
+        return "too few"
+    if low <= 1.0 <= high:
+        return "none"
+    if ratio < 1.0:
+        return "slightly better" if 1.0 - ratio < SMALL else "better"
+    return "slightly worse" if ratio - 1.0 < SMALL else "worse"
+
+
+def conclusion_of(conditions: Sequence[ConditionResult], *, quick: bool) -> list[str]:
+    """Return the sentences of the conclusion: which method predicts better, and by how much."""
+    found = [f"{capitalised(one.words)}: {_outcome(one.comparison)}." for one in conditions]
+    a, b = (len(one.values) * one.duration for one in conditions[0].methods)
+    found.append(f"A was fitted to {a:.0f} s of motion, B to {b:.0f} s.")
+    if quick:
+        found.append("The quick setting supports no conclusion about the methods.")
+    return found
+
+
+def _outcome(row: Comparison) -> str:
+    """Format whose error is smaller, by how much, and how certain that is."""
+    if row.verdict == "too few":
+        return "too few repetitions or motions for a conclusion"
+    words = (
+        f"the error with B is {fixed(row.ratio, 3)} times that with A"
+        f" (95 %: {fixed(row.low, 3)} to {fixed(row.high, 3)}),"
+        f" smaller on {row.wins} of {row.motions} motions"
+    )
+    if row.verdict == "none":
+        return f"no significant difference, {words}"
     saved = significant(100.0 * (1.0 - min(row.ratio, 1.0 / row.ratio)), 2)
     slightly = "slightly " if row.verdict.startswith("slightly") else ""
-    text = f"{better} is {slightly}better, its error {saved} % smaller"
-    equal = condition.equal_data.comparisons if condition.equal_data is not None else []
-    gone = any(o.verdict == "none" for o in equal if o.motion_class == row.motion_class)
-    return f"{text}, but not with as much motion of each" if gone else text
+    return f"{'B' if row.ratio < 1.0 else 'A'} is {slightly}better by {saved} %, {words}"

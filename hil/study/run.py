@@ -1,29 +1,27 @@
-"""Run of a study: searches, campaigns, estimates, predictions, tables, page."""
+"""Run of a study: searches, campaigns, estimates, predictions, page."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from hil.batch.workers import LocalWorkers
 from hil.cell import Cell
 from hil.design import preset
-from hil.files import digest
+from hil.files import digest, write_files
 from hil.progress import Reporter
 from hil.simulation import planted_values, simulated_link, simulated_provenance
 from hil.version import software
-from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
-from . import campaigns, tables
-from .page import write_outcome
-from .records import PLANTED, FitRecord, Reader, ScoreRecord
-from .results import MotionRow, SearchResult, StudyResults, conclusions
+from . import campaigns, results
+from .campaigns import Search
+from .page import study_page
+from .results import ConditionResult, MotionRow, StudyResults
 from .settings import StudyFolder, StudySettings
 
 _WORDS: Final = {
@@ -42,7 +40,7 @@ def run_study(
 ) -> StudyResults:
     """Reproduce the paper on a simulated cell (default: the NS 16), and write results and page.
 
-    An interrupted study resumes; of a complete one only the results are written again. Results do
+    An interrupted study resumes with the searches and campaigns that are not complete. Results do
     not depend on the number of workers, except for the times.
 
     Raises:
@@ -58,21 +56,46 @@ def run_study(
     else:
         simulated_link(cell)  # raises for real hardware
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
+    truth = planted_values(cell)
     with folder.locked(), LocalWorkers(workers, timeout=campaigns.LONGEST) as processes:
         folder.begin(settings)
         wanted = campaigns.searches(settings, len(cell.joint_names))
         with _stage("searches", times):
             found = campaigns.run_searches(folder, cell, wanted, reporter, workers)
-        with _stage("plans", times):
-            plans = campaigns.plan_study(folder, cell, settings, found)
         with _stage("campaigns", times):
-            plans = plans.without(campaigns.execute_all(plans.all, reporter, processes))
+            best = campaigns.chosen(found)
+            plans = campaigns.plan_study(folder, cell, settings, best)
+            runs = [(one.root, (one,)) for some in plans.values() for one in some.values()]
+            campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
         with _stage("estimates and predictions", times):
-            reader = Reader(folder.fits, reporter, processes)
-            results = _simulated(root, cell, settings, plans, found, reader)
-        results = results.model_copy(update={"times": times})
-        write_outcome(root, results, reporter)
-    return results
+            calls = []
+            for key, some in plans.items():
+                provenance = simulated_provenance(cell, key == campaigns.EFFECTS)
+                roots = {name: one.root for name, one in some.items()}
+                effects = json.loads(provenance["effects"])
+                calls.append((folder.campaign(key, ""), (key, _WORDS[key], effects, roots, truth)))
+            conditions = campaigns.in_children(
+                results.condition_result, calls, "estimating and predicting", reporter, processes
+            )
+        sizes = preset("b").search
+        quick = settings.effort_b.tried < sizes.population * sizes.generations
+        study = StudyResults(
+            name=root.resolve().name,
+            cell=cell.name,
+            quick=quick,
+            settings=settings,
+            software=software(),
+            joint_names=list(cell.joint_names),
+            n_base=len(cell.model.base.names),
+            parameters=results.parameters_of(cell, truth),
+            table1=[*_rows(found, best, conditions), *results.printed_rows(cell)],
+            conditions=conditions,
+            conclusion=results.conclusion_of(conditions, quick=quick),
+            times=times,
+        )
+        write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
+        reporter.say(f"report: {root / 'report.html'}")
+    return study
 
 
 @contextmanager
@@ -83,82 +106,23 @@ def _stage(name: str, times: dict[str, float]) -> Iterator[None]:
     times[name] = round(time.perf_counter() - begin, 1)
 
 
-def _simulated(
-    root: Path,
-    cell: Cell,
-    settings: StudySettings,
-    plans: campaigns.Plans,
-    found: Mapping[str, campaigns.Search],
-    reader: Reader,
-) -> StudyResults:
-    """Estimate, predict and tabulate."""
-    truth = planted_values(cell)
-    parameters, conditions = tables.parameters_of(cell, truth), []
-    fits, scores = dict[str, dict[str, FitRecord]](), dict[str, dict[str, ScoreRecord]]()
-    for name, some in plans.executions.items():
-        roots = {key: one.root for key, one in some.items()}
-        within = replace(reader, fits=reader.fits / name)
-        fits[name] = within.fit(roots)
-        if name == campaigns.ABLATION:
-            continue
-        scores[name] = within.score(roots, tables.estimates_of(fits[name]) | {PLANTED: truth})
-        drifts = name == campaigns.EFFECTS
-        effects = tuple(json.loads(simulated_provenance(cell, drifts)["effects"]))
-        condition = tables.Condition(name, _WORDS[name], effects, drifts)
-        conditions.append(tables.condition_result(condition, fits[name], scores[name], parameters))
-    sines, sizes, main = plans.searched[campaigns.A], preset("b").search, fits[campaigns.NO_EFFECTS]
-    evidence = tables.Evidence(
-        fits[campaigns.ABLATION], main, scores[campaigns.NO_EFFECTS], truth, sines
-    )
-    varied, ranges = tables.ablations(settings, evidence)
-    results = StudyResults(
-        name=root.resolve().name,
-        cell=cell.name,
-        simulated=True,
-        quick=settings.effort_b.tried < sizes.population * sizes.generations,
-        settings=settings,
-        software=software(),
-        joint_names=list(cell.joint_names),
-        n_base=len(cell.model.base.names),
-        parameters=parameters,
-        searches=[
-            _search_result(one, chosen=key in (sines, campaigns.B, campaigns.B0))
-            for key, one in found.items()
-        ],
-        table1=[
-            _row(key, found[plans.searched[key]].notes, one.plan.excitation, main[key])
-            for key, one in plans.executions[campaigns.NO_EFFECTS].items()
-        ]
-        + tables.printed_rows(cell),
-        conditions=conditions,
-        ablations=varied,
-        ranges=ranges,
-        missing=plans.missing
-        + ([] if settings.effects else ["The unmodelled effects were not simulated."]),
-        reading=[],
-        times={},
-    )
-    return results.model_copy(update={"reading": conclusions(results)})
-
-
-def _row(key: str, words: str, excitation: Excitation, record: FitRecord) -> MotionRow:
-    """Return a row of Table 1."""
-    return MotionRow.of(
-        excitation.criteria,
-        key=key,
-        words=words,
-        executed_log10_det=record.log10_det,
-        executed_coupling_index=record.coupling_index,
-        duration=excitation.trajectory.duration,
-    )
-
-
-def _search_result(search: campaigns.Search, *, chosen: bool) -> SearchResult:
-    found, one = {"key": search.key, "words": search.words, "chosen": chosen}, search.excitation
-    if one is None:
-        return SearchResult.of(**found)
-    rejected = {name: int(n) for name, n in one.rejected.items()}
-    duration = float(one.trajectory.duration)
-    return SearchResult.of(
-        one.criteria, **found, tried=one.tried, infeasible=rejected, duration=duration
-    )
+def _rows(
+    found: Sequence[Search], best: Mapping[str, Search], conditions: Sequence[ConditionResult]
+) -> list[MotionRow]:
+    """Return a row of Table 1 for each search, with what was executed of the best of a method."""
+    executed = {best[one.key].key: one for one in conditions[0].methods}
+    rows = []
+    for search in found:
+        one, method = search.excitation, executed.get(search.key)
+        row = MotionRow(key=search.key, words=search.words, executed=method is not None)
+        if one is not None:
+            row = MotionRow.of(
+                one.criteria,
+                **row.model_dump(exclude_defaults=True),
+                tried=one.tried,
+                duration=float(one.trajectory.duration),
+                executed_log10_det=None if method is None else method.log10_det,
+                executed_coupling_index=None if method is None else method.coupling_index,
+            )
+        rows.append(row)
+    return rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Final
 
 from pydantic import Field
 
@@ -14,7 +14,6 @@ from hil.files import lock_folder, write_output
 from hil.reading import read_text
 from hil.results import Frozen
 
-M = TypeVar("M", bound=Frozen)
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 
@@ -35,16 +34,10 @@ class StudySettings(Frozen):
 
     seed: int = Field(ge=0, description="of searches, held-out motions and the simulated cell")
     repetitions: int = Field(ge=2, description="executions of each excitation")
-    motions: int = Field(ge=2, description="held-out motions of each class")
+    motions: int = Field(ge=2, description="held-out motions")
     effects: bool = Field(description="whether to repeat it with unmodelled effects")
     effort_a: Effort = Field(description="of each search of method A")
-    effort_b: Effort = Field(description="of each search of method B and the ablations")
-    ablation_repetitions: Count
-    fly: tuple[float, ...] = Field(description="fly-by shares of B's via points")
-    n_via: tuple[int, ...] = Field(description="numbers K of via points of further searches")
-    coupling_weight: tuple[float, ...] = Field(description="lambda_2 of further searches")
-    subsets: tuple[int, ...] = Field(description="numbers of fitted repetitions")
-    noise: tuple[float, ...] = Field(description="multiples of the cell's current noise")
+    effort_b: Effort = Field(description="of the search of method B")
     cell: str = Field(default="", description="digest of the cell, empty for the paper's NS 16")
 
 
@@ -53,30 +46,18 @@ FULL: Final = StudySettings(
     repetitions=30,
     motions=30,
     effects=True,
-    # Sizes of the paper's Table 1; for method A, of each of its four searches.
+    # Sizes of the paper's Table 1; for method A, of each of its searches.
     effort_a=Effort(population=100, generations=120),
     effort_b=Effort(population=150, generations=120),
-    ablation_repetitions=3,
-    fly=(0.0, 0.25, 0.5, 0.75, 1.0),
-    n_via=(3, 4, 6, 10, 14),
-    coupling_weight=(0.0, 0.3, 0.6, 0.9, 1.0),
-    subsets=(1, 2, 5, 10, 20, 30),
-    noise=(0.0, 1.0, 4.0, 16.0),
 )
 """Sizes of the paper: 30 executions, 30 motions."""
 
 QUICK: Final = FULL.model_copy(
     update={
         "repetitions": 4,
-        "motions": 10,  # with fewer, none of nine corrected comparisons can be significant
+        "motions": 10,
         "effort_a": Effort(population=40, generations=12),
         "effort_b": Effort(population=40, generations=12),
-        "ablation_repetitions": 1,
-        "fly": (0.0, 0.5, 1.0),
-        "n_via": (4, 6, 10),
-        "coupling_weight": (0.0, 0.3, 0.9),
-        "subsets": (1, 2, 4),
-        "noise": (0.0, 1.0, 16.0),
     }
 )
 """The same procedure in minutes, too small to draw conclusions about the methods."""
@@ -96,14 +77,6 @@ def study_settings(
     return StudySettings.model_validate((QUICK if quick else FULL).model_dump() | changes)
 
 
-def load_json(kind: type[M], path: Path, problem: str, remedy: str) -> M:
-    """Read a file of the study's folder; InputError if it cannot be read or parsed."""
-    try:
-        return kind.model_validate_json(read_text(path))
-    except (OSError, ValueError) as error:
-        raise InputError(path, f"{problem} ({error})", remedy=remedy) from error
-
-
 @dataclass(frozen=True)
 class StudyFolder:
     """Paths in the folder of a study."""
@@ -117,11 +90,6 @@ class StudyFolder:
     def campaign(self, condition: str, key: str) -> Path:
         """Return the campaign folder of one excitation under one condition."""
         return self.root / "campaigns" / condition / key
-
-    @property
-    def fits(self) -> Path:
-        """Folder of the records of estimates and predictions."""
-        return self.root / "fits"
 
     @property
     def settings(self) -> Path:
@@ -140,7 +108,11 @@ class StudyFolder:
                 raise InputError(self.root, "is not empty and contains no study", remedy=remedy)
             write_output(self.settings, settings.to_json())
             return
-        old = load_json(StudySettings, self.settings, "is not the settings of a study", remedy)
+        try:
+            old = StudySettings.model_validate_json(read_text(self.settings))
+        except (OSError, ValueError) as error:
+            problem = f"is not the settings of a study ({error})"
+            raise InputError(self.settings, problem, remedy=remedy) from error
         for name in StudySettings.model_fields:
             new, existing = getattr(settings, name), getattr(old, name)
             if new != existing:

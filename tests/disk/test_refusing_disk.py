@@ -19,7 +19,6 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
 from hil.progress import Silent
 from hil.study import study_settings
-from hil.study.records import Record, read_record, write_record
 from hil.study.settings import StudyFolder
 from tests.disk.disks import (
     CREATE,
@@ -215,17 +214,3 @@ class TestStudy:
         assert names(folder.root) == []
         folder.begin(settings)
         assert names(folder.root) == ["study.json"]
-
-    @pytest.mark.parametrize("rule", REFUSED)
-    def test_record_is_written_completely_or_not_at_all(
-        self, disk: Disk, tmp_path: Path, rule: Rule
-    ) -> None:
-        path, record = disk.root / tmp_path.name / "a.json", Record(inputs="these archives")
-        disk.do_wrong(rule)
-        with pytest.raises(OutputError, match=rf"a\.json {REFUSAL}"):
-            write_record(path, record)
-        disk.do_wrong()
-        assert names(path.parent) == []
-        assert read_record(path, Record, "these archives") is None
-        write_record(path, record)
-        assert read_record(path, Record, "these archives") == record

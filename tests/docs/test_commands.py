@@ -63,8 +63,6 @@ NOT_TYPED = {
     "hil payload bare --loaded gripper": "typed in payload.md",
     "hil identify ur10.mcap": "needs a recording; tests/benchmarks/test_studies.py",
     "hil reidentify /data": "needs other people's archives",
-    "hil reidentify s3:": "network",
-    "hil reidentify https:": "network",
     "hil study --quick": "minutes; tests/hil/test_study.py runs a shorter one",
     "hil study --output": "an hour; tests/hil/test_study.py runs a short one",
 }  # Beginnings of commands that are read and not run, and why

@@ -11,15 +11,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.batch.estimates import speed_rms
 from hil.batch.types import LevelEstimate
 from hil.cell import Cell
-from hil.compare.trend import ArmTrend, arm_trend
 from identification import Motion, RobotModel
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import estimate, joint_weights
 from identification.factor.phases import PhaseFactor
-from identification.model.payload import Payload
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
 
@@ -47,10 +44,6 @@ class Condition:
 
     friction: Array = field(default_factory=lambda: FRICTION)
     load: Load = Load()
-    louder: Array = field(default_factory=lambda: np.ones(6))
-    """Factor on the noise of each joint."""
-    stated: Payload | None = None
-    """Payload stated by the cell, in the frame of the last joint."""
 
 
 Life = Callable[[int, np.random.Generator], Condition]
@@ -65,10 +58,6 @@ def history(life: Life, count: int, seed: int) -> list[LevelEstimate]:
     """`count` campaigns, one a fortnight, of two repetitions each."""
     random = np.random.default_rng(seed)
     return [campaign(life(k, random), k, random) for k in range(count)]
-
-
-def trend_of(life: Life, count: int, seed: int = 7) -> ArmTrend:
-    return arm_trend("arm", model(), history(life, count, seed))
 
 
 @cache
@@ -111,24 +100,13 @@ def torque(condition: Condition) -> Array:
 
 
 @cache
-def stated_torque(payload: Payload | None) -> Array:
-    """Of a payload whose inertia is that of `Load`."""
-    if payload is None:
-        return np.zeros(motion().position.shape)
-    load = Load(payload.mass, payload.centre)
-    return torque(Condition(load=load)) - torque(Condition())
-
-
-@cache
 def noise_size() -> Array:
     return NOISE * np.sqrt(np.mean(torque(Condition()) ** 2, axis=0))
 
 
 def campaign(condition: Condition, k: int, random: np.random.Generator) -> LevelEstimate:
     arm, moved = model(), motion()
-    # What is stated is known, and no part of the torque that parameters have to explain.
-    clean = torque(condition) - stated_torque(condition.stated)
-    size = noise_size() * condition.louder
+    clean, size = torque(condition), noise_size()
     phase = PhaseFactor.zero(arm)
     for _ in range(2):
         # Coloured: residuals of torque models remember some tenths of a second.
@@ -168,7 +146,4 @@ def campaign(condition: Condition, k: int, random: np.random.Generator) -> Level
         undetermined=found.undetermined,
         method=found.method,
         settings="settings",
-        speed_rms=speed_rms(arm, phase.total),
-        information=phase.total.weighted(weights).A,
-        payload=condition.stated,
     )

@@ -6,10 +6,10 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-from hil.batch.discovery import Location
 from hil.batch.types import ArchiveRef, Unused
 from hil.batch.workers import ArchiveTask, Workers, run_task
 from hil.errors import ArchiveError
@@ -25,6 +25,7 @@ class Here(Workers):
     """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
 
     def __init__(self, *deadly: str, local: bool = True) -> None:
+        super().__init__(ThreadPoolExecutor(1))
         self.deadly, self.local = deadly, local
         self.tasks: list[ArchiveTask[Any]] = []
 
@@ -42,17 +43,12 @@ class Here(Workers):
 def _refs(argument: Any) -> Iterator[ArchiveRef]:
     if isinstance(argument, ArchiveRef):
         yield argument
-    elif not isinstance(argument, Location):
+    elif not isinstance(argument, str):
         for one in argument:
             yield from _refs(one)
 
 
 def number(k: int) -> int:
-    return k
-
-
-def slow_number(k: int) -> int:
-    time.sleep(0.1)
     return k
 
 
@@ -74,13 +70,15 @@ def crash(_: int) -> None:
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
+def once(path: str) -> str:
+    """End the process the first time."""
+    if not Path(path).exists():
+        Path(path).touch()
+        os._exit(3)
+    return "again"
+
+
 def hang(_: int) -> None:
-    time.sleep(600.0)
-
-
-def kill_worker(_: int) -> None:
-    """Kill the worker, as the kernel does where memory runs out."""
-    os.kill(os.getppid(), signal.SIGKILL)
     time.sleep(600.0)
 
 

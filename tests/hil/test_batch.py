@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
-import fsspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -261,16 +260,6 @@ class TestCache:
         assert (second.read, second.cached, workers.tasks) == (0, 5, [])
         assert "consistent" in second.campaigns[0].method
 
-    def test_is_continued_by_a_longer_campaign(self, folder: Path) -> None:
-        archive = sorted((folder / "archives").glob("excitation_002*"))[0]
-        away = folder.parent / archive.name
-        archive.rename(away)
-        assert batch(folder, cache=CacheLocation()).read == 4
-        away.rename(archive)
-        longer = batch(folder, cache=CacheLocation())
-        assert longer.read == 1
-        assert bits(batch(folder)) == bits(longer)
-
     def test_depends_on_settings_and_is_optional(self, folder: Path) -> None:
         before = sorted(folder.rglob("*"))
         batch(folder)
@@ -430,7 +419,7 @@ def record(monkeypatch: pytest.MonkeyPatch) -> Record:
 
 
 class TestWarnings:
-    def test_are_printed_tabulated_and_on_the_page(self, record: Record, tmp_path: Path) -> None:
+    def test_are_printed_and_tabulated(self, record: Record, tmp_path: Path) -> None:
         record(tmp_path / "bare", 2, first=0)
         findings = json.dumps({"lines": [], "doubts": [CLOCK]})
         record(tmp_path / "warned", 2, first=2, metadata={"findings": findings})
@@ -450,7 +439,6 @@ class TestWarnings:
             assert CLOCK in warnings[level, "warned"]
             assert CLOCK not in warnings[level, "bare"]
         assert line in warnings["pooled", ""]
-        assert CLOCK in (tmp_path / "out" / "trend.html").read_text()
 
     def test_name_different_payloads(self, record: Record, tmp_path: Path) -> None:
         record(tmp_path / "line" / "a", 1, first=0)
@@ -458,10 +446,9 @@ class TestWarnings:
         laden.rename(tmp_path / "line" / "a" / "excitation_001_a1.mcap")
         found = batch(tmp_path)
         assert len(found.campaigns) == 2
-        stated = {None if one.payload is None else one.payload.mass for one in found.campaigns}
-        assert stated == {None, 3.0}
+        assert sum("carries 3 kg" in one.setup for one in found.campaigns) == 1
         (pooled,) = found.pooled
-        assert (pooled.repetitions, pooled.setup, pooled.payload) == (2, "", None)
+        assert (pooled.repetitions, pooled.setup) == (2, "")
         assert "cells state different payloads" in pooled.warnings[0]
         command = ["reidentify", str(tmp_path), "--cache", "none", "--json", *NOTHING_OPEN]
         ran = CliRunner().invoke(app, command)
@@ -745,77 +732,20 @@ class TestCachedMetadata:
         assert [task.path for task in far.tasks] == [ref.location for ref in found.refs]
 
 
-@pytest.fixture
-def remote(arm: Cell, tmp_path: Path) -> tuple[str, bytes]:
-    """Return the address of an archive in a store, and bytes to replace it with."""
-    store = fsspec.filesystem("memory")
-    address = f"memory://{tmp_path.name}/a.mcap"
-    store.pipe(address, recording(tmp_path / "a.mcap", arm).read_bytes())
-    return address, recording(tmp_path / "b.mcap", arm).read_bytes()
+def test_archive_changed_while_it_is_read_is_not_cached(
+    tmp_path: Path, arm: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = recording(tmp_path / "a.mcap", arm)
+    (ref,) = found_in(path).refs
+    read = factors.open_archive
 
+    def written_to(cache: Path, **how: object):
+        path.write_bytes(path.read_bytes()[:-500])
+        return read(cache, **how)
 
-class TestChanges:
-    """Files that change, and stores that fail."""
-
-    def test_remote_archive_changed_after_hashing(
-        self, remote: tuple[str, bytes], tmp_path: Path
-    ) -> None:
-        address, other = remote
-        cache = CacheLocation(str(tmp_path / "cache"))
-        (ref,) = discover([address], cache, Here(), Silent()).refs
-        with open_ref(ref):
-            pass
-        fsspec.filesystem("memory").pipe(address, other)
-        with pytest.raises(ArchiveError, match="was changed"), open_ref(ref):
-            pass
-        assert "changed" in reduce_bundle((ref,), SETTINGS, cache).broken[0].reason
-        assert cached_bundle((ref,), SETTINGS, cache) is None
-
-    def test_archive_changed_while_it_is_read(
-        self, tmp_path: Path, arm: Cell, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path = recording(tmp_path / "a.mcap", arm)
-        (ref,) = found_in(path).refs
-        read = factors.open_archive
-
-        def written_to(cache: Path, **how: object):
-            path.write_bytes(path.read_bytes()[:-500])
-            return read(cache, **how)
-
-        monkeypatch.setattr(factors, "open_archive", written_to)
-        with pytest.raises(ArchiveError, match="was changed"), open_ref(ref):
-            pass
-        cache = CacheLocation(str(tmp_path / "cache"))
-        assert reduce_bundle((ref,), SETTINGS, cache).broken
-        assert cached_bundle((ref,), SETTINGS, cache) is None
-
-    def test_errors_of_a_store_are_not_cached(
-        self, remote: tuple[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        address, _ = remote
-        cache = CacheLocation(str(tmp_path / "cache"))
-        (ref,) = discover([address], cache, Here(), Silent()).refs
-
-        def busy(*_: object) -> None:
-            raise RuntimeError("503, Service Unavailable")
-
-        with monkeypatch.context() as patch:
-            patch.setattr(fsspec.get_filesystem_class("memory"), "get_file", busy)
-            with pytest.raises(InputError, match="503"), open_ref(ref):
-                pass
-            failed = reduce_bundle((ref,), SETTINGS, cache)
-            assert "503" in failed.broken[0].reason
-        again = reduce_bundle((ref,), SETTINGS, cache)
-        assert again.read == 1
-        assert "503" not in str(again.broken)
-
-    def test_unchanged_remote_archives_are_cached(self, folder: Path, tmp_path: Path) -> None:
-        store = fsspec.filesystem("memory")
-        for path in sorted((folder / "archives").glob("*.mcap")):
-            store.pipe(f"memory://{tmp_path.name}/archives/{path.name}", path.read_bytes())
-        cache = CacheLocation(str(tmp_path / "cache"))
-        remote, local = (batch(at, cache=cache) for at in (f"memory://{tmp_path.name}", folder))
-        assert not remote.broken
-        assert remote.campaigns[0].values.tobytes() == local.campaigns[0].values.tobytes()
-        again = batch(f"memory://{tmp_path.name}", cache=cache)
-        assert (again.read, again.cached) == (0, 5)
+    monkeypatch.setattr(factors, "open_archive", written_to)
+    with pytest.raises(ArchiveError, match="was changed"):
+        open_ref(ref)
+    cache = CacheLocation(str(tmp_path / "cache"))
+    assert reduce_bundle((ref,), SETTINGS, cache).broken
+    assert cached_bundle((ref,), SETTINGS, cache) is None

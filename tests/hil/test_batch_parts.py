@@ -1,11 +1,10 @@
-"""Parts of a batch: cache, keys, workers, tables, and remote files."""
+"""Parts of a batch: cache, keys, workers and tables."""
 
 from __future__ import annotations
 
 import csv
 import json
 import math
-import os
 import re
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -15,14 +14,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import fsspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from isal.isal_zlib import crc32
 
-from hil.batch import remote, table
+from hil.batch import table
 from hil.batch.cache import (
     _HEAD,
     _MAGIC,
@@ -36,7 +34,6 @@ from hil.batch.cache import (
     sum_key,
 )
 from hil.batch.factors import BUNDLE, cached_bundle, split_bundles
-from hil.batch.remote import archives_below, local_file
 from hil.batch.table import TABLES, write_tables
 from hil.batch.types import (
     ArchiveRef,
@@ -47,18 +44,17 @@ from hil.batch.types import (
     LevelEstimate,
     Unused,
 )
-from hil.batch.workers import ArchiveTask, LocalWorkers
+from hil.batch.workers import LocalWorkers
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
-from hil.errors import InputError
 from hil.identify.settings import Settings
-from hil.version import install_command
 from identification.estimators.consistent import Shrinkage
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from sim_fixtures.ns16 import CELL_PATH
 
+from . import batch_work as work
 from .arm_histories import cell, history, model, steady
 
 KEY = "0123456789abcdef"
@@ -120,7 +116,7 @@ class TestCache:
     @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "PhaseFactor"}, Bundle(), None])
     def test_forged_sums_are_ignored(self, tmp_path: Path, forged: object) -> None:
         settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
-        key = sum_key([a_ref(0)], settings_digest(settings))
+        key = sum_key([a_ref(0)], settings)
         cache.store(a_ref(0).location).put(key, forged)
         assert cached_bundle([a_ref(0)], settings, cache) is None
 
@@ -144,8 +140,6 @@ class TestCache:
             assert place.store(here) == place.store(there)
             assert place.store(here) != place.store(str(tmp_path / "sub" / "a.mcap"))
         assert CacheLocation().store(here).folder == tmp_path / ".hil-cache"
-        remote = CacheLocation(str(tmp_path)).store("s3://bucket/one/a.mcap")
-        assert remote.folder.parent == tmp_path
         (tmp_path / ".hil-cache").write_text("not a folder")
         assert tmp_path not in CacheLocation().store(here).folder.parents
 
@@ -217,29 +211,42 @@ def test_digest_of_settings_ignores_those_of_the_estimate() -> None:
         replace(stated, delay_variance=1e-9),
     ]
     assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
-    digest = settings_digest(stated)
-    assert sum_key([a_ref(0), a_ref(1)], digest) != sum_key([a_ref(1), a_ref(0)], digest)
+    assert sum_key([a_ref(0), a_ref(1)], stated) != sum_key([a_ref(1), a_ref(0)], stated)
 
 
 # Workers
 
 
-@pytest.mark.slow
-def test_tasks_that_kill_or_hang_their_process_do_not_affect_others() -> None:
-    """The functions are importable in the child."""
-    fine = ArchiveTask("fine.mcap", abs, (-2.0,))
-    dead = ArchiveTask("dead.mcap", os._exit, (3,))
-    slow = ArchiveTask("slow.mcap", time.sleep, (60.0,))
-    wrong = ArchiveTask("wrong.mcap", int, ("no number",))
+def test_tasks_that_kill_or_hang_their_process_do_not_affect_others(tmp_path: Path) -> None:
+    """A task whose process ends is run once more."""
+    tasks = [work.task(work.number, k) for k in range(12)]
+    failing = {
+        2: (work.crash, "ended its process, twice, with status -11"),
+        4: (work.absent, "No such file"),
+        5: (work.hang, "took too long"),
+        7: (work.faulty, "IndexError"),
+    }
+    for k, (function, _) in failing.items():
+        tasks[k] = work.task(function, k)
+    tasks[9] = work.task(work.once, str(tmp_path / "ran"))
     finished: list[int] = []
     with LocalWorkers(2, timeout=4.0) as workers:
-        found = list(workers.results([fine, dead, slow, wrong, fine], finished.append))
-    assert sum(finished) == 5
-    assert [found[0], found[4]] == [2.0, 2.0]
-    broken = {one.path: one.reason for one in found if isinstance(one, Unused)}
-    assert "ended its process, twice, with status 3" in broken["dead.mcap"]
-    assert "took longer than 4 s" in broken["slow.mcap"]
-    assert "ValueError" in broken["wrong.mcap"]
+        found = list(workers.results(tasks, finished.append))
+    assert sum(finished) == 12
+    for k, one in enumerate(found):
+        if k in failing:
+            assert isinstance(one, Unused)
+            assert (one.path, failing[k][1] in one.reason) == (tasks[k].path, True), one
+        else:
+            assert one == ("again" if k == 9 else k)
+
+
+def test_closing_ends_tasks_at_work() -> None:
+    begin = time.monotonic()
+    with LocalWorkers(2) as workers:
+        found = workers.results([work.task(work.number, 0), *[work.task(work.hang, 1)] * 20])
+        assert next(found) == 0
+    assert time.monotonic() - begin < 60.0
 
 
 # Tables
@@ -406,60 +413,3 @@ def test_every_column_is_documented_and_no_other() -> None:
         part = text.split(f"### `{one.name}`")[1].split("###")[0]
         rows = re.findall(r"^\| (`.+?`(?:, `.+?`)*) \|", part, flags=re.MULTILINE)
         assert re.findall(r"`(\w+)`", " ".join(rows)) == list(one.kinds)
-
-
-# Remote archives
-
-CONTENT = {"a/first.mcap": b"one" * 1_000_000, "b/c/second.mcap": b"", "b/notes.txt": b"no archive"}
-ARCHIVES = ["a/first.mcap", "b/c/second.mcap"]
-
-
-@pytest.fixture(params=["memory", "file"])
-def root(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """The same files in two kinds of store."""
-    address = f"memory://{tmp_path.name}" if request.param == "memory" else tmp_path.as_uri()
-    store, place = fsspec.url_to_fs(address)
-    for name, content in CONTENT.items():
-        store.makedirs(f"{place}/{name}".rpartition("/")[0], exist_ok=True)
-        store.pipe(f"{place}/{name}", content)
-    return address
-
-
-def test_remote_archives_are_found_in_order_and_fetched(root: str) -> None:
-    found = archives_below(root)
-    assert archives_below(f"{root}/{ARCHIVES[0]}") == found[:1]
-    for (url, _), name in zip(found, ARCHIVES, strict=True):
-        assert url.endswith(f"/{name}")
-        with local_file(url) as path:
-            assert path.name == Path(name).name
-            assert path.read_bytes() == CONTENT[name]
-        assert not path.parent.exists()
-
-
-def test_version_of_remote_archives(monkeypatch: pytest.MonkeyPatch) -> None:
-    store, address = fsspec.filesystem("memory"), "memory://store/a.mcap"
-    store.pipe(address, b"one")
-    assert archives_below(address)[0][1] == ""
-    original = type(store).info
-    monkeypatch.setattr(type(store), "info", lambda *path: original(*path) | {"ETag": '"5f3"'})
-    assert archives_below(address)[0][1] == '"5f3"'
-
-
-@pytest.mark.parametrize(
-    ("address", "message"),
-    [
-        ("memory://store/absent.mcap", "is not there"),
-        ("nosuch://store/x.mcap", "Protocol not known: nosuch"),
-    ],
-)
-def test_unreadable_addresses_are_named(address: str, message: str) -> None:
-    with pytest.raises(InputError, match=f"{address}.*{message}"):
-        archives_below(address)
-    with pytest.raises(InputError, match=f"{address}.*{message}"), local_file(address):
-        pass
-
-
-def test_without_fsspec_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remote, "find_spec", lambda _: None)
-    with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
-        archives_below("memory://store")

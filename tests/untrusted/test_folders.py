@@ -48,7 +48,6 @@ from hil.importers.table import Table
 from hil.outcome import SERIES, _load_series, rewrite_report
 from hil.reading import open_file, parse_toml, read_text
 from hil.results import Results
-from hil.study.records import Record, read_record, write_record
 from hil.study.results import StudyResults
 from identification import IdentificationError
 from identification.excitation import Journal
@@ -570,16 +569,6 @@ def test_name_that_is_not_utf8_is_printed_as_json(tmp_path: Path) -> None:
     )
     assert done.returncode == 2
     assert "x\\udcff" in json.loads(done.stdout)["error"]
-
-
-def test_invalid_record_of_a_study_is_ignored(tmp_path: Path) -> None:
-    path = tmp_path / "run.json"
-    write_record(path, Record(inputs="digest"))
-    assert read_record(path, Record, "digest") is not None
-    assert read_record(path, Record, "another digest") is None
-    for content in ('{"inputs": 1}', '{"inputs": "digest", "more": 1}', "[" * 10_000, "\0"):
-        path.write_text(content)
-        assert read_record(path, Record, "digest") is None
 
 
 def test_journal_of_forged_frames_is_read_in_linear_time(

@@ -1,0 +1,405 @@
+"""Parameters that differ significantly between campaigns of one arm; see `docs/compare.md`.
+
+The variance of a value is the larger of that of the estimate and that of the repetitions, whose
+effective number is n (1 - ρ) / (1 + ρ) (Bayley and Hammersley 1946) with ρ corrected for bias
+(Marriott and Pope 1954). Differences are tested by Welch's t test with Holm's procedure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from os.path import commonpath
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.stats import t as student
+
+from hil.batch import run
+from hil.batch.factors import cell_in, open_ref
+from hil.batch.types import ArchiveRef, Arm, LevelEstimate, Unused
+from hil.batch.workers import Workers
+from hil.errors import InputError
+from hil.identify.options import Options
+from hil.identify.sources import arm_differences
+from hil.progress import Reporter
+from identification import RobotModel
+
+Array = NDArray[np.float64]
+
+MIN_REPETITIONS: Final = 15
+"""Repetitions needed to estimate their correlation. With fewer the effective number is 1, as all
+may have been recorded while the arm warmed up."""
+CONFIDENCE: Final = 0.95  #: Of each interval
+FALSE_ALARMS: Final = 0.01  #: Probability of any change of an arm that has none
+LEAST: Final = 0.05  #: Smallest relevant change, as a share of the first value
+_SPEEDS: Final = np.geomspace(0.02, 5.0, 40)  # rad/s or m/s
+_MAX_CORRELATION: Final = 0.95
+_NORMAL: Final = float(student.ppf(0.975, 1e6))
+_TWO: Final = "give two or more campaigns of one arm"
+_CAVEAT: Final = (
+    "the normal variation from day to day is not known from a few campaigns: friction of a cold arm"
+    " is tens of per cent higher, so compare campaigns at the same temperature"
+)
+
+
+class Figure(NamedTuple):
+    """A value of one campaign, its variance and the degrees of freedom of the variance."""
+
+    value: float
+    variance: float
+    freedom: float
+
+
+class Quantity(NamedTuple):
+    """What is compared: an inertial parameter, or the friction of an axis."""
+
+    name: str
+    axis: str  #: joint; "" if it is none of one axis
+    kind: str  #: "friction" or "inertia"
+    unit: str
+    weights: Array  #: (p,); its product with the parameters is the value
+
+
+@dataclass(frozen=True)
+class Change:
+    """A quantity in a campaign against the first one; NaN if unknown."""
+
+    parameter: str
+    axis: str  #: joint; "" if it is none of one axis
+    kind: str  #: "friction" or "inertia"
+    unit: str
+    campaign: str  #: name
+    before: float
+    before_std: float
+    after: float
+    after_std: float
+    change: float
+    half: float  #: half width of the 95 % interval of the change
+    p_value: float  #: of no change, adjusted for all quantities and campaigns
+    changed: bool  #: whether the change is significant and at least `LEAST` of the first value
+
+
+@dataclass(frozen=True, eq=False)
+class CampaignSet:
+    """Campaigns of one arm."""
+
+    arm: Arm
+    #: in chronological order if the times of all are known, else as given
+    campaigns: tuple[LevelEstimate, ...]
+    repetitions: tuple[tuple[LevelEstimate, ...], ...]  #: of each campaign
+    broken: tuple[Unused, ...] = ()  #: archives that could not be used
+    simulated: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Changes of the campaigns of one arm from the first."""
+
+    arm: str  #: name
+    simulated: bool
+    dated: bool  #: whether campaigns are in chronological order
+    verdict: str  #: one line
+    campaigns: tuple[LevelEstimate, ...]
+    names: tuple[str, ...]  #: of the campaigns, with their days if known
+    changes: tuple[Change, ...]  #: of all quantities, by campaign
+    warnings: tuple[str, ...]
+
+    @property
+    def changed(self) -> tuple[Change, ...]:
+        """Significant and relevant changes."""
+        return tuple(one for one in self.changes if one.changed)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """JSON data, None for unknown values."""
+        numbers = [asdict(one) for one in self.changes]
+        return {
+            "arm": self.arm,
+            "simulated": self.simulated,
+            "dated": self.dated,
+            "verdict": self.verdict,
+            "changed": bool(self.changed),
+            "campaigns": [
+                {"name": name, "folder": one.campaign, "when": one.when or None, "setup": one.setup}
+                for name, one in zip(self.names, self.campaigns, strict=True)
+            ],
+            "parameters": [
+                {name: None if value != value else value for name, value in row.items()}
+                for row in numbers
+            ],
+            "warnings": list(self.warnings),
+        }
+
+
+def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> CampaignSet:
+    """Identify campaigns, given as folders or `results.json`, by unregularised least squares.
+
+    Raises:
+        InputError: there is only one campaign, or they are of different arms.
+    """
+    paths = [Path(place) for place in places]
+    roots = [path.parent if path.name == "results.json" else path for path in paths]
+    refs: list[ArchiveRef] = []
+
+    def check(found: Sequence[ArchiveRef]) -> None:
+        _require_campaigns_of_one_arm(found)
+        refs.extend(found)
+
+    options = Options(estimator="wls")
+    result = run.reidentify([str(root) for root in roots], options, workers, reporter, check=check)
+    campaigns = list(result.campaigns)
+    if len(campaigns) < 2:
+        reason = "".join(f"; {one.path}: {one.reason}" for one in result.broken[:1])
+        only = campaigns[0].campaign if campaigns else None
+        raise InputError(only, f"is the only campaign that can be estimated{reason}", remedy=_TWO)
+    given = [root.resolve() for root in roots]
+
+    def order(one: LevelEstimate) -> tuple[str, int, str]:
+        own = Path(one.campaign)
+        inside = [own.is_relative_to(root) for root in given]
+        return (one.when if dated else "", inside.index(True) if any(inside) else 0, one.campaign)
+
+    dated = all(one.when for one in campaigns)
+    campaigns.sort(key=order)
+    return CampaignSet(
+        arm=result.arms[campaigns[0].arm],
+        campaigns=tuple(campaigns),
+        repetitions=tuple(
+            tuple(
+                each
+                for each in result.repetitions
+                if (each.campaign, each.setup) == (one.campaign, one.setup)
+            )
+            for one in campaigns
+        ),
+        broken=result.broken,
+        simulated=refs[0].simulated,  # as all of one arm
+    )
+
+
+def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
+    campaigns = {ref.key: ref for ref in found if ref.use == "excitation"}
+    if not campaigns:
+        return  # reidentify raises the error
+    first = next(iter(campaigns.values()))
+    for one in campaigns.values():
+        if one.arm != first.arm:
+            here, there = (Arm(ref.arm, cell_in(open_ref(ref))) for ref in (one, first))
+            other = ["simulation or the controller's drive train"]
+            differing = arm_differences(here.cell, there.cell) or other
+            raise InputError(
+                one.campaign,
+                f"is of another arm ({here.name}) than {first.campaign} ({there.name}): they differ"
+                f" in {' and '.join(differing)}",
+                remedy="compare campaigns of one arm",
+            )
+    if len(campaigns) < 2:
+        raise InputError(first.campaign, "is the only campaign given", remedy=_TWO)
+
+
+def compare_campaigns(gathered: CampaignSet) -> Comparison:
+    """Compare the parameters of the campaigns of one arm with those of the first."""
+    model, campaigns = gathered.arm.cell.model, gathered.campaigns
+    names, compared = _names(campaigns), quantities(model, campaigns[0])
+    figures = np.array(
+        [_figures(compared, *pair) for pair in zip(campaigns, gathered.repetitions, strict=True)]
+    )
+    value, variance, _ = np.moveaxis(figures, 2, 0)
+    change, half, p_value = against_first(figures)
+    std = np.sqrt(variance)
+    changes = tuple(
+        Change(
+            parameter=one.name,
+            axis=one.axis,
+            kind=one.kind,
+            unit=one.unit,
+            campaign=names[c],
+            before=float(value[0, k]),
+            before_std=float(std[0, k]),
+            after=float(value[c, k]),
+            after_std=float(std[c, k]),
+            change=float(change[c, k]),
+            half=float(half[c, k]),
+            p_value=float(p_value[c, k]),
+            changed=bool(
+                p_value[c, k] < FALSE_ALARMS and abs(change[c, k]) >= LEAST * abs(value[0, k])
+            ),
+        )
+        for c in range(1, len(campaigns))
+        for k, one in enumerate(compared)
+    )
+    return Comparison(
+        arm=gathered.arm.name,
+        simulated=gathered.simulated,
+        dated=all(one.when for one in campaigns),
+        verdict=_verdict([one for one in changes if one.changed]),
+        campaigns=campaigns,
+        names=tuple(names),
+        changes=changes,
+        warnings=(*_warnings(names, gathered), _CAVEAT),
+    )
+
+
+def quantities(model: RobotModel, first: LevelEstimate) -> list[Quantity]:
+    """Return what is compared: all parameters but friction, and the friction of each axis.
+
+    That is the mean of both directions at the speed at which the first campaign determines it best:
+    single coefficients are correlated, and their changes much less certain.
+    """
+    layout, joints, terms = model.layout, model.joint_names, model.friction.terms
+    own = [(*links, *layout.rotors[j : j + 1]) for j, links in enumerate(layout.links)]
+    axes = {layout.names[k]: joints[j] for j, places in enumerate(own) for k in places}
+    rank, single = model.base.rank, np.eye(model.n_parameters)
+    rows = [*range(rank), *range(rank + len(terms), model.n_parameters)]
+    names, units = model.parameter_names, model.units
+    found = [
+        Quantity(names[k], axes.get(names[k], ""), "inertia", units[k], single[k]) for k in rows
+    ]
+    table = np.zeros((len(_SPEEDS), model.n_joints, model.n_parameters))
+    for k, term in enumerate(terms):
+        forwards, backwards = (
+            term.term.column(sign * _SPEEDS, np.full(len(_SPEEDS), sign)) for sign in (1.0, -1.0)
+        )
+        table[:, term.owner, rank + k] = 0.5 * (forwards - backwards)
+    for j, (joint, turns) in enumerate(zip(joints, model.chain.revolute, strict=True)):
+        if not table[:, j].any():
+            continue
+        value, variance = _projected(first, table[:, j])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            best = int(np.argmax(np.nan_to_num(np.abs(value) / np.sqrt(variance))))
+        unit, speed = ("N·m", "rad/s") if turns else ("N", "m/s")
+        name = f"friction of {joint} at {_SPEEDS[best]:.2g} {speed}"
+        found.append(Quantity(name, joint, "friction", unit, table[best, j]))
+    return found
+
+
+def _projected(level: LevelEstimate, weights: Array) -> tuple[Array, Array]:
+    """Return values and variances (k,) of weighted sums (k, p) of parameters; NaN if unknown."""
+    covariance = np.diag(level.std**2) if level.covariance is None else level.covariance
+    known = np.isfinite(level.std)
+    determined = ~weights[:, ~known].any(axis=1)
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    variance = np.einsum("kp,pq,kq->k", weights, finite, weights)
+    value = np.where(determined, weights @ level.values, np.nan)
+    return value, np.where(determined, variance, np.nan)
+
+
+def _verdict(changed: Sequence[Change]) -> str:
+    """Return one line: what changed, friction by axis."""
+    names = dict.fromkeys(
+        f"friction of {one.axis}" if one.kind == "friction" else one.parameter for one in changed
+    )
+    return f"Changed: {', '.join(names)}" if names else "No significant change"
+
+
+def _names(campaigns: Sequence[LevelEstimate]) -> list[str]:
+    """Return names of campaigns: folder below the common one, setup if ambiguous, and day."""
+    folders = [one.campaign for one in campaigns]
+    shared = commonpath([Path(folder).parent for folder in folders])
+    names = []
+    for one in campaigns:
+        setup = f", {one.setup or 'nothing stated'}" if folders.count(one.campaign) > 1 else ""
+        day = f" ({one.when[:10]})" if one.when else ""
+        names.append(f"{Path(one.campaign).relative_to(shared)}{setup}{day}")
+    return names
+
+
+def _warnings(names: Sequence[str], gathered: CampaignSet) -> list[str]:
+    found = [f"{path} could not be used: {reason}" for path, reason in gathered.broken]
+    setups = {name: one.setup for name, one in zip(names, gathered.campaigns, strict=True)}
+    if len(set(setups.values())) > 1:
+        stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups.items())
+        found.append(f"the cells state different payloads or delays, compensated ({stated})")
+    for name, own in zip(names, gathered.repetitions, strict=True):
+        if len(own) < 2:
+            found.append(
+                f"{name}: with one repetition, uncertainty includes noise only, not the scatter of"
+                " repetitions"
+            )
+    each = zip(names, gathered.campaigns, strict=True)
+    return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
+
+
+# Statistics
+
+
+def freedom_of(level: LevelEstimate) -> float:
+    """Return the degrees of freedom of the covariance, from the Student factor of its intervals."""
+    factor = level.interval_factor
+    if factor <= _NORMAL:
+        return 1e6
+    return float(brentq(lambda freedom: student.ppf(0.975, freedom) - factor, 0.5, 1.1e6))
+
+
+def _figures(
+    compared: Sequence[Quantity], one: LevelEstimate, repetitions: Sequence[LevelEstimate]
+) -> list[Figure]:
+    """Return the figure of each quantity of a campaign."""
+    weights, freedom = np.array([each.weights for each in compared]), freedom_of(one)
+    singles = np.array([_projected(each, weights)[0] for each in repetitions])
+    columns = singles.reshape(len(repetitions), len(compared)).T
+    rows = zip(*_projected(one, weights), columns, strict=True)
+    return [figure(float(value), float(variance), freedom, own) for value, variance, own in rows]
+
+
+def figure(value: float, variance: float, freedom: float, repetitions: Array) -> Figure:
+    """Combine a pooled estimate (variance NaN if undetermined) with repetitions (m,)."""
+    if not np.isfinite(variance):
+        return Figure(math.nan, math.nan, 1.0)
+    own = repetitions[np.isfinite(repetitions)]
+    if len(own) < 2:
+        return Figure(value, variance, freedom)
+    count = effective_count(own)
+    scatter = float(np.var(own, ddof=1)) / count
+    if scatter <= variance:
+        return Figure(value, variance, freedom)
+    few = len(own) < MIN_REPETITIONS
+    return Figure(value, scatter, len(own) - 1.0 if few else max(1.0, count - 1.0))
+
+
+def effective_count(repetitions: Array) -> float:
+    """Return the effective number of independent repetitions (m,), between 1 and m."""
+    m = len(repetitions)
+    if m < MIN_REPETITIONS:
+        return 1.0
+    centred = repetitions - repetitions.mean()
+    size = float(centred @ centred)
+    if size == 0.0:
+        return float(m)
+    raw = float(centred[:-1] @ centred[1:]) / size
+    rho = min(max(raw + (1.0 + 4.0 * raw) / (m - 1), 0.0), _MAX_CORRELATION)
+    return max(1.0, m * (1.0 - rho) / (1.0 + rho))
+
+
+def against_first(figures: Array) -> tuple[Array, Array, Array]:
+    """Test all campaigns against the first: a `Figure` per campaign and parameter (c, k, 3).
+
+    Returns the changes, half widths of their intervals and adjusted p values, (c, k) each; NaN for
+    the first campaign, and where unknown.
+    """
+    value, variance, freedom = np.moveaxis(figures, 2, 0)
+    change, total = value - value[0], variance + variance[0]
+    change[0] = np.nan
+    change[~(total > 0.0)] = np.nan
+    squares = variance**2 / freedom
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = np.where(np.isfinite(change), total**2 / (squares + squares[0]), np.nan)
+        std = np.where(np.isfinite(change), np.sqrt(total), np.nan)
+        p_value = holm(2.0 * student.sf(np.abs(change) / std, both))
+    return change, student.isf(0.5 - 0.5 * CONFIDENCE, both) * std, p_value
+
+
+def holm(p_values: Array) -> Array:
+    """Return p values of any shape adjusted for multiple tests (Holm 1979); NaN stays NaN."""
+    flat = np.asarray(p_values, dtype=np.float64).ravel()
+    adjusted = np.full(flat.shape, np.nan)
+    places = np.flatnonzero(np.isfinite(flat))
+    order = places[np.argsort(flat[places], kind="stable")]
+    factors = np.arange(len(order), 0, -1)
+    adjusted[order] = np.minimum(1.0, np.maximum.accumulate(factors * flat[order]))
+    return adjusted.reshape(np.shape(p_values))
