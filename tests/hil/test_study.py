@@ -256,7 +256,7 @@ class TestWhole:
             folder = CampaignFolder(whole[0] / "campaigns" / "no-effects" / key)
             archives = [open_archive(path) for path in folder.completed("validation")]
             moves = [moves_from_dict(archive.table("plan.json")) for archive in archives]
-            assert all(any(m.fly.percent > 0.0 for m in one.moves[:-1]) for one in moves)
+            assert all(any(m.fly_percent > 0.0 for m in one.moves[:-1]) for one in moves)
             counts.append(len(moves))
         assert counts == [0, 3]
 
