@@ -285,9 +285,15 @@ SHAPES = {
     "excitation_time": (5,),
     "excitation_position": (5, 2),
     "excitation_velocity": (5, 2),
+    "excitation_fitted": (5, 2),
     "example_time": (3,),
     "example_measured": (3, 2),
     "example_predicted": (3, 2),
+    "example_used": (3, 2),
+    "friction_torque": (4, 2),
+    "friction_speed": (4, 2),
+    "law_torque": (6, 2),
+    "law_speed": (6, 2),
 }
 MEMBERS = {f"{name}.npy": member(np.zeros(shape)) for name, shape in SHAPES.items()}
 MEMBERS["example_archive.npy"] = member("one.mcap")
