@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from json import dumps as json_text
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar
 
@@ -30,7 +29,7 @@ from planner.errors import (
     PlanningTimedOut,
 )
 from planner.moves import MotionPlan, Move, plan_moves
-from planner.plan_file import PlanFile, to_csv
+from planner.plan_file import PlanFile
 from planner.worker import in_child
 
 Array = NDArray[np.float64]
@@ -122,11 +121,8 @@ def plan(
     random: Annotated[int | None, typer.Option(min=1)] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
-    acceleration: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
     fly: Annotated[float, typer.Option(min=0.0, max=100.0)] = 50.0,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
-    csv: Path | None = None,
-    rate: float | None = None,
     picture: Path | None = None,
     json: JsonOption = False,
 ) -> None:
@@ -145,11 +141,8 @@ def plan(
         random: Number of random via points, in place of --via.
         seed: Seed of the random via points.
         speed: Percent of the joint speed limits.
-        acceleration: Percent of the joint acceleration limits.
         fly: Fly in percent (FLY_NORM); 0 stops at each point.
         output: Write a plan file (*.json).
-        csv: Write a table of time, position, velocity, acceleration.
-        rate: Rows per second of that table. Default: one per cycle of the cell.
         picture: Plot the plan (*.png, *.svg, *.pdf).
     """
     if output is not None and output.suffix.lower() != PLAN_SUFFIX:
@@ -157,8 +150,6 @@ def plan(
         raise InputError(output, problem, field="--output", remedy=remedy)
     if picture is not None:
         check_format(picture)
-    if rate is not None and not (isfinite(rate) and rate > 0.0):
-        raise InputError(None, f"{rate} rows per second", field="--rate", remedy="give more than 0")
     exactly_one(via=via, random=random)
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
@@ -170,23 +161,17 @@ def plan(
             if via is None
             else read_via_points(via, frame)
         )
-        moves = [
-            Move(target=point, speed=speed / 100, acceleration=acceleration / 100, fly_percent=fly)
-            for point in points[1:]
-        ]
+        moves = [Move(target=one, speed=speed / 100, fly_percent=fly) for one in points[1:]]
         planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
     names = loaded.joint_names
-    if rate is None:
-        rate = 1000.0 if loaded.file.controller is None else 1.0 / loaded.period
     summary = _summary(planned, loaded, frame)
     if json:
         print_json(summary)
     else:
         typer.echo(printable(_table(summary, frame.shown(planned.start), names)))
     if output is not None:
-        _write(output, json_text(PlanFile.of(planned, names).to_dict()) + "\n")
-    if csv is not None:
-        _write(csv, to_csv(planned.trajectory, rate, names))
+        with convert_write_errors(output):
+            write_atomically(output, json_text(PlanFile.of(planned, names).to_dict()) + "\n")
     if picture is not None:
         save(draw_plan(planned, names, frame, title=loaded.name), picture)
 
@@ -239,8 +224,3 @@ def _table(summary: Mapping[str, Any], start: Array, joint_names: Sequence[str])
         "floor, walls, currents and self-collision were not checked)".format_map(summary),
     ]
     return "\n".join(lines)
-
-
-def _write(path: Path, text: str) -> None:
-    with convert_write_errors(path):
-        write_atomically(path, text)

@@ -18,7 +18,6 @@ from hil.plots import draw_plan
 from hil.plots.plan_picture import corner_times
 from planner.moves import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
-from tests.motion_table import MotionTable
 
 VIA = """\
 # as on the teach pendant
@@ -80,7 +79,7 @@ def test_targets_are_in_the_angles_of_the_controller(run, via):
 
 def test_slower_moves(run, via):
     out = json.loads(run("--via", via, "--json"))
-    slow = json.loads(run("--via", via, "--json", "--speed", 20, "--acceleration", 30))
+    slow = json.loads(run("--via", via, "--json", "--speed", 20))
     assert slow["duration"] > 2.0 * out["duration"]
 
 
@@ -103,22 +102,6 @@ def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
     )
 
 
-def test_the_table_holds_the_motion(run, via, tmp_path, cell):
-    path = tmp_path / "motion.csv"
-    run("--via", via, "--csv", path)
-    table = MotionTable.of(path.read_text())
-    assert table.joint_names == cell.joint_names
-    np.testing.assert_allclose(np.diff(table.time)[:-1], cell.period)
-    frame = AngleFrame.of(cell)
-    np.testing.assert_allclose(
-        frame.shown(table.position[[0, -1]]), [[0, 0, -90, 0, 90, 0]] * 2, atol=1e-9
-    )
-    assert np.all(np.abs(table.velocity) <= cell.joint_limits.velocity)
-    assert np.max(np.abs(table.acceleration) / cell.joint_limits.acceleration) > 0.9
-    run("--via", via, "--csv", path, "--rate", 50)
-    assert len(path.read_text().splitlines()) < 0.02 / cell.period * len(table.time)
-
-
 def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
     path = tmp_path / "plan.png"
     run("--via", via, "--picture", path)
@@ -138,9 +121,8 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         (["--via", "missing.csv"], "cannot be read"),
         (["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
         (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
-        (["--via", "VIA", "--csv", "nowhere/plan.csv"], "cannot be written"),
+        (["--via", "VIA", "--output", "nowhere/plan.json"], "cannot be written"),
         (["--via", "VIA", "--output", "plan.yaml"], "not a plan file"),
-        (["--via", "VIA", "--csv", "motion.csv", "--rate", "nan"], "--rate: nan rows per second"),
     ],
 )
 def test_names_what_is_wrong(app, via, arguments, problem):
