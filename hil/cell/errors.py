@@ -70,7 +70,7 @@ def _place(schema: type[BaseModel], location: Sequence[str | int]) -> _Place:
         fields = models[0].model_fields if models else {}
         siblings = sorted(fields)
         if isinstance(part, str) and part in fields:
-            models = list(_models_of(fields[part].annotation))
+            models = list(models_of(fields[part].annotation))
             description = fields[part].description or (f"a table [{part}]" if models else "")
     return _Place(name, description, siblings)
 
@@ -82,12 +82,12 @@ def _kinds(model: type[BaseModel]) -> tuple[object, ...]:
     return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
 
 
-def _models_of(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_of(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield the models in an annotation, such as those of a union."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
-        yield from _models_of(part)
+        yield from models_of(part)
 
 
 def _short(value: object) -> str:
@@ -118,7 +118,8 @@ WHERE: Final[Mapping[str, str]] = {
         "the controller's init packet; 0.0 without wrist coupling",
     ),
     "drive_train.joint_sign": "jog each joint by a few degrees: 1 if the angle of the pendant "
-    "increases for a positive rotation about the axis of the URDF, else -1",
+    "increases for a positive rotation about the axis of the URDF, else -1. With a wrong sign "
+    "the arm moves in the opposite direction, and no check applies to its motion",
     "drive_train.joint_offset_deg": "reading of the pendant with all URDF angles at zero",
     "drive_train.torque_constant": "plates or data sheets of the motors, or hil gains with a known "
     "payload",

@@ -12,16 +12,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_origin
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import NDArray
+from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
 from hil.cell import Cell, CellError
-from hil.cell.errors import UNKNOWN, WHERE
+from hil.cell.errors import UNKNOWN, WHERE, models_of
+from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits, with_values
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
@@ -100,12 +101,35 @@ def _three(text: str | None, default: str) -> Array:
     return np.array([float(part) for part in (text or default).split()])
 
 
-_ONE_FOR_ALL: Final = {
-    *("cell.urdf", "controller.host", "controller.cycle_ms", "workspace.floor", "workspace.walls"),
-    *("drive_train.k54", "drive_train.k64", "drive_train.k65"),
-    "drive_train.encoder_counts_per_revolution",
+_DEFAULTS: Final[Mapping[str, Any]] = {
+    "cell.description": "",
+    "robot.gravity": [0.0, 0.0, -9.81],
+    "robot.friction": {"standstill": 0.05},
+    "limits.frame": "urdf",
+    "limits.torque": [],
+    "controller.transport": "udp",
+    "controller.port": 1000,
+    "controller.arm": 1,
+    "controller.current_delay_cycles": 0.0,
+    "nominal.uncertainty": 0.3,
+    "workspace.margin": 0.05,
+    "campaign.approach_speed": 0.05,
+    "campaign.repetitions": 30,
+    "campaign.validation_runs": 10,
 }
-"""Unknown fields that are no lists."""
+"""Values of a new cell file, unless known; others are unknown (`WHERE`) or not written."""
+_HEAD: Final = """\
+# {name}: cell file made by `hil new`. {sources}
+#
+# "?" is an unknown value. A file with a "?" is refused, with a list of all of them and where to
+# find each. List values that are assumed, not measured, in `assumed`: results that depend on them
+# report it. An arrow (->) names the source of a value.
+#
+# Lists have one entry per joint, in this order:
+#   {joints}
+# Units are SI, except where a name says degrees (_deg) or milliseconds (_ms), or a comment
+# revolutions.
+"""
 _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """Fields whose default is written as an assumption."""
 _MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
@@ -128,60 +152,49 @@ class NewCell:
     def text(self, path: Path) -> tuple[str, tuple[str, ...]]:
         """Return the text of the cell file at `path`, and its unknown fields."""
         path = path.resolve()
-        values, origin = self.known.values, self.known.origin
-        written: set[str] = set()
-        unknown: list[str] = []
-
-        def line(name: str, default: Any = None) -> str:
-            """Format one field: known value, else default, else `"?"`."""
-            written.add(name)
-            key = name.partition(".")[2]
-            value = values.get(name, default)
-            if value is None:
-                value = UNKNOWN if name in _ONE_FOR_ALL else [UNKNOWN] * len(self.joint_names)
-            if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
-                unknown.append(name)
-                where = textwrap.fill(
-                    WHERE.get(name, ""), 96, initial_indent="# -> ", subsequent_indent="#    "
-                )
-                key = f"{where}\n{key}" if where else key
-            comment = f"  # {origin[name]}" if name in origin else ""
-            return f"{key} = {toml_value(value)}{comment}"
-
-        def rest(table: str) -> str:
-            """Format the known fields of a table without a line in the template."""
-            return "".join(
-                f"{toml_key(name.partition('.')[2])} = {toml_value(value)}\n"
-                for name, value in values.items()
-                if name.startswith(f"{table}.") and name not in written
-            )
-
-        own = {"cell", "robot", "limits", "campaign", "workspace", "nominal", "drive_train"}
-        tables = {name.partition(".")[0] for name in values}
         urdf = self.urdf_beside(path) if self.urdf is not None else self.urdf_path.resolve()
-        origins = ", ".join(dict.fromkeys(origin.values()))
-        environment = Environment(
-            loader=PackageLoader("hil.new", "."),
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-            autoescape=False,  # a TOML file
-        )
-        text = environment.get_template("cell.toml.j2").render(
+        values = dict(_DEFAULTS)
+        if len(self.joint_names) < WRIST_AXES:
+            values |= {f"drive_train.{name}": 0.0 for name in ("k54", "k64", "k65")}
+        folders = self._mesh_folders(path.parent)
+        values |= {
+            "cell.name": self.name,
+            "cell.urdf": os.path.relpath(urdf, path.parent),
+            "cell.assumed": self._assumed(),
+            **({} if folders is None else {"cell.mesh_folders": folders}),
+            **self.known.values,
+        }
+        origins = ", ".join(dict.fromkeys(self.known.origin.values()))
+        head = _HEAD.format(
             name=self.name,
             sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
-            urdf=os.path.relpath(urdf, path.parent),
-            mesh_folders=self._mesh_folders(path.parent),
-            assumed=self._assumed(),
-            design_only=self.design_only,
-            suggested=self._suggested(),
-            wrist=UNKNOWN if len(self.joint_names) >= WRIST_AXES else 0.0,
-            others=sorted(tables - own - {"controller"}),
-            line=line,
-            rest=rest,
         )
-        return text.rstrip("\n") + "\n", tuple(unknown)
+        lines, unknown = [head], list[str]()
+        suggested = self._suggested()
+        without = ("drive_train", "controller") if self.design_only else ()
+        tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
+        for table in (one for one in dict.fromkeys(tables) if one not in without):
+            fields = _fields_of(table)
+            others = (name for name in values if name.startswith(f"{table}."))
+            names = [one for one in dict.fromkeys([*fields, *others]) if one in values | _UNKNOWN]
+            lines += [f"\n[{table}]"] if names else []
+            for name in names:
+                value = values.get(name)
+                if value is None:
+                    value = UNKNOWN
+                    if _is_one_each(fields[name]):
+                        value = [UNKNOWN] * len(self.joint_names)
+                if name in fields:
+                    lines += _comment(fields[name].description or "", "# ")
+                if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
+                    unknown.append(name)
+                    lines += _comment(WHERE.get(name, ""), "# -> ")
+                lines += suggested.get(name, [])
+                origin = self.known.origin.get(name)
+                comment = f"  # {origin}" if origin else ""
+                lines.append(f"{toml_key(name.partition('.')[2])} = {toml_value(value)}{comment}")
+        return "\n".join(lines) + "\n", tuple(unknown)
 
     def _assumed(self) -> list[str]:
         """Return the names of assumed fields."""
@@ -205,15 +218,21 @@ class NewCell:
             found[os.path.relpath(place, folder)] = None
         return list(found)
 
-    def _suggested(self) -> list[str] | None:
-        """Return proposed lines of acceleration and jerk if all speeds are known."""
+    def _suggested(self) -> dict[str, list[str]]:
+        """Return proposed lines of acceleration and jerk by field, if all speeds are known."""
         speeds = self.known.values.get("limits.velocity_deg", [UNKNOWN])
         if "limits.jerk_deg" in self.known.values or UNKNOWN in speeds:
-            return None
-        return [
-            f"{name} = {toml_value([round(speed / seconds, _ROUND) for speed in speeds])}"
-            for name, seconds in (("acceleration_deg", 0.3), ("jerk_deg", 0.03))
-        ]
+            return {}
+        return {
+            f"limits.{name}": [
+                f"# Proposal, for {text} s:",
+                f"#   {name} = {toml_value([round(speed / seconds, _ROUND) for speed in speeds])}",
+            ]
+            for name, text, seconds in (
+                ("acceleration_deg", "full speed in 0.3", 0.3),
+                ("jerk_deg", "full acceleration in 0.1", 0.03),
+            )
+        }
 
     def for_design(self) -> NewCell:
         """Return the cell for design only, with assumed values."""
@@ -226,6 +245,29 @@ class NewCell:
         if beside.resolve() == self.urdf_path.resolve():
             return path.with_name(f"{path.stem}_fixed.urdf")
         return beside
+
+
+_UNKNOWN: Final = {name: UNKNOWN for name in WHERE if name != "cell.mesh_folders"}
+"""Fields that a new cell file has even if their values are unknown."""
+
+
+def _fields_of(table: str) -> dict[str, FieldInfo]:
+    """Return the fields of a table of the schema by dotted name; none of an unknown one."""
+    if table not in CellFile.model_fields:
+        return {}
+    model = next(models_of(CellFile.model_fields[table].annotation))
+    return {f"{table}.{name}": field for name, field in model.model_fields.items()}
+
+
+def _is_one_each(field: FieldInfo) -> bool:
+    """Whether a field is a list with an entry for each joint."""
+    return get_origin(field.annotation) is list and not any(models_of(field.annotation))
+
+
+def _comment(text: str, mark: str) -> list[str]:
+    """Return lines of a comment."""
+    rest = "# " if mark == "# " else "#    "
+    return textwrap.wrap(text, 98, initial_indent=mark, subsequent_indent=rest)
 
 
 def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
