@@ -134,7 +134,6 @@ _ASSUMED: Final = ("nominal.uncertainty", "controller.current_delay_cycles")
 """Fields whose default is written as an assumption."""
 _MESH: Final = re.compile(r"""filename\s*=\s*["'](package://[^"']+)["']""")
 _COLLISION: Final = re.compile(r"<collision\b.*?</collision>", re.DOTALL)
-_ROUND: Final = 3
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,6 @@ class NewCell:
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
         )
         lines, unknown = [head], list[str]()
-        suggested = self._suggested()
         without = ("drive_train", "controller") if self.design_only else ()
         tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
         for table in (one for one in dict.fromkeys(tables) if one not in without):
@@ -190,7 +188,6 @@ class NewCell:
                 if value == UNKNOWN or (isinstance(value, list) and UNKNOWN in value):
                     unknown.append(name)
                     lines += _comment(WHERE.get(name, ""), "# -> ")
-                lines += suggested.get(name, [])
                 origin = self.known.origin.get(name)
                 comment = f"  # {origin}" if origin else ""
                 lines.append(f"{toml_key(name.partition('.')[2])} = {toml_value(value)}{comment}")
@@ -217,22 +214,6 @@ class NewCell:
                 return [UNKNOWN]
             found[os.path.relpath(place, folder)] = None
         return list(found)
-
-    def _suggested(self) -> dict[str, list[str]]:
-        """Return proposed lines of acceleration and jerk by field, if all speeds are known."""
-        speeds = self.known.values.get("limits.velocity_deg", [UNKNOWN])
-        if "limits.jerk_deg" in self.known.values or UNKNOWN in speeds:
-            return {}
-        return {
-            f"limits.{name}": [
-                f"# Proposal, for {text} s:",
-                f"#   {name} = {toml_value([round(speed / seconds, _ROUND) for speed in speeds])}",
-            ]
-            for name, text, seconds in (
-                ("acceleration_deg", "full speed in 0.3", 0.3),
-                ("jerk_deg", "full acceleration in 0.1", 0.03),
-            )
-        }
 
     def for_design(self) -> NewCell:
         """Return the cell for design only, with assumed values."""

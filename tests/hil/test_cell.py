@@ -18,6 +18,7 @@ from pydantic.fields import FieldInfo
 from drivers.transports.udp import UdpSpec
 from hil.campaign.folder import MESH, MISSING, checksums
 from hil.cell import AngleFrame, Cell, CellError
+from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
 from hil.cell.text import replaced_value, urdf_limits
 from hil.design import preset, problem_of
@@ -327,20 +328,12 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "cell-file.md"
 def tables(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
     """Every table that a cell file may have, by its dotted name."""
     for name, info in model.model_fields.items():
-        for part in parts(info.annotation):
+        for part in models_of(info.annotation):
             kind = part.model_fields.get("kind")
             for one in [""] if kind is None else [f".{one}" for one in get_args(kind.annotation)]:
                 full = f"{prefix}{name}{one}"
                 yield full, part
                 yield from tables(part, f"{full}.")
-
-
-def parts(annotation: Any) -> Iterator[type[BaseModel]]:
-    """The models within an annotation, such as those of a list of several kinds."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    for part in get_args(annotation):
-        yield from parts(part)
 
 
 def default_text(info: FieldInfo) -> str:
