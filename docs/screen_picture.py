@@ -7,7 +7,6 @@ the screen in the middle of the third repetition.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -15,6 +14,7 @@ from typing import Final
 from matplotlib import font_manager
 from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
+from rich.layout import Layout
 from rich.segment import Segment
 from rich.style import Style
 from rich.terminal_theme import MONOKAI, TerminalTheme
@@ -23,7 +23,7 @@ from hil import Campaign, Cell
 from hil.campaign import Stop, design
 from hil.campaign.operator import RunStatus
 from hil.progress import Silent, reporter
-from hil.screen import Screen, Shown, lines
+from hil.screen import Keyboard, Screen
 
 HERE: Final = Path(__file__).parent
 COLUMNS, ROWS = 80, 24
@@ -38,22 +38,24 @@ Colour = tuple[int, int, int]
 
 
 class RecordingScreen(Screen):
-    """A hidden screen whose state at one moment is stored."""
+    """A hidden screen whose picture at one moment is stored."""
 
-    stored: Shown | None = None
+    stored: Layout | None = None
 
     def show(self, status: RunStatus) -> None:
-        """Store the state in the middle of the motion."""
+        """Store the picture in the middle of the motion."""
         super().show(status)
         motion = status.motion
         if self.stored is None and (status.phase, status.number) == ("repetition", REPETITION):
             done = 0.0 if motion is None else (motion.motion_time or 0.0)
             if motion is not None and done > MIDDLE * (motion.duration or 0.0):
-                self.stored = replace(self.shown(), keys=True)
+                self._keyboard = Keyboard(str)
+                self._keyboard.attached = True
+                self.stored, self._keyboard = self.picture(), None
 
 
-def screen_in_run() -> Shown:
-    """Return the state of the screen in the middle of a run."""
+def screen_in_run() -> Layout:
+    """Return the screen in the middle of a run."""
     cell = Cell.load(HERE.parent / "sim_fixtures" / "ns16" / "cell.toml")
     cell = cell.with_campaign(repetitions=5, validation_runs=1)
     with TemporaryDirectory() as folder:
@@ -65,7 +67,7 @@ def screen_in_run() -> Shown:
     return screen.stored
 
 
-def picture(shown: Shown) -> Image.Image:
+def picture(shown: Layout) -> Image.Image:
     """Draw a screen, letter by letter."""
     console = Console(width=COLUMNS, height=ROWS, force_terminal=True, color_system="truecolor")
     fonts = {bold: _font(bold) for bold in (False, True)}
@@ -74,9 +76,9 @@ def picture(shown: Shown) -> Image.Image:
     size = (round(COLUMNS * wide) + 2 * MARGIN, ROWS * high + 2 * MARGIN)
     image = Image.new("RGB", size, THEME.background_color)
     draw = ImageDraw.Draw(image)
-    for row, line in enumerate(lines(shown, COLUMNS, ROWS)):
+    for row, line in enumerate(console.render_lines(shown)):
         column = 0
-        for segment in Segment.strip_links(console.render(line, console.options)):
+        for segment in Segment.strip_links(line):
             style, y = segment.style or Style(), MARGIN + row * high
             ink, paper = _colours(style)
             for letter in segment.text.rstrip("\n"):

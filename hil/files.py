@@ -218,21 +218,6 @@ def file_lock(
         os.close(descriptor)
 
 
-def is_locked(path: Path) -> bool:
-    """Return whether another process holds the lock on a file now."""
-    try:
-        descriptor = os.open(path, _FLAGS | os.O_RDONLY)
-    except OSError:  # never locked, or not readable
-        return False
-    try:
-        _acquire(descriptor, fcntl.LOCK_SH, 0.0)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
-
-
 def _acquire(descriptor: int, kind: int, patience: float) -> None:
     deadline = time.monotonic() + patience
     while True:

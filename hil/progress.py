@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from select import select
-from shutil import get_terminal_size
-from typing import Final, Protocol
+from typing import Protocol
 
 from rich.console import Console, RenderableType
 from rich.progress import (
@@ -26,7 +24,6 @@ from rich.text import Text
 from hil.terminal_text import printable
 
 _NARROWEST = 8  # columns of a bar
-_REFRESH: Final = 0.25  # s between two status lines
 
 
 def put(console: Console, text: str) -> None:
@@ -149,38 +146,8 @@ def reporter(*, quiet: bool = False) -> Reporter:
     return Bar(console) if console.is_terminal else LineReporter()
 
 
-class StatusLine:
-    """Lines of text and, on a terminal, a status line below them; nothing if `quiet`.
-
-    What the terminal or pipe cannot accept at once is dropped, so that no cycle is delayed.
-    """
-
-    def __init__(self, *, quiet: bool, descriptor: int = 1) -> None:
-        self.quiet, self._out = quiet, descriptor
-        self.live = not quiet and os.isatty(descriptor)
-        self._due = 0.0
-
-    def say(self, text: str) -> None:
-        """Print a line."""
-        if not self.quiet:
-            self.clear()
-            self._write(printable(text) + "\n")
-
-    def update(self, text: Callable[[], str]) -> None:
-        """Replace the status line, if there is one and it is due."""
-        if self.live and (now := time.monotonic()) >= self._due:
-            self._due = now + _REFRESH
-            self._write("\r\x1b[K" + printable(text())[: get_terminal_size().columns - 1])
-
-    def clear(self) -> None:
-        """Erase the status line."""
-        if self.live:
-            self._write("\r\x1b[K")
-
-    def _write(self, text: str) -> None:
-        if self.quiet or not select([], [self._out], [], 0.0)[1]:
-            return
-        try:
-            os.write(self._out, text.encode())
-        except OSError:
-            self.quiet = True  # the reader has closed the pipe
+def say_at_once(text: str, descriptor: int = 1) -> None:
+    """Print a line; drop it if terminal or pipe cannot accept it at once, so nothing is delayed."""
+    with suppress(OSError):  # the reader has closed the pipe
+        if select([], [descriptor], [], 0.0)[1]:
+            os.write(descriptor, (printable(text) + "\n").encode())

@@ -12,30 +12,28 @@ import re
 import select
 import sys
 import termios
-import textwrap
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any, Final, Literal, TextIO
 
 import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
+from rich.layout import Layout
 from rich.live import Live
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
 from hil.campaign.dry_run import DryRun
-from hil.campaign.operator import DriftCurve, MotionProgress, OperatorRequest, RunStatus, Stop
+from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
 from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
-
-Array = NDArray[np.float64]
 
 # --- keys
 
@@ -174,80 +172,23 @@ def _chunk(fd: int) -> bytes:
 STALE: Final = 1.0
 """Age of a status that is reported, s."""
 SIMULATED: Final = "SIMULATED"
-_TITLE: Final = 20  # Most columns of the title
-_NAME: Final = 14  # Columns of a joint's name
-_NUMBERS: Final = 28  # Columns of a joint's numbers, beside its name and bars
-_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 WARNING: Final = 0.8
 """Share of a limit from which it is coloured."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """State of the screen; `age` of the status and waiting time `left` in s."""
-
-    title: str
-    joint_names: tuple[str, ...]
-    status: RunStatus | None = None
-    request: OperatorRequest = field(default_factory=OperatorRequest)
-    stopping: bool = False
-    age: float = 0.0
-    messages: tuple[str, ...] = ()
-    keys: bool = True
-    controller: str = ""
-    left: str = ""
-
-
-def lines(shown: Shown, width: int, height: int) -> list[Text]:
-    """Return the picture, made for 80 columns and 24 lines; a smaller terminal shows a part."""
-    status = shown.status
-    motion = None if status is None else status.motion
-    screen = [_heading(shown, width), Text("nothing moves", style="dim"), _state(shown), Text()]
+def status_line(status: RunStatus) -> str:
+    """Return the progress of a run in one line."""
+    parts, motion = [f"{status.phase} {status.number} of {status.total}"], status.motion
     if motion is not None:
-        screen[1] = _bar_of_motion(motion, width)
-        troubled = motion.missed or motion.late or motion.not_accepted
-        screen[3] = Text(f"cycles {motion.cycles}, {_packets(motion)}")
-        screen[3].stylize("bold yellow" if troubled else "green")
-        screen += [Text(), *_joints(shown.joint_names, motion, width)]
-    if status is not None and status.drift is not None:
-        screen += [Text(), _drift(status.drift, width)]
-    notes, events = status.notes if status else (), motion.events if motion else ()
-    rows = [
-        row
-        for line in (*shown.messages, *notes, *events)
-        for row in textwrap.wrap(printable(line, keep=""), max(8, width), subsequent_indent="  ")
-    ]
-    room = height - len(screen) - 2
-    if room > 0:
-        screen += [Text(), *(Text(row, style="dim") for row in rows[-room:])]
-    screen += [Text()] * (height - 1 - len(screen))
-    keys = HELP if shown.keys else "Ctrl-C stops on the path"
-    screen = [*screen[: height - 1], Text(keys.ljust(width), style="reverse")]
-    for line in screen:
-        line.truncate(width, overflow="ellipsis")
-    return screen
-
-
-def status_line(status: RunStatus, left: str = "") -> str:
-    """Return the progress of a run in one line; `left` is the waiting time to its end."""
-    parts = [_phase(status)]
-    motion = status.motion
-    if motion is not None:
-        held = "held" if motion.held else f"override {100.0 * motion.override:.0f} %"
+        held = "held" if motion.held else f"override {motion.override:.0%}"
         parts += [_times(motion), held, _packets(motion)]
         shares = {"following error": motion.following_share, "current": motion.current_share}
         parts += [
-            f"{what} {100.0 * share.max():.0f} % of its limit"
+            f"{what} {share.max():.0%} of its limit"
             for what, share in shares.items()
             if share is not None
         ]
-    if status.drift is not None:
-        parts.append(_drift_text(status.drift))
-    return ", ".join([*parts, left or f"{clock(status.time_left)} left"])
-
-
-def _phase(status: RunStatus) -> str:
-    return f"{status.phase} {status.number} of {status.total}"
+    return ", ".join([*parts, f"{clock(status.time_left)} of motion left"])
 
 
 def _times(motion: MotionProgress) -> str:
@@ -257,102 +198,40 @@ def _times(motion: MotionProgress) -> str:
 
 
 def _packets(motion: MotionProgress) -> str:
-    """Return the packet counts of a motion and its reply times."""
-    text = f"{motion.missed} missed, {motion.late} late, {motion.not_accepted} not accepted"
-    if (latency := motion.latency) is None:
-        return text
-    median, p99, worst = map(duration, (latency.median, latency.p99, latency.worst))
-    return f"{text}, {median}, 99 % {p99}, worst {worst}"
+    return f"{motion.missed} missed, {motion.late} late, {motion.not_accepted} not accepted"
 
 
-def _heading(shown: Shown, width: int) -> Text:
-    status, title = shown.status, Text(printable(shown.title), style="bold")
-    title.truncate(_TITLE, overflow="ellipsis")
-    simulated = shown.controller == SIMULATED
-    text = title.append(f"  {shown.controller}", "bold green" if simulated else "bold yellow")
-    if status is None:
-        return text.append("  beginning", "dim")
-    left = shown.left or f"{clock(status.time_left)} left"
-    text.append(f"  {_phase(status)}", "bold cyan")
-    text.truncate(max(0, width - len(left) - 2), overflow="ellipsis")
-    return text.append(left.rjust(width - text.cell_len), "bold")
-
-
-def _bar_of_motion(motion: MotionProgress, width: int) -> Text:
-    times = _times(motion)
-    done = 0.0 if motion.motion_time is None else motion.motion_time / (motion.duration or math.inf)
-    return _bar(done, width - len(times) - 1, "cyan").append(f" {times}")
-
-
-def _state(shown: Shown) -> Text:
-    text, motion = Text(), None if shown.status is None else shown.status.motion
-    if shown.stopping or shown.request.held:
-        word, hue = ("STOPPING", "red") if shown.stopping else ("HELD", "yellow")
-        text.append(f" {word} ", style=f"bold {hue} reverse").append("  ")
-    if shown.age > STALE and shown.status is not None:
-        text.append(f"no news for {shown.age:.0f} s  ", style="bold red")
-    override = shown.request.override if motion is None else motion.override
-    text.append(f"override {100.0 * override:.0f} %")
-    if motion is not None and motion.rate is not None:
-        text.append(f", now {100.0 * motion.rate:.0f} %", style="dim")
-    if motion is not None:
-        text.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
-    return text
-
-
-def _joints(names: Sequence[str], motion: MotionProgress, width: int) -> list[Text]:
-    """Return a line per joint: following error and current with their shares of the limits."""
+def _motion_rows(names: Sequence[str], motion: MotionProgress) -> list[RenderableType]:
+    """Return progress and packets of a motion, and a table of its joints."""
+    progress = Table.grid(padding=(0, 1), expand=True)
+    progress.add_column(ratio=1)
+    progress.add_column(no_wrap=True)
+    done, total = motion.motion_time or 0.0, motion.duration or math.inf
+    progress.add_row(ProgressBar(total, done), _times(motion))
+    lost = motion.missed or motion.late or motion.not_accepted
+    packets = Text(f"cycles {motion.cycles}, {_packets(motion)}", "bold yellow" if lost else "")
     if motion.following_error is None or motion.current is None:
-        return []
+        return [progress, packets]
     assert motion.following_share is not None
     assert motion.current_share is not None
-    bars = max(1, (width - _NAME - _NUMBERS) // 2)
-    titles = "".join(
-        f"  {title}".ljust(14 + bars)
-        for title in ("following error / threshold", "current / limit")
-    )
-    rows = [Text("joint".ljust(_NAME) + titles, style="bold")]
+    joints = Table(box=None, pad_edge=False, expand=True)
+    joints.add_column("joint", no_wrap=True)
+    for title in ("following error", "of its threshold", "current", "of its limit"):
+        joints.add_column(title, justify="right", no_wrap=True)
     for index, name in enumerate(names):
-        line = Text(name[:_NAME].ljust(_NAME))
-        for value, share in (
-            (f"{np.degrees(motion.following_error[index]):8.3f}°", motion.following_share[index]),
-            (f"{motion.current[index]:7.2f} A", motion.current_share[index]),
-        ):
-            line.append(f"{value} ").append_text(_bar(share, bars - 1, colour(share)))
-            line.append(f" {100.0 * share:3.0f}%", style=colour(share))
-        rows.append(line)
-    return rows
+        joints.add_row(
+            Text(name),
+            f"{np.degrees(motion.following_error[index]):.3f}°",
+            _share(motion.following_share[index]),
+            f"{motion.current[index]:.2f} A",
+            _share(motion.current_share[index]),
+        )
+    return [progress, packets, joints]
 
 
-def _drift(drift: DriftCurve, width: int) -> Text:
-    text = Text(f"warm-up: {_drift_text(drift)}  ")
-    return text.append(curve(drift.change, max(0, width - text.cell_len)), style="cyan")
-
-
-def _drift_text(drift: DriftCurve) -> str:
-    known = drift.change[np.isfinite(drift.change)]
-    change = f"{100.0 * known[-1]:.1f} %" if len(known) else "?"
-    return f"friction changed by {change} (warm below {100.0 * drift.threshold:g} %)"
-
-
-def _bar(share: float, width: int, style: str) -> Text:
-    """Return a bar of a share of a limit, full from 1 on."""
-    filled = round(max(0, width) * float(np.clip(np.nan_to_num(share), 0.0, 1.0)))
-    return Text.assemble(("█" * filled, style), ("·" * (width - filled), "dim"))
-
-
-def colour(share: float) -> str:
-    """Return the style of a share of a limit."""
-    if share <= WARNING:
-        return "green"
-    return "yellow" if share <= 1.0 else "bold red"
-
-
-def curve(values: Array, width: int) -> str:
-    """Return the last `width` finite values as a row of blocks, from 0 to the largest of them."""
-    shown = np.maximum(values[np.isfinite(values)], 0.0)[-max(1, width) :]
-    step = (shown.max(initial=0.0) or 1.0) / len(_HEIGHTS)
-    return "".join(_HEIGHTS[min(len(_HEIGHTS) - 1, int(value / step))] for value in shown)
+def _share(share: float) -> Text:
+    colour = "bold red" if share > 1.0 else "yellow" if share > WARNING else "green"
+    return Text(f"{share:.0%}", style=colour)
 
 
 def clock(seconds: float) -> str:
@@ -360,60 +239,6 @@ def clock(seconds: float) -> str:
     minutes, rest = divmod(max(0, round(seconds)), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
-
-
-def duration(seconds: float) -> str:
-    """Return a latency as text."""
-    if not math.isfinite(seconds):
-        return "> 5 ms"
-    return f"{1e3 * seconds:.1f} ms" if seconds >= 1e-3 else f"{1e6 * seconds:.0f} µs"
-
-
-# --- time left
-
-_KNOWN_AFTER: Final = 2.0
-"""s of motion and of waiting after which the time left in virtual time is shown."""
-_BETWEEN: Final = 0.6
-"""Initial estimate of the time between two motions, s."""
-
-
-class Pace:
-    """Estimates the waiting time per second of motion, 1 in real time, and between motions."""
-
-    def __init__(self, *, virtual: bool) -> None:
-        self._virtual = virtual
-        self._waited = self._moved = 0.0
-        self._between = self._gaps = 0.0
-        self._last: tuple[float, RunStatus] | None = None
-
-    def update(self, status: RunStatus, now: float, *, held: bool) -> None:
-        """Update the estimate with a status at `now` [s, monotonic clock], not during a hold."""
-        if self._last is not None and not held:
-            came, last = self._last
-            waited, moved = now - came, last.time_left - status.time_left
-            between = status.motion is None or last.motion is None
-            self._gaps += 0.5 * ((status.motion is None) != (last.motion is None))  # begin, end
-            if between or moved == 0.0:
-                self._between += waited
-            elif moved > 0.0:  # another override makes what is left longer
-                self._waited += waited
-                self._moved += moved
-                self._between += 0.0 if self._virtual else waited - moved
-        self._last = (now, status)
-
-    def pause(self) -> None:
-        """Leave out the time until the next status, in which the operator is asked."""
-        self._last = None
-
-    def left(self, status: RunStatus) -> float | None:
-        """Return the waiting time to the end of the run [s]; None if it is not known yet."""
-        changes = status.motions_left + (status.motion is None)
-        between = changes * (_BETWEEN + self._between) / (1.0 + self._gaps)
-        if not self._virtual:
-            return status.time_left + between
-        if min(self._waited, self._moved) < _KNOWN_AFTER:
-            return None
-        return status.time_left * self._waited / self._moved + between
 
 
 # --- questions
@@ -468,7 +293,7 @@ def confirmed(console: Console, question: str, word: str, stop: Stop) -> bool:
 REFRESH_PERIOD: Final = 0.1  # s between two pictures
 LINE_EVERY: Final = 5.0  # s between two lines where there is no terminal
 FAREWELL: Final = 0.5  # s that a terminal may take for the last picture
-NEWEST, REMEMBERED = 8, 200
+NEWEST, REMEMBERED = 5, 200
 """Messages that are shown, and that are printed at the end."""
 
 
@@ -494,7 +319,6 @@ class Screen:
         stop: set by the keys s and q.
         title: of the run.
         controller: `SIMULATED`, or the controller's address.
-        virtual: whether time is virtual; the time left is that of waiting in any case.
         quiet: show nothing and read no keys.
         console: written to; standard output if left out.
     """
@@ -506,7 +330,6 @@ class Screen:
         *,
         title: str = "hil",
         controller: str = "",
-        virtual: bool = False,
         quiet: bool = False,
         console: Console | None = None,
     ) -> None:
@@ -515,8 +338,9 @@ class Screen:
         self._quiet = quiet
         self._stop = stop
         self._request = OperatorRequest()
-        self._shown = Shown(title, tuple(joint_names), keys=False, controller=controller)
-        self._pace = Pace(virtual=virtual)
+        self._title, self._controller = title, controller
+        self._names = tuple(joint_names)
+        self._status: RunStatus | None = None
         self._came = time.monotonic()
         self._messages: deque[str] = deque(maxlen=REMEMBERED)
         self._undo = contextlib.ExitStack()
@@ -536,7 +360,6 @@ class Screen:
             stop,
             title=title or cell.name,
             controller=controller_of(cell),
-            virtual=cell.controller.transport == "simulated",
             quiet=quiet,
         )
 
@@ -551,11 +374,7 @@ class Screen:
     def show(self, status: RunStatus) -> None:
         """Show the progress of the run at once. ScreenError: the drawing thread has ended."""
         self._came = time.monotonic()
-        self._pace.update(status, self._came, held=self._request.held)
-        waiting = self._pace.left(status)
-        left = f"{clock(status.time_left)} of motion left"
-        left = left if waiting is None else f"{clock(waiting)} left"
-        self._shown = replace(self._shown, status=status, left=left)
+        self._status = status
         self._leave_dry_run(status)
         if self._undrawn is not None:
             raise ScreenError(f"{type(self._undrawn).__name__}: {self._undrawn}")
@@ -577,10 +396,9 @@ class Screen:
         if not self.can_answer:
             return False
         self._undo.close()
-        self._pace.pause()
         try:
             self._print_messages_at_end()
-            return not self._stuck and ask(self._console, self._shown.title, found, self._stop)
+            return not self._stuck and ask(self._console, self._title, found, self._stop)
         finally:
             try:
                 self._open()
@@ -603,23 +421,54 @@ class Screen:
         if _ACTIONS.get(key) == "stop":
             self._stop.requested = True
             return
-        motion = None if self._shown.status is None else self._shown.status.motion
+        motion = None if self._status is None else self._status.motion
         with self._changing:
             override = self._request.override
             if motion is not None:
                 override = min(override, motion.override)
             self._request = after(self._request, key, override)
 
-    def shown(self) -> Shown:
-        """Return the present state of the screen."""
-        return replace(
-            self._shown,
-            request=self._request,
-            stopping=self._stop.requested,
-            age=time.monotonic() - self._came,
-            messages=tuple(self._messages)[-NEWEST:],
-            keys=self._keyboard is not None and self._keyboard.attached,
-        )
+    @property
+    def age(self) -> float:
+        """Time since the last status [s]."""
+        return time.monotonic() - self._came
+
+    def picture(self) -> Layout:
+        """Return the present picture, made for 80 columns and 24 lines."""
+        status, request = self._status, self._request
+        motion = None if status is None else status.motion
+        top = Table.grid(padding=(0, 2), expand=True)
+        top.add_column(no_wrap=True, ratio=1)
+        top.add_column(no_wrap=True, justify="right")
+        simulated = self._controller == SIMULATED
+        title = Text(printable(self._title), style="bold")
+        title.append(f"  {self._controller}", "bold green" if simulated else "bold yellow")
+        left = ""
+        if status is not None:
+            title.append(f"  {status.phase} {status.number} of {status.total}", "bold cyan")
+            left = f"{clock(status.time_left)} of motion left"
+        top.add_row(title, left)
+        state = Text()
+        if self._stop.requested or request.held:
+            stopping = self._stop.requested
+            word, colour = ("STOPPING", "red") if stopping else ("HELD", "yellow")
+            state.append(f" {word} ", style=f"bold {colour} reverse").append("  ")
+        if status is not None and self.age > STALE:
+            state.append(f"no news for {self.age:.0f} s  ", style="bold red")
+        state.append(f"override {request.override if motion is None else motion.override:.0%}")
+        if motion is not None and motion.rate is not None:
+            state.append(f", now {motion.rate:.0%}")
+        if motion is not None:
+            state.append(f"   {motion.state.name.lower().replace('_', ' ')}", style="dim")
+        rows: list[RenderableType] = [top, state]
+        rows += [] if motion is None else _motion_rows(self._names, motion)
+        newest = tuple(self._messages)[-NEWEST:]
+        rows += [Text(), *(Text(printable(one, keep=""), style="dim") for one in newest)]
+        keys = self._keyboard is not None and self._keyboard.attached
+        help_line = Text(HELP if keys else "Ctrl-C stops on the path", style="reverse")
+        page = Layout()
+        page.split_column(Layout(Group(*rows)), Layout(help_line, size=1))
+        return page
 
     def _leave_dry_run(self, status: RunStatus) -> None:
         """Reset the override after the dry run; a hold remains."""
@@ -651,7 +500,7 @@ class Screen:
         def draw() -> None:
             try:
                 while not over.wait(REFRESH_PERIOD):
-                    display(self.shown())
+                    display()
             except Exception as error:  # reported by `show`
                 self._undrawn = error
             with contextlib.suppress(Exception):
@@ -667,19 +516,19 @@ class Screen:
 
         self._undo.callback(close)
 
-    def _draw_page(self, live: Live, shown: Shown) -> None:
-        live.update(Group(*lines(shown, *self._console.size)), refresh=True)
+    def _draw_page(self, live: Live) -> None:
+        live.update(self.picture(), refresh=True)
 
-    def _print_line(self, shown: Shown) -> None:
+    def _print_line(self) -> None:
         """Print new messages, and a status line every `LINE_EVERY` s and for each motion."""
         self._print_messages()
-        status = shown.status
-        if status is None or shown.age > LINE_EVERY:
+        status = self._status
+        if status is None or self.age > LINE_EVERY:
             return
         at = (status.phase, status.number)
         if at != self._line_of or time.monotonic() >= self._line_due:
             self._line_of, self._line_due = at, time.monotonic() + LINE_EVERY
-            put(self._console, status_line(status, shown.left))
+            put(self._console, status_line(status))
 
     def _print_messages(self) -> None:
         while self._messages:

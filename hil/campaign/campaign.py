@@ -30,7 +30,6 @@ from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
     from hil.identify import Identification, Options
-    from sim_fixtures import SimulatedDrive
 
     from .run import RunResult
 
@@ -139,7 +138,6 @@ class Campaign:
         seed: int | None = None,
         stop: Stop | None = None,
         again: bool = False,
-        drive: SimulatedDrive | None = None,
     ) -> Rehearsal:
         """Run the plan on a simulated copy of the cell, and judge it.
 
@@ -151,8 +149,6 @@ class Campaign:
             seed: of the simulated parameters, noise and link faults.
             stop: ends it early.
             again: repeat a passed rehearsal.
-            drive: gears and motors of the simulated arm in place of the cell's; the result is then
-                only returned, and opens no gate.
 
         Raises:
             MotionRefusedError: a motion breaks a limit of the cell.
@@ -167,7 +163,6 @@ class Campaign:
             seed=SEED if seed is None else seed,
             stop=stop,
             again=again,
-            drive=drive,
         )
 
     def identify(

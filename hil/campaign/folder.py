@@ -21,7 +21,6 @@ from hil.files import (
     digest,
     file_digest,
     file_lock,
-    is_locked,
     json_digest,
     write_atomically,
     write_output,
@@ -40,7 +39,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 LOCK: Final = "campaign.lock"
-LOCK_PATIENCE: Final = 0.5  # s to wait for a lock: `busy` holds it for a moment
+LOCK_PATIENCE: Final = 0.5  # s to wait for a lock
 MESH: Final = "mesh "  # Prefix of the entry of a mesh, by its name in the URDF
 MISSING: Final = "missing"
 _ANOTHER: Final = "{} is not the one this campaign began with"
@@ -192,18 +191,6 @@ class CampaignFolder:
         """SHA-256 over the present cell, URDF, plan and collision meshes."""
         return json_digest(self._inputs())
 
-    @property
-    def motion_hash(self) -> str:
-        """SHA-256 as `plan_hash`, without the number of repetitions."""
-        contents = self._contents()
-        sums = self._checksums(contents)
-        try:
-            cell = parse_toml(as_text(contents[self.cell.name]))
-        except (KeyError, ValueError):
-            return json_digest(sums)  # not a cell that can be run
-        cell.get("campaign", {}).pop("repetitions", None)
-        return json_digest(sums | {self.cell.name: json_digest(cell)})
-
     def hash_of(self, cell: Cell, plan: CampaignPlan) -> str:
         """Return the hash of a cell and a plan in memory, which must be those of the folder.
 
@@ -244,11 +231,6 @@ class CampaignFolder:
             return CampaignFolderError(self.root, problem, "make it a writable file")
 
         return file_lock(self.root / LOCK, refusal, patience=LOCK_PATIENCE)
-
-    @property
-    def busy(self) -> bool:
-        """Whether a run uses the folder now."""
-        return is_locked(self.root / LOCK)
 
     def seal(self) -> None:
         """Create the manifest with the checksums of cell, URDF, plan and meshes."""

@@ -41,9 +41,7 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
                 f"rehearsal: run `hil rehearse {root}`",
             )
         return
-    if (warning := require_rehearsed(run.folder, run.plan_hash).warning) is not None:
-        run.notes.append(warning)
-        run.reporter.say(f"note: {warning}")
+    require_rehearsed(run.folder, run.plan_hash)
     # Refused before anything moves if the dry run could not be accepted afterwards.
     found, first = dry_run.found(), f"run `hil run {root} --dry-run`"
     if found is None and run.accept_dry_run and not run.simulated:
@@ -69,7 +67,7 @@ def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> R
     rehearse = f"run `hil rehearse {folder.root}`"
     if found is None:
         raise NotRehearsedError(folder.root, "was not rehearsed", rehearse)
-    if not found.covers(folder, folder.plan_hash if plan_hash is None else plan_hash):
+    if found.plan_hash != (plan_hash or folder.plan_hash):
         what = "was rehearsed with another cell, URDF or plan than it has now"
         raise NotRehearsedError(folder.root, what, f"{rehearse} again")
     if not found.passed:

@@ -27,16 +27,18 @@ from hil.errors import ControllerFault
 
 from .motion_link import (
     END_TIMEOUT,
+    REQUEST_PERIOD,
     Connection,
+    Counts,
     MotionLink,
     Progress,
     StartTimeout,
+    Steering,
     Watch,
     described,
     recording_end,
 )
 from .operator import Stop
-from .steering import REQUEST_PERIOD, PacketCounts, Steering
 
 DRAIN_CYCLES: Final = 100
 """Cycles after which records are archived: 100 ms at 1 kHz, the flush period."""
@@ -237,10 +239,10 @@ class Link(MotionLink):
     def _exchange_until(self, finished: Callable[[], bool], _consequence: str, /) -> None:
         exchange(self.transport, self.session, until=finished)
 
-    def _counts(self) -> PacketCounts:
+    def _counts(self) -> Counts:
         counters = self.session.counters
         late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
-        return PacketCounts(counters.answered, counters.missed, late, counters.not_accepted)
+        return counters.answered, counters.missed, late, counters.not_accepted
 
 
 class _Archiving:
@@ -262,7 +264,6 @@ class _Archiving:
         earlier = self._overflow
         self._overflow = link.ring.overflow
         if self.steering is not None:
-            self.steering.add_events(events)
             self.steering.add_records(records)
         if self._failure is not None:
             recorder.update(events)

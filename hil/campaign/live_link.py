@@ -32,7 +32,6 @@ from drivers.events import (
 from drivers.exchange.control import ControlBlock, HeartbeatMonitor
 from drivers.exchange.event_log import (
     NO_ARCHIVE,
-    NO_SUPERVISOR,
     EventsLost,
     ExchangeEnded,
     ExchangeEvent,
@@ -67,9 +66,11 @@ from hil.terminal_text import plural
 from .motion_link import (
     END_TIMEOUT,
     Connection,
+    Counts,
     MotionLink,
     Progress,
     StartTimeout,
+    Steering,
     Watch,
     active_drive_train,
     active_guard,
@@ -77,7 +78,6 @@ from .motion_link import (
     recording_end,
 )
 from .operator import Stop
-from .steering import PacketCounts, Steering
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -113,7 +113,6 @@ class Heartbeat:
     ) -> None:
         self._beat, self._clock = beat, clock
         self._turned: float | None = None
-        self._stalled = 0.0
         self._ended = False
 
     def start(self) -> None:
@@ -130,11 +129,6 @@ class Heartbeat:
         """End the thread."""
         self._ended = True
 
-    def begin(self) -> None:
-        """A motion is requested: forget the delays of before, and require turns of the loop."""
-        self._stalled = 0.0
-        self.turn()
-
     def turn(self) -> None:
         """The supervising loop turned; it must again within `STALL` s, until `rest`."""
         self._turned = self._clock()
@@ -146,21 +140,8 @@ class Heartbeat:
     def update(self) -> None:
         """Beat, unless the supervising loop stalls."""
         now, turned = self._clock(), self._turned
-        stalled = 0.0 if turned is None else now - turned
-        if stalled > STALL:
-            self._stalled = max(self._stalled, stalled)
-        else:
+        if turned is None or now - turned <= STALL:
             self._beat()
-
-    def with_cause(self, text: str) -> str:
-        """Return a reason of the exchange, with the cause where heartbeats paused for a stall."""
-        if not self._stalled:
-            return text
-        cause = (
-            f"show or request of the motion's watch did not return for {self._stalled:.1f} s, "
-            "so that no stop could be passed on"
-        )
-        return text.replace(NO_SUPERVISOR, f"{NO_SUPERVISOR} ({cause})")
 
 
 @dataclass(eq=False)
@@ -168,7 +149,6 @@ class ExchangeView:
     """State of the exchange process and of the motion requested last, from its events.
 
     Attributes:
-        with_cause: adds its cause to a reason of the process.
         lost: the last loss of the link.
         ended: the end of the motion, if its event came.
         inits: init packets so far.
@@ -179,7 +159,6 @@ class ExchangeView:
     """
 
     exchange: ExchangeProcess
-    with_cause: Callable[[str], str] = str
     connection: Connection = field(default_factory=Connection)
     lost: LinkLost | None = None
     ended: MotionEnded | None = None
@@ -221,7 +200,7 @@ class ExchangeView:
                 case ExchangeFailed():
                     self._last_message = event.trace.strip().splitlines()[-1]
                 case Leaving() | ExchangeEnded() if not self._last_message:
-                    self._last_message = self.with_cause(event.reason)
+                    self._last_message = event.reason
         return events
 
     def reset_motion(self) -> None:
@@ -301,7 +280,7 @@ class LiveLink(MotionLink):
     _READY: ClassVar[frozenset[State]] = frozenset((State.CLOSED, State.OPENING, State.OPEN))
 
     def __post_init__(self) -> None:
-        self.view = ExchangeView(self.exchange, with_cause=self.heart.with_cause)
+        self.view = ExchangeView(self.exchange)
         self.connection = self.view.connection
         self._restart_reader()
 
@@ -527,16 +506,9 @@ class LiveLink(MotionLink):
             self._position = records["position"][-1].copy()
         return records
 
-    def _counts(self) -> PacketCounts:
+    def _counts(self) -> Counts:
         status = self.view.status
-        return PacketCounts(
-            status.answered,
-            status.missed,
-            status.late,
-            status.not_accepted,
-            tuple(status.latencies),
-            1e-6 * status.worst_turnaround_us,
-        )
+        return status.answered, status.missed, status.late, status.not_accepted
 
     def _shut(self) -> str | None:
         """End both processes; return what was wrong with them, None if nothing was."""
@@ -577,7 +549,7 @@ class LiveLink(MotionLink):
                 f"{reason}; nothing was sent, run again: its limits are checked again"
             )
         self.view.reset_motion()
-        self.heart.begin()
+        self.heart.turn()
 
         def still_wanted() -> bool:
             self.heart.turn()
@@ -613,7 +585,7 @@ class LiveLink(MotionLink):
         guard = active_guard(self.cell, drives, self.connection.init)
         while True:
             self.heart.turn()
-            steering.add_events(view.poll())
+            view.poll()
             if stop.requested and not stop_sent:
                 self.exchange.stop()
                 stop_sent = True
@@ -657,7 +629,7 @@ class LiveLink(MotionLink):
         if ended.reason == NO_ARCHIVE and recorded.disk_waited > SLOW_DISK:
             waited = f"it waited for its disk for {recorded.disk_waited:.1f} s"
             return replace(ended, reason=f"{NO_ARCHIVE} ({waited}: check that disk)")
-        return replace(ended, reason=self.heart.with_cause(ended.reason))
+        return ended
 
     def _give_up(self, spec: ArchiveSpec, reason: str) -> MotionEnded:
         """Drop a motion that has not started; without an archive it cannot start any more."""

@@ -7,24 +7,26 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.drive_train import DriveTrain
+from drivers.drive_train import TURN, DriveTrain
 from drivers.errors import RequestError
 from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange.event_log import ExchangeEvent
-from drivers.exchange.process import WithdrawnError
+from drivers.exchange.process import ExchangeProcess, WithdrawnError
 from drivers.guard import Guard
 from drivers.init_check import InitCheck, compare, float32_text, is_narrower
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
+from drivers.session import Session
 from drivers.states import State
 from hil.archive import ArchiveSpec
 from hil.archive.recorder import Recorded, describe
@@ -32,8 +34,7 @@ from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 from hil.motion_checks import MotionChecks
 
-from .operator import MotionWatch, Stop, unwatched_motion
-from .steering import PacketCounts, Steering
+from .operator import MotionProgress, MotionWatch, Stop, unwatched_motion
 
 Array = NDArray[np.float64]
 
@@ -61,6 +62,133 @@ class StartTimeout:
         if now - self._requested > START_TIMEOUT:
             return f"the motion did not begin within {START_TIMEOUT:g} s ({state.name})"
         return None
+
+
+REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during a hold, s
+SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s
+
+Counts = tuple[int, int, int, int]
+"""Packets of a session that were answered, missed, answered late, and whose reply was not accepted;
+see `drivers.events.Counters`."""
+
+
+class Steering:
+    """Applies the requests of a motion's watch to the motion, and shows the motion to it.
+
+    Args:
+        most: largest fraction of the planned speed, whatever is requested.
+        counts: returns the present packet counts.
+
+    Attributes:
+        fraction: applied to the motion last.
+        held: whether a hold was applied last.
+
+    Raises:
+        ValueError: `most` is not in 0..1.
+    """
+
+    def __init__(
+        self, source: MotionSource, watch: MotionWatch, most: float, counts: Callable[[], Counts]
+    ) -> None:
+        if not 0.0 < most <= 1.0:
+            raise ValueError(f"an override of {most!r} is not above 0 and at most 1")
+        self.source, self._watch, self._most, self._counts = source, watch, most, counts
+        duration = getattr(source, "duration", None)
+        self._duration = float(duration) if isinstance(duration, int | float) else None
+        self.fraction, self.held = most, False
+        self._before = counts()
+        self._last: NDArray[np.void] | None = None
+        self._due = -math.inf
+
+    def begin(self, stop: Stop, meanwhile: Callable[[], object]) -> bool:
+        """Set the requested speed and wait while a hold is requested; return False after a stop.
+
+        Raises:
+            ControllerFault: it is to be slower than planned and supports no override.
+        """
+        request = self._watch.request()
+        while request.held and not stop.requested:
+            meanwhile()
+            time.sleep(REQUEST_PERIOD)
+            request = self._watch.request()
+        if stop.requested:
+            return False
+        self.fraction = min(self._most, request.override)
+        change = getattr(self.source, "override", None)
+        if callable(change):
+            change(self.fraction)
+        elif self.fraction < 1.0:
+            raise ControllerFault(
+                f"a {type(self.source).__name__} supports no override and cannot be run at "
+                f"{100.0 * self.fraction:.0f} %; nothing was sent"
+            )
+        self._before = self._counts()
+        return True
+
+    def unchanged(self, stop: Stop) -> bool:
+        """Return whether the motion may begin as `begin` left it: no stop, hold or lower speed."""
+        request = self._watch.request()
+        return not (stop.requested or request.held or request.override < self.fraction)
+
+    def follow(self, motion: Session | ExchangeProcess) -> None:
+        """Apply the present request. A motion held before it began begins at rest."""
+        request = self._watch.request()
+        fraction = min(self._most, request.override)
+        with suppress(RequestError):  # the motion has ended
+            if fraction != self.fraction:
+                self.fraction = fraction
+                motion.override(fraction)
+        with suppress(RequestError):
+            if request.held is not self.held:
+                self.held = request.held
+                (motion.hold if request.held else motion.resume)()
+
+    @property
+    def due(self) -> bool:
+        """Whether the motion is to be shown again."""
+        return time.monotonic() >= self._due
+
+    def add_records(self, records: NDArray[np.void]) -> None:
+        """Add cycle records; the last one is shown."""
+        if len(records):
+            self._last = records[-1:].copy()
+
+    def show(
+        self, drives: DriveTrain, guard: Guard, state: State, motion_time: float, rate: float
+    ) -> None:
+        """Show the motion at `motion_time` s, at `rate` of the planned speed (NaN if unknown).
+
+        Shares are of the active limits of `drives` and `guard`.
+        """
+        self._due = time.monotonic() + SHOW_PERIOD
+        answered, missed, late, not_accepted = np.subtract(self._counts(), self._before).tolist()
+        arrays: dict[str, Array] = {}
+        if self._last is not None:
+            last = self._last[0]
+            error = last["target_position"] - last["position"]
+            turns = np.abs(error @ drives.motor_from_joint.T) / TURN
+            arrays = {
+                "position": last["position"].copy(),
+                "following_error": error,
+                "following_share": turns / guard.following_error,
+                "current": last["target_current"].copy(),
+                "current_share": np.abs(last["target_current"]) / guard.current,
+            }
+        self._watch.show(
+            MotionProgress(
+                motion_time=None if math.isnan(motion_time) else motion_time,
+                duration=self._duration,
+                cycles=answered,
+                missed=missed,
+                late=late,
+                not_accepted=not_accepted,
+                state=state,
+                override=self.fraction,
+                rate=None if math.isnan(rate) else rate,
+                held=self.held,
+                **arrays,
+            )
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +454,7 @@ class MotionLink(ABC):
         """Return the cycle records since the last call."""
 
     @abstractmethod
-    def _counts(self) -> PacketCounts:
+    def _counts(self) -> Counts:
         """Return the packet counts of the session."""
 
     @abstractmethod

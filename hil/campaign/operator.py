@@ -74,15 +74,6 @@ class OperatorRequest:
             raise ValueError(f"an override of {self.override!r} is not one of 0..1")
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Time from a packet's arrival to its reply, in this motion [s]; `p99` is its 99 % quantile."""
-
-    median: float
-    p99: float
-    worst: float
-
-
 @dataclass(frozen=True, eq=False)
 class MotionProgress:
     """State of a motion. Joint arrays are (n,); None before the first record.
@@ -97,8 +88,6 @@ class MotionProgress:
         following_share, current_share: their magnitudes as shares of the active limits.
         override: the fraction requested last.
         rate: present fraction of the planned speed; None if unknown.
-        latency: None in virtual time, and before the first reply.
-        events: the last events of this motion, oldest first.
     """
 
     motion_time: float | None
@@ -116,8 +105,6 @@ class MotionProgress:
     override: float = 1.0
     rate: float | None = None
     held: bool = False
-    latency: Latency | None = None
-    events: tuple[str, ...] = ()
 
 
 class MotionWatch(Protocol):
@@ -141,23 +128,6 @@ Phase = Literal["dry run", "warm-up", "standstill", "repetition", "validation", 
 
 
 @dataclass(frozen=True, eq=False)
-class DriftCurve:
-    """Change of friction from motion to motion while the joints warm up.
-
-    Attributes:
-        friction: (k, n) friction of each motion so far [N·m], by the measure of `warmup`.
-        change: (k,) largest change of any joint from the motion before, as a share of its
-            friction; NaN for the first.
-        threshold: change below which the joints count as warm.
-    """
-
-    joint_names: tuple[str, ...]
-    friction: Array
-    change: Array
-    threshold: float
-
-
-@dataclass(frozen=True, eq=False)
 class RunStatus:
     """Progress of a run, about ten times a second while the arm moves.
 
@@ -166,10 +136,7 @@ class RunStatus:
         total: number of its kind; of a warm-up, the largest number.
         time_left: of motion to the end of the run, the present one at its override [s]; of a
             warm-up with its least number of motions.
-        motions_left: after the present one.
         motion: the motion that is being run; None between two.
-        drift: of the warm-up so far, None without one.
-        notes: on the quality of the last repetitions, newest last.
     """
 
     phase: Phase
@@ -177,9 +144,6 @@ class RunStatus:
     total: int
     time_left: float
     motion: MotionProgress | None = None
-    drift: DriftCurve | None = None
-    notes: tuple[str, ...] = ()
-    motions_left: int = 0
 
 
 class Operator(Protocol):
@@ -224,8 +188,6 @@ class Unattended:
 
 unwatched_motion = Unattended()  # For motions without a watch
 
-NOTES = 4  # Notes on quality that are shown
-
 
 @dataclass(eq=False)
 class RunWatch:
@@ -250,10 +212,9 @@ class RunWatch:
     _request: OperatorRequest = OperatorRequest()
     _problems: dict[str, str] = field(default_factory=dict)
 
-    def expect(self, times: list[float]) -> None:
-        """Add motions that are to be run, with the duration of each [s]."""
-        self.time_left += sum(times)
-        self.status = replace(self.status, motions_left=self.status.motions_left + len(times))
+    def expect(self, duration: float) -> None:
+        """Add motions that are to be run, with their duration in all [s]."""
+        self.time_left += duration
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
         """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
@@ -264,17 +225,7 @@ class RunWatch:
             phase=cast(Phase, KIND_NAMES.get(kind, kind)),
             number=number,
             total=total,
-            motions_left=max(0, self.status.motions_left - 1),
         )
-
-    def add_note(self, text: str) -> None:
-        """Add a line on the quality of the motion that has ended."""
-        self._duration = 0.0
-        self._show(None, notes=(*self.status.notes, text)[-NOTES:])
-
-    def set_drift(self, drift: DriftCurve) -> None:
-        """Set the state of the warm-up."""
-        self.status = replace(self.status, drift=drift)
 
     def show(self, progress: MotionProgress) -> None:
         """See `MotionWatch.show`."""

@@ -58,9 +58,8 @@ class Rehearsal(Frozen):
     motion_seconds: float
     software: dict[str, str]
     failed_seeds: tuple[int, ...] = ()
-    """Seeds with which this plan failed before."""
     motion_hash: str = ""
-    """As `plan_hash`, without the number of repetitions; empty in files of older versions."""
+    """Of earlier versions, not used."""
 
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:
@@ -84,42 +83,17 @@ class Rehearsal(Frozen):
         """Write the file (OutputError if the disk refuses)."""
         write_output(path, self.model_dump_json(indent=1) + "\n")
 
-    def covers(self, folder: CampaignFolder, plan_hash: str) -> bool:
-        """Return whether it is of this plan, up to the number of repetitions."""
-        if self.plan_hash == plan_hash:
-            return True
-        return folder.plan_hash == plan_hash and folder.motion_hash == self.motion_hash
-
     @property
     def failures(self) -> tuple[str, ...]:
         """Criteria that were not met, in sentences."""
         return tuple(one.sentence for one in self.criteria if not one.passed)
 
-    def after(self, before: Rehearsal | None) -> Rehearsal:
-        """Return this rehearsal with the seeds with which the same plan failed before."""
-        same = before is not None and (
-            before.plan_hash == self.plan_hash or before.motion_hash == self.motion_hash
-        )
-        if before is None or not same:
-            return self
-        failed = {*before.failed_seeds} | (set() if before.passed else {before.seed})
-        return self.model_copy(update={"failed_seeds": tuple(sorted(failed - {self.seed}))})
-
-    @property
-    def warning(self) -> str | None:
-        """Warning of a passed rehearsal, in a sentence; None for none."""
-        if not self.passed or not self.failed_seeds:
-            return None
-        seeds = ", ".join(map(str, self.failed_seeds))
-        return f"the rehearsal passed with seed {self.seed}, but failed with seed {seeds}"
-
     @property
     def line(self) -> str:
         """Its result, in one sentence."""
         if self.passed:
-            but = "" if self.warning is None else f"; {self.warning}"
             return (
                 f"the rehearsal passed all {len(self.criteria)} criteria; what it cannot detect "
-                f"is in rehearsal.json (not_seen){but}"
+                "is in rehearsal.json (not_seen)"
             )
         return f"the rehearsal failed: {'; '.join(self.failures)}"

@@ -40,7 +40,7 @@ from identification.distributions import normal_limit
 from identification.errors import IdentificationError
 from identification.signals.recording import RecordingError
 from identification.validation.prediction import pooled_error, prediction_error
-from sim_fixtures import ServoSettings, SimulatedDrive, SimulationError, UnmodelledEffects
+from sim_fixtures import ServoSettings, SimulationError, UnmodelledEffects
 
 from .campaign import Campaign
 from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
@@ -101,7 +101,7 @@ class Twin:
         )
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
-    def link(self, seconds: float, *, effects: bool, drive: SimulatedDrive | None = None) -> Link:
+    def link(self, seconds: float, *, effects: bool) -> Link:
         """Return a link in virtual time to the arm, with random faults."""
         table = self.cell.controller
         # The current loop has the delay of `[controller] current_delay_cycles`.
@@ -114,11 +114,7 @@ class Twin:
             while_silent="continue",
         )
         controller = simulated_controller(
-            self.cell,
-            settings=settings,
-            effects=effects,
-            drive=drive,
-            seed=self.seed,
+            self.cell, settings=settings, effects=effects, seed=self.seed
         )
         faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
         return Link.over(
@@ -328,8 +324,6 @@ def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[
 REPETITIONS: Final = 3
 """Repetitions of the excitation: enough for their scatter, few enough for a minute."""
 SEED: Final = 1
-OTHER_DRIVE: Final = "other_drive"
-"""Folder of a rehearsal with other gears and motors than the cell's; it opens no gate."""
 
 
 def rehearse(
@@ -339,7 +333,6 @@ def rehearse(
     seed: int = SEED,
     stop: Stop | None = None,
     again: bool = False,
-    drive: SimulatedDrive | None = None,
 ) -> Rehearsal:
     """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
 
@@ -351,39 +344,28 @@ def rehearse(
         plan_hash = folder.hash_of(campaign.cell, campaign.plan)
         folder.accept_changes()
         require_runnable(campaign.cell, campaign.plan)
-        if drive is not None:
-            where = folder.rehearsed / OTHER_DRIVE
-            shutil.rmtree(where, ignore_errors=True)
-            return _rehearsed(campaign, where, plan_hash, reporter, seed, stop, drive)
         before = None
         with suppress(HilError):  # a file that cannot be read is replaced
             before = Rehearsal.load(folder)
-        same = before is not None and before.covers(folder, plan_hash) and before.seed == seed
+        same = before is not None and (before.plan_hash, before.seed) == (plan_hash, seed)
         if before is not None and same and before.passed and not again:
             reporter.say("this plan has passed its rehearsal already")
             return before
-        if again or (same and before is not None):
+        if again or same:
             shutil.rmtree(folder.rehearsed, ignore_errors=True)
-        found = _rehearsed(campaign, folder.rehearsed, plan_hash, reporter, seed, stop, None)
+        found = _rehearsed(campaign, plan_hash, reporter, seed, stop)
         if folder.hash_of(campaign.cell, campaign.plan) != plan_hash:
             raise CampaignFolderError(
                 folder.root, "a mesh was changed during the rehearsal", "rehearse again"
             )
-        found = found.after(before)
         found.save(folder.rehearsal)
         return found
 
 
 def _rehearsed(
-    campaign: Campaign,
-    root: Path,
-    plan_hash: str,
-    reporter: Reporter,
-    seed: int,
-    stop: Stop,
-    drive: SimulatedDrive | None,
+    campaign: Campaign, plan_hash: str, reporter: Reporter, seed: int, stop: Stop
 ) -> Rehearsal:
-    """Run the plan below `root` and judge it."""
+    """Run the plan in the folder of the rehearsal and judge it."""
     twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
     for sentence in twin.assumed:
         reporter.say(f"assumed: {sentence}")
@@ -392,11 +374,11 @@ def _rehearsed(
     for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
         # One repetition shows the effects that the model leaves out.
         cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
-        rehearsal = _campaign(root / where, replace(campaign, cell=cell))
+        rehearsal = _campaign(campaign.folder.rehearsed / where, replace(campaign, cell=cell))
         reporter.say(f"rehearsing on a simulated arm, {name}")
         motions = planned_intervals(rehearsal.cell, rehearsal.plan)
         planned = sum(one.trajectory.duration for one in motions)
-        link = twin.link(planned, effects=effects, drive=drive)
+        link = twin.link(planned, effects=effects)
         failure = _failure(rehearsal, link, twin, reporter, stop)
         seconds += link.cycles * cell.period
         criteria.append(
@@ -417,7 +399,6 @@ def _rehearsed(
     names = {one.name for one in criteria}
     return Rehearsal(
         plan_hash=plan_hash,
-        motion_hash=campaign.folder.motion_hash,
         seed=seed,
         passed=names == {*CRITERIA} and all(one.passed for one in criteria),
         criteria=criteria,

@@ -161,9 +161,7 @@ class Run:
             for interval in self.missing(kind):
                 warm = warm_up if kind == "excitation" else None
                 runner.run_until_accepted(interval, interval.index + 1, total, warm)
-                if kind == "excitation":
-                    self.watch.add_note(f"{interval}: good")
-                elif kind == "validation":
+                if kind == "validation":
                     warm_up.motion_ended()
 
     @contextmanager
@@ -201,11 +199,11 @@ class Run:
             straight = StraightMoves(cell, narrowed)
             joined = straight.joining([*slow, *full], start)
             runner = Runner(self, link, straight, start)
-            times = runner.times(joined, len(slow))
+            duration = runner.duration(joined, len(slow))
             if any(one.kind != "standstill" for one in full):
-                times += warm_up.expected()
-            self.watch.expect(times)
-            with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
+                duration += warm_up.expected()
+            self.watch.expect(duration)
+            with reporter.task("running the campaign (s of motion)", duration) as runner.task:
                 yield runner
             link.close()
         self.cycles = runner.cycles
@@ -320,9 +318,9 @@ class Runner:
         """Cycles archived so far."""
         return self._link.cycles - self._before
 
-    def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
-        """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
-        times, watched = [], slow > 0
+    def duration(self, joined: Sequence[Interval], slow: int) -> float:
+        """Return the duration of these motions [s]; the first `slow` ones are run slowly."""
+        duration, watched = 0.0, slow > 0
         for one in joined:
             share = OVERRIDE if slow else 1.0
             if one.kind == "move":
@@ -330,8 +328,8 @@ class Runner:
                 share = self._approach(OVERRIDE) if slow or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
-            times.append(one.trajectory.duration / share)
-        return times
+            duration += one.trajectory.duration / share
+        return duration
 
     def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
         """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
@@ -370,8 +368,7 @@ class Runner:
                 warm_up.motion_ended()
             if problem is None:
                 return name
-            run.watch.expect([interval.trajectory.duration])
-            run.watch.add_note(f"{interval}: rejected, {problem.sentence}")
+            run.watch.expect(interval.trajectory.duration)
             run.reporter.say(
                 f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"
             )

@@ -36,8 +36,7 @@ class Step:
         sentence: its result, or what is missing.
         command: to do it; "" for a step that is done, or for which there is no command.
         details: more sentences, for the report.
-        name: "design", "rehearse", "dry run", "warm-up", "repetitions", "validation", "identify"
-            or "report".
+        name: of the step.
     """
 
     state: State
@@ -54,12 +53,11 @@ class Step:
 
 @dataclass(frozen=True)
 class CampaignStatus:
-    """Progress of a campaign: its steps in order, and archives that are not used, in sentences."""
+    """Progress of a campaign: its steps in order."""
 
     root: str
     plan_hash: str
     steps: tuple[Step, ...]
-    notes: tuple[str, ...]
 
     @property
     def complete(self) -> bool:
@@ -104,7 +102,7 @@ def status_of(campaign: Campaign) -> CampaignStatus:
         first = first or ("" if step.done else name)
         command = f"hil {step.command.replace('{}', at)}" if step.command else ""
         steps.append(replace(step, command=command))
-    return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps), _notes(folder))
+    return CampaignStatus(str(folder.root), folder.plan_hash, tuple(steps))
 
 
 def _step(evaluate: Callable[[], Step], repair: str = "") -> Step:
@@ -126,13 +124,12 @@ def _rehearsal(folder: CampaignFolder) -> Step:
     found = Rehearsal.load(folder)
     if found is None:
         return Step("next", "not rehearsed on the simulated arm", "rehearse {}")
-    if not found.covers(folder, folder.plan_hash):
+    if found.plan_hash != folder.plan_hash:
         words = "rehearsed with another cell, URDF or plan than it has now"
         return Step("next", words, "rehearse {}")
-    but = "" if found.warning is None else f"; {found.warning}"
     return Step(
         "done" if found.passed else "next",
-        f"passed all {len(found.criteria)} criteria{but}" if found.passed else found.line,
+        found.line,
         "rehearse {}",
         (
             *(one.sentence for one in found.criteria),
@@ -200,22 +197,10 @@ def _warm_up(found: WarmUp | None) -> Step:
     """Return the step for the report: done if the arm was warm."""
     if found is None:
         return Step("next", "not done", "run {}")
-    details = []
-    if lost := len(found.earlier):
-        details.append(f"the arm cooled down in a pause after {plural(lost, 'motion')}")
-    if found.outcome == "not warm":
-        change = float(found.curve.change[-1]) if found.motions else math.nan
-        left = (
-            f"friction still changed by {change:.2%} a motion"
-            if math.isfinite(change)
-            else "no joint moved enough to measure its friction"
-        )
-        details.append(
-            f"{left}; below {found.threshold:.2%} was required: friction may have drifted during "
-            "the repetitions, and its mean over them is estimated"
-        )
     words = f"{found.outcome} after {plural(len(found.motions), 'motion')}"
-    return Step("done" if found.outcome == "warm" else "next", words, "run {}", tuple(details))
+    cold = found.outcome == "not warm" and bool(found.motions)
+    state: State = "done" if found.outcome == "warm" else "next"
+    return Step(state, words, "run {}", (found.sentence,) if cold else ())
 
 
 def _motions(campaign: Campaign, kind: str, words: str) -> Step:
@@ -245,24 +230,6 @@ def _reported(folder: CampaignFolder) -> Step:
     if folder.results.exists() and folder.results.stat().st_mtime > written + 1.0:
         return Step("next", "older than the results", "report {}")
     return Step("done", str(folder.report))
-
-
-def _notes(folder: CampaignFolder) -> tuple[str, ...]:
-    """Return archives that are not used, with the reason."""
-    entries = folder.manifest()
-    there = {path.name for path in folder.archives.glob("*.mcap")}
-    left = [
-        f"{name} was left by a run that ended abruptly; the next run uses it if it is complete and "
-        "needed"
-        for name in sorted(there - {one.name for one in entries})
-    ]
-    bad = [
-        f"{one.name} is {one.outcome}" + (f": {one.reason}" if one.reason else "")
-        for one in entries
-        if one.outcome != "completed"
-    ]
-    busy = ["it is in use by a run or a rehearsal"] if folder.busy else []
-    return (*busy, *folder.damaged(), *left, *bad)
 
 
 def conduct_of(folder: CampaignFolder) -> ConductResult:
@@ -297,7 +264,7 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
             verdict=warm.outcome,
             threshold=warm.threshold,
             friction=[list(one.friction) for one in warm.motions],
-            change=[float(c) if math.isfinite(c) else None for c in warm.curve.change],
+            change=[one if math.isfinite(one) else None for one in warm.changes],
         ),
         recorded=recorded,
     )

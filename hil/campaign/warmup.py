@@ -26,7 +26,6 @@ from planner import FourierSeries, PiecewiseCubic
 
 from .folder import load_record, save_record
 from .intervals import Interval
-from .operator import DriftCurve
 from .quality import Problem
 
 if TYPE_CHECKING:
@@ -114,18 +113,17 @@ class WarmUp:
         return self.moved_at is None or not 0.0 <= now - self.moved_at <= COLD_AFTER
 
     @property
-    def curve(self) -> DriftCurve:
-        """Friction and its change from motion to motion."""
+    def changes(self) -> list[float]:
+        """Largest change of any joint's friction up to each motion, as a share; NaN if unknown."""
         friction = np.array([one.friction for one in self.motions], dtype=np.float64)
         friction = friction.reshape(len(self.motions), len(self.joint_names))
-        change = [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
-        return DriftCurve(self.joint_names, friction, np.array(change), self.threshold)
+        return [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
 
     def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUp:
         """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
         known = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
-        done, change = len(longer.motions), longer.curve.change[-1]
+        done, change = len(longer.motions), longer.changes[-1]
         if done >= max(least, WINDOW) and change <= self.threshold:
             return replace(longer, outcome="warm")
         unknown = done >= least and np.isnan(change)  # and would be after more motions
@@ -139,7 +137,7 @@ class WarmUp:
     @property
     def sentence(self) -> str:
         """Its state in a sentence; it has had a motion."""
-        done, change = len(self.motions), float(self.curve.change[-1])
+        done, change = len(self.motions), self.changes[-1]
         return (
             f"warm-up: friction changes by {change:.2%} a motion after {done} motions, below "
             f"{self.threshold:.2%} the arm is warm: {self.outcome}"
@@ -223,29 +221,26 @@ class WarmUpStage:
         """Return the next motion of a warm-up; none where no warm-up is wanted."""
         return [self._interval(self._state())] if self._threshold else []
 
-    def expected(self) -> list[float]:
-        """Return the durations [s] of the motions that it runs at least."""
+    def expected(self) -> float:
+        """Return the duration of the motions that it runs at least [s]."""
         state, motions = self._state(), self.next_motion()
         if state.outcome != "going on":
-            return []
+            return 0.0
         missing = self._run.cell.campaign.warmup_least - len(state.motions)
-        return [motion.trajectory.duration for motion in motions] * max(missing, 0)
+        return sum(motion.trajectory.duration for motion in motions) * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
         """Run motions until the arm is warm (RepetitionsRejectedError: each attempt was slowed)."""
         if not self._threshold:
             return
         run, state = self._run, self._present()
-        run.watch.set_drift(state.curve)
         while state.outcome == "going on":
             interval, done = self._interval(state), len(state.motions)
             if done >= run.cell.campaign.warmup_least:
-                run.watch.expect([interval.trajectory.duration])
+                run.watch.expect(interval.trajectory.duration)
             name = runner.run_until_accepted(interval, done + 1, run.cell.campaign.warmup_most)
             state = self._saved(state, name, time.time())
-            run.watch.set_drift(state.curve)
-            run.watch.add_note(state.sentence)
-        run.reporter.say(state.sentence)
+            run.reporter.say(state.sentence)
 
     def rewarm(self, runner: Runner) -> None:
         """Warm up again if the joints have cooled down."""

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -15,7 +13,6 @@ from hil.campaign import (
     Campaign,
     CampaignFolder,
     CampaignFolderError,
-    MotionLink,
     design,
     plan_around,
     require_runnable,
@@ -24,7 +21,6 @@ from hil.campaign import (
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
-from hil.demo_link import CAN, LOOPBACK, loopback_link
 from hil.design import DesignResult
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.outcome import FILES, REPORT, RESULTS, SERIES
@@ -34,10 +30,6 @@ from hil.simulation import simulated_link, simulated_provenance
 from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
-PATIENCE = 0.5
-"""Longest extension of a cycle to wait for a reply over a real link, s: this PC need not be fit
-for a robot."""
-
 
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/demo"),
@@ -46,7 +38,6 @@ def demo(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     effects: Annotated[bool, typer.Option("--effects/--no-effects")] = False,
     excitation: Annotated[Path | None, typer.Option(metavar="FILE")] = None,
-    link: Literal["simulated", "udp", "can"] = "simulated",
     force: bool = False,
     resume: bool = False,
     quiet: QuietOption = False,
@@ -56,9 +47,7 @@ def demo(
 
     Writes `archives/*.mcap`, `results.json` and `report.html` to OUTPUT. The last line printed is
     the verdict: how well the identified model predicts motions that were not fitted. No hardware is
-    used; controller, drives and arm are simulated down to the packet. With --link udp or can the
-    campaign runs in real time, so reduce --repetitions. The CAN bus is internal to this computer,
-    with a cycle of 2 ms.
+    used; controller, drives and arm are simulated down to the packet, in virtual time.
 
     Options:
         output: Campaign folder to create.
@@ -69,8 +58,6 @@ def demo(
             elasticity, delay.
         excitation: Run this excitation (a result of `hil design` for the NS 16 cell) instead of
             searching one for a few seconds.
-        link: simulated: virtual time. udp, can: the controller runs in its own process and is
-            reached over sockets in real time.
         force: Replace an earlier campaign in OUTPUT.
         resume: Continue an interrupted campaign in OUTPUT.
     """
@@ -86,14 +73,6 @@ def demo(
         cell = Cell.load(CELL_PATH).with_campaign(
             repetitions=repetitions, validation_runs=validation, simulation_seed=seed
         )
-        if link != "simulated":
-            cell = cell.with_link(
-                transport=link,
-                host=LOOPBACK,
-                bind=LOOPBACK,
-                cycle_ms=2 if link == "can" else None,
-                can=CAN if link == "can" else None,
-            )
         plan = (
             design(cell, reporter)
             if excitation is None
@@ -109,20 +88,14 @@ def demo(
 def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
     """Run the missing motions on a simulated controller; Ctrl-C stops the arm, then the program."""
     cell, started = campaign.cell, time.perf_counter()
-    real_time = cell.controller.transport != "simulated"
-    if real_time:
-        reporter.say(
-            f"simulated controller in a separate process, over {cell.controller.transport}, in "
-            f"real time; unlike a real one it waits up to {PATIENCE:g} s for a reply"
-        )
-    with stop_on_interrupt() as stop, _link(cell, effects=effects) as link:
+    link = simulated_link(cell, effects=effects)
+    with stop_on_interrupt() as stop:
         try:
             campaign.run(
                 link,
                 stop,
                 reporter,
                 provenance=simulated_provenance(cell, effects),
-                durable=real_time,
                 unrehearsed=True,  # the arm is simulated
             )
         except ControllerFault as fault:
@@ -135,16 +108,6 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
         f"recorded {seconds:.0f} s of simulated motion in {took:.1f} s "
         f"({seconds / took:.1f} x real time)"
     )
-
-
-@contextmanager
-def _link(cell: Cell, *, effects: bool) -> Iterator[MotionLink]:
-    if cell.controller.transport == "simulated":
-        yield simulated_link(cell, effects=effects)
-        return
-    options = ("--patience", str(PATIENCE), *(("--effects",) if effects else ()))
-    with loopback_link(cell, options=options) as link:
-        yield link
 
 
 def _designed(path: Path, cell: Cell) -> Excitation:

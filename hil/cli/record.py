@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -12,17 +13,17 @@ import typer
 
 from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
-from hil.campaign import Progress, Stop, stop_on_interrupt
+from hil.campaign import Progress, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
 from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError
-from hil.progress import StatusLine, say
+from hil.progress import say
 from hil.recording import archive_path
 from hil.recording import record as record_motion
 
 LINE_PERIOD = 5.0
-"""Time between two lines without a terminal, s."""
+"""Time between two lines, s."""
 
 
 def record(
@@ -70,20 +71,17 @@ def record(
             loaded, accept_init=accept_init, live=None if live is None else LiveView.parse(live)
         ) as link,
     ):
-        view = View(loaded, stop, quiet=quiet or json)
-        link.connection.report = view.warn
+        view = View(loaded, quiet=quiet or json)
+        link.connection.report = partial(say, err=True)
         view.say(f"waiting for the controller; recording to {path}. Ctrl-C to stop")
         if link.live is not None:
             view.say(link.live.notice)
         for note in link.notes():
             view.say(f"note: {note}")
-        try:
-            done = record_motion(
-                link, loaded, path,
-                kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
-            )  # fmt: skip
-        finally:
-            view.clear()
+        done = record_motion(
+            link, loaded, path,
+            kind=kind, stop=stop, duration=duration, wait=wait, watch=view.show,
+        )  # fmt: skip
     early = _early_end(path, done, duration)
     figures = _figures(path, done, loaded)
     if not json:
@@ -129,28 +127,26 @@ def _line(figures: Mapping[str, object]) -> str:
     ).format_map(figures)
 
 
-class View(StatusLine):
-    """Progress of a recording: a status line on a terminal, else a line every 5 s."""
+class View:
+    """Progress of a recording: a line every 5 s, and one when it is over."""
 
-    def __init__(self, cell: Cell, stop: Stop, *, quiet: bool) -> None:
-        super().__init__(quiet=quiet)
-        self._cell, self._stop = cell, stop
+    def __init__(self, cell: Cell, *, quiet: bool) -> None:
+        self._cell, self._quiet = cell, quiet
         self._over, self._next = "", 0.0
 
-    def warn(self, text: str) -> None:
-        """Print a line to stderr, also when quiet."""
-        self.clear()
-        say(text, err=True)
+    def say(self, text: str) -> None:
+        """Print a line, unless quiet."""
+        if not self._quiet:
+            say(text)
 
     def show(self, progress: Progress) -> None:
-        """Update the display."""
+        """Print what has changed."""
         if progress.over != self._over:
             self._over = progress.over
             # Also when quiet: the arm still moves, and needs replies.
             how = "replying until the arm is at rest (Ctrl-C to exit at once)"
-            (self.warn if self.quiet else self.say)(f"{progress.over}; {how}")
-        self.update(lambda: self._line(progress))
-        if not self.live and time.monotonic() >= self._next:
+            say(f"{progress.over}; {how}", err=self._quiet)
+        if time.monotonic() >= self._next:
             self._next = time.monotonic() + LINE_PERIOD
             self.say(self._line(progress))
 
@@ -160,14 +156,11 @@ class View(StatusLine):
         parts = [
             progress.state.name.lower().replace("_", " "),
             f"{progress.cycles * self._cell.period:.1f} s",
-            f"{progress.missed} missed",
-            f"{progress.late} late",
+            f"{progress.missed} missed, {progress.late} late",
         ]
         if progress.not_accepted:
             parts.append(f"{progress.not_accepted} replies not accepted")
         if progress.position is not None and np.isfinite(progress.position).all():
             angles = np.degrees(self._cell.controller_angles(progress.position))
             parts.append(" ".join(f"{angle:.2f}°" for angle in angles))
-        if self._stop.requested:
-            parts.append("ending")
         return "  ".join(parts)

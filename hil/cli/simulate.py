@@ -14,7 +14,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.errors import InputError
 from hil.move import joint_index
-from hil.progress import StatusLine
+from hil.progress import say_at_once
 from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import plural, printable
@@ -40,62 +40,31 @@ WORDS: Final = {
 }
 
 
-class Status(StatusLine):
-    """Progress of a session: a line for each change of phase, and counts.
+class Status:
+    """Prints a line for each change of a session's phase; nothing if `quiet`."""
 
-    `stretch` is the largest extension of a cycle, s.
-    """
-
-    def __init__(
-        self, place: str, settings: ControllerSettings, *, quiet: bool, stretch: float = 0.0,
-        descriptor: int = 1,
-    ) -> None:  # fmt: skip
-        super().__init__(quiet=quiet, descriptor=descriptor)
-        self._place, self._settings, self._stretch = place, settings, stretch
+    def __init__(self, settings: ControllerSettings, *, quiet: bool) -> None:
+        self._settings, self._quiet = settings, quiet
         self._began = time.monotonic()
         self._phase: Phase | None = None
-        self._reason, self._cycles = "", -1
+        self._cycles = -1
 
-    def introduce(self, name: str) -> None:
-        """Print cell, link and settings."""
-        settings = self._settings
-        self.say(
-            f"{name}: a SIMULATED controller for {self._place}; nothing moves.\n"
-            f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, "
-            f"{'cold' if settings.cold_start else 'warm'} start, missing replies that end open "
-            f"mode: {settings.missed_replies}, process {os.getpid()}"
-        )
-        if self._stretch:
-            how = f"cycles are extended by up to {self._stretch:g} s to wait for a reply"
-            self.say(f"{how}, unlike a real controller")
+    def say(self, text: str) -> None:
+        """Print a line, unless the terminal blocks."""
+        if not self._quiet:
+            say_at_once(text)
 
-    def watch(self, controller: SimulatedController, tally: ServeCounts) -> None:
-        """Print changes since the last cycle."""
-        if self.quiet:
-            return
-        if controller.phase is not self._phase or tally.cycles < self._cycles:
-            self._phase = controller.phase
-            self._say_change(controller)
-        self._cycles = tally.cycles
-        self.update(lambda: self._line(tally))
-
-    def _say_change(self, controller: SimulatedController) -> None:
-        text, reason = WORDS[controller.phase], controller.reason
-        if controller.phase is Phase.OPENING:
-            text += f" in mode {self._settings.open_mode}"
-        if reason and reason != self._reason:
-            text += f": {reason}"
-        self._reason = reason
-        self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
-
-    def _line(self, tally: ServeCounts) -> str:
-        if not tally.cycles:
-            return f"waiting for a PC program at {self._place} ({tally.knocks} packets sent)"
-        return (
-            f"{tally.cycles} cycles, {tally.replies} replies, {tally.missed} missed, "
-            f"{tally.late} late, {tally.rejected} rejected, {tally.own_late} started late, "
-            f"{tally.stretched} stretched"
-        )
+    def watch(self, controller: SimulatedController, counts: ServeCounts) -> None:
+        """Print the phase if it has changed since the last cycle."""
+        phase = controller.phase
+        if phase is not self._phase or counts.cycles < self._cycles:
+            self._phase = phase
+            text = WORDS[phase]
+            if phase is Phase.OPENING:
+                text += f" in mode {self._settings.open_mode}"
+            text += f": {controller.reason}" if controller.reason else ""
+            self.say(f"{time.monotonic() - self._began:8.3f} s  {text}")
+        self._cycles = counts.cycles
 
 
 OWN_MOVE: Final = 30.0
@@ -202,10 +171,15 @@ def simulate(
         )
 
     link = open_controller_link(udp, can, settings, len(loaded.joint_names))
-    status = Status(udp or can or "", settings, quiet=json, stretch=patience)
+    status = Status(settings, quiet=json)
+    status.say(
+        f"{loaded.name}: a SIMULATED controller for {udp or can}; nothing moves.\n"
+        f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, process {os.getpid()}"
+    )
+    if patience:
+        status.say(f"cycles are extended by up to {patience:g} s to wait for a reply")
     try:
         with buttons(duration) as pressed, realtime_process(priority):
-            status.introduce(loaded.name)
             served = serve_session(
                 build,
                 link,
@@ -220,7 +194,6 @@ def simulate(
     if json:
         print_json(_figures(served))
     else:
-        status.clear()
         typer.echo(printable("\n".join(_sentences(served))))
     if not served.summary.ended and pressed.interrupted:
         raise typer.Exit(130)

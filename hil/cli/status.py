@@ -9,6 +9,7 @@ from rich.text import Text
 from hil.campaign import Campaign
 from hil.campaign.status import CampaignStatus
 from hil.cli.arguments import CampaignArgument, JsonOption, print_json
+from hil.progress import put
 from hil.terminal_text import printable
 
 _MARKS = {"done": ("done", "green"), "next": ("next", "bold yellow"), "blocked": ("blocked", "dim")}
@@ -20,8 +21,7 @@ def status(
 ) -> None:
     """Show which steps of CAMPAIGN are done, which is next, and its command.
 
-    Lists truncated, damaged and rejected archives. Changes nothing, and can be used while the
-    campaign runs.
+    Changes nothing, and can be used while the campaign runs.
     """
     found = Campaign.open(campaign).status()
     if json:
@@ -29,8 +29,7 @@ def status(
         return
     console = Console()
     console.print(_table(found))
-    for line in (*(f"note: {note}" for note in found.notes), _last(found)):
-        console.print(printable(line), markup=False, emoji=False, highlight=False, soft_wrap=True)
+    put(console, _last(found))
 
 
 def _last(found: CampaignStatus) -> str:

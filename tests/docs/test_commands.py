@@ -48,7 +48,6 @@ OTHER_PROGRAMS = {
 NOT_TYPED = {
     "hil demo --effects": "minutes",
     "hil demo --resume": "resumes a stopped one; tests/hil/test_cli.py stops one",
-    "hil demo --link udp": "minutes, in real time",
     "hil demo --excitation": "the whole NS 16 campaign: minutes",
     "hil demo --output runs/demo": "a campaign of the fixture stands in its place",
     "hil design cell.toml --method b -o runs/b": "half a minute; a short one needs other settings",

@@ -264,10 +264,7 @@ def require_shown(seen: list[MotionProgress]) -> None:
     assert sum(now and not before for before, now in itertools.pairwise(held)) == 2
     last = seen[-1]
     assert last.cycles > 500
-    assert 0.0 < last.latency.median <= last.latency.p99 <= last.latency.worst
     assert 0.0 < last.current_share.max() < 1.0
-    texts = {event for progress in seen for event in progress.events}
-    assert any("first set-point" in event for event in texts)  # later ones take its place
 
 
 class Pressed:

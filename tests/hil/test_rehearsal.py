@@ -25,7 +25,6 @@ from hil.cli import app
 from hil.errors import OperatorStopError
 from hil.identify import identify_campaign
 from hil.progress import Silent, Task
-from hil.simulation import simulated_drive
 from planner import Move, plan_moves
 from sim_fixtures.plant import ElasticPlant, PlantTruth
 from tests.hil.fast_cell import CELL, URDF, fast_campaign, fast_cell
@@ -128,7 +127,6 @@ def moving(designed: Campaign, degrees: tuple[float, float], speed: float) -> Ca
         ("joint_sign = [1, -1]", "joint_sign = [-1, -1]"),
         ("gear_ratio = [100.0, -80.0]", "gear_ratio = [-100.0, -80.0]"),
         ("gear_ratio = [100.0, -80.0]", "gear_ratio = [100.0, 80.0]"),
-        ("torque_constant = [0.5, 0.4]", "another arm"),
         ("torques", "of the wrong sign on our side"),
         ("excitation", "tiny and slow"),
         ("excitation", "one joint only"),
@@ -139,10 +137,8 @@ def test_a_wrong_cell_or_plan_fails(
     tmp_path: Path, designed: Campaign, monkeypatch: pytest.MonkeyPatch, right: str, wrong: str
 ) -> None:
     """The simulated arm shares no conversion with the PC, so that a sign cannot cancel."""
-    cell, plan, drive, expected = designed.cell, designed.plan, None, {"parameters"}
+    cell, plan, expected = designed.cell, designed.plan, {"parameters"}
     match wrong:
-        case "another arm":  # where the cell file does not say so, and the caller does
-            drive = replace(simulated_drive(cell), torque_constant=(0.4, 0.5))
         case "of the wrong sign on our side":
             honest = DriveTrain.joint_torque
             monkeypatch.setattr(
@@ -159,15 +155,14 @@ def test_a_wrong_cell_or_plan_fails(
         case _:
             cell, expected = cell_of(tmp_path, CELL.replace(right, wrong, 1) + GEARS), set()
     campaign = Campaign.create(tmp_path / "campaign", cell, plan)
-    found = campaign.rehearse(drive=drive)
+    found = campaign.rehearse()
     failed = {one.name for one in found.criteria if not one.passed}
     assert not found.passed
     assert failed & expected if expected else failed, found.failures
     if wrong == "nearly too weak":
         assert failed == expected
-    if drive is None:
-        with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
-            require_rehearsed(campaign.folder)
+    with pytest.raises(NotRehearsedError, match="failed its rehearsal"):
+        require_rehearsed(campaign.folder)
 
 
 def test_a_cell_of_hardware_is_rehearsed_from_nominal_figures(

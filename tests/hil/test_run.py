@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
 import signal
-import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,8 +32,8 @@ from hil.campaign import (
     Link,
     MotionRefusedError,
     NotRehearsedError,
+    motion_link,
     quality,
-    steering,
 )
 from hil.campaign.dry_run import OVERRIDE, DryRun, agreement
 from hil.campaign.errors import (
@@ -45,14 +43,13 @@ from hil.campaign.errors import (
     MotionFailedError,
     RepetitionsRejectedError,
 )
-from hil.campaign.folder import LOCK, CampaignFolder
+from hil.campaign.folder import CampaignFolder
 from hil.campaign.gates import require_rehearsed
 from hil.campaign.motion_link import active_checks
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
-from hil.campaign.status import conduct_of
 from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
 from hil.cell import Cell
 from hil.cli import app
@@ -62,12 +59,10 @@ from hil.motion_checks import MotionChecks
 from hil.move import plan_move, send
 from hil.progress import Silent
 from hil.results import Results
-from hil.screen import Pace
 from hil.simulation import (
     controller_settings,
     planted_truth,
     simulated_controller,
-    simulated_drive,
     simulated_link,
 )
 from sim_fixtures.faults import parse_fault, split_faults
@@ -288,15 +283,12 @@ class TestTimeLeft:
                 campaign.run(stop=stop, operator=Operator(requests=stopping), durable=False)
         link = simulated_link(campaign.cell)
         controller_time = SimpleNamespace(monotonic=lambda: link.cycles * 0.002, sleep=time.sleep)
-        monkeypatch.setattr(steering, "time", controller_time)
-        pace, estimates = Pace(virtual=False), list[tuple[float, float]]()
+        monkeypatch.setattr(motion_link, "time", controller_time)
+        estimates = list[tuple[float, float]]()
 
         class Clock(Operator):
             def show(self, status: RunStatus) -> None:
-                now = link.cycles * 0.002
-                pace.update(status, now, held=False)
-                left = pace.left(status)
-                estimates.append((now, left))
+                estimates.append((link.cycles * 0.002, status.time_left))
 
         campaign.run(link, operator=Clock(), durable=False)
         now, left = np.array(estimates).T
@@ -826,50 +818,6 @@ def test_what_a_warm_up_sends_is_checked(make: Make, monkeypatch: pytest.MonkeyP
     assert any(motion is campaign.plan.excitation.trajectory for motion in checked)
 
 
-def test_a_rehearsal_on_other_gears_opens_no_gate(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    campaign = make()
-    campaign.folder.rehearsal.unlink()
-    stop = Stop()
-
-    class Stopping(Silent):
-        def say(self, text: str) -> None:
-            stop.requested = stop.requested or "what the model leaves out" in text
-
-    drive = simulated_drive(campaign.cell)
-    with pytest.raises(OperatorStopError):
-        campaign.rehearse(drive=drive, stop=stop, reporter=Stopping())
-    found = campaign.folder.rehearsed.rglob("manifest.json")
-    assert {path.parent.parent.name for path in found} == {"other_drive"}, "never resumed"
-
-    from hil.campaign import rehearsal_run
-
-    passed = make("passed")
-    good = Rehearsal.load(passed.folder)
-    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: good)
-    assert campaign.rehearse(drive=drive) is good
-    assert Rehearsal.load(campaign.folder) is None
-
-
-def test_a_failure_with_another_seed_is_reported(
-    make: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from hil.campaign import rehearsal_run
-
-    campaign = make()
-    good = Rehearsal.load(campaign.folder)
-    pass_rehearsal(campaign.folder, passed=False)
-    other = good.model_copy(update={"seed": 7})
-    monkeypatch.setattr(rehearsal_run, "_rehearsed", lambda *_: other)
-    text = "passed with seed 7, but failed with seed 1"
-    assert text in campaign.rehearse(seed=7).line
-    assert text in campaign.rehearse(seed=7, again=True).line
-    assert text in campaign.status().steps[1].sentence
-    assert any(text in note for note in campaign.run(dry_run_only=True).notes)
-    assert text in conduct_of(campaign.folder).steps[0].words
-
-
 @pytest.mark.parametrize(
     "edit",
     [
@@ -985,7 +933,7 @@ def test_a_script_that_slows_each_attempt_is_ended(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("hil.campaign.run.MOST_BY_HAND", 2)
-    monkeypatch.setattr("hil.campaign.steering.SHOW_PERIOD", 0.0)
+    monkeypatch.setattr("hil.campaign.motion_link.SHOW_PERIOD", 0.0)
     campaign, stop = make(), Stop()
 
     def at_its_begin(status: RunStatus) -> OperatorRequest:
@@ -1070,22 +1018,6 @@ def test_a_warm_up_motion_that_was_not_noted_is_adopted(make: Make) -> None:
 
 
 # --- folder, disk, stop
-def test_a_query_of_the_lock_does_not_hold_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hil.campaign.folder.LOCK_PATIENCE", 30.0)
-    folder = CampaignFolder(tmp_path)
-    lock = os.open(tmp_path / LOCK, os.O_RDWR | os.O_CREAT)
-    fcntl.flock(lock, fcntl.LOCK_SH)
-    assert not folder.busy
-    threading.Timer(0.1, os.close, [lock]).start()
-    with folder.locked():
-        assert folder.busy
-        monkeypatch.undo()
-        with pytest.raises(CampaignFolderError, match="another run"), folder.locked():
-            pass
-
-
 @pytest.mark.parametrize("name", ["dry_run.json", "warmup.json"])
 def test_a_full_disk_is_named(make: Make, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     drift = 1e-9 if name == "warmup.json" else 0.0

@@ -24,10 +24,11 @@ from typer.testing import CliRunner
 
 from hil.cell import Cell, CellError
 from hil.cli import exit_code_of, main
-from hil.cli.simulate import WORDS, Status, simulate
+from hil.cli.simulate import WORDS, simulate
 from hil.demo_link import free_port
 from hil.errors import InputError
 from hil.motion_checks import MotionChecks
+from hil.progress import say_at_once
 from hil.serving import Buttons, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures.ns16 import CELL_PATH
@@ -420,14 +421,12 @@ def test_the_first_signal_asks_for_the_end_the_second_aborts():
 
 def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
     reader, writer = os.pipe()
-    status = Status("nowhere", controller_settings(Cell.load(CELL_PATH)), quiet=False,
-                    descriptor=writer)  # fmt: skip
     try:
         for _ in range(3000):
-            status.say("x" * 100)  # more than the pipe holds: a blocking write would wait here
+            say_at_once("x" * 100, writer)  # more than the pipe holds: a blocking write would wait
     finally:
         os.close(reader)
-    status.say("the reader has gone")
+    say_at_once("the reader has gone", writer)
     os.close(writer)
 
 

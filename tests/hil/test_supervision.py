@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from drivers.events import MotionEnded, MotionStarted
 from drivers.exchange import control as control_memory
-from drivers.exchange.event_log import NO_SUPERVISOR, EventsLost
+from drivers.exchange.event_log import EventsLost
 from drivers.record import cycle_dtype
 from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
@@ -340,8 +340,6 @@ def test_heartbeats_end_when_the_supervising_loop_stalls() -> None:
     heart.turn()
     beats_in(heart, clock, given, 2.0 * STALL)
     assert clock.now - given[-1] > 0.9 * STALL
-    explained = heart.with_cause(f"the exchange process ended ({NO_SUPERVISOR})")
-    assert "show or request of the motion's watch did not return for 2.0 s" in explained
     heart.turn()
     assert beats_in(heart, clock, given, 0.5) > 5, "and resume with the loop"
     heart.rest()
@@ -382,7 +380,7 @@ def watch(operator: Failing) -> RunWatch:
 def test_a_screen_that_fails_is_asked_all_the_same(operator: Failing, watch: RunWatch) -> None:
     operator.fails = True
     for _ in range(3):
-        watch.add_note("good")
+        watch.begin("move", 1, 1, 1.0, 1.0)
     assert operator.shown == 1
     operator.answer = OperatorRequest(0.4, held=True)
     assert watch.request() == operator.answer
