@@ -20,12 +20,9 @@ from drivers.transports.udp import UdpSpec
 from hil.archive.live import LiveView
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
-from hil.cell.schema import CanTable
 from hil.errors import ControllerFault
 
 LOOPBACK = "127.0.0.1"
-CAN = CanTable(interface="udp_multicast", channel="239.74.163.31")
-"""Virtual CAN bus of python-can, without an adapter."""
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
 END_TIMEOUT = 20.0
 """Time limit for a simulated controller to end its session, s."""

@@ -188,7 +188,7 @@ def status_line(status: RunStatus) -> str:
             for what, share in shares.items()
             if share is not None
         ]
-    return ", ".join([*parts, f"{clock(status.time_left)} of motion left"])
+    return ", ".join([*parts, f"{clock(status.time_left)} left"])
 
 
 def _times(motion: MotionProgress) -> str:
@@ -446,7 +446,7 @@ class Screen:
         left = ""
         if status is not None:
             title.append(f"  {status.phase} {status.number} of {status.total}", "bold cyan")
-            left = f"{clock(status.time_left)} of motion left"
+            left = f"{clock(status.time_left)} left"
         top.add_row(title, left)
         state = Text()
         if self._stop.requested or request.held:

@@ -95,15 +95,6 @@ class Acceptance:
     by: str
     at: str
 
-    @classmethod
-    def now(cls) -> Self:
-        """Return the acceptance by the user of this program."""
-        try:
-            user = getpass.getuser()
-        except (OSError, KeyError):  # a user without a name
-            user = "unknown"
-        return cls(user, datetime.now(UTC).isoformat(timespec="seconds"))
-
 
 @dataclass(frozen=True)
 class DryRun:
@@ -232,7 +223,12 @@ class DryRun:
 
     def accepted_now(self) -> DryRun:
         """Return this dry run, accepted by the user of this program."""
-        return replace(self, accepted=Acceptance.now())
+        try:
+            user = getpass.getuser()
+        except (OSError, KeyError):  # a user without a name
+            user = "unknown"
+        at = datetime.now(UTC).isoformat(timespec="seconds")
+        return replace(self, accepted=Acceptance(user, at))
 
 
 class DryRunStage:

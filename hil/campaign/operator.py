@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,23 +123,20 @@ class MotionWatch(Protocol):
         ...
 
 
-Phase = Literal["dry run", "warm-up", "standstill", "repetition", "validation", "move"]
-"""Purpose of a motion as shown on the screen. A "move" is a way between the others."""
-
-
 @dataclass(frozen=True, eq=False)
 class RunStatus:
     """Progress of a run, about ten times a second while the arm moves.
 
     Attributes:
+        phase: purpose of the motion, such as "repetition"; "move" for a way between the others.
         number: which of its kind, from 1.
         total: number of its kind; of a warm-up, the largest number.
-        time_left: of motion to the end of the run, the present one at its override [s]; of a
-            warm-up with its least number of motions.
+        time_left: to the end of the run, the present motion at its override [s]; of a warm-up with
+            its least number of motions.
         motion: the motion that is being run; None between two.
     """
 
-    phase: Phase
+    phase: str
     number: int
     total: int
     time_left: float
@@ -189,6 +186,9 @@ class Unattended:
 unwatched_motion = Unattended()  # For motions without a watch
 
 
+BETWEEN: Final = 0.6  # s between two motions, to open and close the axes
+
+
 @dataclass(eq=False)
 class RunWatch:
     """A `MotionWatch` that shows the progress of the whole run to its operator.
@@ -197,7 +197,7 @@ class RunWatch:
     requested last. A hold that cannot be released any more becomes a stop.
 
     Attributes:
-        time_left: s of motion after the present one, each at its largest override.
+        time_left: s after the present motion, each of the others at its largest override.
         began: when the present or the last motion began [s since 1970], after any hold.
         status: shown last, except for its time left.
     """
@@ -212,17 +212,17 @@ class RunWatch:
     _request: OperatorRequest = OperatorRequest()
     _problems: dict[str, str] = field(default_factory=dict)
 
-    def expect(self, duration: float) -> None:
-        """Add motions that are to be run, with their duration in all [s]."""
-        self.time_left += duration
+    def expect(self, times: Sequence[float]) -> None:
+        """Add motions that are to be run, with the duration of each [s]."""
+        self.time_left += sum(times) + BETWEEN * len(times)
 
     def begin(self, kind: str, number: int, total: int, duration: float, most: float) -> None:
         """Begin a motion of `duration` s at full speed, at an override of at most `most`."""
-        self.time_left = max(0.0, self.time_left - duration / most)
+        self.time_left = max(0.0, self.time_left - duration / most - BETWEEN)
         self._duration, self._most, self.began = duration, most, time.time()
         self._show(
             None,
-            phase=cast(Phase, KIND_NAMES.get(kind, kind)),
+            phase=KIND_NAMES.get(kind, kind),
             number=number,
             total=total,
         )

@@ -199,11 +199,11 @@ class Run:
             straight = StraightMoves(cell, narrowed)
             joined = straight.joining([*slow, *full], start)
             runner = Runner(self, link, straight, start)
-            duration = runner.duration(joined, len(slow))
+            times = runner.times(joined, len(slow))
             if any(one.kind != "standstill" for one in full):
-                duration += warm_up.expected()
-            self.watch.expect(duration)
-            with reporter.task("running the campaign (s of motion)", duration) as runner.task:
+                times += warm_up.expected()
+            self.watch.expect(times)
+            with reporter.task("running the campaign (s of motion)", sum(times)) as runner.task:
                 yield runner
             link.close()
         self.cycles = runner.cycles
@@ -218,8 +218,18 @@ class Run:
 
     @cached_property
     def provenance(self) -> dict[str, str]:
-        """Metadata of every archive."""
-        return provenance_of(self)
+        """Metadata of every archive; a date only in real time.
+
+        The caller knows what a link simulates; the link decides whether a real arm can move.
+        """
+        own: Mapping[str, str] = {}
+        if not self.virtual:
+            own = origin_of(self.cell, only_simulated=self.simulated, virtual=False)
+        elif self.given_provenance is None:
+            from hil.simulation import simulated_provenance  # which opens links of this package
+
+            own = simulated_provenance(self.cell, effects=False)
+        return {**own, **(self.given_provenance or {}), SIMULATED: yes_or_no(self.simulated)}
 
     @cached_property
     def review(self) -> ArchiveReview:
@@ -285,21 +295,6 @@ class Run:
         )
 
 
-def provenance_of(run: Run) -> dict[str, str]:
-    """Return the origin of a run's archives; a date only in real time.
-
-    The caller knows what a link simulates; the link decides whether a real arm can move.
-    """
-    own: Mapping[str, str] = {}
-    if not run.virtual:
-        own = origin_of(run.cell, only_simulated=run.simulated, virtual=False)
-    elif run.given_provenance is None:
-        from hil.simulation import simulated_provenance  # which opens links of this package
-
-        own = simulated_provenance(run.cell, effects=False)
-    return {**own, **(run.given_provenance or {}), SIMULATED: yes_or_no(run.simulated)}
-
-
 class Runner:
     """Runs motions of a run on a connected link, and the straight moves to them.
 
@@ -318,9 +313,9 @@ class Runner:
         """Cycles archived so far."""
         return self._link.cycles - self._before
 
-    def duration(self, joined: Sequence[Interval], slow: int) -> float:
-        """Return the duration of these motions [s]; the first `slow` ones are run slowly."""
-        duration, watched = 0.0, slow > 0
+    def times(self, joined: Sequence[Interval], slow: int) -> list[float]:
+        """Return the seconds of each motion and way; the first `slow` motions are run slowly."""
+        times, watched = [], slow > 0
         for one in joined:
             share = OVERRIDE if slow else 1.0
             if one.kind == "move":
@@ -328,8 +323,8 @@ class Runner:
                 share = self._approach(OVERRIDE) if slow or unseen else 1.0
             else:
                 slow = max(0, slow - 1)
-            duration += one.trajectory.duration / share
-        return duration
+            times.append(one.trajectory.duration / share)
+        return times
 
     def run_motion(self, interval: Interval, number: int, total: int, most: float = 1.0) -> str:
         """Move to the start of a motion, run it, and return its archive, not yet in the manifest.
@@ -368,7 +363,7 @@ class Runner:
                 warm_up.motion_ended()
             if problem is None:
                 return name
-            run.watch.expect(interval.trajectory.duration)
+            run.watch.expect([interval.trajectory.duration])
             run.reporter.say(
                 f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"
             )

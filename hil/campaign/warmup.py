@@ -221,13 +221,13 @@ class WarmUpStage:
         """Return the next motion of a warm-up; none where no warm-up is wanted."""
         return [self._interval(self._state())] if self._threshold else []
 
-    def expected(self) -> float:
-        """Return the duration of the motions that it runs at least [s]."""
+    def expected(self) -> list[float]:
+        """Return the durations [s] of the motions that it runs at least."""
         state, motions = self._state(), self.next_motion()
         if state.outcome != "going on":
-            return 0.0
+            return []
         missing = self._run.cell.campaign.warmup_least - len(state.motions)
-        return sum(motion.trajectory.duration for motion in motions) * max(missing, 0)
+        return [motion.trajectory.duration for motion in motions] * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
         """Run motions until the arm is warm (RepetitionsRejectedError: each attempt was slowed)."""
@@ -237,7 +237,7 @@ class WarmUpStage:
         while state.outcome == "going on":
             interval, done = self._interval(state), len(state.motions)
             if done >= run.cell.campaign.warmup_least:
-                run.watch.expect(interval.trajectory.duration)
+                run.watch.expect([interval.trajectory.duration])
             name = runner.run_until_accepted(interval, done + 1, run.cell.campaign.warmup_most)
             state = self._saved(state, name, time.time())
             run.reporter.say(state.sentence)

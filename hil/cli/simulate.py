@@ -235,28 +235,10 @@ def _sentences(served: Served) -> list[str]:
         sent = plural(summary.knocks, "time")
         return [f"no reply of a PC program; the first packet was sent {sent}"]
     end = "the session has ended (504)" if summary.ended else "the session was aborted"
-    counts = (
-        f"{summary.cycles} cycles, {summary.replies} replies, {summary.missed} missed, "
-        f"{summary.late} late, {summary.surplus} surplus, {summary.rejected} rejected, "
-        f"{served.foreign} from other addresses; {plural(summary.stretched, 'cycle')} extended by "
-        f"up to {1e3 * summary.stretch_max:.1f} ms to wait for a reply"
-    )
-    opened = plural(served.intervals, "time")
-    return [
-        f"{end}{': ' if reason else ''}{reason}; open mode was reached {opened}",
-        counts,
-        f"time to reply: {_spread(summary.answer)}",
-        f"time to simulate a cycle: {_spread(summary.cost)}; "
-        f"{summary.own_late} cycles started late by the simulation, {summary.slips} of them by a "
-        "full cycle",
-    ]
+    figures = (f"{name} {value}" for name, value in _figures(served).items() if value != reason)
+    return [f"{end}{': ' if reason else ''}{reason}", ", ".join(figures)]
 
 
 def _parts(times: Histogram) -> tuple[float, float, float]:
     """Return median, 99 % quantile and maximum, s."""
     return times.quantile(0.5), times.quantile(0.99), times.largest
-
-
-def _spread(times: Histogram) -> str:
-    median, most, longest = (f"{1e6 * seconds:.0f} µs" for seconds in _parts(times))
-    return f"{median} median, {most} 99 %, {longest} maximum"

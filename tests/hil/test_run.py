@@ -50,7 +50,7 @@ from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
-from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, change_per_motion
+from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, WarmUpStage, change_per_motion
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
@@ -375,7 +375,12 @@ def test_a_slowed_repetition_is_rejected_and_run_again(make: Make) -> None:
 def test_a_motion_that_is_always_rejected_ends_the_run(make: Make) -> None:
     campaign = make(bad_repetitions=2)
     with pytest.raises(RepetitionsRejectedError, match="was rejected 3 times") as ended:
-        campaign.run(operator=slowed("repetition", once=False), unrehearsed=True)
+        campaign.run(
+            operator=Operator(
+                lambda status: OperatorRequest(0.5 if status.phase == "repetition" else 1.0)
+            ),
+            unrehearsed=True,
+        )
     assert ended.value.exit_code == 5
     outcomes = [e.outcome for e in campaign.folder.manifest() if "excitation" in e.name]
     assert outcomes == ["rejected"] * 3
@@ -544,19 +549,15 @@ def test_the_arm_warms_up_and_again_when_it_has_cooled_down(make: Make) -> None:
     campaign = make(warmup_drift=0.004, warmup_least=5, warmup_most=7, repetitions=2)
     text = campaign.cell.text
     assert "friction_drift = 0.9" in text
-    watching = Operator()
-    first = campaign.run(
-        simulated_link(campaign.cell, effects=True), operator=watching, unrehearsed=True
-    )
+    first = campaign.run(simulated_link(campaign.cell, effects=True), unrehearsed=True)
     assert first.warm_up == "warm"
     assert kinds(first)[1:] == [*["warmup"] * 5, "standstill", *["excitation"] * 2, "validation",
                                 "move"]  # fmt: skip
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
-    curve = found.curve
-    assert curve.friction.shape == (5, 2)
-    assert np.all(curve.friction[-1] < curve.friction[0]), "friction falls as the gears warm up"
-    assert curve.change[-1] <= 0.004
-    assert watching.seen[-1].drift is not None
+    friction = np.array([one.friction for one in found.motions])
+    assert friction.shape == (5, 2)
+    assert np.all(friction[-1] < friction[0]), "friction falls as the gears warm up"
+    assert found.changes[-1] <= 0.004
 
     gone = campaign.folder.archives / "excitation_001_a1.mcap"
     gone.unlink()
@@ -909,19 +910,19 @@ def test_an_arm_that_changes_during_a_campaign_ends_it(make: Make) -> None:
     assert good == ["excitation_000_a1.mcap", "excitation_001_a1.mcap"], "nothing is checked again"
 
 
-def slowed(phase: str, *, once: bool = True) -> Operator:
-    """An operator who slows motions of a phase, or only until one is rejected."""
+def slowed(campaign: Campaign, phase: str) -> Operator:
+    """An operator who slows motions of a phase until one is run again."""
 
     def requests(status: RunStatus) -> OperatorRequest:
-        rejected = once and any("rejected" in note for note in status.notes)
-        return OperatorRequest(0.5 if status.phase == phase and not rejected else 1.0)
+        again = any(campaign.folder.archives.glob("*_a2.mcap"))
+        return OperatorRequest(0.5 if status.phase == phase and not again else 1.0)
 
     return Operator(requests)
 
 
 def test_a_repetition_slowed_for_a_moment_is_no_attempt(make: Make) -> None:
     campaign = make(bad_repetitions=0)
-    result = campaign.run(operator=slowed("repetition"), unrehearsed=True)
+    result = campaign.run(operator=slowed(campaign, "repetition"), unrehearsed=True)
     assert result.complete
     assert len(result.rejected) == 1
     slow = make("slow", bad_repetitions=0)
@@ -975,8 +976,17 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
         def show(self, status: RunStatus) -> None:
             super().show(status)
             second = (status.phase, status.number) == ("repetition", 2)
-            if second if when == "held" else any("good" in note for note in status.notes):
+            if second and when == "held":
                 passed[0] = 2.0 * 3600.0
+
+    motion_ended = WarmUpStage.motion_ended
+
+    def rests_after(stage: WarmUpStage) -> None:
+        motion_ended(stage)
+        passed[0] = 2.0 * 3600.0
+
+    if when == "before":
+        monkeypatch.setattr(WarmUpStage, "motion_ended", rests_after)
 
     result = campaign.run(operator=Leaves(), unrehearsed=True)
     assert result.complete
@@ -989,7 +999,7 @@ def test_an_arm_that_rests_for_hours_is_warmed_up_again(
 
 def test_a_slowed_warm_up_motion_gives_no_friction(make: Make) -> None:
     campaign = make(warmup_drift=1e-9, warmup_least=3, warmup_most=3)
-    result = campaign.run(operator=slowed("warm-up"), unrehearsed=True)
+    result = campaign.run(operator=slowed(campaign, "warm-up"), unrehearsed=True)
     assert [one.archive for one in result.rejected] == ["warmup_000_a1.mcap"]
     found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
     assert [one.archive for one in found.motions] == [

@@ -86,7 +86,7 @@ class TestPicture:
         rows = screen_lines(80, 24, screen)
         text = "\n".join(rows)
         for words in (
-            "10.2.12.150", "repetition 7 of 30", "19:05 of motion left", "6.2 of 18.6 s",
+            "10.2.12.150", "repetition 7 of 30", "19:05 left", "6.2 of 18.6 s",
             "override 80%", "now 75%", "cycles 123456, 2 missed, 1 late, 0 not accepted",
             "repetition 5 rejected: its current differs",
             "h hold", "space resume", "s stop", "+ - override",
@@ -100,7 +100,7 @@ class TestPicture:
             "following error 130% of its limit", "current 88% of its limit",
         ):  # fmt: skip
             assert words in line
-        assert line.endswith(", 19:05 of motion left")
+        assert line.endswith(", 19:05 left")
 
     @pytest.mark.parametrize(("width", "height"), [(20, 3), (80, 24), (300, 60)])
     def test_fits_the_terminal(self, width: int, height: int) -> None:
@@ -117,8 +117,8 @@ class TestPicture:
         held, stopping, silent = (screen_of(status()) for _ in range(3))
         held.press("h")
         stopping.press("s")
-        silent._came -= 3.2
-        for screen, words in ((held, "HELD"), (stopping, "STOPPING"), (silent, "no news for 3 s")):
+        silent._came -= 30.0
+        for screen, words in ((held, "HELD"), (stopping, "STOPPING"), (silent, "no news for 3")):
             assert words in screen_lines(80, 24, screen)[1]
 
     def test_names_the_controller(self) -> None:
