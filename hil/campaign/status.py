@@ -78,6 +78,7 @@ def status_of(campaign: Campaign) -> CampaignStatus:
     """Return the progress of a campaign from the files in its folder; nothing is changed."""
     folder, again = replace(campaign.folder, digests={}), "rehearse {} --again"
     campaign = replace(campaign, folder=folder)
+    folder.manifest()  # one that cannot be read is an error of all steps
     at = shlex.quote(str(folder.root))
     # With the command that recreates the file of a step, should it be damaged: none does for the
     # cell or the plan of recordings, nor for an acceptance.

@@ -914,7 +914,7 @@ def slowed(campaign: Campaign, phase: str) -> Operator:
     """An operator who slows motions of a phase until one is run again."""
 
     def requests(status: RunStatus) -> OperatorRequest:
-        again = any(campaign.folder.archives.glob("*_a2.mcap"))
+        again = any(one.outcome == "rejected" for one in campaign.folder.manifest())
         return OperatorRequest(0.5 if status.phase == phase and not again else 1.0)
 
     return Operator(requests)
