@@ -147,22 +147,24 @@ class Run:
                 with self._connected(warm_up, slow, full) as runner:
                     dry_run.run(runner)
                     if full:
-                        self._run_at_full_speed(runner, warm_up)
+                        if self.missing("excitation", "validation"):
+                            warm_up.run(runner)
+                        self._run_missing("standstill", runner, warm_up)
+                        self._run_missing("excitation", runner, warm_up)
+                        # Later repetitions may have shown that the first one was disturbed.
+                        self._run_missing("excitation", runner, warm_up)
+                        self._run_missing("validation", runner, warm_up)
                     runner.go_back(OVERRIDE if self.dry_run_only else 1.0)
             return self._result(dry_run, warm_up)
 
-    def _run_at_full_speed(self, runner: Runner, warm_up: WarmUpStage) -> None:
-        """Warm-up, the arm at rest, repetitions while the joints are warm, validation motions."""
-        if self.missing("excitation", "validation"):
-            warm_up.run(runner)
-        # Excitations twice: later repetitions may show that the first one was disturbed.
-        for kind in ("standstill", "excitation", "excitation", "validation"):
-            total = sum(one.kind == kind for one in self.wanted)
-            for interval in self.missing(kind):
-                warm = warm_up if kind == "excitation" else None
-                runner.run_until_accepted(interval, interval.index + 1, total, warm)
-                if kind == "validation":
-                    warm_up.motion_ended()
+    def _run_missing(self, kind: str, runner: Runner, warm_up: WarmUpStage) -> None:
+        """Run the missing motions of a kind; repetitions only while the joints are warm."""
+        total = sum(one.kind == kind for one in self.wanted)
+        for interval in self.missing(kind):
+            warm = warm_up if kind == "excitation" else None
+            runner.run_until_accepted(interval, interval.index + 1, total, warm)
+            if kind == "validation":
+                warm_up.motion_ended()
 
     @contextmanager
     def _connected(
