@@ -16,9 +16,7 @@ import pytest
 from scipy.stats import norm
 
 from drivers.events import AnswersLost, MotionEnded
-from hil import Campaign
 from hil.campaign.errors import MotionFailedError
-from hil.campaign.status import CampaignStatus
 from hil.errors import ControllerFault
 from tests.drivers import oracle
 from tests.hil.mcap_bytes import chunks
@@ -562,19 +560,6 @@ def test_changed_removed_and_repeated_archives_are_found(observed: Observed) -> 
     assert f"{name} is gone" in found(with_life(observed, 1, after=gone), "folder")
     again = with_life(observed, 1, archives=(*life.archives, "standstill_000_a2.mcap"))
     assert f"was run although {name} was complete by then" in found(again, "folder")
-
-
-def test_an_invalid_archive_without_a_note_is_found(
-    copied: Observed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert "hil status" not in found(copied, "folder")  # one file was truncated by a kill
-    status = Campaign.status
-
-    def silent(campaign: Campaign) -> CampaignStatus:
-        return replace(status(campaign), notes=())
-
-    monkeypatch.setattr(Campaign, "status", silent)
-    assert "hil status does not name" in found(copied, "folder")
 
 
 def test_a_failed_motion_may_end_a_run(observed: Observed) -> None:

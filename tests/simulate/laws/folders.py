@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from hil import Campaign
 from tests.simulate.observed import Observed
 from tests.simulate.script import kind_of
 
@@ -84,7 +83,6 @@ def folder(observed: Observed) -> Iterator[str]:
     yield from _unchanged_files(observed)
     yield from _executed_once(observed, entries)
     yield from _left_over(observed, names)
-    yield from _reported(observed, entries)
 
 
 def _entry(observed: Observed, entry: Entry, torn: set[str]) -> Iterator[str]:
@@ -154,16 +152,3 @@ def _left_over(observed: Observed, entered: list[str]) -> Iterator[str]:
             yield f"{path.name} is of no run"
         elif life.result is not None:
             yield f"{path.name} was not entered by a complete run"
-
-
-def _reported(observed: Observed, entries: list[Entry]) -> Iterator[str]:
-    """`hil status` names each archive that is not valid."""
-    good = {entry.name for entry in entries if entry.outcome == "completed" and entry.unchanged}
-    there = {path.name for path in (observed.folder / "archives").glob("*.mcap")}
-    invalid = ({entry.name for entry in entries} | there) - good
-    if not invalid:
-        return
-    notes = Campaign.open(observed.folder).status().notes
-    for name in sorted(invalid):
-        if not any(note.startswith(name) for note in notes):
-            yield f"hil status does not name {name}, which is not valid"
