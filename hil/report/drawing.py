@@ -25,14 +25,9 @@ Array = NDArray[np.float64]
 # Figures have placeholder colours, which become variables of the style sheet (light, dark, print).
 CSS_VARIABLES: Final = {
     f"#0102{k:02x}": f"var(--{name})"
-    for k, name in enumerate(
-        (
-            *("ink", "muted", "grid", "band", "paper", "first", "second", "wide"),
-            *("route-0", "route-1", "route-2", "route-3", "outside-3"),
-        )
-    )
+    for k, name in enumerate(("ink", "muted", "grid", "band", "first", "second", "wide"))
 }
-INK, MUTED, GRID, BAND, PAPER, FIRST, SECOND, WIDE, *ROUTES, OUTSIDE_3 = CSS_VARIABLES
+INK, MUTED, GRID, BAND, FIRST, SECOND, WIDE = CSS_VARIABLES
 """`WIDE` is a light colour for a broad line below another one."""
 
 TICK_SIZE, TEXT_SIZE = 10.5, 11.0

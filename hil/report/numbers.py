@@ -66,11 +66,6 @@ def with_std(value: float | None, std: float | None) -> str:
     return f"{beside(value, std)} ± {significant(std, 2)}" if std > 0.0 else significant(value)
 
 
-def speed_text(speed: float | None, unit: str) -> str:
-    """Format the speed at which friction is compared; None or NaN is any."""
-    return "any speed" if speed is None or math.isnan(speed) else f"{speed:.2g} {unit}"
-
-
 def unit_text(unit: str) -> str:
     """Replace blanks of a unit: N·m for `N m`."""
     return unit.replace(" ", "·")

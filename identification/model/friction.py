@@ -47,7 +47,6 @@ class FrictionTerm:
     label: str  # name in lists; in lower case on the command line
     description: str
     value: Callable[[Array, Array, float], Array]  # column, of speeds, directions and `speed`
-    rate: Callable[[Array, Array, float], Array]  # its derivative by the speed
     selected: Callable[[FrictionLaw], Any] | None = None  # setting, if not that of `option`
     basis: str = ""  # the column as a formula
     # the column in Python, as a factor of the coefficient, with the speed `v`, its direction
@@ -88,10 +87,6 @@ class FrictionTerm:
         """Return the column (...) at speeds and directions of dry friction (...)."""
         return self.value(v, s, self.speed)
 
-    def slope(self, v: Array, ds: Array) -> Array:
-        """Return its derivative (...) by v, with that of the direction, `ds` (...)."""
-        return self.rate(v, ds, self.speed)
-
     def unit(self, *, revolute: bool) -> str:
         """Return the unit of the coefficient of a revolute or prismatic joint."""
         if self.power == 0:
@@ -112,7 +107,6 @@ COULOMB: Final = FrictionTerm(
     basis="sgn(v)",
     code=" * sign",
     value=lambda v, s, _: s,
-    rate=lambda v, ds, _: ds,
     selected=lambda law: law.coulomb and law.tanh is None,
     urdf="friction",
     of_motor=True,
@@ -126,7 +120,6 @@ TANH: Final = FrictionTerm(
     basis="tanh(v/vt)",
     code=" * tanh(v / TANH_SPEED[joint])",
     value=lambda v, s, vt: np.tanh(v / vt),
-    rate=lambda v, ds, vt: (1.0 - np.tanh(v / vt) ** 2) / vt,
     speed_symbol="vt",
     urdf="friction",
     of_motor=True,
@@ -140,7 +133,6 @@ VISCOUS: Final = FrictionTerm(
     basis="v",
     code=" * v",
     value=lambda v, s, _: v,
-    rate=lambda v, ds, _: np.ones_like(v),
     power=1,
     urdf="damping",
     of_motor=True,
@@ -155,7 +147,6 @@ ASYMMETRIC: Final = FrictionTerm(
     basis="|v|",
     code=" * abs(v)",
     value=lambda v, s, _: np.abs(v),
-    rate=lambda v, ds, _: np.sign(v),
     selected=lambda law: law.asymmetric and law.viscous,
     power=1,
     not_negative=True,
@@ -169,7 +160,6 @@ QUADRATIC: Final = FrictionTerm(
     basis="sgn(v) v²",
     code=" * v * abs(v)",
     value=lambda v, s, _: np.abs(v) * v,
-    rate=lambda v, ds, _: 2.0 * np.abs(v),
     power=2,
 )
 CUBIC: Final = FrictionTerm(
@@ -180,10 +170,8 @@ CUBIC: Final = FrictionTerm(
     basis="v³",
     code=" * v**3",
     value=lambda v, s, _: v * v * v,
-    rate=lambda v, ds, _: 3.0 * v**2,
     power=3,
 )
-# the slope neglects the derivative of the exponential
 STRIBECK: Final = FrictionTerm(
     symbol="fs",
     option="stribeck",
@@ -192,7 +180,6 @@ STRIBECK: Final = FrictionTerm(
     basis="sgn(v) exp(-(v/vs)²)",
     code=" * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
     value=lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s,
-    rate=lambda v, ds, _: ds,
     speed_symbol="vs",
     not_negative=True,
     pair=("f0", ((1.0, 0.0), (-1.0, 1.0))),
@@ -203,7 +190,6 @@ OFFSET: Final = FrictionTerm(
     label="offset",
     description="a constant offset fo",
     value=lambda v, s, _: np.ones_like(v),
-    rate=lambda v, ds, _: np.zeros_like(v),
     selected=lambda law: law.offset or (law.asymmetric and law.coulomb),
     is_friction=False,
 )
