@@ -20,14 +20,14 @@ from identification.estimators.consistent import (
     shrunk_values,
 )
 from identification.estimators.least_squares import fit_least_squares
-from identification.export.urdf import NotConsistentError, not_in_urdf, write_urdf
+from identification.export.urdf import NotConsistentError, write_urdf
 from identification.factor.factor import joint_weights, rows_of
 from identification.factor.phases import total_phase
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
-from sim_fixtures.ns16 import load_truth, standard_parameters, table2, urdf_text
+from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
 from tests.identification import two_link
-from tests.identification.robots import NS16_TURNS, robot_text
+from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
     URDF,
@@ -116,33 +116,6 @@ def largest_gain(gradient, at, nominal):
         frame = np.linalg.cholesky(pseudo_inertia(inertial))
         missing += max(-float(np.linalg.eigvalsh(frame.T @ dual @ frame)[0]), 0.0)
     return float(gradient @ at) + LARGE * missing
-
-
-def nearest_consistent(column):
-    """Return the distance of a column of Table 2 from consistent parameters, and its bound."""
-    model = RobotModel.from_urdf(
-        urdf_text(), friction=FrictionLaw(coulomb=False, viscous=False, third=None)
-    )
-    rows = {row.pivot: row for row in table2()[:40]}
-    values = np.array([rows[n].sign * getattr(rows[n], column) for n in model.base.names])
-    # One row per base parameter.
-    gram = np.zeros((6, 41, 41))
-    gram[0] = np.eye(41)
-    gram[0, :40, 40] = gram[0, 40, :40] = values
-    gram[0, 40, 40] = values @ values
-    factor = Factor(gram, np.array([40, 0, 0, 0, 0, 0]), model.parameter_names)
-    found = consistent_estimate(model, factor, weights=np.ones(6), prior_weight=1e-6)
-    assert_consistent(model, found)
-    # With Table 2's own grouping.
-    names = model.layout.names
-    grouping = np.zeros((40, len(names)))
-    for i, row in enumerate(table2()[:40]):
-        for name, value in row.terms.items():
-            grouping[i, names.index(name)] = value
-    error = grouping @ found.standard - [getattr(row, column) for row in table2()[:40]]
-    gap = largest_gain(2.0 * grouping.T @ error, found.standard, model.chain.inertial)
-    distance = float(np.linalg.norm(error))
-    return distance, float(np.sqrt(max(distance**2 - gap, 0.0)))
 
 
 class TestConsistentEstimate:
@@ -270,14 +243,6 @@ class TestConsistentEstimate:
         assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
 
     @pytest.mark.parametrize(
-        ("column", "least", "most"), [("pi_c", 0.0, 1e-3), ("pi_b", 1.4, 1.43)]
-    )
-    def test_of_the_paper_only_method_b_is_inconsistent(self, column, least, most):
-        """Not its nominal parameters."""
-        distance, at_least = nearest_consistent(column)
-        assert least <= at_least <= distance < most
-
-    @pytest.mark.parametrize(
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
     )
     def test_other_robots(self, path):
@@ -312,23 +277,6 @@ class TestDrives:
         assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
         assert np.all(found.margin > 0.0)
         assert (error_rise(found) < 1e-4) == (inertia == 0.12)
-
-    def test_the_coupled_ns16_is_written_as_a_urdf(self):
-        law, coupling = FrictionLaw(third=None), Coupling(NS16_TURNS)
-        model = RobotModel.from_urdf(urdf_text(), friction=law, coupling=coupling)
-        known = standard_parameters()
-        standard = np.array([known.get(name, 0.0) for name in model.layout.names])
-        standard[model.layout.couplings] = -0.03, 0.01, -0.02
-        friction = np.random.default_rng(0).uniform(1.0, 9.0, len(model.friction.terms))
-        values = np.concatenate([model.base.grouping @ standard, friction])
-        found = simulated(values, 0.02, 1, model=model)
-        assert found.status == "optimal"
-        assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
-        assert error_rise(found) < 1e-3
-        assert np.all(found.friction > 0.0)
-        write_urdf(urdf_text(), model, found.standard, found.friction)
-        left_out = ("rotor inertias", "coupling inertias", "friction of coupled motors")
-        assert not_in_urdf(model) == left_out
 
     def test_inconsistent_coupling_inertias_raise(self):
         model, standard = self.coupled(0.3)

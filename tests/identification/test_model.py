@@ -242,24 +242,6 @@ class TestLockedJoints:
         expected = whole.torque(values(whole), all_q, all_qd, all_qdd)[:, free]
         np.testing.assert_allclose(model.torque(values(model), q, qd, qdd), expected, atol=1e-9)
 
-    def test_a_written_urdf_keeps_them(self):
-        urdf = panda()
-        model = RobotModel.from_urdf(urdf, locked=FINGERS)
-        standard = model.nominal
-        standard[model.layout.links] *= np.linspace(1.1, 1.5, 7)[:, None]
-        written = write_urdf(urdf, model, standard)
-        before, after = inertials(urdf), inertials(written)
-        for finger in ("panda_leftfinger", "panda_rightfinger"):
-            assert text(after[finger]) == text(before[finger])
-        # The whole arm, read again, has the identified inertia at the locked positions.
-        arm = pin.buildModelFromXML(written)
-        assert arm.nv == 9
-        again = chain_from_urdf(written, FINGERS).inertial
-        np.testing.assert_allclose(again, standard[model.layout.links], atol=1e-8)
-        # The mass of the fingers is still theirs.
-        left = arm.inertias[arm.getJointId("panda_finger_joint1")].mass
-        assert left == pin.buildModelFromXML(urdf).inertias[8].mass > 0.0
-
     def test_locked_links_are_merged_if_the_rest_is_inconsistent(self):
         urdf = panda()
         model = RobotModel.from_urdf(urdf, locked=FINGERS)

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification import FrictionLaw, ModelError, Recording, RobotModel, prepare
+from identification import FrictionLaw, ModelError, RobotModel
 from identification.estimators.payload import (
     NAMES,
     PayloadError,
@@ -15,7 +15,6 @@ from identification.estimators.payload import (
 )
 from identification.model.payload import Payload
 from identification.model.pseudo_inertia import inertial_parameters, margin
-from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text
 from tests.identification.test_gains import load_torque
@@ -26,7 +25,6 @@ from tests.identification.two_link import (
     as_samples,
     four_sines,
     truth,
-    values_of,
 )
 
 TILTED = (2.0, -3.0, -9.0)
@@ -100,25 +98,6 @@ class TestPayload:
         assert Payload(1.0, at, (0.1, 0.0, 0.0, 0.2, 0.0, 0.3)).possible, "a flat body"
         assert not Payload(1.0, at, (0.1, 0.0, 0.0, 0.1, 0.0, 0.3)).possible
         assert not Payload(1.0, at, (-0.1, 0.0, 0.0, 0.1, 0.0, 0.1)).possible
-
-    def test_a_loaded_arm_has_the_parameters_of_the_bare_one(self):
-        payload, law = Payload(16.0, (0.1, 0.0, 0.2), INERTIA, "link_6"), FrictionLaw(third=None)
-        model = RobotModel.from_urdf(urdf_text(), friction=law, payload=payload)
-        bare = RobotModel.from_urdf(urdf_text(), friction=law)
-        motion = four_sines(np.arange(8000) * 1e-3, n=6, seed=8)
-        truth = values_of(bare, np.full(12, 5.0))
-        recording = Recording(
-            motion.time,
-            motion.position,
-            model.joint_names,
-            torque=bare.torque(truth, *motion[1:]) + model.load_torque(*motion[1:4]),
-        )
-        errors = []
-        for arm in (model, bare):
-            samples = prepare(recording, arm, noise_variance=np.full(6, 1e-14))
-            (error,) = prediction_error(arm, truth, [samples])
-            errors.append(error.overall)
-        assert errors[0] < 0.01 and errors[1] > 0.1
 
 
 LOAD = Payload(4.0, (0.2, 0.0, 0.1), (0.02, 0.0, 0.0, 0.03, 0.0, 0.04))

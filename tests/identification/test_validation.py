@@ -193,12 +193,6 @@ class TestHeldOutTorque:
         np.testing.assert_array_equal(off.half_width, sound.half_width)
         assert off.overall == 0.0 < 0.8 < sound.overall
 
-    def test_without_means_the_share_is_nan(self):
-        samples = recording(coloured(np.random.default_rng(3), LENGTH, 5e-3, 0.05), MOTION)
-        found = calibrated(samples, samples.between(0, 0))
-        assert np.isnan(found.overall)
-        assert not found.blocks.any()
-
 
 class TestInnerFolds:
     def test_each_fold_is_predicted_from_the_others(self):
@@ -211,39 +205,13 @@ class TestInnerFolds:
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
         np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
 
-    def test_a_joint_moving_in_one_fold_has_no_interval(self):
-        samples = recording(coloured(np.random.default_rng(5), LENGTH, 5e-3, 0.05), MOTION)
-        usable = samples.usable.copy()
-        usable[200:, 1] = False
-        fitted = replace(samples, usable=usable).between(0, CUT)
-        found = calibrated(fitted, samples.between(CUT, LENGTH))
-        assert np.isnan(found.inside[1])
-        assert found.blocks.tolist() == [12, 0]
-        assert found.overall == found.inside[0]
-
     def test_two_seconds_are_too_short(self):
         samples = recording(np.zeros((LENGTH, 2)), MOTION)
         with pytest.raises(IdentificationError, match="too short"):
             calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
 
-    def test_final_rest_belongs_to_the_last_fold(self):
-        """Unfitted rows are predicted."""
-        samples = recording(coloured(np.random.default_rng(6), LENGTH, 5e-3, 0.05), MOTION)
-        usable = samples.usable.copy()
-        usable[2400:] = False
-        fitted = replace(samples, usable=usable).between(0, CUT)
-        phase, means = PhaseFactor.from_samples(MODEL, fitted), TorqueMeans.of(MODEL, [fitted])
-        assert np.isfinite(inner_errors(phase, means, least_squares)).all()
-
 
 class TestTorqueMeans:
-    def test_a_half_empty_block_has_no_mean(self):
-        samples = recording(np.zeros((LENGTH, 2)), MOTION)
-        for length, known in ((1040, 10), (1060, 11)):
-            errors = TorqueMeans.of(MODEL, [samples.between(0, length)]).errors(truth())
-            assert len(errors) == 11
-            np.testing.assert_array_equal(np.isfinite(errors).sum(axis=0), known)
-
     def test_edges_are_excluded_and_rest_included(self):
         """Motion or torque are unknown at edges."""
         ends, slow = np.zeros((2, LENGTH, 2), dtype=np.bool_)
