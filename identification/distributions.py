@@ -16,8 +16,3 @@ def normal_limit(share: ArrayLike) -> Any:
 def student_limit(share: ArrayLike, freedom: ArrayLike) -> Any:
     """Value that Student's t of so many degrees of freedom exceeds with probability `share`."""
     return -scipy.special.stdtrit(freedom, share)
-
-
-def fisher_tail(value: ArrayLike, freedom: ArrayLike, spare: ArrayLike) -> Any:
-    """Probability that Fisher's F of (`freedom`, `spare`) degrees of freedom exceeds `value`."""
-    return scipy.special.fdtrc(freedom, spare, value)

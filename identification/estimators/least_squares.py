@@ -120,17 +120,6 @@ class RepeatedEstimate:
             return np.full(len(self.pooled.values), np.nan)
         return np.asarray(self.values.std(axis=0, ddof=1))
 
-    @property
-    def scatter_std(self) -> Array:
-        """Standard deviation of that mean (p,), NaN for one repetition."""
-        return np.asarray(self.std / np.sqrt(len(self.repetitions)))
-
-    @property
-    def independent_std(self) -> Array:
-        """RMS of the standard deviations of the repetitions over sqrt(R) (p,)."""
-        variances = [np.diag(one.covariance) for one in self.repetitions]
-        return np.asarray(np.sqrt(np.mean(variances, axis=0) / len(variances)))
-
 
 def no_narrower(covariance: Array, values: Array) -> Array:
     """Widen a covariance (p, p) where the mean of R values (R, p) scatters significantly more."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import scipy
@@ -85,34 +85,13 @@ def _difference_variance(time: Array, values: Array, order: int) -> Array:
 
 _STRETCH: Final = 4.0  # s; resolution 0.25 Hz
 _FEWEST: Final = 32  # samples
-_BINS: Final = 120
 _NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
 _LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
 
 
-class Spectrum(NamedTuple):
-    """Amplitude spectral density."""
-
-    frequency: Array  # (f,) [Hz], above zero and evenly spread on a logarithmic axis
-    density: Array  # (f, c) [unit of the signals per √Hz]
-
-
-def spectrum(time: Array, signals: Array, segments: Sequence[slice]) -> Spectrum:
-    """Return the spectrum of signals (m, c) in the longest segment of time (m,) [s]."""
-    frequency, power = _power(time, signals, segments, "hann")
-    if not frequency.size:
-        return Spectrum(frequency, power)
-    edges = np.geomspace(frequency[0], frequency[-1], _BINS + 1)
-    bins = np.clip(np.searchsorted(edges, frequency, side="right") - 1, 0, _BINS - 1)
-    starts = np.flatnonzero(np.diff(bins, prepend=-1))
-    counts = np.diff(starts, append=len(bins))
-    mean_power = np.add.reduceat(power, starts, axis=0) / counts[:, None]
-    return Spectrum(np.add.reduceat(frequency, starts) / counts, np.sqrt(mean_power))
-
-
 def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
     """Return the frequency [Hz] above which signals (m, c) have no power; None with noise."""
-    frequency, power = _power(time, signals, segments, "blackmanharris")
+    frequency, power = _power(time, signals, segments)
     power = power[:, power.sum(axis=0) > 0.0]
     if not power.size:
         return None
@@ -122,9 +101,7 @@ def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> f
     return found if silent.any() and found < _LOW_PASSED * frequency[-1] else None
 
 
-def _power(
-    time: Array, signals: Array, segments: Sequence[slice], window: str
-) -> tuple[Array, Array]:
+def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
     """Return frequencies (f,) above zero and power spectral densities (f, c)."""
     longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
     time, signals = time[longest], signals[longest]
@@ -135,7 +112,7 @@ def _power(
     resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
     length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
     frequency, power = scipy.signal.welch(
-        resampled, fs=1.0 / interval, window=window, nperseg=length, axis=0
+        resampled, fs=1.0 / interval, window="blackmanharris", nperseg=length, axis=0
     )
     # Without the mean, and the line changed by detrending.
     return frequency[1:], power[1:]
