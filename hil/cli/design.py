@@ -20,7 +20,6 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
 from hil.design.advice import WEAK, criteria_text, margins, weakest
-from hil.design.result import references
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
@@ -79,7 +78,6 @@ def _draw(
     folder: DesignFolder,
     done: Designed,
     cell: Cell,
-    beside: dict[str, tuple[float, ...]],
 ) -> None:
     """Draw the picture; a failure is only reported."""
     from hil.plots.design_picture import draw_design  # matplotlib is slow to import
@@ -87,7 +85,6 @@ def _draw(
     figure = draw_design(
         done.design,
         cell,
-        references=beside,
         unchecked=done.result.settings.unchecked,
         margins=margins(cell, done.problem, done.design.excitation.trajectory),
     )
@@ -108,7 +105,6 @@ def design(
     seed: Annotated[int | None, typer.Option(min=0)] = None,
     workers: Annotated[int | None, typer.Option(min=1, max=256)] = None,
     kinematic: bool = False,
-    compare: list[Path] | None = None,
     resume: bool = False,
     force: bool = False,
     quiet: QuietOption = False,
@@ -151,7 +147,6 @@ def design(
         workers: Number of processes; the result does not depend on it. Default: one per processor.
         kinematic: Check joint limits only and do not return to the home posture; for comparison
             with the paper, not for a robot.
-        compare: Earlier results to plot beside the front, of the same robot and parameters.
         resume: Continue an interrupted search in OUTPUT.
         force: Replace an earlier design in OUTPUT.
     """
@@ -176,7 +171,6 @@ def design(
         asked = asked.replaced(seed=seed)
     if kinematic:
         asked = asked.kinematic()
-    beside = references(compare or [], loaded, asked)
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
@@ -208,7 +202,7 @@ def design(
                     f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
-        _draw(folder, done, loaded, beside)
+        _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:
         done = run_design(

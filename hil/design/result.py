@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -195,14 +195,14 @@ class DesignResult:
             )
         return result
 
-    def require_cell(self, cell: Cell, path: Path, parts: Sequence[str] = DECISIVE) -> None:
-        """Check that the motion was designed for the parts of a cell.
+    def require_cell(self, cell: Cell, path: Path) -> None:
+        """Check that the motion was designed for the `DECISIVE` parts of a cell.
 
         Raises:
             InputError: names the cells and the parts that differ.
         """
         now, then = fingerprint(cell), self.data["cell"]
-        different = [part for part in parts if now[part] != then.get(part)]
+        different = [part for part in DECISIVE if now[part] != then.get(part)]
         if different:
             raise InputError(
                 path,
@@ -291,34 +291,3 @@ def _seal(text: str) -> str:
     data = tomllib.loads(text, parse_float=str)
     data.pop("seal", None)
     return json_digest(data)
-
-
-def references(
-    paths: Sequence[Path], cell: Cell, settings: DesignSettings
-) -> dict[str, tuple[float, ...]]:
-    """Return the `CRITERIA` of designs by name, for comparison with a new one of these settings.
-
-    Those without all checks are marked as kinematic.
-
-    Raises:
-        InputError: a file cannot be read, or its criteria are not comparable.
-    """
-    found: dict[str, tuple[float, ...]] = {}
-    everything = cell.model.parameter_names
-    judged = set(settings.objective.named or everything)
-    for path in paths:
-        result = DesignResult.load(path)
-        result.require_cell(cell, path, ("urdf", "robot"))
-        if set(result.data["search"].get("parameters") or everything) != judged:
-            raise InputError(
-                path,
-                "has criteria of other parameters",
-                field="--compare",
-                remedy="name designs with the same [objective]",
-            )
-        method = result.excitation.method
-        name = f"method {method.upper()}" if len(method) == 1 else method
-        name += " (kinematic)" if result.settings.unchecked else ""
-        name = f"{name} ({path})" if name in found else name
-        found[name] = result.excitation.criteria.measures
-    return found

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -31,13 +30,10 @@ from identification.model.robot import RobotModel
 from planner import Trajectory
 
 Array = NDArray[np.float64]
-Measures = tuple[float, ...]  #: log10 det, I_c
 
 _PERIOD: Final = 0.001
 """Sampling period of the correlations, s."""
-_MARKERS: Final = "DsP^vX"
 _WHITE: Final[dict[str, Any]] = {"linestyle": "none", "markerfacecolor": "white"}
-_NO_REFERENCES: Final[Mapping[str, Measures]] = MappingProxyType({})
 # inch
 _WIDTH, _ROW, _FRONT, _LEGEND_LINE = 11.8, 1.05, 2.9, 0.22
 _CELL, _SMALLEST, _LARGEST = 0.1, 2.6, 4.0
@@ -45,11 +41,8 @@ _TITLE_AT, _HEAD_LINE, _HEAD_FOOT = 0.36, 0.23, 0.3
 _LINE_LENGTH: Final = 1300.0  # Characters of a line times its font size in points
 
 
-def draw_front(axes: Axes, design: Design, references: Mapping[str, Measures]) -> None:
-    """Draw the front, the chosen motion and references (log10 det, I_c), with a legend.
-
-    References outside the range of the front are only in the legend.
-    """
+def draw_front(axes: Axes, design: Design) -> None:
+    """Draw the front and the chosen motion, with a legend."""
     front, chosen, origin = design.front, design.chosen, design.front.measures[design.origin]
     axes.plot(
         front.measure("coupling_index"), front.measure("log10_det"), drawstyle="steps-post",
@@ -67,15 +60,6 @@ def draw_front(axes: Axes, design: Design, references: Mapping[str, Measures]) -
         mark("grew from", origin, **_WHITE, marker="o", markeredgecolor=style.LIMIT)
     else:  # at the sample period of the front
         mark("chosen", origin, **star, zorder=4.0)
-    axes.axis(axes.axis())
-    for k, (name, measures) in enumerate(references.items()):
-        mark(
-            name,
-            measures,
-            **_WHITE,
-            marker=_MARKERS[k % len(_MARKERS)],
-            markeredgecolor=style.INK,
-        )
     axes.set_xlabel("coupling index I_c (lower is better)")
     axes.set_ylabel("log₁₀(det ΦᵀΦ / Nᵖ) (higher is better)")
     axes.legend(
@@ -147,7 +131,6 @@ def draw_design(
     design: Design,
     cell: Cell,
     *,
-    references: Mapping[str, Measures] = _NO_REFERENCES,
     unchecked: Sequence[str] = (),
     margins: str = "",
 ) -> Figure:
@@ -156,14 +139,13 @@ def draw_design(
     Args:
         design: the search with its motion.
         cell: the cell to run it on.
-        references: (log10 det, I_c) of other motions to compare with, by name.
         unchecked: what the search did not check ("floor", "the arm itself", ...).
         margins: text on the distance to the limits.
     """
     model, trajectory = cell.model, design.excitation.trajectory
     lines = list(_heading(design, cell, unchecked, margins))
     side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
-    beside = _FRONT + _LEGEND_LINE * (len(references) + 3)
+    beside = _FRONT + 3 * _LEGEND_LINE
     head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT
     upper = max(_ROW * model.n_joints + 0.6, side + 1.0 + beside)
     height = head + upper
@@ -178,7 +160,7 @@ def draw_design(
         left.align_ylabels()
         matrix, below = right.subplots(2, 1, height_ratios=(side + 0.6, beside))
         draw_correlation(matrix, trajectory, model)
-        draw_front(below, design, references)
+        draw_front(below, design)
         for k, (text, size, colour) in enumerate(lines):
             at = 1.0 - (_TITLE_AT + k * _HEAD_LINE) / height
             weight = "bold" if colour == style.LIMIT else "normal"

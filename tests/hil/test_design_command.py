@@ -262,7 +262,6 @@ def test_a_contact_at_home_is_reported_before_the_search(invoke, settings, tmp_p
         ([CELL_PATH, "--resume", "-o", "NOWHERE"], "has no design to resume"),
         ([CELL_PATH, "--settings", "NOWHERE"], "cannot be read"),
         (["NOWHERE"], "cannot be read"),
-        ([CELL_PATH, "--compare", "NOWHERE"], "cannot be read"),
         ([CELL_PATH, "-o", "SETTINGS"], "cannot be created"),
     ],
 )
@@ -295,16 +294,6 @@ class Seen:
     def __call__(self, *_, **asked) -> Figure:
         self.arguments.update(asked)
         return Figure()
-
-
-def test_other_designs_are_named_on_the_front(made, bare, invoke, copied):
-    seen, compare = Seen(), ("--compare", made[0], "--compare", bare[0])
-    invoke(CELL_PATH, "--resume", "-o", copied, *compare, draw=seen)
-    whole, kinematic = (load_design(folder).criteria for folder in (made[0], bare[0]))
-    assert seen.arguments["references"] == {
-        "method B": whole.measures,
-        "method B (kinematic)": kinematic.measures,
-    }
 
 
 def test_unchecked_constraints_are_in_picture_json_and_stderr(invoke, bare, copied):

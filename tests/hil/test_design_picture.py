@@ -110,12 +110,8 @@ class TestPage:
 
     def test_motions_on_the_front_are_labelled_with_their_criteria(self, two_link):
         design = design_of(two_link, wandering(two_link))
-        references = {"A": (104.0, 90.5), "B (kinematic)": (20.0, 400.0)}
-        figure = draw_design(design, two_link, references=references)
-        labels = "chosen (105.7, 80.0)", "A (104.0, 90.5)", "B (kinematic) (20.0, 400.0)"
-        assert set(labels) <= set(texts(figure))
-        axes = axes_of(figure, "coupling index")
-        assert axes.get_xlim()[1] < 120.0 and axes.get_ylim()[0] > 95.0  # B does not flatten it
+        figure = draw_design(design, two_link)
+        assert "chosen (105.7, 80.0)" in texts(figure)
         figure = draw_design(replace(design, chosen=None), two_link)
         log10_det, index = design.excitation.criteria.measures
         assert f"chosen, polished ({log10_det:.1f}, {index:.1f})" in texts(figure)

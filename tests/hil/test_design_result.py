@@ -1,19 +1,16 @@
-"""Result files of designs, and comparison of designs."""
+"""Result files of designs."""
 
 from __future__ import annotations
 
 import os
 import re
-from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hil.cell import Cell
 from hil.design import DesignResult, load_design, preset, problem_of
-from hil.design.result import _seal, fingerprint, references
+from hil.design.result import _seal, fingerprint
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
 from hil.progress import Silent
@@ -184,57 +181,3 @@ def test_special_files_in_a_folder_are_refused(tmp_path):
         with pytest.raises(InputError, match="cannot be written to"), folder.opened_journal():
             pass
         folder.journal.unlink()
-
-
-# Comparison of designs.
-
-
-@pytest.fixture(scope="module")
-def result(ns16, tmp_path_factory) -> DesignResult:
-    folder = DesignFolder(tmp_path_factory.mktemp("design") / "a")
-    settings = preset("a").kinematic().replaced(search=TINY)
-    return run_design(folder, ns16, settings, Silent(), workers=1).result
-
-
-@pytest.fixture
-def saved(tmp_path):
-    def saved(result: DesignResult) -> Path:
-        result.save(tmp_path / "excitation.toml")
-        return tmp_path / "excitation.toml"
-
-    return saved
-
-
-def changed(result: DesignResult, **tables: Any) -> DesignResult:
-    return replace(result, data={**result.data, **tables})
-
-
-def test_designs_without_all_checks_are_marked(ns16, result, saved):
-    path = saved(result)
-    found = references([path, path], ns16, preset("b"))
-    name, measures = "method A (kinematic)", result.excitation.criteria.measures
-    assert found == {name: measures, f"{name} ({path})": measures}
-    whole = changed(result, settings=preset("a").to_dict())
-    assert set(references([saved(whole)], ns16, preset("b"))) == {"method A"}
-
-
-def test_another_robot_is_refused(ns16, result, saved):
-    heavier = ns16.with_values({"robot.gravity": [0.0, 0.0, -1.62]})
-    words = r"excitation\.toml: cell: was designed for the cell .*, which differs from .* in robot"
-    with pytest.raises(InputError, match=words):
-        references([saved(result)], heavier, preset("b"))
-
-
-def test_only_criteria_of_the_same_parameters_are_compared(ns16, result, saved):
-    names = list(ns16.model.parameter_names)
-    some, others, everything = (
-        preset("b").replaced(objective={"parameters": chosen})
-        for chosen in (names[:3], names[1:4], names)
-    )
-    search = result.data["search"] | {"parameters": names[:3], "n_parameters": 3}
-    subset = changed(result, search=search)
-    for one, settings in ((result, some), (subset, others)):
-        with pytest.raises(InputError, match=r"\.toml: --compare: has criteria of other"):
-            references([saved(one)], ns16, settings)
-    assert references([saved(subset)], ns16, some)
-    assert references([saved(result)], ns16, everything)
