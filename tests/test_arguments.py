@@ -12,8 +12,6 @@ import pytest
 
 from tests.disk import damage
 from tests.endurance import __main__ as endurance
-from tests.fuzz import __main__ as fuzz
-from tests.fuzz.libfuzzer import Piece
 from tests.journal import Journal, JournalError, entries, rounds
 from tests.process_death import __main__ as process_death
 from tests.simulate import __main__ as simulate
@@ -30,8 +28,6 @@ Command = Callable[[list[str]], int]
         (process_death.main, ["--rounds", "1", "--start", "x"], "--start: 'x' is not"),
         (damage.main, ["--rounds", "1.5"], "--rounds: '1.5' is not"),
         (damage.main, ["--rounds", "1", "--start", "-1"], "--start: '-1' is not"),
-        (fuzz.main, ["urdf", "--minutes", "0"], "--minutes: '0' is not a time above 0"),
-        (fuzz.main, ["urdf", "--jobs", "-2"], "--jobs: '-2' is not"),
         (endurance.main, ["--minutes", "nan"], "--minutes: 'nan' is not"),
     ],
 )
@@ -64,7 +60,6 @@ COMMANDS = {
         damage.main, ["--rounds", "1"], {"round": 3, "harm": "cut in x", "broken": []}
     ),
     "endurance": LongCommand(endurance.main, ["--merge"], {"kind": "begin", "rate": 1000}),
-    "fuzz": LongCommand(fuzz.main, ["codec"], asdict(Piece("codec", 9.0, 100, 5, 7, 3, 80))),
     "deaths": LongCommand(
         process_death.main,
         ["--rounds", "1"],

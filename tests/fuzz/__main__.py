@@ -1,161 +1,117 @@
-"""Coverage-guided fuzzing of all that reads foreign content: ``python -m tests.fuzz all``.
+"""Coverage-guided fuzzing of all that reads foreign content: ``python -m tests.fuzz TARGET``.
 
 Targets: `codec` (packets, CAN frames), `session` (any conversation of a controller), `cell_file`,
 `archive`, `importers`, `urdf`, `documents` (plans, settings, results). Needs atheris, which the
-extra ``fuzz`` brings. The command resumes where an earlier one with the same journal ended, also
-after a kill, until each target has been fuzzed for --minutes.
-
-Beside the journal are FILE.files/TARGET/corpus and findings; a finding is a folder with the input
-and the traceback. ``python -m tests.fuzz.child TARGET --once INPUT`` repeats it. Reported as
-"not reproduced" are processes that ended early and whose last input alone does not repeat that.
+extra ``fuzz`` brings. FOLDER/corpus has the inputs that reach new code, with which the same command
+begins again; FOLDER/findings a folder per cause, with the input and its traceback. libFuzzer ends
+with an artefact in FOLDER where one input crashes Python, or takes too long or too much memory.
 
 Examples:
-  python -m tests.fuzz session --minutes 5 --journal runs/fuzz.jsonl
-  nice python -m tests.fuzz all --minutes 60 --jobs 2 --stop-after 85 --journal runs/fuzz.jsonl
+  python -m tests.fuzz session --minutes 5 --folder runs/fuzz/session
+  python -m tests.fuzz session --once runs/fuzz/session/findings/CAUSE/input
 """
 
 from __future__ import annotations
 
-import json
-import signal
+import hashlib
+import logging
+import resource
 import sys
-import threading
-import time
+import traceback
+import warnings
 from pathlib import Path
-from typing import Any
 
-from hil.progress import Reporter, Task, reporter
-from tests.arguments import at_least_one, parser_of, time_above_0
-from tests.fuzz import libfuzzer, targets
-from tests.journal import JournalError
+from tests.arguments import parser_of, time_above_0
+from tests.fuzz import targets
 
-PIECE = 120.0  # s of one process
-LEAST = 5.0  # s below which no process is started
+ROOT = Path(__file__).resolve().parents[2]
+OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
+INPUT, TRACEBACK = "input", "traceback.txt"
+LONGEST = 5  # s for one input
+MEMORY = 1 << 10  # MB resident
+ADDRESSES = 6 << 30  # bytes of address space, so that an absurd array is refused and not tried
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit status is 1 if anything was found, 2 without a journal."""
+    """Run the command; with `--once` run one input, which raises where it violates a law."""
     parser = parser_of("tests.fuzz", __doc__)
     option = parser.add_argument
-    option("target", choices=(*targets.NAMES, "all"))
-    option("--minutes", type=time_above_0, default=1.0, help="of each target, in all pieces")
-    option("--stop-after", type=time_above_0, metavar="MIN", help="end this command after that")
-    option("--jobs", type=at_least_one, default=1, help="targets at a time")
-    option("--journal", type=Path, required=True, help="JSON lines, added to")
-    option("--json", action="store_true", help="print the figures as JSON")
+    option("target", choices=targets.NAMES)
+    option("--minutes", type=time_above_0, default=1.0)
+    option("--folder", type=Path, help="of corpus and findings")
+    option("--once", type=Path, metavar="INPUT", help="run one input without atheris")
     given = parser.parse_args(arguments)
-    names = targets.NAMES if given.target == "all" else (given.target,)
-    progress = reporter(quiet=given.json)
-    until = time.monotonic() + 60.0 * (given.stop_after or 1e6)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C
-    try:
-        Run(names, 60.0 * given.minutes, until, given.journal).work(given.jobs, progress)
-    except KeyboardInterrupt:
-        progress.say("stopped; the same command continues from here")
-    except JournalError as error:
-        sys.stderr.write(f"error: {error}\n")
-        return 2
-    report = reported(names, given.journal)
-    sys.stdout.write(json.dumps(report) + "\n" if given.json else table(report))
-    return int(bool(report["findings"] or report["not_reproduced"]))
+    warnings.simplefilter("error")
+    warnings.filterwarnings("ignore", category=DeprecationWarning, module="rosbags")
+    logging.disable(logging.CRITICAL)
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESSES, ADDRESSES))
+    if given.once is not None:
+        targets.load(given.target).run(given.once.read_bytes())
+    elif given.folder is None:
+        parser.error("name a --folder, or an input with --once")
+    else:
+        fuzz(given.target, given.minutes, given.folder)
+    return 0
 
 
-class Run:
-    """Fuzzes targets in pieces, the one that was fuzzed least first."""
+def fuzz(name: str, minutes: float, folder: Path) -> None:
+    """Fuzz a target; libFuzzer ends this process."""
+    import atheris
 
-    def __init__(self, names: tuple[str, ...], wanted: float, until: float, path: Path) -> None:
-        self._wanted, self._until, self._path = wanted, until, path
-        self._done = dict.fromkeys(names, 0.0)
-        for piece in libfuzzer.pieces(path):
-            if piece.target in self._done:
-                self._done[piece.target] += piece.seconds
-        self._busy: set[str] = set()
-        self._lock, self._ended = threading.Lock(), threading.Event()
-        self._failed: list[BaseException] = []
+    with atheris.instrument_imports(include=[*OURS, "tomllib", "rosbags", "mcap"]):
+        target = targets.load(name)
+    corpus, findings = folder / "corpus", folder / "findings"
+    for made in (corpus, findings):
+        made.mkdir(parents=True, exist_ok=True)
+    for data in target.seeds():  # named as libFuzzer names them
+        (corpus / hashlib.sha1(data, usedforsecurity=False).hexdigest()).write_bytes(data)
 
-    def work(self, jobs: int, progress: Reporter) -> None:
-        """Work until all have their time; RuntimeError if a target cannot be fuzzed at all."""
-        left = sum(max(0.0, self._wanted - done) for done in self._done.values())
-        with progress.task("fuzzing", left) as task:
-            workers = [threading.Thread(target=self._worker, args=(task,)) for _ in range(jobs)]
-            try:
-                for worker in workers:
-                    worker.start()
-                while any(worker.is_alive() for worker in workers):
-                    time.sleep(0.2)
-            finally:
-                self._ended.set()
-                for worker in workers:  # each ends its process and adds it to the journal
-                    if worker.ident is not None:
-                        worker.join()
-        if self._failed:
-            raise self._failed[0]
-
-    def _worker(self, task: Task) -> None:
+    def one(data: bytes) -> None:
         try:
-            while (given := self._next()) is not None:
-                name, seconds = given
-                target = targets.load(name)
-                with libfuzzer.places_of(self._path, name) as places:
-                    if not any(places.corpus.iterdir()):
-                        libfuzzer.add_inputs(places.corpus, target.seeds())
-                    piece = libfuzzer.fuzz(name, seconds, target.most, places, self._ended)
-                with self._lock:
-                    libfuzzer.append(self._path, piece)
-                    self._done[name] += piece.seconds
-                    self._busy.discard(name)
-                    note = f"{name}: {piece.inputs} inputs, {piece.features} features"
-                    task.advance(min(piece.seconds, seconds), note)
+            target.run(data)
+        except KeyboardInterrupt:
+            raise
         except BaseException as error:
-            self._failed.append(error)
-            self._ended.set()
+            record_finding(findings, error, data)
 
-    def _next(self) -> tuple[str, float] | None:
-        with self._lock:
-            free = [name for name in self._done if name not in self._busy]
-            if not free or self._ended.is_set():
-                return None
-            name = min(free, key=lambda one: self._done[one])
-            left = min(self._wanted - self._done[name], self._until - time.monotonic())
-            if left < LEAST:
-                return None
-            self._busy.add(name)
-            return name, min(left, PIECE)
+    def mutate(data: bytes, most: int, seed: int) -> bytes:
+        # Half of the changes are libFuzzer's own, which knows what comparisons were missed.
+        if seed & 1:
+            return bytes(atheris.Mutate(data, most))
+        return target.mutate(data, most, seed >> 1)
 
-
-def reported(names: tuple[str, ...], path: Path) -> dict[str, Any]:
-    """Return the figures of all pieces: sums, the largest coverage, and the causes found."""
-    done = libfuzzer.pieces(path)
-    found: dict[str, dict[str, Any]] = {}
-    for name in names:
-        own = [piece for piece in done if piece.target == name]
-        early = [one for one in own if one.ended not in ("whole", "stopped")]
-        findings = Path(f"{path}.files") / name / "findings"
-        found[name] = {
-            "inputs": sum(piece.inputs for piece in own),
-            "seconds": round(sum(piece.seconds for piece in own), 1),
-            "edges": max((piece.edges for piece in own), default=0),
-            "features": max((piece.features for piece in own), default=0),
-            "not_reproduced": sum(not piece.reproduced for piece in early),
-            "findings": sorted(one.name for one in findings.glob("*")),
-        }
-    return {
-        "inputs": sum(target["inputs"] for target in found.values()),
-        "seconds": round(sum(target["seconds"] for target in found.values()), 1),
-        "findings": sum(len(target["findings"]) for target in found.values()),
-        "not_reproduced": sum(target["not_reproduced"] for target in found.values()),
-        "targets": found,
-    }
+    options = (
+        f"-timeout={LONGEST}", f"-rss_limit_mb={MEMORY}", f"-max_len={target.most}",
+        f"-max_total_time={round(60.0 * minutes)}", f"-artifact_prefix={folder}/", "-reload=0",
+    )  # fmt: skip
+    places = (str(corpus), str(targets.CORPORA / name))
+    atheris.Setup([sys.argv[0], *options, *places], one, custom_mutator=mutate)
+    atheris.Fuzz()
 
 
-def table(report: dict[str, Any]) -> str:
-    """Return the figures as text, a line per target and per cause."""
-    heads = ("inputs", "seconds", "edges", "features", "not_reproduced")
-    lines = [f"{'target':>10} " + " ".join(f"{head:>14}" for head in heads)]
-    for name, target in report["targets"].items():
-        lines.append(f"{name:>10} " + " ".join(f"{target[head]:>14,}" for head in heads))
-        lines += [f"{'finding':>10}   {cause}" for cause in target["findings"]]
-    return "\n".join(lines) + "\n"
+def record_finding(findings: Path, error: BaseException, data: bytes) -> None:
+    """Store an input that violated a law, one of each cause."""
+    folder = findings / signature(error)
+    if not folder.exists():
+        folder.mkdir(parents=True)
+        (folder / INPUT).write_bytes(data)
+        text = "".join(traceback.format_exception(error, limit=-60))
+        (folder / TRACEBACK).write_text(text, "utf-8", errors="backslashreplace")
+
+
+def signature(error: BaseException) -> str:
+    """Return a name of the cause: the kind of error and the last line of the product.
+
+    Of a RecursionError it is the first line, since the last is arbitrary.
+    """
+    places = [
+        f"{Path(one.filename).relative_to(ROOT)}:{one.lineno}"
+        for one in traceback.extract_tb(error.__traceback__)
+        if Path(one.filename).is_relative_to(ROOT) and ".venv" not in Path(one.filename).parts
+    ]
+    own = [place for place in places if place.split("/")[0] in OURS] or places or ["nowhere"]
+    place = own[0 if isinstance(error, RecursionError) else -1]
+    return f"{type(error).__name__}-{place.replace('/', '.')}".replace(":", "-")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.fuzz import targets
-from tests.fuzz.libfuzzer import CORPORA
+from tests.fuzz.targets import CORPORA
 
 MOST_FILES, MOST_BYTES = 40, 200_000
 
@@ -70,7 +70,7 @@ def test_one_input_can_be_run_by_command(tmp_path: Path) -> None:
     path = tmp_path / "input"
     path.write_bytes(inputs("codec")[0])
     tried = subprocess.run(
-        [sys.executable, "-m", "tests.fuzz.child", "codec", "--once", str(path)],
+        [sys.executable, "-m", "tests.fuzz", "codec", "--once", str(path)],
         cwd=Path(__file__).parents[2], check=False, capture_output=True, text=True,
     )  # fmt: skip
     assert tried.returncode == 0, tried.stderr

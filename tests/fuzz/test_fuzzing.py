@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-import json
-import os
-import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,12 +20,10 @@ from drivers.transports.can.ends import ControllerEnd, PcEnd
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
-from tests.fuzz import libfuzzer, targets
+from tests.fuzz import targets
 from tests.fuzz.draw import Draw
 from tests.fuzz.mutate_mcap import join_file, split_file
 from tests.fuzz.test_corpora import inputs
-
-PIECE = libfuzzer.Piece("codec", 10.0, 100, 5, 7, 3, 80)
 
 
 class TestDraw:
@@ -97,7 +91,7 @@ def test_a_planted_defect_is_found(what: str, monkeypatch: pytest.MonkeyPatch) -
         try:
             target.run(data if seed < 0 else target.mutate(data, target.most, seed))
         except Exception as error:
-            causes.add(libfuzzer.signature(error))
+            causes.add(command.signature(error))
     assert any(cause.startswith(wanted) for cause in causes), causes
 
 
@@ -133,79 +127,18 @@ class TestFindings:
             return error
 
     def test_one_cause_has_one_folder(self, tmp_path: Path) -> None:
-        name = libfuzzer.signature(self.raised("x"))
-        assert name == libfuzzer.signature(self.raised("y"))
-        new = [libfuzzer.record_finding(tmp_path, name, data, "text") for data in (b"1", b"2")]
-        assert new == [True, False]
-        assert (tmp_path / name / libfuzzer.INPUT).read_bytes() == b"1"
-
-
-class TestJournal:
-    def test_pieces_add_up_without_a_truncated_line(self, tmp_path: Path) -> None:
-        path = tmp_path / "j.jsonl"
-        libfuzzer.append(path, PIECE)
-        with path.open("a") as stream:
-            stream.write('{"target": "codec", "sec')  # killed while writing
-        libfuzzer.append(path, libfuzzer.Piece("codec", 5.0, 50, 9, 6, 4, 70, "timeout", False))
-        assert command.reported(("codec",), path)["targets"]["codec"] == {
-            "inputs": 150, "seconds": 15.0, "edges": 9, "features": 7, "not_reproduced": 1,
-            "findings": [],
-        }  # fmt: skip
-
-    def test_completed_work_is_not_repeated(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        path = tmp_path / "j.jsonl"
-        libfuzzer.append(path, replace(PIECE, seconds=61.0))
-        arguments = ["codec", "--minutes", "1", "--journal", str(path), "--json"]
-        assert command.main(arguments) == 0
-        report = json.loads(capsys.readouterr().out)
-        assert (report["inputs"], report["seconds"], report["findings"]) == (100, 61.0, 0)
-        libfuzzer.record_finding(Path(f"{path}.files/codec/findings"), "a", b"", "")
-        assert command.main(arguments[:-1]) == 1
-        assert "finding   a" in capsys.readouterr().out
-
-    @pytest.mark.parametrize(("ended", "status"), [("crash", 1), ("killed", 1), ("stopped", 0)])
-    def test_early_end_that_no_input_repeats_is_reported(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str], ended: str, status: int
-    ) -> None:
-        path = tmp_path / "j.jsonl"
-        libfuzzer.append(path, replace(PIECE, seconds=61.0))
-        libfuzzer.append(path, replace(PIECE, ended=ended))
-        assert command.main(["codec", "--journal", str(path), "--json"]) == status
-        assert json.loads(capsys.readouterr().out)["not_reproduced"] == status
+        for wrong in ("x", "y"):
+            command.record_finding(tmp_path, self.raised(wrong), wrong.encode())
+        (found,) = tmp_path.iterdir()
+        assert (found / command.INPUT).read_bytes() == b"x"
+        assert "could not convert" in (found / command.TRACEBACK).read_text()
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
-def test_output_of_libfuzzer_is_parsed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "j.jsonl"
-    assert command.main(["codec", "--minutes", "0.15", "--journal", str(path), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["targets"]["codec"]["features"] > 100
-    assert report["inputs"] > 50
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
-def test_interrupted_run_leaves_no_process(tmp_path: Path) -> None:
-    path = tmp_path / "j.jsonl"
-    run = subprocess.Popen(
-        [sys.executable, "-m", "tests.fuzz", "codec", "--minutes", "3", "--journal", str(path)],
-        cwd=Path(__file__).parents[2], env={**os.environ, "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-    corpus = Path(f"{path}.files/codec/corpus")
-    planted = len(targets.load("codec").seeds())
-    until = time.monotonic() + 120.0
-    while len([*corpus.glob("*")]) <= planted and time.monotonic() < until:
-        time.sleep(0.2)
-    run.send_signal(signal.SIGINT)
-    output, _ = run.communicate(timeout=60.0)
-    assert run.returncode == 0, output
-    (piece,) = libfuzzer.pieces(path)
-    assert piece.ended == "stopped"
-    assert piece.inputs > planted
-    before = {one.name for one in corpus.iterdir()}
-    time.sleep(2.0)
-    assert before == {one.name for one in corpus.iterdir()}, "a process still runs"
+def test_fuzzing_extends_the_corpus(tmp_path: Path) -> None:
+    words = ("-m", "tests.fuzz", "codec", "--minutes", "0.15", "--folder", str(tmp_path))
+    done = subprocess.run([sys.executable, *words], cwd=command.ROOT, check=False)
+    assert done.returncode == 0
+    assert len([*(tmp_path / "corpus").iterdir()]) > len(targets.load("codec").seeds())
+    assert not [*(tmp_path / "findings").iterdir()]

@@ -12,6 +12,8 @@ from pathlib import Path
 
 NAMES = ("codec", "session", "cell_file", "archive", "importers", "urdf", "documents")
 """All targets, each a module of this package with a `TARGET`."""
+CORPORA = Path(__file__).parents[1] / "corpora"
+"""Inputs in the repository, a folder per target."""
 
 
 Mutation = Callable[[bytes, int, int], bytes]
