@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from tests.disk import damage
 from tests.endurance import __main__ as endurance
 from tests.journal import Journal, JournalError, entries, rounds
 from tests.process_death import __main__ as process_death
@@ -26,8 +25,6 @@ Command = Callable[[list[str]], int]
         (simulate.main, ["--seeds", "-3"], "--seeds: '-3' is not a whole number of 0 or more"),
         (process_death.main, ["--rounds", "-1"], "--rounds: '-1' is not"),
         (process_death.main, ["--rounds", "1", "--start", "x"], "--start: 'x' is not"),
-        (damage.main, ["--rounds", "1.5"], "--rounds: '1.5' is not"),
-        (damage.main, ["--rounds", "1", "--start", "-1"], "--start: '-1' is not"),
         (endurance.main, ["--minutes", "nan"], "--minutes: 'nan' is not"),
     ],
 )
@@ -56,9 +53,6 @@ class LongCommand:
 
 
 COMMANDS = {
-    "disk": LongCommand(
-        damage.main, ["--rounds", "1"], {"round": 3, "harm": "cut in x", "broken": []}
-    ),
     "endurance": LongCommand(endurance.main, ["--merge"], {"kind": "begin", "rate": 1000}),
     "deaths": LongCommand(
         process_death.main,

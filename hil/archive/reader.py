@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from hil.archive import schema
 from hil.archive.cdr import Rows
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome
@@ -132,7 +131,6 @@ def open_archive(
     path: str | PathLike[str],
     *,
     fields: Collection[str] | None = None,
-    topics: Collection[str] | None = None,
     start: float | None = None,
     stop: float | None = None,
 ) -> Archive:
@@ -145,34 +143,23 @@ def open_archive(
     Args:
         path: the file.
         fields: columns wanted, None for all.
-        topics: channels wanted, such as ``/joint_states_commanded`` instead of ``/hil/cycle``;
-            None for those with the numbers and the events.
         start: first time wanted [s], on the clock of ``stamp`` and of the events.
         stop: end of the times wanted [s], exclusive.
 
     Raises:
         NotAnArchiveError: another kind of file, or one truncated before its header.
         ArchiveVersionError: written by a newer version of the profile.
-        ArchiveError: the file cannot be read, or has no such channel.
+        ArchiveError: the file cannot be read.
     """
     path = Path(path)
-    alike = {CYCLE, schema.MEASURED, schema.COMMANDED}.intersection(topics or ())
-    if len(alike) > 1:
-        names = ", ".join(sorted(alike))
-        raise ValueError(f"columns of {names} have the same names: open one at a time")
     times = (
         ALWAYS[0] if start is None else round(start * 1e9),
         ALWAYS[1] if stop is None else round(stop * 1e9),
     )
-    scan = scan_file(path, fields=fields, topics=topics, times=times)
+    scan = scan_file(path, fields=fields, times=times)
     damage = scan.damage
     if scan.header is None:
         raise _unreadable(path, scan)
-    recorded = sorted(scan.parser.topics)
-    unknown = [topic for topic in topics or () if topic not in recorded]
-    if damage is None and recorded and unknown:
-        remedy = f"it has {', '.join(recorded)}"
-        raise ArchiveError(path, "has no such channel", field=unknown[0], remedy=remedy)
     columns, text = scan.columns, None
     if damage is not None:
         text = f"the record at byte {damage.offset} {damage.reason}"

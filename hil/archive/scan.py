@@ -47,8 +47,6 @@ class Scan:
 
     Args:
         fields: columns wanted, None for all.
-        topics: channels wanted, None for those of the samples and the events; others are verified
-            only with `past_damage`.
         times: range of the stamps wanted [ns]; chunks outside, by the index, are not read.
         past_damage: whether to continue behind damage, listed in `faults`, or to stop at the first,
             `damage`.
@@ -70,7 +68,6 @@ class Scan:
         stream: BinaryIO,
         *,
         fields: Collection[str] | None = (),
-        topics: Collection[str] | None = None,
         times: tuple[int, int] = ALWAYS,
         past_damage: bool = False,
     ) -> None:
@@ -87,7 +84,7 @@ class Scan:
         self.pieces: list[tuple[int, int, int]] = []
         self.damage: Damage | None = None
         self.faults: list[str] = []
-        self._fields, self._topics, self._times = fields, topics, times
+        self._fields, self._times = fields, times
         self._past_damage = past_damage
         self._lost = False
         self._gap = False  # whether something was lost behind the last valid chunk
@@ -122,9 +119,7 @@ class Scan:
 
     @property
     def topics(self) -> Collection[str]:
-        """The channels wanted."""
-        if self._topics is not None:
-            return self._topics
+        """The channels of the samples and the events; others are verified with `past_damage`."""
         recorded = schema.CYCLE in self.parser.topics
         samples = (schema.CYCLE,) if recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
         return (*samples, schema.EVENTS)
@@ -320,11 +315,10 @@ class Scan:
         if outcome is None:
             yield "the outcome is missing"
             return
-        found: dict[str, tuple[int | None, int]] = {}
-        for key, topics in {"samples": NUMBERS, "events": (schema.EVENTS,)}.items():
-            if self._past_damage or not set(topics).isdisjoint(self.topics):
-                count = max(self.counts.get(topic, 0) for topic in topics)
-                found[key] = getattr(outcome, key), count
+        found = {
+            "samples": (outcome.samples, self.samples),
+            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
+        }
         if self._chunk_list is not None:
             found["chunks"] = len(self._chunk_list), self.chunks
         for key, (stated, count) in found.items():
@@ -369,8 +363,8 @@ class Scan:
             found = {parser.channels[number].topic: one for number, one in by_number.items()}
             wanted = [topic for topic in self.topics if topic in found]
             numbers = found.keys() & set(NUMBERS)
-            lacking = self._topics is None and numbers and numbers.isdisjoint(wanted)
-            if lacking or (numbers and self._numbers not in (set(), numbers)):
+            new = self._numbers not in (set(), numbers) or numbers.isdisjoint(wanted)
+            if numbers and new:
                 raise Damage(offset, "(chunk) has samples in other channels than those before")
             verified = found if self._past_damage else {topic: found[topic] for topic in wanted}
             missing = self._check_sequences(verified, offset)
@@ -398,8 +392,7 @@ class Scan:
     ) -> dict[str, MessageLayout]:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
         layouts = {}
-        numbers = {*NUMBERS, *(self._topics or ())} - {schema.EVENTS}
-        for topic in found.keys() & numbers if self.header else ():
+        for topic in found.keys() & set(NUMBERS) if self.header else ():
             messages, layout = found[topic], self._layouts.get(topic)
             if layout is None:
                 assert self.header is not None

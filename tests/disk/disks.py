@@ -28,7 +28,7 @@ from hil.files import write_atomically
 RULES, STRUCK = "rules.json", "struck.txt"
 CREATE, WRITE, SYNC, RENAME = "create", "write", "fsync", "rename"
 CHANGES: Final = (CREATE, WRITE, SYNC, RENAME)  # operations on which a disk may fail or hang
-REFUSALS: Final = {"EIO": errno.EIO, "EDQUOT": errno.EDQUOT, "ENOSPC": errno.ENOSPC}
+REFUSALS: Final = {name: getattr(errno, name) for name in ("EIO", "EDQUOT", "ENOSPC", "EROFS")}
 
 
 @dataclass(frozen=True)

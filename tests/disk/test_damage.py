@@ -12,8 +12,7 @@ from hil.archive import open_archive
 from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
-from tests.disk.damage import KINDS, SWAPPED, campaign, main, play
-from tests.disk.laws import Undamaged, broken
+from tests.disk.damage import KINDS, SWAPPED, Undamaged, broken, campaign, play
 from tests.hil.mcap_bytes import chunks
 
 
@@ -73,17 +72,8 @@ def test_wrong_sample_violates_a_law(truth: Undamaged, monkeypatch: pytest.Monke
         current[len(current) // 2] += 0.002
         return replace(archive, columns={**archive.columns, "target_current": current})
 
-    monkeypatch.setattr("tests.disk.laws.open_archive", wrong)
+    monkeypatch.setattr("tests.disk.damage.open_archive", wrong)
     assert any("never written" in law for law in broken(truth, [path], 1))
-
-
-def test_rounds_in_the_journal_are_not_run_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    journal = tmp_path / "rounds.jsonl"
-    journal.write_text('{"round": 3, "harm": "cut in x", "broken": ["a law"]}\n{"rou')
-    assert main(["--rounds", "0", "--journal", str(journal), "--json"]) == 1
-    assert '"seeds_failed": [3]' in capsys.readouterr().out
 
 
 HARMED = "archives/excitation_000_a1.mcap"
@@ -105,7 +95,7 @@ def test_error_must_name_what_was_damaged(
         raise ArchiveError(None, text.format(root=truth.root))
 
     for reader in ("open_archive", "check_archive", "view_of", "identify_archives"):
-        monkeypatch.setattr(f"tests.disk.laws.{reader}", refused)
+        monkeypatch.setattr(f"tests.disk.damage.{reader}", refused)
     laws = list(broken(truth, [truth.root / HARMED], 0))
     assert all("names nothing that was damaged" in law for law in laws)
     assert bool(laws) is not passes

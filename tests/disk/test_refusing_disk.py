@@ -6,21 +6,31 @@ once the disk works.
 
 from __future__ import annotations
 
+import os
 import random
-from collections.abc import Iterator
+import re
+import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner, Result
 
+from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan
+from hil.campaign.link import Link
 from hil.cell import Cell
+from hil.cli import app
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
 from hil.progress import Silent
+from hil.simulation import controller_settings, simulated_controller
 from hil.study import study_settings
 from hil.study.settings import StudyFolder
 from tests.disk.disks import (
+    CHANGES,
     CREATE,
     REFUSALS,
     RENAME,
@@ -38,7 +48,7 @@ DONE = {
     "manifest.json*": {CREATE: 6, WRITE: 6, SYNC: 6, RENAME: 6},
 }  # Least number of operations of a run, by pattern of file names
 Designed = tuple[Cell, CampaignPlan]
-WORDS = ("Input/output error", "Disk quota exceeded", "No space left on device")
+WORDS = ("Input/output", "quota exceeded", "No space left", "Read-only file system")
 REMEDIES = ("make room", "another folder", "record again", "writable")
 
 
@@ -214,3 +224,120 @@ class TestStudy:
         assert names(folder.root) == []
         folder.begin(settings)
         assert names(folder.root) == ["study.json"]
+
+
+STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "design":
+        ("design cell/cell.toml --settings short.toml -o designed --workers 1", ("designed",)),
+    "compare":
+        ("compare campaign second -o pages/compare.html", ("pages", "campaign", "second")),
+    "rehearse": ("rehearse campaign --again", ("campaign",)),
+    "identify": ("identify campaign --quiet", ("campaign",)),
+    "report": ("report campaign", ("campaign",)),
+    "reidentify": ("reidentify campaign --output batch --quiet", ("batch", "campaign")),
+    "plot": ("plot campaign/archives/excitation_000_a1.mcap --output plot.png", ("plot.png",)),
+    "repair": ("archive repair excitation_000_a1.mcap", ("excitation_000_a1_repaired.mcap",)),
+    "new": ("new --urdf campaign/robot.urdf --output new.toml --force", ("new.toml",)),
+}  # fmt: skip
+"""Commands that write, and where."""
+SHORT = {"population": 8, "generations": 1}  # settings of the shortest search
+
+
+def hil(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.fixture(scope="module")
+def prepared(disk: Disk, designed: Designed) -> Campaign:
+    """Complete a campaign; add a second one, a cell file, and settings of a short search."""
+    campaign = rehearsed(disk, "campaign", designed)
+    campaign.run(accept_dry_run=True)
+    campaign.identify()
+    (disk.root / "cell").mkdir()
+    cell = fast_cell(disk.root / "cell", repetitions=2)
+    other = Cell.from_texts(cell.text.replace("seed = 3", "seed = 4"), cell.urdf, cell.path)
+    Campaign.create(disk.root / "second", other, campaign.plan).run(unrehearsed=True)
+    settings = hil("design", "--show-settings", "b").output
+    for key, value in SHORT.items():
+        settings, count = re.subn(rf"(?m)^{key} = \d+", f"{key} = {value}", settings)
+        assert count == 1, settings
+    (disk.root / "short.toml").write_text(settings)
+    return campaign
+
+
+@pytest.mark.slow
+class TestCommands:
+    """Commands report a full or read-only disk, and work once it accepts their files."""
+
+    @pytest.mark.parametrize("error", ["ENOSPC", "EROFS"])
+    @pytest.mark.parametrize("stage", sorted(STAGES))
+    def test_refusal_is_reported(
+        self,
+        disk: Disk,
+        prepared: Campaign,
+        stage: str,
+        error: str,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        monkeypatch.chdir(disk.root)
+        truncated = disk.root / "excitation_000_a1.mcap"
+        whole = (prepared.folder.archives / truncated.name).read_bytes()
+        truncated.write_bytes(whole[: len(whole) // 2])
+        (disk.root / "excitation_000_a1_repaired.mcap").unlink(missing_ok=True)
+        for made in ("designed", "pages", "batch"):
+            shutil.rmtree(disk.root / made, ignore_errors=True)
+        before = entered(prepared)
+        command, written = STAGES[stage]
+        disk.do_wrong(Rule(CHANGES, error=error))
+        refused = hil(*command.split())
+        assert disk.do_wrong()
+        assert entered(prepared) == before
+        text = str(refused.exception)
+        if isinstance(refused.exception, SystemExit):  # printed by a command for several files
+            text = refused.output.partition("error: ")[2]
+        assert any(word in text for word in WORDS), f"{text} {refused.output}"
+        blamed = Path(text.partition(": ")[0]).resolve()
+        assert any(blamed.is_relative_to(disk.root.resolve() / place) for place in written), text
+        again = hil(*command.split())
+        expected = {"repair": 3}.get(stage, 0)  # the end of the archive is lost
+        assert again.exit_code == expected, f"{again.exception!r} {again.output}"
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Campaign:
+    return fast_campaign(tmp_path / "campaign", fast_cell(tmp_path, repetitions=1))
+
+
+def remove_at(
+    monkeypatch: pytest.MonkeyPatch, campaign: Campaign, archive: str, parts: Sequence[str]
+) -> None:
+    """Remove parts of the folder when an archive has been written to five times."""
+    true, count = os.write, 0
+
+    def write(descriptor: int, data: Any) -> int:
+        nonlocal count
+        name = Path(f"/proc/self/fd/{descriptor}").readlink().name
+        count += name == archive
+        if count == 5 and name == archive:
+            for part in parts:
+                shutil.rmtree(campaign.folder.root / part, ignore_errors=True)
+        return true(descriptor, data)
+
+    monkeypatch.setattr(os, "write", write)
+
+
+@pytest.mark.parametrize("parts", [("archives",), ("",)], ids=["the archives", "all of it"])
+def test_removed_folder_is_reported_with_the_arm_at_rest(
+    small: Campaign, parts: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = small.folder.root
+    controller = simulated_controller(small.cell, settings=controller_settings(small.cell))
+    link = Link.over(SimulatedTransport(controller), small.cell, finish=controller.finish)
+    remove_at(monkeypatch, small, "excitation_000_a1.mcap", parts)
+    with pytest.raises(HilError) as raised:
+        small.run(link, None, Silent(), accept_dry_run=True, durable=True)
+    monkeypatch.undo()
+    assert raised.value.exit_code in (1, 2)
+    assert str(root) in str(raised.value)
+    assert "check whether it was moved or removed" in str(raised.value)
+    assert np.abs(controller.plant.velocity).max() < 1e-3

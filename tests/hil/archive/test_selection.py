@@ -14,7 +14,6 @@ from drivers.record import cycle_dtype
 from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.repair import repair
-from hil.errors import ArchiveError
 from tests.hil.archive.conftest import FIRST, peak
 
 PERIOD = 0.01
@@ -68,21 +67,6 @@ class TestTimes:
         )
         archive = open_archive(path, start=3.0, stop=8.0)
         assert archive.columns["position"][:, 0].tolist() == [0.0, 3.0, 4.0]
-
-
-class TestChannels:
-    def test_one_can_be_read_alone(self, written):
-        archive = open_archive(written.path, topics=["/joint_states_commanded"])
-        assert set(archive.columns) == {"stamp", "position", "velocity"}
-        assert np.array_equal(archive.columns["position"], written.rows["commanded_position"])
-        assert archive.events == ()
-        archive = open_archive(written.path, topics=["/hil/events"])
-        assert [event.data["start"] for event in archive.events] == [0, 15, 30]
-        assert archive.n_samples == 0
-        with pytest.raises(ArchiveError, match=r"/wheel: has no such channel; it has /hil/cycle,"):
-            open_archive(written.path, topics=["/wheel"])
-        with pytest.raises(ValueError, match="have the same names"):
-            open_archive(written.path, topics=["/joint_states", "/hil/cycle"])
 
 
 def test_damaged_summary_is_ignored(written, path: Path) -> None:
