@@ -12,13 +12,13 @@ PLOTS = {
     "commanded": "/joint_states_commanded",
 }
 EVENTS = "/hil/events"
-ARM = ("/robot_description", "/tf_static")
+ARM = "/robot_description"
 
 plots = [
     rrb.TimeSeriesView(name=name, origin=topic, contents=f"{topic}/**")
     for name, topic in PLOTS.items()
 ]
-arm = rrb.Spatial3DView(name="arm", origin="/", contents=[f"{topic}/**" for topic in ARM])
+arm = rrb.Spatial3DView(name="arm", origin="/", contents=f"{ARM}/**")
 events = rrb.TextLogView(name="events", origin=EVENTS, contents=f"{EVENTS}/**")
 layout = rrb.Horizontal(rrb.Vertical(arm, events), rrb.Vertical(*plots))
 rrb.Blueprint(layout, collapse_panels=True).save("hil", "arm.rbl")

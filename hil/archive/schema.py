@@ -5,13 +5,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Any, Final, NamedTuple
-from xml.etree.ElementTree import Element, ParseError, fromstring
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.records import Schema
@@ -37,10 +35,6 @@ COMMANDED = "/joint_states_commanded"
 MOTOR_CURRENT = "/motor_currents"
 EVENTS = "/hil/events"
 DESCRIPTION = "/robot_description"
-TRANSFORMS = "/tf_static"
-
-ONCE = frozenset((DESCRIPTION, TRANSFORMS))
-"""Channels of one message without stamp, from which viewers draw the arm."""
 
 PER_CYCLE = frozenset((CYCLE, MEASURED, COMMANDED))
 """Channels with one message per cycle, where there are cycles."""
@@ -138,34 +132,6 @@ _DESCRIPTION = """\
 string data
 """
 
-_TRANSFORMS = """\
-geometry_msgs/TransformStamped[] transforms
-"""
-_TRANSFORM_STAMPED = """\
-MSG: geometry_msgs/TransformStamped
-std_msgs/Header header
-string child_frame_id
-geometry_msgs/Transform transform
-"""
-_TRANSFORM = """\
-MSG: geometry_msgs/Transform
-geometry_msgs/Vector3 translation
-geometry_msgs/Quaternion rotation
-"""
-_VECTOR = """\
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-_QUATERNION = """\
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-"""
-
 
 def _text(message: str, *dependencies: str) -> str:
     return "".join([message, *(f"{_SEPARATOR}\n{part}" for part in dependencies)])
@@ -173,11 +139,6 @@ def _text(message: str, *dependencies: str) -> str:
 
 EVENT_CHANNEL = Channel(EVENTS, "rcl_interfaces/msg/Log", _text(_LOG, _TIME))
 DESCRIPTION_CHANNEL = Channel(DESCRIPTION, "std_msgs/msg/String", _DESCRIPTION)
-TRANSFORM_CHANNEL = Channel(
-    TRANSFORMS,
-    "tf2_msgs/msg/TFMessage",
-    _text(_TRANSFORMS, _TRANSFORM_STAMPED, _HEADER, _TIME, _TRANSFORM, _VECTOR, _QUATERNION),
-)
 
 
 @lru_cache(maxsize=16)
@@ -194,7 +155,6 @@ def profile(n_joints: int) -> Mapping[str, Channel]:
         Channel(MOTOR_CURRENT, f"hil_msgs/msg/MotorCurrent{n_joints}", current),
         EVENT_CHANNEL,
         DESCRIPTION_CHANNEL,
-        TRANSFORM_CHANNEL,
     )
     return {channel.topic: channel for channel in channels}
 
@@ -316,70 +276,11 @@ def message_layout(
     return layout
 
 
-WORLD: Final = "world"  # Parent frame of the base, where the description has no link of that name
-
-
-def description_messages(urdf: bytes) -> dict[Channel, bytes]:
-    """Return the messages that describe an arm, by channel; none for an invalid or too long URDF.
-
-    The transforms are those of the fixed joints, and of the base in the world.
-    """
-    builder, transforms = LayoutBuilder(), LayoutBuilder()
+def description_message(urdf: bytes) -> bytes | None:
+    """Return the message that shows a robot description; None where it is too long, or no text."""
+    builder = LayoutBuilder()
     try:
-        text = urdf.decode()
-        builder.string(text)
-        root = fromstring(text)
-        poses = [*_poses(root)]
-        transforms.count(len(poses))
-        for k, (parent, child, _) in enumerate(poses):
-            transforms.variable(f"stamp{k}", "uint32", 2)  # zero: at all times
-            transforms.string(parent)
-            transforms.string(child)
-            transforms.variable(f"pose{k}", "float64", 7)
-        row = transforms.build().rows(1)
-        for k, (*_, pose) in enumerate(poses):
-            row[f"pose{k}"] = pose
-    except (LayoutError, LookupError, ParseError, ValueError):
-        return {}
-    return {DESCRIPTION_CHANNEL: builder.build().template, TRANSFORM_CHANNEL: row.tobytes()}
-
-
-_Pose = tuple[str, str, tuple[float, ...]]
-"""Parent, child, and the child's origin [m] and quaternion (x, y, z, w) in the parent."""
-
-
-def _poses(root: Element) -> Iterator[_Pose]:
-    """Yield the base in the world, then the fixed joints."""
-
-    def link(joint: Element, end: str) -> str:
-        found = joint.find(end)
-        return "" if found is None else found.get("link", "")
-
-    links = [one.get("name", "") for one in root.findall("link")]
-    if not links:
-        raise ValueError("it has no link")
-    joints = root.findall("joint")
-    children = {link(joint, "child") for joint in joints}
-    for base in links:
-        if WORLD not in links and base not in children:
-            yield WORLD, base, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    for joint in joints:
-        if joint.get("type") == "fixed":
-            origin = joint.find("origin")
-            stated = {} if origin is None else origin.attrib
-            (x, y, z), (roll, pitch, yaw) = (
-                map(float, stated.get(key, "0 0 0").split()) for key in ("xyz", "rpy")
-            )
-            pose = (x, y, z, *_quaternion(roll, pitch, yaw))
-            yield link(joint, "parent"), link(joint, "child"), pose
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return rotations about the fixed axes x, y and z in that order, as (x, y, z, w)."""
-    (a, p), (b, q), (c, r) = ((math.sin(t / 2.0), math.cos(t / 2.0)) for t in (roll, pitch, yaw))
-    return (
-        a * q * r - p * b * c,
-        p * b * r + a * q * c,
-        p * q * c - a * b * r,
-        p * q * r + a * b * c,
-    )
+        builder.string(urdf.decode())
+    except (LayoutError, UnicodeDecodeError):
+        return None
+    return builder.build().template

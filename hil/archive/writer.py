@@ -42,10 +42,11 @@ from hil.archive.schema import (
     Batch,
     Channel,
     cycle_messages,
-    description_messages,
+    description_message,
     profile,
     sample_messages,
 )
+from hil.archive.schema import DESCRIPTION as DESCRIPTION_TOPIC
 from hil.errors import ArchiveWriteError
 from hil.files import sync_folder
 
@@ -101,9 +102,10 @@ class ArchiveFile:
             described["period"] = json.dumps(period)
         described["format_version"] = str(FORMAT_VERSION)
         described["attachments"] = json.dumps(sorted(attachments))
-        self._once = description_messages(attachments.get("robot.urdf", b""))
+        self._description_message = description_message(attachments.get("robot.urdf", b""))
         known = profile(len(joint_names))
-        channels = [*(known[topic] for topic in topics), *self._once]
+        shown = [] if self._description_message is None else [DESCRIPTION_TOPIC]
+        channels = [known[topic] for topic in (*topics, *shown)]
         self.counts = {channel.topic: 0 for channel in channels}
         self.slowest_flush = 0.0
         self.closed = False
@@ -129,12 +131,11 @@ class ArchiveFile:
         numbers = (self.counts[topics[0]] + np.arange(len(batch.stamp))) % _MOST_NUMBERS
         channels = [self._numbers[topic] for topic in topics]
         with self._guarded():
-            if len(batch.stamp):
-                for channel, message in self._once.items():
-                    number, stamp = self._numbers[channel.topic], int(batch.stamp[0])
-                    self._writer.add_message(number, stamp, 0, message)
-                    self.counts[channel.topic] = 1
-                self._once = {}
+            if len(batch.stamp) and self._description_message is not None:
+                number, stamp = self._numbers[DESCRIPTION_TOPIC], int(batch.stamp[0])
+                self._writer.add_message(number, stamp, 0, self._description_message)
+                self.counts[DESCRIPTION_TOPIC] = 1
+                self._description_message = None
             self._writer.add_rows(channels, batch.stamp, numbers, [*batch.messages.values()])
         for topic in topics:
             self.counts[topic] += len(batch.stamp)

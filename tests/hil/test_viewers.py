@@ -80,8 +80,6 @@ class TestLayouts:
             assert np.isfinite(getattr(six[topic][0][1], word)[int(index)])
         named = {*panels["3D!arm"]["topics"], panels["RosOut!events"]["topicToRender"]}
         assert named <= set(six)
-        frames = [t.header.frame_id for t in six["/tf_static"][0][1].transforms]
-        assert panels["3D!arm"]["followTf"] in frames
 
     def test_plotjuggler(self, six: Messages) -> None:
         """It calls the numbers of a JointState topic/joint/word."""
