@@ -17,7 +17,6 @@ from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy import stats
 
 from hil.campaign import CampaignFolder
@@ -165,9 +164,6 @@ class StudyResults(Frozen):
     table1: list[MotionRow]
     conditions: list[ConditionResult]
     conclusion: list[str]  #: Sentences
-    times: dict[str, float] = Field(
-        default_factory=dict
-    )  #: Wall time [s] of each stage in the last session
 
     @classmethod
     def load(cls, path: Path) -> Self:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -41,7 +39,7 @@ def run_study(
     """Reproduce the paper on a simulated cell (default: the NS 16), and write results and page.
 
     An interrupted study resumes with the searches and campaigns that are not complete. Results do
-    not depend on the number of workers, except for the times.
+    not depend on the number of workers.
 
     Raises:
         CellError: the cell is not simulated.
@@ -50,7 +48,7 @@ def run_study(
         NoExcitationError: a search found no feasible motion.
         OutputError: the results cannot be written.
     """
-    folder, times = StudyFolder(root), dict[str, float]()
+    folder = StudyFolder(root)
     if cell is None:
         cell = Cell.load(CELL_PATH)
     else:
@@ -60,23 +58,20 @@ def run_study(
     with folder.locked(), LocalWorkers(workers, timeout=campaigns.LONGEST) as processes:
         folder.begin(settings)
         wanted = campaigns.searches(settings, len(cell.joint_names))
-        with _stage("searches", times):
-            found = campaigns.run_searches(folder, cell, wanted, reporter, workers)
-        with _stage("campaigns", times):
-            best = campaigns.chosen(found)
-            plans = campaigns.plan_study(folder, cell, settings, best)
-            runs = [(one.root, (one,)) for some in plans.values() for one in some.values()]
-            campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
-        with _stage("estimates and predictions", times):
-            calls = []
-            for key, some in plans.items():
-                provenance = simulated_provenance(cell, key == campaigns.EFFECTS)
-                roots = {name: one.root for name, one in some.items()}
-                effects = json.loads(provenance["effects"])
-                calls.append((folder.campaign(key, ""), (key, _WORDS[key], effects, roots, truth)))
-            conditions = campaigns.in_children(
-                results.condition_result, calls, "estimating and predicting", reporter, processes
-            )
+        found = campaigns.run_searches(folder, cell, wanted, reporter, workers)
+        best = campaigns.chosen(found)
+        plans = campaigns.plan_study(folder, cell, settings, best)
+        runs = [(one.root, (one,)) for some in plans.values() for one in some.values()]
+        campaigns.in_children(campaigns.execute, runs, "running campaigns", reporter, processes)
+        calls = []
+        for key, some in plans.items():
+            provenance = simulated_provenance(cell, key == campaigns.EFFECTS)
+            roots = {name: one.root for name, one in some.items()}
+            effects = json.loads(provenance["effects"])
+            calls.append((folder.campaign(key, ""), (key, _WORDS[key], effects, roots, truth)))
+        conditions = campaigns.in_children(
+            results.condition_result, calls, "estimating and predicting", reporter, processes
+        )
         sizes = preset("b").search
         quick = settings.effort_b.tried < sizes.population * sizes.generations
         study = StudyResults(
@@ -91,19 +86,10 @@ def run_study(
             table1=[*_rows(found, best, conditions), *results.printed_rows(cell)],
             conditions=conditions,
             conclusion=results.conclusion_of(conditions, quick=quick),
-            times=times,
         )
         write_files(root, {"results.json": study.to_json(), "report.html": study_page(study)})
         reporter.say(f"report: {root / 'report.html'}")
     return study
-
-
-@contextmanager
-def _stage(name: str, times: dict[str, float]) -> Iterator[None]:
-    """Measure the time of a stage [s]."""
-    begin = time.perf_counter()
-    yield
-    times[name] = round(time.perf_counter() - begin, 1)
 
 
 def _rows(

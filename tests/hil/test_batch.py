@@ -23,7 +23,6 @@ from hil.archive.repair import repair, repaired_name
 from hil.batch import discovery, factors
 from hil.batch.cache import CacheLocation
 from hil.batch.discovery import Discovery, discover
-from hil.batch.estimates import warning_lines
 from hil.batch.factors import cached_bundle, open_ref, reduce_bundle
 from hil.batch.run import reidentify
 from hil.batch.types import ArchiveRef, BatchEstimator, BatchResult
@@ -375,12 +374,6 @@ class TestCommand:
         assert (found["read"], found["cached"]) == (0, 5)
         assert all(Path(path).is_file() for path in found["written"])
 
-    def test_needs_a_place_with_archives(self, tmp_path: Path) -> None:
-        for place in (tmp_path, tmp_path / "missing"):
-            ran = CliRunner().invoke(app, ["reidentify", str(place)])
-            assert isinstance(ran.exception, InputError)
-            assert ran.exception.exit_code == 2
-
 
 # Warnings about archives, and payloads that their cells state
 
@@ -455,22 +448,6 @@ class TestWarnings:
         (arm,) = json.loads(ran.stdout)["arms"].values()
         assert len(arm["campaigns"]) == 2
         assert sum("carries 3 kg" in one["setup"] for one in arm["campaigns"].values()) == 1
-
-    def test_are_listed_once_with_their_archives(self) -> None:
-        def warned(name: str, *warnings: str) -> tuple[ArchiveRef, tuple[str, ...]]:
-            path = f"/line/c1/archives/{name}"
-            return ArchiveRef(path, "", "excitation", "", "/line/c1", 0, "", ""), warnings
-
-        found = [warned(name, "of all") for name in ("a", "b", "c")]
-        assert warning_lines(found) == ("of all",)
-        found += [warned("d", "of all", "of one"), warned("e", "of all", "of two")]
-        found += [warned("f", "of all", "of two")]
-        two = "2 of 6 archives, such as c1/e: of two"
-        one = "1 of 6 archives, such as c1/d: of one"
-        assert warning_lines(found) == ("of all", two, one)
-        many = warning_lines([warned(f"{k}", f"{k} steps of the clock") for k in range(100)])
-        assert len(many) < 20
-        assert "more warnings are listed with the repetitions" in many[-1]
 
 
 # Discovery
