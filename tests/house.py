@@ -29,15 +29,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 72_900,
-    "product files": 380,
-    "test lines": 68_800,
-    "test files": 260,
+    "product lines": 64_200,
+    "product files": 300,
+    "test lines": 62_000,
+    "test files": 240,
     "import circles": 0,
-    "imports inside functions": 32,
-    "files with one importer": 20,
+    "imports inside functions": 30,
+    "files with one importer": 10,
     "banned names": 0,
-    "functions over 60 lines": 23,
+    "functions over 60 lines": 19,
 }
 """Figures that no change may exceed: targets that are met, else those of today, to be lowered."""
 BANNED: Final = {

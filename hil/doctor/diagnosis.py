@@ -102,7 +102,7 @@ def judge(latencies: Sequence[Latency], cycle_ms: int) -> Fitness:
     if not latencies:
         return Fitness(cycle_ms, False, 0, None, None, "nothing was measured")
     period = cycle_ms / 1000
-    worst = max(latencies, key=lambda each: each.late_cycles(period))
+    worst = max(latencies, key=lambda each: (each.late_cycles(period), each.percentile(100)))
     slow = max(latencies, key=lambda each: each.percentile(99.9))
     late, used = worst.late_cycles(period), (slow.percentile(99.9) + RESERVE) / period
     hours = worst.seconds / 3600.0
