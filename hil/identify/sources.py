@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -51,15 +51,6 @@ class Source:
     #: of a part: the complete recording, with torques set to zero outside the part, and the index
     #: of its first sample, so that filters see the motion beyond its ends
     context: tuple[Recording, int] | None = None
-
-    def map_recording(self, change: Callable[[Recording], Recording]) -> Source:
-        """Return the source with a row-by-row change of its recording and context."""
-        context = self.context
-        return replace(
-            self,
-            recording=change(self.recording),
-            context=None if context is None else (change(context[0]), context[1]),
-        )
 
 
 @dataclass(frozen=True, eq=False)
