@@ -19,10 +19,9 @@ from hil.progress import Reporter
 from hil.reading import open_file
 from hil.report import ReportSeries, report_bytes
 from hil.results import ExportResult, Results
-from identification import Estimate, IdentificationError, RobotModel
+from identification import Estimate, IdentificationError
 from identification.estimators.consistent import ConsistentEstimate
-from identification.export.friction import friction_source
-from identification.export.parameters import parameters_csv, parameters_json, standard_csv
+from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 
 RESULTS, REPORT, SERIES = "results.json", "report.html", "report_series.npz"
@@ -98,9 +97,7 @@ def _load_series(path: Path, n_joints: int) -> ReportSeries:
 
 URDF = "identified.urdf"
 PARAMETERS_JSON, PARAMETERS_CSV = "parameters.json", "parameters.csv"
-STANDARD_CSV = "standard.csv"
-FRICTION_SOURCE = "friction.py"
-FILES = (PARAMETERS_JSON, PARAMETERS_CSV, FRICTION_SOURCE, STANDARD_CSV, URDF)
+FILES = (PARAMETERS_JSON, PARAMETERS_CSV, URDF)
 """Exports of an identification."""
 
 
@@ -128,7 +125,7 @@ def exports_of(
 ) -> Exports:
     """Return the exports of an identified model; `provenance` see :func:`provenance_of`.
 
-    URDF and standard parameters need a physically consistent estimate (else `consistent` is the
+    The URDF needs a physically consistent estimate (else `consistent` is the
     reason why there is none). IdentificationError: the estimate is of another model.
     """
     model = cell.model
@@ -143,14 +140,11 @@ def exports_of(
             model, estimate, consistent=possible, essential=essential, provenance=origin
         ),
         PARAMETERS_CSV: parameters_csv(model, estimate, provenance=origin),
-        FRICTION_SOURCE: _friction(model, estimate, possible, origin),
     }
     withheld = {}
     if possible is None:
-        why = f"there are no physically consistent parameters: {consistent}"
-        withheld = {STANDARD_CSV: why, URDF: why}
+        withheld[URDF] = f"there are no physically consistent parameters: {consistent}"
     else:
-        contents[STANDARD_CSV] = standard_csv(model, possible, provenance=origin)
         try:
             contents[URDF] = _urdf(cell, estimate, possible, origin)
         except IdentificationError as error:
@@ -168,26 +162,6 @@ def provenance_of(results: Results, archives: Sequence[Path]) -> dict[str, str]:
         "software": ", ".join(f"{name} {version}" for name, version in results.software.items()),
         "verdict": ("good" if results.verdict.good else "NOT GOOD") + f": {results.verdict.line}",
     }
-
-
-def _friction(
-    model: RobotModel,
-    estimate: Estimate,
-    consistent: ConsistentEstimate | None,
-    origin: Mapping[str, str],
-) -> str:
-    """Return the friction law as source: that of the URDF, if there is one."""
-    if consistent is None:
-        values, whose = estimate.values[model.friction_part], "least squares"
-    else:
-        values, whose = consistent.friction, f"the physically consistent parameters of {URDF}"
-    names = model.parameter_names[model.friction_part]
-    remarks = [f"friction of {whose}"]
-    if unknown := ", ".join(name for name in names if name in estimate.undetermined):
-        remarks.append(f"NOT DETERMINED by the data, what stands for them is no figure: {unknown}")
-    remarks += [f"{key}: {value}" for key, value in origin.items()]
-    header = "".join(f"# {line}\n" for line in remarks)
-    return header + friction_source(model, values)
 
 
 def _urdf(

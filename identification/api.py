@@ -30,7 +30,6 @@ from identification.estimators.prior import (
     with_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.export.friction import friction_source
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
 from identification.factor.factor import Estimate, Factor, NormalEquations, QRFactor, estimate

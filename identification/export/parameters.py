@@ -55,6 +55,8 @@ def parameters_json(
             for one in model.elements.placed
         ],
         "gravity": model.gravity.tolist(),
+        "friction_laws": [law.table() for law in model.friction.laws],
+        "motor_speeds": model.friction.motor_speeds().tolist(),
         "convention": CONVENTION,
         "method": estimate.method,
         "interval_factor": estimate.interval_factor,
@@ -99,36 +101,12 @@ def parameters_csv(
     return _table(remarks, rows)
 
 
-def standard_csv(
-    model: RobotModel,
-    consistent: ConsistentEstimate,
-    *,
-    provenance: Mapping[str, str] | None = None,
-) -> str:
-    """Return a table of the consistent standard parameters, one row per joint.
-
-    A name that a spreadsheet would take for a formula gets an apostrophe.
-    """
-    layout, standard = model.layout, consistent.standard
-    remarks = {**(provenance or {}), "convention": CONVENTION}
-    remarks |= {
-        layout.names[k]: f"{float(standard[k])!r} {layout.units[k]}" for k in layout.couplings
-    }
-    inertial, rotors = standard[layout.links].tolist(), standard[layout.rotors].tolist()
-    heading = ["joint", *LINK_SYMBOLS, *(["Im"] if rotors else []), "margin", "reference"]
-    rows: list[list[object]] = [[*heading]]
-    for joint, name in enumerate(model.joint_names):
-        numbers = [*inertial[joint], *rotors[joint : joint + 1], float(consistent.margin[joint])]
-        formula = name.lstrip().startswith(("=", "+", "-", "@"))
-        rows.append([f"'{name}" if formula else name, *numbers, consistent.reference[joint]])
-    return _table(remarks, rows)
-
-
 def _table(remarks: Mapping[str, str], rows: Iterable[Sequence[object]]) -> str:
     """Return CSV after one line per remark that starts with #."""
     out = io.StringIO()
     for key, value in remarks.items():
         line = " ".join(f"{key}: {value}".split())
+        # Otherwise a spreadsheet may take a part for a formula.
         out.write("# " + re.sub(r"(?<=[,;])[=+@-]", r"'\g<0>", line) + "\n")
     csv.writer(out, lineterminator="\n").writerows(rows)
     return out.getvalue()

@@ -48,10 +48,6 @@ class FrictionTerm:
     description: str
     value: Callable[[Array, Array, float], Array]  # column, of speeds, directions and `speed`
     selected: Callable[[FrictionLaw], Any] | None = None  # setting, if not that of `option`
-    basis: str = ""  # the column as a formula
-    # the column in Python, as a factor of the coefficient, with the speed `v`, its direction
-    # `sign`, Euler's number `E` and `speed` as `LABEL_SPEED[joint]`
-    code: str = ""
     power: int = 0  # of the speed in the denominator of the coefficient's unit
     speed_symbol: str = ""  # of `speed`; empty for a column without it
     urdf: str = ""  # attribute of `<dynamics>` for the coefficient, if any
@@ -65,11 +61,6 @@ class FrictionTerm:
 
     def __reduce__(self) -> tuple[object, ...]:
         return _term, (self.label, self.speed)
-
-    @property
-    def formula(self) -> str:
-        """The term as a formula."""
-        return f"{self.symbol} {self.basis}".rstrip()
 
     def of(self, law: FrictionLaw) -> FrictionTerm | None:
         """Return the term with the settings of a law, None if the law does not have it."""
@@ -104,8 +95,6 @@ COULOMB: Final = FrictionTerm(
     option="coulomb",
     label="Coulomb",
     description="Coulomb (dry) friction f0",
-    basis="sgn(v)",
-    code=" * sign",
     value=lambda v, s, _: s,
     selected=lambda law: law.coulomb and law.tanh is None,
     urdf="friction",
@@ -117,8 +106,6 @@ TANH: Final = FrictionTerm(
     option="tanh",
     label="tanh",
     description="Coulomb friction f0 with a smooth sign",
-    basis="tanh(v/vt)",
-    code=" * tanh(v / TANH_SPEED[joint])",
     value=lambda v, s, vt: np.tanh(v / vt),
     speed_symbol="vt",
     urdf="friction",
@@ -130,8 +117,6 @@ VISCOUS: Final = FrictionTerm(
     option="viscous",
     label="viscous",
     description="viscous friction f1",
-    basis="v",
-    code=" * v",
     value=lambda v, s, _: v,
     power=1,
     urdf="damping",
@@ -144,8 +129,6 @@ ASYMMETRIC: Final = FrictionTerm(
     option="asymmetric",
     label="asymmetric",
     description="half the difference fd of viscous friction forwards and backwards",
-    basis="|v|",
-    code=" * abs(v)",
     value=lambda v, s, _: np.abs(v),
     selected=lambda law: law.asymmetric and law.viscous,
     power=1,
@@ -157,8 +140,6 @@ QUADRATIC: Final = FrictionTerm(
     option="third",
     label="quadratic",
     description="a term f2 with the speed squared",
-    basis="sgn(v) v²",
-    code=" * v * abs(v)",
     value=lambda v, s, _: np.abs(v) * v,
     power=2,
 )
@@ -167,8 +148,6 @@ CUBIC: Final = FrictionTerm(
     option="third",
     label="cubic",
     description="a term f2 with the third power of the speed",
-    basis="v³",
-    code=" * v**3",
     value=lambda v, s, _: v * v * v,
     power=3,
 )
@@ -177,8 +156,6 @@ STRIBECK: Final = FrictionTerm(
     option="stribeck",
     label="Stribeck",
     description="additional friction fs at low speed (Stribeck)",
-    basis="sgn(v) exp(-(v/vs)²)",
-    code=" * sign * E ** -((v / STRIBECK_SPEED[joint]) ** 2)",
     value=lambda v, s, vs: np.exp(-(v / vs) * (v / vs)) * s,
     speed_symbol="vs",
     not_negative=True,

@@ -47,12 +47,8 @@ SLIDER = """<robot name="slider"><link name="base"/>
 <link name="arm"><inertial><origin xyz="0 0.01 -0.3"/><mass value="1.5"/>
 <inertia ixx="0.02" iyy="0.02" izz="0.004" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
 """
-ALL = {"parameters.json", "parameters.csv", "standard.csv", "friction.py",
-       "identified.urdf"}  # fmt: skip
+ALL = {"parameters.json", "parameters.csv", "identified.urdf"}
 PROVENANCE = {"robot": "arm", "archives": "run_1.mcap sha256 0a1b", "verdict": "good: 1.1%"}
-BARE = "import json, runpy, sys; f = runpy.run_path(sys.argv[1]); " + (
-    "print(json.dumps([f['torques'](v) for v in json.load(sys.stdin)]))"
-)
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +107,7 @@ def any_arm(request: pytest.FixtureRequest) -> IdentifiedArm:
 
 
 def test_urdf_rotors_and_friction_give_the_torque(any_arm: IdentifiedArm, tmp_path: Path) -> None:
-    """From the files: pinocchio on the URDF, JSON, friction source in a separate interpreter."""
+    """From the files: pinocchio on the URDF, and JSON."""
     parameters = parameters_of(any_arm, tmp_path)
     model, consistent = any_arm.cell.model, any_arm.consistency.consistent
     motion = a_motion(model.n_joints, seed=5)
@@ -121,7 +117,7 @@ def test_urdf_rotors_and_friction_give_the_torque(any_arm: IdentifiedArm, tmp_pa
     q, qd, qdd = q[moving], qd[moving], qdd[moving]
     rigid = rigid_torque(tmp_path / "identified.urdf", parameters, q, qd, qdd)
     rotors = qdd @ np.array(parameters["standard"]["rotor_matrix"])
-    total = rigid + rotors + bare_friction(tmp_path / "friction.py", qd)
+    total = rigid + rotors + friction_torque(parameters, qd)
     expected = model.torque(consistent.estimate.values, q, qd, qdd)
     np.testing.assert_allclose(total, expected, atol=1e-7 * np.abs(expected).max())
 
@@ -145,12 +141,24 @@ def rigid_torque(urdf: Path, parameters: dict[str, Any], q: Array, qd: Array, qd
     return torque
 
 
-def bare_friction(source: Path, speeds: Array) -> Array:
-    """Return friction torques from an interpreter without packages."""
-    given = json.dumps(speeds.tolist())
-    words = [sys.executable, "-I", "-S", "-c", BARE, str(source)]
-    done = subprocess.run(words, input=given, capture_output=True, text=True, check=True)
-    return np.array(json.loads(done.stdout))
+def friction_torque(parameters: dict[str, Any], speeds: Array) -> Array:
+    """Return the friction of joints and coupled motors by the formulas of docs/results.md."""
+
+    def of(law: dict[str, Any], values: dict[str, float], v: Array) -> Array:
+        sign, third = np.sign(v), v * np.abs(v) if law["third"] == "quadratic" else v**3
+        slow = sign * np.exp(-((v / law["stribeck"]) ** 2)) if law["stribeck"] else 0.0 * v
+        terms = {"f0": sign, "f1": v, "fd": abs(v), "f2": third, "fs": slow, "fo": np.ones_like(v)}
+        return np.asarray(sum(value * terms[symbol] for symbol, value in values.items()))
+
+    laws, standard = parameters["friction_laws"], parameters["standard"]
+    joints = zip(laws, standard["links"], speeds.T, strict=True)
+    torque = np.column_stack([of(law, link["friction"], v) for law, link, v in joints])
+    for name, value in standard["motor_friction"].items():
+        symbol, motor = name.split("_m")
+        motors = dict.fromkeys(key.split("_m")[1] for key in standard["motor_friction"])
+        share = np.array(parameters["motor_speeds"][[*motors].index(motor)])
+        torque += np.outer(of(laws[int(motor) - 1], {symbol: value}, speeds @ share), share)
+    return torque
 
 
 def table(path: Path) -> list[dict[str, str]]:
@@ -159,17 +167,14 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 def test_only_consistent_parameters_become_a_urdf(arm: IdentifiedArm, tmp_path: Path) -> None:
-    """Otherwise an old URDF is removed; friction is that of the free estimate."""
+    """Otherwise an old URDF is removed."""
     exported(arm, tmp_path)
     (tmp_path / "mine.urdf").write_text("mine")
     found = write_exports(tmp_path, arm.cell, arm.estimate, "no convergence")
-    assert set(found.withheld) == {"identified.urdf", "standard.csv"}
+    assert set(found.withheld) == {"identified.urdf"}
     assert "no convergence" in found.withheld["identified.urdf"]
     left = {path.name for path in tmp_path.iterdir()}
     assert left == (ALL - set(found.withheld)) | {"mine.urdf"}
-    free = arm.estimate.values[arm.cell.model.base.rank :]
-    torque = bare_friction(tmp_path / "friction.py", np.array([[1.0, 1.0]]))[0]
-    np.testing.assert_allclose(torque, free.reshape(-1, 2).sum(axis=0), rtol=1e-12)
     broken = arm.consistency.consistent.standard.copy()
     broken[arm.cell.model.layout.links[1, 9]] = -1.0
     impossible = replace(arm.consistency.consistent, standard=broken)
@@ -184,7 +189,6 @@ def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
     write_exports(tmp_path, arm.cell, arm.estimate, arm.consistency.consistent, provenance=evil)
     model = arm.cell.model
     assert chain_from_urdf((tmp_path / "identified.urdf").read_text()).n_joints == model.n_joints
-    assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
     assert len(table(tmp_path / "parameters.csv")) == model.n_parameters
     evil = "a---&gt;'&quot;&quot;&quot; &lt;script&gt;alert(1)&lt;/script&gt;#"
     urdf = TWO_LINK.replace("shoulder", evil).replace('"upper"', f'"{evil}"')
@@ -193,8 +197,7 @@ def test_names_cannot_break_a_file(arm: IdentifiedArm, tmp_path: Path) -> None:
     assert not found.withheld
     chain = chain_from_urdf((tmp_path / "identified.urdf").read_text())
     assert chain.joint_names == arm.cell.joint_names
-    assert bare_friction(tmp_path / "friction.py", np.ones((1, 2))).shape == (1, 2)
-    assert len(table(tmp_path / "standard.csv")) == 2
+    assert len(table(tmp_path / "parameters.csv")) == arm.cell.model.n_parameters
 
 
 def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
@@ -204,9 +207,6 @@ def test_a_joint_at_rest_keeps_its_description(tmp_path: Path) -> None:
     text = (tmp_path / "identified.urdf").read_text()
     assert '<dynamics damping="0.7" friction="0.3"/>' in text
     assert "not determined by the data" in text
-    source = (tmp_path / "friction.py").read_text()
-    assert "NOT DETERMINED" in source.splitlines()[1]
-    assert "f0_2" in source.splitlines()[1]
     rows = {row["name"]: row for row in table(tmp_path / "parameters.csv")}
     assert float(rows["f0_2"]["std"]) == np.inf
     rows = json.loads((tmp_path / "parameters.json").read_text())["parameters"]

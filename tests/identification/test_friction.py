@@ -1,7 +1,3 @@
-import math
-import pickle
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,28 +5,11 @@ from hypothesis import strategies as st
 
 from identification import FrictionLaw, ModelError, RobotModel, ShapeError
 from identification.model.coupling import Coupling
-from identification.model.friction import TERMS, JointFriction, dissipation, presliding_state
+from identification.model.friction import JointFriction, dissipation, presliding_state
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import NS16_TURNS
 from tests.identification.two_link import MODEL, a_motion, truth
 from tests.identification.two_link import URDF as TWO_LINK
-
-
-@pytest.mark.parametrize("kind", TERMS)
-class TestFrictionTerms:
-    """Column and source code of each term agree."""
-
-    SPEED = np.array([-2.0, -0.3, 0.1, 0.7])
-
-    def test_source_code_computes_the_column(self, kind):
-        term = replace(kind, speed=0.4)
-        names = {f"{kind.label.upper()}_SPEED": [term.speed], "joint": 0}
-        names |= {"E": math.e, "tanh": math.tanh}
-        code = [eval("1.0" + kind.code, {"v": v, "sign": np.sign(v), **names}) for v in self.SPEED]
-        np.testing.assert_allclose(code, term.column(self.SPEED, np.sign(self.SPEED)), rtol=1e-14)
-
-    def test_another_process_has_the_same_term(self, kind):
-        assert pickle.loads(pickle.dumps(replace(kind, speed=0.4))) == replace(kind, speed=0.4)
 
 
 class TestFrictionTable:
