@@ -39,10 +39,10 @@ test: $(STAMP)  ## lint, types, floors, declared dependencies and the quick test
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/deptry .
-	$(PYTEST) -m "not slow and not qemu and not safety and not long"
+	$(PYTEST) -m "not slow and not safety and not long"
 
 test-safety: $(STAMP)  ## what drives an arm, and what breaks it: for any change on the way to the controller
-	$(PYTEST) -m "safety and not slow and not qemu"
+	$(PYTEST) -m "safety and not slow"
 
 test-all: $(STAMP)  ## every test but those that take minutes
 	$(PYTEST)

@@ -7,23 +7,21 @@ are waited for; cyclic packets are timed by the controller.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
 import can
 
 from drivers.transports.base import TransportError
-from drivers.transports.can.ends import ControllerEnd
-from drivers.transports.can.layout import BusRates
-from drivers.transports.can.transport import CanSpec, Port, open_bus
+from drivers.transports.can.profile import BusRates, ControllerEnd
+from drivers.transports.can.transport import CanLink, CanSpec, open_bus
 from sim_fixtures.serve import ControllerLinkError
 
 START_PATIENCE: Final = 0.25
 """Least timeout for the answer to a packet sent as segments [s]."""
 
 
-class CanControllerLink:
+class CanControllerLink(CanLink):
     """`sim_fixtures.serve.ControllerLink` on a CAN bus, which `close` closes.
 
     After a packet sent as segments, the timeout of `receive` is at least `start_patience` [s];
@@ -39,7 +37,7 @@ class CanControllerLink:
         clock: Callable[[], float] = time.time,
     ) -> None:
         self._end = ControllerEnd(rates)
-        self._port = Port(bus, self._end, fd=rates.profile == "fd", clock=clock)
+        super().__init__(bus, self._end, clock=clock)
         self._start_patience = start_patience
         self._awaited = False
 
@@ -52,7 +50,7 @@ class CanControllerLink:
         """
         if not packet:
             return
-        self._port.send(self._end.packet(packet))
+        self.send_frames(self._end.packet(packet))
         self._awaited = self._end.segmented
 
     def receive(self, timeout: float) -> bytes | None:
@@ -63,21 +61,12 @@ class CanControllerLink:
         """
         patience = max(timeout, self._start_patience) if self._awaited else timeout
         self._awaited = False  # a lost answer is waited for once
-        return self._port.receive(patience)
-
-    @property
-    def discarded(self) -> Counter[str]:
-        """Number of discarded frames, sets and packets by kind."""
-        return self._port.discarded
+        return super().receive(patience)
 
     @property
     def foreign(self) -> int:
         """Number of frames that are not the PC's."""
-        return self._port.discarded["foreign"]
-
-    def close(self) -> None:
-        """Close the bus; closing twice has no effect."""
-        self._port.close()
+        return self.discarded["foreign"]
 
 
 def open_controller_link(

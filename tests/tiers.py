@@ -71,7 +71,7 @@ LONG: Final = (
 """Files that take too long for every change."""
 
 QUICK: Final = (
-    "drivers/test_can_frames.py",
+    "drivers/test_can_profile.py",
     "drivers/test_can_transport.py",
     "drivers/test_captures.py",
     "drivers/test_guard.py",

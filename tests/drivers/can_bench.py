@@ -24,8 +24,7 @@ from drivers import (
     exchange,
 )
 from drivers.packets import next_number
-from drivers.transports.can.ends import ControllerEnd, PcEnd
-from drivers.transports.can.layout import BusRates
+from drivers.transports.can.profile import PAYLOADS_FD, BusRates, ControllerEnd, PcEnd
 from drivers.transports.can.transport import CanTransport
 from hil.cell import Cell
 from hil.simulation import planted_truth, simulated_drive
@@ -76,22 +75,15 @@ class Wire:
 
     def up(self, packet: bytes) -> bytes | None:
         self.time += 0.002
-        return self.take(self.far.packet(packet))
-
-    def take(self, frames) -> bytes | None:
-        out = None
-        for frame in frames:
-            packet = self.near.receive(frame, self.time)
-            assert packet is None or out is None
-            out = packet if packet is not None else out
-        return out
+        return self._passed(self.near, self.far.packet(packet))
 
     def down(self, reply: bytes) -> bytes | None:
-        out = None
-        for frame in self.near.reply(reply):
-            packet = self.far.receive(frame, self.time)
-            out = packet if packet is not None else out
-        return out
+        return self._passed(self.far, self.near.reply(reply))
+
+    def _passed(self, end, frames) -> bytes | None:
+        packets = [packet for frame in frames if (packet := end.receive(frame, self.time))]
+        assert len(packets) <= 1
+        return packets[0] if packets else None
 
 
 class Cycles:
@@ -126,13 +118,14 @@ class PacedByPackets:
     Bytes go over whatever bus the two ends are on; time is a count of cycles.
     """
 
-    def __init__(self, near, far, controller, *, lost=(), clock=None) -> None:
+    def __init__(self, near, far, controller, *, lost=(), clock) -> None:
         self.near, self.far, self.controller = near, far, controller
         self.lost = frozenset(lost)
         self.cycle = 0
-        self.clock = clock if clock is not None else Cycles()
+        self.clock = clock
         self.replies: list[bytes | None] = []
         self._awaiting = False
+        self.rejected, self.forget_peer = near.rejected, near.forget_peer
 
     @property
     def now(self) -> float:
@@ -170,12 +163,6 @@ class PacedByPackets:
         self.replies.append(reply)
         self.controller.accept(reply)
 
-    def rejected(self) -> dict[str, int]:
-        return self.near.rejected()
-
-    def forget_peer(self) -> None:
-        self.near.forget_peer()
-
     def close(self) -> None:
         self.near.close()
         self.far.close()
@@ -205,26 +192,42 @@ def ns16_controller(**settings) -> SimulatedController:
 PERIOD = 0.002
 
 
+def session_on(profile, *, until, clock=None, ends=None, controller=None, session=None, lost=()):
+    """Run a session, paced by its packets, until `until(link)`; returns link and session."""
+    clock = clock if clock is not None else Cycles()
+    near, far = ends or virtual_ends(profile, clock)
+    controller = controller or ns16_controller()
+    link = PacedByPackets(near, far, controller, lost=lost, clock=clock)
+    guard = Guard(wide_limits(), controller.period)
+    session = session or Session(NS16.drive_train, guard, CycleRing(N, 64))
+    exchange(link, session, until=lambda: until(link))
+    return link, session
+
+
 class Run:
-    """One session from cold start to its end, paced by its packets."""
+    """One session from cold start to its end."""
 
     def __init__(self, profile, *, ends=None, cycles=300, lost=(), mode=4, **settings):
-        clock = Cycles()
-        self.near, self.far = ends or virtual_ends(profile, clock)
         self.controller = ns16_controller(open_mode=mode, **settings)
-        self.link = PacedByPackets(self.near, self.far, self.controller, lost=lost, clock=clock)
         self.ring = CycleRing(N, 8192)
         guard = Guard(wide_limits(), PERIOD)
         self.session = Session(NS16.drive_train, guard, self.ring, settle_cycles=20, mode=mode)
         self.session.request(smooth_move(MOVE, cycles, start=HOME))
         self.events = []
-        exchange(self.link, self.session, until=self._until)
+        self.link, _ = session_on(
+            profile,
+            until=self._until,
+            ends=ends,
+            controller=self.controller,
+            session=self.session,
+            lost=lost,
+        )
         self.link.close()
         self.events += self.session.events()
 
-    def _until(self):
+    def _until(self, link):
         self.events += self.session.events()
-        return self.link.cycle > 5000
+        return link.cycle > 5000
 
     def seen(self, kind):
         return [event for event in self.events if isinstance(event, kind)]
@@ -234,117 +237,75 @@ class Run:
         return self.ring.last(self.ring.capacity)
 
 
-_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
-_OK, _BELL = b"\r", b"\a"
-
-
-class _Adapter:
-    """One adapter: its end of the pseudo-terminal and the commands that it got."""
-
-    def __init__(self) -> None:
-        self.master, self._slave = pty.openpty()
-        tty.setraw(self.master)
-        tty.setraw(self._slave)
-        self.port = os.ttyname(self._slave)
-        self.open = False
-        self.rates: list[str] = []
-        self.waiting = bytearray()
-        self._line = bytearray()
-        os.set_blocking(self.master, False)
-
-    def hand_over(self) -> None:
-        """Give the host as much of what waits for it as it takes."""
-        with contextlib.suppress(BlockingIOError):
-            del self.waiting[: os.write(self.master, self.waiting)]
-
-    def lines(self) -> list[str]:
-        """Commands that have come in whole."""
-        self._line += os.read(self.master, 4096)
-        *whole, rest = self._line.split(b"\r")
-        self._line = bytearray(rest)
-        return [line.decode("ascii") for line in whole]
-
-    def close(self) -> None:
-        os.close(self.master)
-        os.close(self._slave)
-
-
-def _is_frame(line: str) -> bool:
-    """Whether a command is a well-formed data frame with a standard identifier."""
-    if len(line) < 5 or line[0] not in "tdb":
-        return False
-    length = int(line[4], 16)
-    if line[0] == "t" and length > 8:
-        return False
-    return len(line) == 5 + 2 * _LENGTHS[length] and int(line[1:4], 16) < 0x800
-
-
 class SlcanBus:
-    """Two adapters joined by a bus, served by a thread.
+    """Two emulated serial adapters joined by a bus, served by a thread.
 
-    Attributes:
-        ports: the two serial devices.
-        refused: commands that were answered with the bell.
+    `ports` are the serial devices, `rates` the bit rate commands of each, `refused` the commands
+    that were answered with the bell.
     """
 
     def __init__(self) -> None:
-        self._adapters = (_Adapter(), _Adapter())
-        self.ports = tuple(adapter.port for adapter in self._adapters)
+        self._terminals = [pty.openpty() for _ in range(2)]
+        self.ports = tuple(os.ttyname(slave) for _, slave in self._terminals)
+        self.rates: tuple[list[str], list[str]] = ([], [])
         self.refused: list[str] = []
-        self._wake = os.pipe()
+        self._open = [False, False]
+        self._waiting = bytearray(), bytearray()
+        self._ending = threading.Event()
+        for master, slave in self._terminals:
+            tty.setraw(slave)
+            os.set_blocking(master, False)
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
-    @property
-    def rates(self) -> list[list[str]]:
-        """The bit rate commands each adapter was given."""
-        return [adapter.rates for adapter in self._adapters]
-
     def _serve(self) -> None:
-        masters = {adapter.master: adapter for adapter in self._adapters}
-        ending = False
+        masters = [master for master, _ in self._terminals]
+        parts = [b"", b""]
         while True:
             # Commands written before the end are still executed.
-            sources = [*masters] if ending else [*masters, self._wake[0]]
-            full = [adapter.master for adapter in self._adapters if adapter.waiting]
-            ready, free, _ = select.select(sources, full, [], 0.0 if ending else None)
+            ending = self._ending.is_set()
+            full = [master for master, data in zip(masters, self._waiting, strict=True) if data]
+            ready, free, _ = select.select(masters, full, [], 0.0 if ending else 0.01)
             if ending and not ready:
                 return
-            for master in free:
-                masters[master].hand_over()
-            ending = ending or self._wake[0] in ready
-            for master in ready:
-                if master not in masters:
-                    continue
-                adapter = masters[master]
-                other = next(a for a in self._adapters if a is not adapter)
-                for line in adapter.lines():
-                    self._execute(adapter, other, line)
+            for side, master in enumerate(masters):
+                if master in free:
+                    with contextlib.suppress(BlockingIOError):
+                        del self._waiting[side][: os.write(master, self._waiting[side])]
+                if master in ready:
+                    *lines, parts[side] = (parts[side] + os.read(master, 4096)).split(b"\r")
+                    for line in lines:
+                        self._execute(side, line.decode("ascii"))
 
-    def _execute(self, adapter: _Adapter, other: _Adapter, line: str) -> None:
-        answer = _OK
-        if line == "O":
-            adapter.open = True
-        elif line in ("C", ""):
-            adapter.open = adapter.open and line == ""
-        elif line[0] in "SY":
-            adapter.rates.append(line)
-        elif adapter.open and _is_frame(line):
-            if other.open:
-                other.waiting += line.encode() + b"\r"
+    def _execute(self, side: int, line: str) -> None:
+        answer = b"\r"
+        if line in ("O", "C"):
+            self._open[side] = line == "O"
+        elif line[:1] in ("S", "Y"):
+            self.rates[side].append(line)
+        elif self._open[side] and self._is_frame(line):
+            if self._open[1 - side]:
+                self._waiting[1 - side].extend(line.encode() + b"\r")
             answer = b"z\r"
-        else:
+        elif line:
             self.refused.append(line)
-            answer = _BELL
-        adapter.waiting += answer
+            answer = b"\a"
+        self._waiting[side].extend(answer)
+
+    @staticmethod
+    def _is_frame(line: str) -> bool:
+        """Whether a command is a well-formed data frame with a standard identifier."""
+        if len(line) < 5 or line[0] not in "tdb":
+            return False
+        length = int(line[4], 16)
+        fits = line[0] != "t" or length <= 8
+        return fits and len(line) == 5 + 2 * PAYLOADS_FD[length] and int(line[1:4], 16) < 0x800
 
     def close(self) -> None:
-        os.write(self._wake[1], b"x")
+        self._ending.set()
         self._thread.join()
-        for adapter in self._adapters:
-            adapter.close()
-        for end in self._wake:
-            os.close(end)
+        for descriptor in (each for pair in self._terminals for each in pair):
+            os.close(descriptor)
 
 
 class Far:
@@ -352,10 +313,8 @@ class Far:
 
     def __init__(self, end: CanControllerLink) -> None:
         self.end = end
+        self.send = end.send
         self.replies: list[bytes] = []
-
-    def send(self, packet: bytes) -> None:
-        self.end.send(packet)
 
     def wait(self) -> None:
         reply = self.end.receive(2.0)
@@ -371,28 +330,22 @@ class CanContract(TransportContract):
         # Cycles so long that a pause of this computer does not truncate a set of frames.
         begin = init_packet(sample_time=100)
         far.send(begin)
-        init = near.receive(2.0)
-        assert init == begin
-        near.send(init)
+        assert near.receive(2.0) == begin
+        near.send(begin)
         far.wait()
         rng = np.random.default_rng(1)
         for number in (11, 12, 13):
             sent = random_packet(rng, number)
             far.send(sent)
-            received = CyclicPacket.decode(near.receive(2.0), 6)
-            wanted = CyclicPacket.decode(sent, 6)
-            assert received.number == number
-            assert received.status == wanted.status
-            for column in (0, 2, 4):
-                np.testing.assert_array_equal(
-                    received.axes["d"][:, column], wanted.axes["d"][:, column]
-                )
+            received, wanted = decoded(near.receive(2.0)), decoded(sent)
+            assert (received.number, received.status) == (number, wanted.status)
+            fresh = received.axes["d"][:, [0, 2, 4]]
+            np.testing.assert_array_equal(fresh, wanted.axes["d"][:, [0, 2, 4]])
             axes = wanted.axes.copy()
             axes["d"][:, 1:] = axes["extra"] = 0.0
-            reply = CyclicPacket(next_number(number), bytes(4), bytes(4), axes).encode()
-            near.send(reply)
+            near.send(CyclicPacket(next_number(number), bytes(4), bytes(4), axes).encode())
             far.wait()
-            arrived = CyclicPacket.decode(far.replies[-1], 6)
+            arrived = decoded(far.replies[-1])
             np.testing.assert_array_equal(arrived.axes["d"][:, 0], axes["d"][:, 0])
             assert arrived.number == next_number(number)
         assert near.rejected() == {}

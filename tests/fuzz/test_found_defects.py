@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, InitPacket
-from drivers.transports.can.ends import ControllerEnd
-from drivers.transports.can.layout import BusRates
+from drivers.transports.can.profile import BusRates, ControllerEnd
 from hil.archive import Samples, write_samples
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.rehearsal import Rehearsal

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from drivers import CyclicPacket, Guard, Session
-from drivers.transports.can import ends
-from drivers.transports.can.codecs import write_reply
-from drivers.transports.can.ends import ControllerEnd, PcEnd
+from drivers.transports.can import profile
+from drivers.transports.can.profile import ControllerEnd, PcEnd, write_reply
 from hil.archive import ArchiveHeader, open_archive
 from hil.errors import ArchiveError
 from tests.fuzz import __main__ as command
@@ -63,7 +62,7 @@ PLANTED: dict[str, tuple[str, Any, str, Callable[..., Any], str]] = {
     "a codec that changes a byte":
         ("codec", CyclicPacket, "encode", lambda self: encode(self)[:-1] + b"\7", IN_THE_CODEC),
     "replies by CAN to another packet":
-        ("codec", ends, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
+        ("codec", profile, "write_reply", lambda *a: b"\1\1" + write_reply(*a)[2:], IN_THE_CODEC),
     "a PC that receives nothing by CAN":
         ("codec", PcEnd, "receive", lambda *_: None, IN_THE_CODEC),
     "a controller that receives nothing":

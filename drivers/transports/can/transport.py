@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from drivers.errors import TransportClosed
 from drivers.packets import Mode
 from drivers.transports.base import TransportError
-from drivers.transports.can.ends import End, PcEnd
-from drivers.transports.can.layout import (
+from drivers.transports.can.profile import (
     MAX_AXES,
     SEGMENT_DOWN,
     SEGMENT_UP,
@@ -31,7 +30,9 @@ from drivers.transports.can.layout import (
     CanAxesError,
     CanError,
     CanModeError,
+    End,
     Frame,
+    PcEnd,
     ProfileName,
 )
 
@@ -111,20 +112,18 @@ MAX_QUEUED: Final = 1000
 _MAX_ECHOES: Final = 256
 
 
-class Port:
-    """Sends and receives the frames of one end; the bus is closed with it.
+class CanLink:
+    """One end of the profile on an open bus, which is closed with it.
 
     `clock` gives the time of arrival of frames without a time stamp, s. `discarded` has the counts
     of the end, and "bus_error" (error frames) and "unsent" (frames not accepted by the bus).
     """
 
-    def __init__(
-        self, bus: can.BusABC, end: End, *, fd: bool, clock: Callable[[], float] = time.time
-    ) -> None:
+    def __init__(self, bus: can.BusABC, end: End, *, clock: Callable[[], float]) -> None:
         self.discarded = end.discarded
         self._bus = bus
-        self._end = end
-        self._fd = fd
+        self._frames = end
+        self._fd = end.rates.profile == "fd"
         self._clock = clock
         self._closed = False
         self._waiting: deque[can.Message] = deque()
@@ -179,9 +178,9 @@ class Port:
             self._own.remove(frame)
             return None
         # The time on the bus matters, not that of reading.
-        return self._end.receive(frame, message.timestamp or self._clock())
+        return self._frames.receive(frame, message.timestamp or self._clock())
 
-    def send(self, frames: Sequence[Frame]) -> None:
+    def send_frames(self, frames: Sequence[Frame]) -> None:
         """Send frames in order; if the bus does not accept one, the rest is dropped and counted."""
         self._require_open()
         for frame in frames:
@@ -189,7 +188,17 @@ class Port:
             timeout = SEGMENT_TIMEOUT if segment else SEND_TIMEOUT
             try:
                 with _failing_as_closed():
-                    self._bus.send(self._message(frame), timeout)
+                    self._bus.send(
+                        can.Message(
+                            arbitration_id=frame.id,
+                            data=frame.data,
+                            is_extended_id=False,
+                            is_fd=self._fd,
+                            bitrate_switch=self._fd,
+                            check=False,
+                        ),
+                        timeout,
+                    )
             except TransportClosed as error:
                 # A full queue, or no node that acknowledges; `receive` detects a failed bus.
                 if not isinstance(error.__cause__, can.CanOperationError | can.CanTimeoutError):
@@ -199,16 +208,6 @@ class Port:
             if self._own is not None:
                 self._own.append(frame)
                 self._fetch()
-
-    def _message(self, frame: Frame) -> can.Message:
-        return can.Message(
-            arbitration_id=frame.id,
-            data=frame.data,
-            is_extended_id=False,
-            is_fd=self._fd,
-            bitrate_switch=self._fd,
-            check=False,
-        )
 
     def close(self) -> None:
         """Close the bus; may be called again."""
@@ -226,73 +225,55 @@ _IN_PROCESS: Final = "virtual"
 """Interface of python-can within one process."""
 
 
-class BusLock:
-    """An advisory lock of a bus among programs of hil; TransportError if another has it."""
-
-    def __init__(self, interface: str, channel: str) -> None:
-        self._fd = -1
-        if interface == _IN_PROCESS:
-            return
-        link = f"CAN bus {interface}:{channel}"
-        path = _path(interface, channel)
-        try:
-            self._fd = _opened(path)
-        except OSError as error:
-            remedy = f"remove {path} or make it writable"
-            reason = f"its lock {path} cannot be opened ({error.strerror})"
-            raise TransportError(link, reason, remedy) from error
-        try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.pread(self._fd, 20, 0).decode("ascii", "replace").strip()
-            self.release()
-            raise TransportError(
-                link,
-                f"another program uses it (process {holder or 'unknown'})",
-                "wait for it to end, or stop it",
-            ) from error
-        os.ftruncate(self._fd, 0)
-        os.pwrite(self._fd, f"{os.getpid()}\n".encode(), 0)
-
-    def release(self) -> None:
-        """Release the lock; may be called again."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
-
-
-def _path(interface: str, channel: str) -> Path:
-    """Return the path of the lock, the same for all names of one serial port."""
-    if channel.startswith("/"):
-        channel = str(Path(channel).resolve())
-    name = re.sub(r"[^0-9A-Za-z.]+", "_", f"{interface}_{channel}")
-    return Path(tempfile.gettempdir()) / f"hil-can-{name}.lock"
-
-
-def _opened(path: Path) -> int:
-    """Open the lock file, for all users of this computer.
+def lock_bus(interface: str, channel: str) -> int | None:
+    """Lock a bus among programs of hil; return the descriptor to close, None within one process.
 
     The file is never removed, else two programs could lock two files of one name. O_CREAT is
     refused for files of other users in a folder writable by all, so an existing file is opened
     without it.
+
+    Raises:
+        TransportError: another program has it.
     """
+    if interface == _IN_PROCESS:
+        return None
+    # The same for all names of one serial port.
+    device = str(Path(channel).resolve()) if channel.startswith("/") else channel
+    name = re.sub(r"[^0-9A-Za-z.]+", "_", f"{interface}_{device}")
+    path = Path(tempfile.gettempdir()) / f"hil-can-{name}.lock"
+    link = f"CAN bus {interface}:{channel}"
     flags = os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
-    with contextlib.suppress(FileExistsError):
-        created = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
-        os.fchmod(created, 0o666)
-        return created
-    return os.open(path, flags)
+    try:
+        try:
+            lock = os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
+            os.fchmod(lock, 0o666)
+        except FileExistsError:
+            lock = os.open(path, flags)
+    except OSError as error:
+        remedy = f"remove {path} or make it writable"
+        reason = f"its lock {path} cannot be opened ({error.strerror})"
+        raise TransportError(link, reason, remedy) from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        holder = os.pread(lock, 20, 0).decode("ascii", "replace").strip()
+        os.close(lock)
+        reason = f"another program uses it (process {holder or 'unknown'})"
+        raise TransportError(link, reason, "wait for it to end, or stop it") from error
+    os.ftruncate(lock, 0)
+    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+    return lock
 
 
 MOVABLE = frozenset((Mode.POSITION, Mode.POSITION_RELATIVE, Mode.DELTA_POSITION))
 """Open modes whose set-points fit the frames."""
 
 
-class CanTransport:
-    """The PC's end of the CAN profile on an open bus, which is closed with it, and its lock.
+class CanTransport(CanLink):
+    """The PC's end of the CAN profile on an open bus, which is closed with it, as is `lock`.
 
     A reply that the frames cannot carry is replaced by a request for drive-off, and the link is
-    closed with the reason. `clock` is that of `Port`.
+    closed with the reason. `clock` is that of `CanLink`.
     """
 
     def __init__(
@@ -301,11 +282,11 @@ class CanTransport:
         rates: BusRates,
         *,
         clock: Callable[[], float] = time.time,
-        lock: BusLock | None = None,
+        lock: int | None = None,
     ) -> None:
-        self._lock = lock
         self._end = PcEnd(rates)
-        self._port = Port(bus, self._end, fd=rates.profile == "fd", clock=clock)
+        self._lock = lock
+        super().__init__(bus, self._end, clock=clock)
 
     @property
     def now(self) -> float:
@@ -324,7 +305,7 @@ class CanTransport:
             TransportClosed: closed, the bus failed, or it cannot carry the session.
         """
         try:
-            return self._port.receive(timeout)
+            return super().receive(timeout)
         except CanError as error:
             self.close()
             raise TransportClosed(str(error)) from error
@@ -339,15 +320,15 @@ class CanTransport:
         try:
             frames = self._end.reply(packet)
         except CanError as error:
-            self._port.send(self._end.drive_off())
+            self.send_frames(self._end.drive_off())
             self.close()
             raise TransportClosed(str(error)) from error
-        self._port.send(frames)
+        self.send_frames(frames)
 
     def rejected(self) -> dict[str, int]:
-        """Return frames and sets discarded since the last call, by kind; see `End` and `Port`."""
-        counts = dict(self._port.discarded)
-        self._port.discarded.clear()
+        """Return frames and sets discarded since the last call, by kind."""
+        counts = dict(self.discarded)
+        self.discarded.clear()
         return counts
 
     def forget_peer(self) -> None:
@@ -357,10 +338,11 @@ class CanTransport:
     def close(self) -> None:
         """Close the bus; may be called again."""
         try:
-            self._port.close()
+            super().close()
         finally:
             if self._lock is not None:
-                self._lock.release()
+                os.close(self._lock)
+                self._lock = None
 
 
 @dataclass(frozen=True)
@@ -420,10 +402,11 @@ class CanSpec:
                 carry the session.
         """
         self.check()
-        lock = BusLock(self.interface, self.channel)
+        lock = lock_bus(self.interface, self.channel)
         try:
             bus = open_bus(self.interface, self.channel, self.rates, self.options)
         except BaseException:
-            lock.release()
+            if lock is not None:
+                os.close(lock)
             raise
         return CanTransport(bus, self.rates, lock=lock)

@@ -18,8 +18,15 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
-from drivers.transports.can.ends import ControllerEnd, PcEnd
-from drivers.transports.can.layout import SEGMENT_DOWN, SEGMENT_UP, BusRates, CanError, Frame
+from drivers.transports.can.profile import (
+    SEGMENT_DOWN,
+    SEGMENT_UP,
+    BusRates,
+    CanError,
+    ControllerEnd,
+    Frame,
+    PcEnd,
+)
 from tests.fuzz.draw import Draw, mutate_bytes
 from tests.fuzz.targets import Target
 
@@ -92,7 +99,7 @@ class Talk:
     def _as_sent(self, got: CyclicPacket, sent: CyclicPacket) -> None:
         """Number, status and modes are what was sent; of FD frames also the numbers.
 
-        `tests/drivers/test_can_frames.py` has the laws of rounding and age.
+        `tests/drivers/test_can_profile.py` has the laws of rounding and age.
         """
         assert (got.number, got.status) == (sent.number, sent.status)
         assert (got.axes["mode"] == sent.axes["mode"]).all()
