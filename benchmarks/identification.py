@@ -47,7 +47,6 @@ from identification import Motion, RobotModel
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights
-from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.signals.recording import Recording
@@ -181,10 +180,9 @@ def case(friction: FrictionLaw, coupling: Coupling | None = None) -> Case:
 
 def fit(model: RobotModel, samples: Samples) -> Estimate:
     """Weighted least squares with cluster-robust covariance, as `hil identify` does it."""
-    phase = PhaseFactor.from_samples(model, samples)
-    total = phase.total
-    weights = joint_weights(total)
-    return with_block_covariance(estimate(model, total, weights), phase, weights)
+    factor = Factor.by_time(model, samples)
+    weights = joint_weights(factor)
+    return with_block_covariance(estimate(model, factor, weights), factor, weights)
 
 
 def prepared_fit(one: Case) -> Estimate:

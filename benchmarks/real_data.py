@@ -48,7 +48,6 @@ from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
 from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Estimate, Factor, NormalEquations, joint_weights, solve
-from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -209,12 +208,12 @@ def essential_table(
     table: dict[str, dict[str, float | int]] = {}
     for kind in ("held_out", "held_out_first"):
         fitted, predicted, options = case.prepared(model, splits[kind])
-        whole = PhaseFactor.from_samples(model, fitted)
-        flattered = eliminate(model, whole, PhaseFactor.from_samples(model, predicted))
+        whole = Factor.by_time(model, fitted)
+        flattered = eliminate(model, whole, Factor.by_time(model, predicted))
         part = splits[kind].fitted
         cut = round(_CHOSEN_SHARE * part.n_samples)
         inner = [
-            PhaseFactor.from_samples(model, prepare(one, model, options=options))
+            Factor.by_time(model, prepare(one, model, options=options))
             for one in (part.between(0, cut), part.between(cut, part.n_samples))
         ]
         essential = eliminate(model, *inner).estimate.names
@@ -308,10 +307,9 @@ def _without_lowpass(model: RobotModel, split: Split) -> float:
     return error(model, ESTIMATORS["wls"](model, fitted), predicted)
 
 
-def _refitted(model: RobotModel, whole: PhaseFactor, essential: Collection[str]) -> Array:
+def _refitted(model: RobotModel, whole: Factor, essential: Collection[str]) -> Array:
     """Weighted least squares of some parameters (p,), zero for the others."""
-    total = whole.total
-    equations = total.weighted(joint_weights(total))
+    equations = whole.weighted(joint_weights(whole))
     index = np.flatnonzero([name in essential for name in model.parameter_names])
     values = np.zeros(model.n_parameters)
     values[index] = solve(

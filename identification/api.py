@@ -32,8 +32,8 @@ from identification.estimators.prior import (
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.urdf import write_urdf
-from identification.factor.factor import Estimate, Factor, NormalEquations, QRFactor, estimate
-from identification.factor.phases import PhaseFactor, instrument_factor
+from identification.factor.columns import instrument_factor
+from identification.factor.factor import Estimate, Factor, NormalEquations, estimate
 from identification.model.base_parameters import BaseParameters
 from identification.model.coupling import Coupling
 from identification.model.elements import (

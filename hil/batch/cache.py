@@ -31,8 +31,7 @@ from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.reading import open_file
 from identification.estimators.consistent import Shrinkage
-from identification.factor.factor import Estimate
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Estimate, Factor
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
@@ -50,7 +49,7 @@ _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
     kind.__name__: kind
     for kind in (
-        *(ArchiveRef, Bundle, Summary, Estimate, PhaseFactor),
+        *(ArchiveRef, Bundle, Summary, Estimate, Factor),
         *(Settings, Preprocessing, LowPassShape, Shrinkage, Choice),
     )
 }

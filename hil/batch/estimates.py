@@ -26,7 +26,6 @@ from identification.factor.factor import (
     no_rows_message,
     solve,
 )
-from identification.factor.phases import PhaseFactor
 from identification.model.robot import RobotModel
 
 from .types import ArchiveRef, BatchEstimator, Bundle, Level, LevelEstimate, Summary
@@ -41,9 +40,9 @@ class Group:
     """Archives that are fitted together, and the sums that predict and are predicted."""
 
     refs: list[ArchiveRef] = field(default_factory=list)  #: archives that were fitted
-    phase: PhaseFactor | None = None  #: sum of their factors; None if there are none
+    total: Factor | None = None  #: sum of their factors; None if there are none
     repetitions: list[LevelEstimate] = field(default_factory=list)  #: estimates of each
-    unseen: PhaseFactor | None = None  #: sum of the totals of validation runs; None if none
+    unseen: Factor | None = None  #: sum of the totals of validation runs; None if none
     #: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`
     products: Array | None = None
     #: every archive, with the warnings about it
@@ -52,7 +51,7 @@ class Group:
 
     def add_bundle(self, bundle: Bundle) -> None:
         """Add archives without their estimates."""
-        self.phase = plus(self.phase, bundle.phase)
+        self.total = plus(self.total, bundle.total)
         for summary in bundle.summaries:
             self.warned.append((summary.ref, summary.warnings))
             if summary.ref.use == "excitation":
@@ -64,7 +63,7 @@ class Group:
     def add(self, other: Group) -> None:
         """Add another group."""
         self.refs += other.refs
-        self.phase = plus(self.phase, other.phase)
+        self.total = plus(self.total, other.total)
         self.repetitions += other.repetitions
         self.unseen = plus(self.unseen, other.unseen)
         self.products = plus(self.products, other.products)
@@ -84,13 +83,12 @@ class Estimator:
         self.name, self.model, self.delay_variance = name, model, settings.delay_variance
         self._shrinkage = settings.shrinkage if name == "auto" else Shrinkage()
 
-    def centre(self, phase: PhaseFactor) -> Array | None:
+    def centre(self, total: Factor) -> Array | None:
         """Return the centre of shrinkage of a sum and its archives (p,); None for none.
 
         Raises:
             IdentificationError: there is no usable row.
         """
-        total = phase.total
         if not total.samples.any():
             raise IdentificationError(no_rows_message(self.model))
         if self._shrinkage.strength == 0.0:
@@ -103,11 +101,12 @@ class Estimator:
         That of the consistent estimator is unconstrained, as in `hil identify`. The covariance is
         that of the unconstrained estimate, shrunk by the same factor.
         """
-        own, total = summary.fit, summary.total.total
+        # A copy: the total itself does not cache what is computed here.
+        own, total = summary.fit, replace(summary.total)
         assert own is not None, "it was fitted"
         if centre is None or math.isinf(self._shrinkage.strength):
             return own
-        shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, phase=summary.total)
+        shrunk = fit_shrunk(self.model, (), self._shrinkage, centre=centre, factor=total)
         equations = total.weighted(joint_weights(total))
         prior = self._shrinkage.strength * np.diag(equations.A)
         solution = solve(equations._replace(A=equations.A + np.diag(prior)))
@@ -133,16 +132,16 @@ class Estimator:
         Raises:
             IdentificationError: there is no consistent solution.
         """
-        assert group.phase is not None
+        assert group.total is not None
         fit = fit_of(self.model, self.name, self._shrinkage, centre)
-        found = fit((), group.phase)
+        found = fit((), group.total)
         motions = {ref.motion for ref in group.refs}
         if len(motions) == 1 and "" not in motions:
             values = np.array([one.values for one in group.repetitions])
             found = replace(found, covariance=no_narrower(found.covariance, values))
         if group.products is None:
             return found
-        return with_uncertain_delay(found, group.phase.total, group.products, self.delay_variance)
+        return with_uncertain_delay(found, group.total, group.products, self.delay_variance)
 
 
 def warning_lines(warned: Sequence[tuple[ArchiveRef, Sequence[str]]]) -> tuple[str, ...]:
@@ -180,7 +179,7 @@ def repetition_level(
         repetitions=1,
         **(_figures(found) | own | {"names": model.parameter_names, "units": model.units}),
         covariance=None,
-        torque_rms=_rms(summary.total.total),
+        torque_rms=_rms(replace(summary.total)),
         unseen_rms=nothing,
         unseen_torque_rms=nothing,
         settings=settings,
@@ -201,10 +200,10 @@ def sum_level(
     Raises:
         IdentificationError: there is no estimate.
     """
-    assert group.phase is not None
+    assert group.total is not None
     refs, found = group.refs, estimator.of_group(group, centre)
     setups = {ref.setup for ref in refs}
-    unseen = Factor.zero(estimator.model) if group.unseen is None else group.unseen.total
+    unseen = Factor.zero(estimator.model) if group.unseen is None else group.unseen
     if not found.undetermined and found.condition > QR_CONDITION:
         conditioning = (
             f"the scaled condition number is {found.condition:.2g}: the motion separates some"
@@ -222,7 +221,7 @@ def sum_level(
         repetitions=len(refs),
         **_figures(found),
         covariance=found.covariance,
-        torque_rms=_rms(group.phase.total),
+        torque_rms=_rms(group.total),
         unseen_rms=_rms(unseen, unseen.squared_errors(found.values)),
         unseen_torque_rms=_rms(unseen),
         settings=next(iter(group.settings)) if len(group.settings) == 1 else "",

@@ -28,8 +28,7 @@ from hil.progress import Silent
 from identification.estimators.covariance import block_covariance
 from identification.estimators.delay import rate_products
 from identification.estimators.least_squares import fit_least_squares
-from identification.factor.factor import Estimate, joint_weights
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Estimate, Factor, joint_weights
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -202,7 +201,7 @@ def decide_settings(
 # Factors
 
 
-def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseFactor]:
+def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, Factor]:
     """Reduce one archive to its summary and its factor by blocks of time.
 
     Raises:
@@ -213,8 +212,8 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
     cell, fitted = cell_in(archive, settings), ref.use == "excitation"
     samples = (samples_of if fitted else validation_samples)(source, cell, settings)
     model = cell.model
-    phase = PhaseFactor.from_samples(model, samples)
-    fit, effect = _fit(model, samples, phase) if fitted else (None, 1.0)
+    factor = Factor.by_time(model, samples)
+    fit, effect = _fit(model, samples, factor) if fitted else (None, 1.0)
     warnings = [*known_warnings(cell, archive), *archive.header.findings.warnings]
     if source.merged:
         warnings.append(source.merged)
@@ -222,23 +221,23 @@ def archive_factor(ref: ArchiveRef, settings: Settings) -> tuple[Summary, PhaseF
         warnings.append("it was repaired with loss")
     return Summary(
         ref=ref,
-        total=phase.merged(max(1, len(phase))),
+        total=factor.merged(max(1, len(factor))),
         fit=fit,
         design_effect=effect,
         warnings=tuple(warnings),
         products=rate_products(model, samples) if fitted and settings.delay_variance else None,
-    ), phase
+    ), factor
 
 
-def _fit(model: RobotModel, samples: Samples, phase: PhaseFactor) -> tuple[Estimate, float]:
+def _fit(model: RobotModel, samples: Samples, factor: Factor) -> tuple[Estimate, float]:
     """Return the estimate, and the mean ratio of its variances to those of white residuals."""
-    found = fit_least_squares(model, [samples], phase=phase)
-    weights = joint_weights(phase.total)
+    found = fit_least_squares(model, [samples], factor=factor)
+    weights = joint_weights(factor)
     if found.undetermined:
-        return found, block_covariance(phase, weights, found.values).design_effect
-    information = phase.total.weighted(weights).A
+        return found, block_covariance(factor, weights, found.values).design_effect
+    information = factor.weighted(weights).A
     trace = np.einsum("ij,ji->", information, found.covariance)
-    return found, float(trace) / phase.n_parameters
+    return found, float(trace) / factor.n_parameters
 
 
 def split_bundles(refs: Sequence[ArchiveRef]) -> list[tuple[ArchiveRef, ...]]:
@@ -255,7 +254,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
     """
     if (known := cached_bundle(refs, settings, cache)) is not None:
         return known
-    summaries, broken, phase = list[Summary](), list[Unused](), None
+    summaries, broken, total = list[Summary](), list[Unused](), None
     for ref in refs:
         try:
             summary, own = archive_factor(ref, settings)
@@ -264,8 +263,8 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
         else:
             summaries.append(summary)
             if ref.use == "excitation":
-                phase = own if phase is None else phase + own
-    found = Bundle(tuple(summaries), phase)
+                total = own if total is None else total + own
+    found = Bundle(tuple(summaries), total)
     if not broken:
         cache.store(refs[0].location).put(sum_key(refs, settings), found)
     return replace(found, broken=tuple(broken), read=len(refs))
@@ -280,7 +279,7 @@ def cached_bundle(
         return None
     pairs = zip(found.summaries, refs, strict=True)  # the archives may have been moved
     summaries = tuple(replace(one, ref=ref) for one, ref in pairs)
-    return Bundle(summaries, found.phase, cached=len(refs))
+    return Bundle(summaries, found.total, cached=len(refs))
 
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:

@@ -227,18 +227,18 @@ class _Batch:
         for one in members:
             group, found = self._campaign(one, estimator, advance)
             campaigns += found
-            if group.phase is not None:
+            if group.total is not None:
                 everything.add(group)
         levels = [*everything.repetitions, *campaigns]
         keys = {ref.key for ref in everything.refs}
         if len(keys) == 1:
             levels += [replace(one, level="pooled", campaign="") for one in campaigns]
-        elif everything.phase is not None:
+        elif everything.total is not None:
             setups = sorted({key.setup or "nothing" for key in keys})
             text = "pooled over campaigns whose cells state different payloads or delays, which are"
             apart = [f"{text} compensated: {'; '.join(setups)}"] if len(setups) > 1 else []
             with self._failing(f"arm {arm.digest[:8]}"):
-                centre = estimator.centre(everything.phase)
+                centre = estimator.centre(everything.total)
                 levels.append(sum_level("pooled", estimator, everything, centre, apart))
         return levels
 
@@ -256,9 +256,9 @@ class _Batch:
             summaries += [each for each in bundle.summaries if each.ref.use == "excitation"]
             advance(bundle.read + bundle.cached, one.key.campaign)
         levels: list[LevelEstimate] = []
-        if group.phase is not None:
+        if group.total is not None:
             with self._failing(one.key.campaign):
-                centre = estimator.centre(group.phase)
+                centre = estimator.centre(group.total)
                 group.repetitions = [
                     repetition_level(estimator, each, used, centre) for each in summaries
                 ]

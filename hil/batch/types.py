@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.errors import InputError
-from identification.factor.factor import Estimate
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Estimate, Factor
 
 Array = NDArray[np.float64]
 
@@ -100,7 +99,7 @@ class Summary:
     """Cached results of one archive, beside the sum of several."""
 
     ref: ArchiveRef
-    total: PhaseFactor  #: its factor as one block
+    total: Factor  #: its factor as one block
     #: the estimate from it alone, with cluster-robust covariance; None of a validation run
     fit: Estimate | None
     design_effect: float  #: ratio of its mean variance to that of white residuals
@@ -116,7 +115,7 @@ class Bundle:
 
     summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
     #: sum of the factors of those that are fitted; None if there are none
-    phase: PhaseFactor | None = None
+    total: Factor | None = None
     broken: tuple[Unused, ...] = ()  #: the others
     read: int = 0  #: number of archives that were read, broken ones included
     cached: int = 0  #: number of the others

@@ -43,8 +43,14 @@ from identification.estimators.prior import (
     nominal_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
-from identification.factor.factor import QR_CONDITION, Estimate, Factor, no_rows_message
-from identification.factor.phases import PhaseFactor, instrument_factor, total_phase
+from identification.factor.columns import instrument_factor
+from identification.factor.factor import (
+    QR_CONDITION,
+    Estimate,
+    Factor,
+    no_rows_message,
+    total_factor,
+)
 from identification.signals.samples import Samples
 from identification.validation.finding import joined
 
@@ -76,7 +82,7 @@ class Estimation:
 
     estimator: Estimator
     result: RepeatedEstimate  #: pooled and per repetition
-    held_out: tuple[PhaseFactor, ...]  #: one per held-out recording
+    held_out: tuple[Factor, ...]  #: one per held-out recording
     #: estimate with the prior from CAD, or the reason why there is none
     posterior: PosteriorEstimate | str
     warnings: tuple[str, ...]
@@ -117,13 +123,13 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
         task.advance(1, "prior")
         posterior: PosteriorEstimate | str = ""
         try:
-            posterior = fit_with_prior(model, fitted, require_prior(prior), phase=result.phase)
+            posterior = fit_with_prior(model, fitted, require_prior(prior), factor=result.factor)
         except (IdentificationError, InputError) as error:
             posterior = prior if isinstance(prior, str) else str(error)
         if name == "prior" and isinstance(posterior, PosteriorEstimate):
             warnings += _prior_contradictions(model, posterior)
         task.advance(1, "held-out motion")
-        held_out = tuple(PhaseFactor.from_samples(model, one) for one in prepared.held_out)
+        held_out = tuple(Factor.by_time(model, one) for one in prepared.held_out)
         task.advance(1)
     pooled = result.pooled
     if not pooled.undetermined and pooled.condition > QR_CONDITION:
@@ -186,15 +192,15 @@ def fit_of(
     of the estimator "prior".
     """
 
-    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
+    def fit(some: Sequence[Samples], factor: Factor) -> Estimate:
         if centre is not None:
-            return fit_shrunk(model, some, shrinkage, centre=centre, phase=phase)
+            return fit_shrunk(model, some, shrinkage, centre=centre, factor=factor)
         if prior is not None:
-            return fit_with_prior(model, some, prior, phase=phase).estimate
+            return fit_with_prior(model, some, prior, factor=factor).estimate
         weighting: Weighting = "ordinary" if name == "ols" else "weighted"
-        found = fit_least_squares(model, some, weighting, phase=phase)
+        found = fit_least_squares(model, some, weighting, factor=factor)
         if name == "consistent":
-            found = consistent_estimate(model, phase.total, found).estimate
+            found = consistent_estimate(model, factor, found).estimate
         return found
 
     return fit
@@ -220,7 +226,7 @@ def _by_factor(
 ) -> tuple[RepeatedEstimate, list[str]]:
     centre, warnings = None, list[str]()
     if name == "auto" and shrinkage.strength > 0.0:
-        centre, warnings = centre_of(model, total_phase(model, fitted).total, shrinkage)
+        centre, warnings = centre_of(model, total_factor(model, fitted), shrinkage)
     own = require_prior(prior) if name == "prior" else None
     fit = fit_of(model, name, shrinkage, centre, own)
     free = name == "consistent" or (centre is not None and math.isinf(shrinkage.strength))
@@ -244,8 +250,8 @@ def _robust(
 ) -> tuple[RepeatedEstimate, list[str]]:
     fits: list[RobustEstimate] = []
 
-    def fit(some: Sequence[Samples], phase: PhaseFactor) -> Estimate:
-        fits.append(robust_estimate(model, some, _LOSSES[name], gram=phase.total))
+    def fit(some: Sequence[Samples], total: Factor) -> Estimate:
+        fits.append(robust_estimate(model, some, _LOSSES[name], total=total))
         return fits[-1].estimate
 
     result, found = estimate_repetitions(model, fitted, fit), fits[-1]  # the last: all samples
@@ -326,7 +332,7 @@ def _instrumental(
         remedy = "record the commanded positions as well, or use --estimator wls"
         raise InputError(None, problem, field="--estimator iv", remedy=remedy)
     result = RepeatedEstimate.of(
-        model, found.pooled.estimate, found.each, total_phase(model, fitted)
+        model, found.pooled.estimate, found.each, total_factor(model, fitted)
     )
     weak = found.pooled.weak
     return result, [f"the instruments are too weak for {joined(weak)}"] if weak else []

@@ -14,7 +14,8 @@ from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.progress import Reporter
 from identification.estimators.gains import Gains, identify_gains
-from identification.factor.phases import PhaseFactor, gain_factor, joined
+from identification.factor.columns import gain_factor
+from identification.factor.factor import Factor, joined
 from identification.model.payload import Payload
 from identification.signals.recording import RecordingError
 
@@ -49,7 +50,7 @@ def find_gains(
         InputError: an archive cannot be used, or not with the others; no archive has a payload.
         IdentificationError: no usable row.
     """
-    factors: list[PhaseFactor] = []
+    factors: list[Factor] = []
     loads: dict[str, Payload | None] = {}
     first: Cell | None = None
     names = [path.name for path in (*archives, *loaded)]

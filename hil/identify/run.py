@@ -23,7 +23,6 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.export.friction import friction_curve, friction_torque
 from identification.factor.factor import joint_weights
-from identification.factor.phases import PhaseFactor
 from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.evidence import gather
@@ -72,15 +71,12 @@ class Identification:
         return self.estimation.result
 
 
-def consistency_of(
-    model: RobotModel, training: PhaseFactor, held_out: Factor
-) -> ConsistencyCheck | str:
+def consistency_of(model: RobotModel, training: Factor, held_out: Factor) -> ConsistencyCheck | str:
     """Compare the consistent with the unconstrained estimate, or return why that failed."""
-    total = training.total
     try:
-        weights = joint_weights(total)
-        free = with_block_covariance(estimate(model, total, weights), training, weights)
-        return check_consistency(model, total, held_out, free, weights=weights)
+        weights = joint_weights(training)
+        free = with_block_covariance(estimate(model, training, weights), training, weights)
+        return check_consistency(model, training, held_out, free, weights=weights)
     except IdentificationError as error:
         return str(error)
 
@@ -164,8 +160,8 @@ def identify_archives(
         sources = sources.with_warning(warning)
     cell = sources.cell
     with reporter.task("validating", 3) as task:
-        unseen = sum(estimation.held_out, PhaseFactor.zero(cell.model)).total
-        consistency = consistency_of(cell.model, result.phase, unseen)
+        unseen = sum(estimation.held_out, Factor.zero(cell.model))
+        consistency = consistency_of(cell.model, result.factor, unseen)
         impossible: list[str] = []
         if isinstance(consistency, str):
             sources = sources.with_warning(
@@ -184,7 +180,7 @@ def identify_archives(
         essential: EssentialChoice | str = "they are chosen on held-out data, and there is none"
         if not sources.in_sample:
             try:
-                essential = choose_essential(cell.model, result.phase, estimation.held_out)
+                essential = choose_essential(cell.model, result.factor, estimation.held_out)
             except IdentificationError as error:
                 essential = str(error)
         if isinstance(essential, str):

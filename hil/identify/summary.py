@@ -117,7 +117,7 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> results.Calibrat
     try:
         found = calibrate(
             result.pooled,
-            result.phase,
+            result.factor,
             TorqueMeans.of(model, prepared.training),
             TorqueMeans.of(model, prepared.held_out),
             lambda factor: fitted_values(model, factor, shrinkage),

@@ -44,9 +44,9 @@ from identification.factor.factor import (
     joint_weights,
     rows_of,
     solve,
+    total_factor,
     undetermined_names,
 )
-from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.friction import dissipation
 from identification.model.pseudo_inertia import (
     ReferenceBodies,
@@ -539,21 +539,20 @@ def fit_shrunk(
     shrinkage: Shrinkage,
     *,
     centre: Array | None = None,
-    phase: PhaseFactor | None = None,
+    factor: Factor | None = None,
 ) -> Estimate:
     """Fit recordings, shrunk to a centre (p,), by default the consistent solution of the samples.
 
-    The covariance is that of least squares, cluster-robust; `phase` is the recordings' factor if
-    known.
+    The covariance is that of least squares, cluster-robust; `factor` is that of the recordings by
+    time, if known.
 
     Raises:
         IdentificationError: no usable row, or no consistent parameters were found.
     """
-    phase = total_phase(model, recordings) if phase is None else phase
-    factor = phase.total
+    factor = total_factor(model, recordings) if factor is None else factor
     free = estimate(model, factor)
     values = fitted_values(model, factor, shrinkage, centre)
-    found = block_covariance(phase, joint_weights(factor), free.values)
+    found = block_covariance(factor, joint_weights(factor), free.values)
     variance = factor.squared_errors(values) / np.maximum(factor.samples, 1)
     return replace(
         free,

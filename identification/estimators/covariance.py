@@ -26,13 +26,17 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.estimators.losses import Loss
 from identification.factor.factor import (
+    FINE_BLOCK,
     Estimate,
+    Factor,
     Solution,
     augmented_rows,
+    block_slices,
+    fine_blocks,
     mark_undetermined,
+    merged,
     solve,
 )
-from identification.factor.phases import FINE_BLOCK, PhaseFactor, block_slices, fine_blocks, merged
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -66,19 +70,19 @@ class Clustered:
 
 
 def block_covariance(
-    phase: PhaseFactor, weights: Array, values: Array, prior: Array | None = None
+    factor: Factor, weights: Array, values: Array, prior: Array | None = None
 ) -> Clustered:
     """Return the cluster-robust covariance of a weighted least-squares estimate by its factor.
 
-    `values` (p,) solve `phase.total` with weights (n,). With the information (p,) of a Gaussian
+    `values` (p,) solve the factor with weights (n,). With the information (p,) of a Gaussian
     prior, H = A + diag(prior) replaces A, and ``H^-1 diag(prior) H^-1`` times the design effect is
     added.
     """
-    phase = phase.occupied()
-    scores = phase.scores(weights, values)
+    used = factor.occupied()
+    scores = used.scores(weights, values)
     length = block_length(scores)
-    longer = phase.merged(length)
-    equations = phase.total.weighted(weights)
+    longer = used.merged(length)
+    equations = factor.weighted(weights)
     if prior is not None:
         equations = equations._replace(A=equations.A + np.diag(prior))
     solution = solve(equations)
@@ -86,7 +90,7 @@ def block_covariance(
     shares = np.empty((len(scores), root.shape[1], root.shape[1]))
     for start in range(0, len(scores), _AT_ONCE):
         part = slice(start, start + _AT_ONCE)
-        information = longer.blocks(part).weighted(weights)[:, :-1, :-1]
+        information = longer.blocks(part).by_block(weights)[:, :-1, :-1]
         shares[part] = _shares(information, root, root)
     return _sandwich(shares, scores, solution, length * FINE_BLOCK, prior)
 
@@ -140,10 +144,10 @@ def _sandwich(
 
 
 def with_block_covariance(
-    estimate: Estimate, phase: PhaseFactor, weights: Array, name: str = "weighted least squares"
+    estimate: Estimate, factor: Factor, weights: Array, name: str = "weighted least squares"
 ) -> Estimate:
-    """Return the estimate from `phase.total` and weights (n,) with cluster-robust covariance."""
-    found = block_covariance(phase, weights, estimate.values)
+    """Return the estimate from a factor and weights (n,) with cluster-robust covariance."""
+    found = block_covariance(factor, weights, estimate.values)
     return replace(
         estimate,
         covariance=found.covariance,

@@ -28,13 +28,14 @@ from identification.factor.factor import (
     Factor,
     NormalEquations,
     Solution,
+    count_by_block,
     estimate,
     inverse_variance,
+    merged,
     no_rows_message,
     residual_variance,
     solve,
 )
-from identification.factor.phases import PhaseFactor, merged
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.masks import near_any_reversal
@@ -361,12 +362,12 @@ class _Reader:
         index = np.arange(len(samples.usable)) * _BLOCKS // max(1, len(samples.usable))
         own = tuple(np.append(used, p) for used in columns)
         names = (*model.parameter_names, "delay")
-        whole = [(slice(None), tables)]
-        phase = PhaseFactor.of_rows(index, samples.usable, own, names, whole)
+        counts = count_by_block(index, samples.usable)
+        factor = Factor.of_rows([(index, tables)], counts, own, names)
         if weights is None:
             nothing = np.zeros((p + 1, 0))
             variance = residual_variance(
-                phase.total, np.append(values, 0.0), nothing, np.ones(model.n_joints)
+                factor, np.append(values, 0.0), nothing, np.ones(model.n_joints)
             )
             weights = inverse_variance(variance)
-        return _Blocks(phase.weighted(weights), weights, max(1, int(phase.samples.sum())))
+        return _Blocks(factor.by_block(weights), weights, max(1, int(factor.samples.sum())))

@@ -1,7 +1,7 @@
 r"""Current-to-torque gains of all drives, from a payload of known torque.
 
 Weighted least squares of the measured currents on one
-:func:`identification.factor.phases.gain_factor` (after Gautier and Briot 2014),
+:func:`identification.factor.columns.gain_factor` (after Gautier and Briot 2014),
 
 .. math:: i_m = \kappa_m \bigl(W_m \pi + t_m\bigr) + e_m, \qquad \kappa_m = 1 / K_m
 
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import cluster_covariance
-from identification.factor.factor import NormalEquations, Solution, solve
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor, NormalEquations, Solution, solve
 
 Array = NDArray[np.float64]
 
@@ -49,14 +48,14 @@ class Gains:
         return np.isfinite(self.values)
 
 
-def identify_gains(factor: PhaseFactor, motor_names: Sequence[str]) -> Gains:
+def identify_gains(factor: Factor, motor_names: Sequence[str]) -> Gains:
     """Estimate gains of motors (n,), from blocks with a known payload and with another or none.
 
     Raises:
         IdentificationError: no usable row, or no recording with a payload.
     """
-    grams = np.stack(factor.gram, axis=1)
-    total, rows = grams.sum(axis=0), factor.samples.sum(axis=0)
+    grams = np.stack(factor.matrices, axis=1)
+    total, rows = grams.sum(axis=0), factor.samples
     p = factor.n_parameters - 1
     if not rows.any():
         raise IdentificationError("no usable sample to identify gains from")

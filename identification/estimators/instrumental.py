@@ -23,15 +23,18 @@ from numpy.typing import NDArray
 from identification.distributions import student_limit
 from identification.errors import IdentificationError
 from identification.estimators.covariance import block_length, spread
+from identification.factor.columns import measured_part
 from identification.factor.factor import (
+    FINE_BLOCK,
     WORST_CONDITION,
     Estimate,
+    Factor,
     estimate_of,
     inverse_variance,
     joint_weights,
+    merged,
     residual_variance,
 )
-from identification.factor.phases import FINE_BLOCK, PhaseFactor, measured_part, merged
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.signals.samples import RIGID_BANDWIDTH, Samples
@@ -188,7 +191,7 @@ def solve_cross(total: Array) -> CrossSolution:
 
 
 def estimate_instrumental(
-    model: RobotModel, factor: PhaseFactor, weights: Array | None = None
+    model: RobotModel, factor: Factor, weights: Array | None = None
 ) -> InstrumentalEstimate:
     """Estimate with instrumental variables, from a factor of :func:`instrument_factor`.
 
@@ -201,13 +204,13 @@ def estimate_instrumental(
     p, names = model.n_parameters, model.parameter_names
     if not factor.samples.any():
         raise IdentificationError("no row in which samples and instruments move")
-    rows = measured_part(factor).total
+    rows = measured_part(factor)
     if weights is None:
         first = joint_weights(rows)
-        values = solve_cross(factor.weighted(first).sum(axis=0)).values
+        values = solve_cross(factor.by_block(first).sum(axis=0)).values
         root = rows.solve(first).root
         weights = inverse_variance(residual_variance(rows, values, root, first))
-    blocks = factor.weighted(weights)[factor.samples.any(axis=1)]
+    blocks = factor.occupied().by_block(weights)
     total = blocks.sum(axis=0)
     solution = solve_cross(total)
     strength = np.where(solution.determined, partial_r2(total), 0.0)

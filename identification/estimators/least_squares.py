@@ -14,14 +14,13 @@ from identification.estimators.covariance import Clustered, block_covariance, cl
 from identification.factor.factor import (
     Estimate,
     Factor,
-    QRFactor,
     Solution,
     estimate,
     estimate_of,
     joint_weights,
     reduced,
+    total_factor,
 )
-from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -36,7 +35,7 @@ def fit_least_squares(
     recordings: Sequence[Samples],
     weighting: Weighting = "weighted",
     *,
-    phase: PhaseFactor | None = None,
+    factor: Factor | None = None,
 ) -> Estimate:
     """Fit recordings with cluster-robust covariance, by QR if the condition requires it.
 
@@ -46,34 +45,34 @@ def fit_least_squares(
     Raises:
         IdentificationError: no recordings, or no usable row.
     """
-    phase = total_phase(model, recordings) if phase is None else phase
-    factor = reduced(model, recordings, phase.total)
-    weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(factor)
-    solution, found = clustered_fit(model, factor, recordings, phase, weights)
-    method = f"{weighting} least squares{factor.words}, {found.words}"
+    factor = total_factor(model, recordings) if factor is None else factor
+    precise = reduced(model, recordings, factor)
+    weights = np.ones(model.n_joints) if weighting == "ordinary" else joint_weights(precise)
+    solution, found = clustered_fit(model, precise, recordings, factor, weights)
+    method = f"{weighting} least squares{precise.words}, {found.words}"
     return estimate_of(
-        model.units, factor, solution, weights, method, found.covariance, found.interval_factor
+        model.units, precise, solution, weights, method, found.covariance, found.interval_factor
     )
 
 
 def clustered_fit(
     model: RobotModel,
-    factor: Factor,
+    precise: Factor,
     recordings: Sequence[Samples],
-    phase: PhaseFactor,
+    by_time: Factor,
     weights: Array,
 ) -> tuple[Solution, Clustered]:
     """Solve with weights (n,) and return the cluster-robust covariance; QR reads the samples."""
-    solution = factor.solve(weights)
-    if isinstance(factor, QRFactor):
+    solution = precise.solve(weights)
+    if precise.storage == "qr":
         return solution, clustered_covariance(model, recordings, solution, weights)
-    return solution, block_covariance(phase, weights, solution.values)
+    return solution, block_covariance(by_time, weights, solution.values)
 
 
 _CERTAIN: Final = 0.99  # probability that the scatter of equal repetitions is not significant
 
-Fit = Callable[[Sequence[Samples], PhaseFactor], Estimate]
-"""Estimator: recordings and their factor to an estimate."""
+Fit = Callable[[Sequence[Samples], Factor], Estimate]
+"""Estimator: recordings and their factor by time to an estimate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,21 +81,15 @@ class RepeatedEstimate:
 
     pooled: Estimate  #: result, from all samples, with covariance clustered by time of the motion
     repetitions: tuple[Estimate, ...]  #: from each alone
-    phase: PhaseFactor  #: sum of the factors, by time of the motion
-    factor: Factor  #: the same summed over time
+    factor: Factor  #: sum of the factors, by time of the motion
     classical_std: Array  #: of weighted least squares with white residuals (p,)
 
     @classmethod
     def of(
-        cls,
-        model: RobotModel,
-        pooled: Estimate,
-        repetitions: Sequence[Estimate],
-        phase: PhaseFactor,
+        cls, model: RobotModel, pooled: Estimate, repetitions: Sequence[Estimate], factor: Factor
     ) -> RepeatedEstimate:
         """Combine an estimate from all repetitions with those from each."""
-        factor = phase.total
-        return cls(pooled, tuple(repetitions), phase, factor, estimate(model, factor).std)
+        return cls(pooled, tuple(repetitions), factor, estimate(model, factor).std)
 
     def with_scatter(self) -> RepeatedEstimate:
         """Widen the intervals to the scatter of repetitions, which can cancel in the covariance."""
@@ -150,13 +143,13 @@ def estimate_repetitions(
         IdentificationError: a repetition without a usable row.
     """
 
-    def weighted(some: Sequence[Samples], factor: PhaseFactor) -> Estimate:
-        return fit_least_squares(model, some, phase=factor)
+    def weighted(some: Sequence[Samples], factor: Factor) -> Estimate:
+        return fit_least_squares(model, some, factor=factor)
 
     fit = fit or weighted
-    phase, repetitions = PhaseFactor.zero(model), []
+    total, repetitions = Factor.zero(model), []
     for samples in recordings:
-        own = PhaseFactor.from_samples(model, samples)
+        own = Factor.by_time(model, samples)
         repetitions.append((each or fit)([samples], own))
-        phase = phase + own
-    return RepeatedEstimate.of(model, fit(recordings, phase), repetitions, phase)
+        total = total + own
+    return RepeatedEstimate.of(model, fit(recordings, total), repetitions, total)

@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from identification.errors import IdentificationError
 from identification.estimators.covariance import Clustered, cluster_covariance
-from identification.factor.factor import NormalEquations, no_rows_message, solve
-from identification.factor.phases import (
+from identification.factor.factor import (
     FINE_BLOCK,
-    PhaseFactor,
-    add_grams,
-    equal_runs,
+    Factor,
+    NormalEquations,
+    count_by_block,
     fine_blocks,
-    samples_by_cell,
+    no_rows_message,
+    solve,
 )
 from identification.model.pseudo_inertia import (
     Body,
@@ -80,7 +80,7 @@ class Run:
     """Reduced recording."""
 
     name: str
-    phase: PhaseFactor  # parameters of the arm, of the body (10), and offsets of the joints (n)
+    factor: Factor  # parameters of the arm, of the body (10), and offsets of the joints (n)
     loaded: bool  # whether the arm carried the body
 
     @classmethod
@@ -98,16 +98,13 @@ class Run:
         blocks, columns = samples.regressor(model)
         loads = plan.evaluate(*samples.motion[1:4])
         index = fine_blocks(samples)
-        grams, places = [], []
+        tables, places = [], []
         for j, block in enumerate(blocks):
             load = loads.blocks[j] @ moved[loads.columns[j]]
             beside = np.column_stack([load, np.ones(len(block))])
             rows = [block, samples.as_measured(j, beside), samples.torque[:, [j]]]
-            table = np.concatenate(rows, axis=1).T
-            table[:, ~samples.usable[:, j]] = 0.0
-            gram = np.zeros((int(index[-1]) + 1, len(table), len(table)))
-            add_grams(gram, table, equal_runs(index))
-            grams.append(gram)
+            tables.append(np.concatenate(rows, axis=1).T)
+            tables[-1][:, ~samples.usable[:, j]] = 0.0
             own = p + np.arange(load.shape[1])
             places.append(np.concatenate([columns[j], own, [p + _BODY + j]]))
         names = (
@@ -115,8 +112,9 @@ class Run:
             *LINK_SYMBOLS,
             *(f"offset of {joint}" for joint in model.joint_names),
         )
-        counts = samples_by_cell(index, samples.usable)
-        return cls(name, PhaseFactor(tuple(grams), tuple(places), counts, names), loaded)
+        counts = count_by_block(index, samples.usable)
+        factor = Factor.of_rows([(index, tables)], counts, tuple(places), names)
+        return cls(name, factor, loaded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +235,7 @@ class _Fit(NamedTuple):
 
 def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
     """Solve the joint problem for the r unknowns of the body, ten parameters by shape (10, r)."""
-    rows = np.sum([run.phase.samples.sum(axis=0) for run in runs], axis=0)
+    rows = np.sum([run.factor.samples for run in runs], axis=0)
     if not rows.any():
         raise IdentificationError(no_rows_message(model))
     p, n, r = model.n_parameters, model.n_joints, shape.shape[1]
@@ -251,8 +249,10 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
         """Return Gram matrices over the unknowns, of merged blocks."""
         found = []
         for k, run in enumerate(runs):
-            phase = run.phase.merged(length or max(1, len(run.phase)))
-            for joint, (gram, columns) in enumerate(zip(phase.gram, phase.columns, strict=True)):
+            factor = run.factor.merged(length or max(1, len(run.factor)))
+            for joint, (gram, columns) in enumerate(
+                zip(factor.matrices, factor.columns, strict=True)
+            ):
                 c = len(columns)
                 mapping = np.zeros((c + 1, width + 1))
                 mapping[c, -1] = 1.0
@@ -296,7 +296,7 @@ def _fit(model: RobotModel, runs: Sequence[Run], shape: Array) -> _Fit:
         values = solve(equations_of(total, prior_of(problem, weights))).values
         weights = _weights(problem, values, rows)
         friction = np.where(model.friction_columns, values[:p], 0.0)
-    length = max(1, -(-max(len(run.phase) for run in runs) // _MOST_BLOCKS))
+    length = max(1, -(-max(len(run.factor) for run in runs) // _MOST_BLOCKS))
     problem = problem_of(length)
     # The prior is not scaled; the data are, by the design effect of coloured noise.
     effect = 1.0

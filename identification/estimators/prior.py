@@ -25,8 +25,8 @@ from identification.factor.factor import (
     mark_undetermined,
     reduced,
     solve_rows,
+    total_factor,
 )
-from identification.factor.phases import PhaseFactor, total_phase
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -151,7 +151,7 @@ def fit_with_prior(
     recordings: Sequence[Samples],
     prior: GaussianPrior,
     *,
-    phase: PhaseFactor | None = None,
+    factor: Factor | None = None,
 ) -> PosteriorEstimate:
     """Fit recordings with a prior, allowing for coloured residuals.
 
@@ -162,12 +162,12 @@ def fit_with_prior(
     Raises:
         IdentificationError: no recordings, or no usable row.
     """
-    phase = total_phase(model, recordings) if phase is None else phase
-    factor = reduced(model, recordings, phase.total)
-    weights = _weights(factor)
-    _, clustered = clustered_fit(model, factor, recordings, phase, weights)
+    factor = total_factor(model, recordings) if factor is None else factor
+    precise = reduced(model, recordings, factor)
+    weights = _weights(precise)
+    _, clustered = clustered_fit(model, precise, recordings, factor, weights)
     effect = max(1.0, clustered.design_effect)
-    result = with_prior(model, factor, prior, weights, design_effect=effect)
+    result = with_prior(model, precise, prior, weights, design_effect=effect)
     estimate = replace(result.estimate, interval_factor=clustered.interval_factor)
     return replace(result, estimate=estimate)
 

@@ -19,8 +19,8 @@ from identification.factor.factor import (
     estimate_of,
     inverse_variance,
     reduced,
+    total_factor,
 )
-from identification.factor.phases import total_phase
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
@@ -70,20 +70,20 @@ def robust_estimate(
     recordings: Sequence[Samples],
     loss: Loss = Huber(),  # noqa: B008 - frozen
     *,
-    gram: Factor | None = None,
+    total: Factor | None = None,
     most_iterations: int = MOST_ITERATIONS,
 ) -> RobustEstimate:
     """Fit recordings with a robust loss; every iteration reads the samples once.
 
     The noise scale of each joint is estimated from the median absolute residual; Tukey's loss
-    starts from the solution and scales of Huber's (Yohai 1987). `gram`, the recordings' factor,
+    starts from the solution and scales of Huber's (Yohai 1987). `total`, the recordings' factor,
     saves a pass.
 
     Raises:
         IdentificationError: no recordings, or no usable row.
     """
-    gram = total_phase(model, recordings).total if gram is None else gram
-    factor, n = reduced(model, recordings, gram), model.n_joints
+    total = total_factor(model, recordings) if total is None else total
+    factor, n = reduced(model, recordings, total), model.n_joints
     state = _State(factor, factor.solve(np.ones(n)), np.full(n, np.inf))
     stages = [(Huber(), _STEP_TOLERANCE)] if isinstance(loss, Tukey) else []
     for one, tolerance in [*stages, (loss, TOLERANCE)]:
@@ -121,7 +121,10 @@ def _iterate(
     """Weight all rows by their residuals, solve, and update the scale unless fixed."""
     residuals = tuple(np.full(samples.torque.shape, np.nan) for samples in recordings)
     rows = _weighted_rows(model, recordings, state.solution.values, state.scale, loss, residuals)
-    factor = state.factor.from_blocks(model, rows, state.factor.samples)
+    before = state.factor
+    factor = Factor.of_rows(
+        rows, before.samples[None], model.plan.columns, before.parameter_names, before.storage
+    )
     weights = inverse_variance(state.scale**2)
     solution = factor.solve(weights if weights.any() else np.ones(len(weights)))
     scale = state.scale if state.scale_fixed else _scales(recordings, residuals, state.solution)
@@ -151,8 +154,8 @@ def _weighted_rows(
     scale: Array,
     loss: Loss,
     residuals: Sequence[Array],
-) -> Iterator[list[Array]]:
-    """Yield rows times the roots of their weights; writes the residuals to `residuals`."""
+) -> Iterator[tuple[NDArray[np.intp], list[Array]]]:
+    """Yield rows of one block times the roots of their weights; writes to `residuals`."""
     for samples, left in zip(recordings, residuals, strict=True):
         for part, blocks in augmented_rows(model, samples):
             for joint, (block, used) in enumerate(zip(blocks, model.plan.columns, strict=True)):
@@ -160,7 +163,7 @@ def _weighted_rows(
                 left[part, joint] = np.where(samples.usable[part, joint], error, np.nan)
                 if np.isfinite(scale[joint]):
                     block *= np.sqrt(loss.weight(error / scale[joint]))
-            yield blocks
+            yield np.zeros(part.stop - part.start, dtype=np.intp), blocks
 
 
 def _scales(recordings: Sequence[Samples], residuals: Sequence[Array], solution: Solution) -> Array:

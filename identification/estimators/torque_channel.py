@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -12,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from identification.factor.factor import Factor, estimate
+from identification.factor.factor import Factor, count_by_block, estimate
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
 from identification.signals.noise import noiseless_above
@@ -133,19 +132,17 @@ class _Channel:
 
     def misfit(self, bandwidth: float | None = None, shape: LowPassShape = SMOOTHER) -> float:
         """Return the mean log standard deviation of the residual of moving joints."""
-
-        def rows() -> Iterator[list[Array]]:
-            tables = []
-            for joint, block in enumerate(self.blocks):
-                if bandwidth is not None:
-                    parts = [(self.time[one], block[one]) for one in self.segments]
-                    block = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
-                table = np.column_stack([block[:, :-1], self.torque[:, joint] - block[:, -1]])
-                tables.append(table[self.usable[:, joint]].T)
-            yield tables
-
-        count = np.count_nonzero(self.usable, axis=0)
-        found = estimate(self.model, Factor.from_blocks(self.model, rows(), count))
+        tables = []
+        for joint, block in enumerate(self.blocks):
+            if bandwidth is not None:
+                parts = [(self.time[one], block[one]) for one in self.segments]
+                block = np.concatenate([low_passed(*part, bandwidth, shape) for part in parts])
+            table = np.column_stack([block[:, :-1], self.torque[:, joint] - block[:, -1]])
+            tables.append(np.where(self.usable[:, joint], table.T, 0.0))
+        index = np.zeros(len(self.usable), dtype=np.intp)
+        counts, names = count_by_block(index, self.usable), self.model.parameter_names
+        factor = Factor.of_rows([(index, tables)], counts, self.model.plan.columns, names)
+        found = estimate(self.model, factor)
         return float(np.nanmean(np.log(found.noise_std)))
 
     def best(self, shape: LowPassShape) -> tuple[float, float]:

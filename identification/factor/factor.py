@@ -1,15 +1,17 @@
 """Reduced samples, and weighted least squares on them (eq. 4 of the paper).
 
-Per joint j a :class:`Factor` holds the Gram matrix of the rows [W | y], a :class:`QRFactor` their
-triangular factor. Both add over chunks, repetitions, archives and processes; joint weights are
-applied afterwards. Gram matrices square the condition: from 1e5 on triangles are used.
+A :class:`Factor` sums the rows [W | y] joint by joint and by blocks of time, as Gram matrices or
+triangles. Factors add over chunks, repetitions, archives and processes; joint weights are applied
+afterwards. Gram matrices square the condition: from 1e5 on triangles are used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Final, NamedTuple, Self
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,11 @@ from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Blocks = TypeVar("Blocks", NDArray[np.float64], NDArray[np.intp])
+Storage = Literal["gram", "qr"]
+
+FINE_BLOCK: Final = 0.125  # s
 
 # Condition 1e6 leaves four digits of a Gram matrix, enough for torque measurements; rank deficiency
 # shows as 1e8 and more.
@@ -39,7 +46,7 @@ class NormalEquations(NamedTuple):
     yy: float = 0.0  #: sum of the weighted ``y^T y``
     n: int = 0  #: rows (one joint at one time)
 
-    def part(self, chosen: NDArray[np.intp]) -> NormalEquations:
+    def part(self, chosen: Indices) -> NormalEquations:
         """Return the equations of some parameters (k,), the others zero."""
         return self._replace(A=self.A[np.ix_(chosen, chosen)], b=self.b[chosen])
 
@@ -60,32 +67,49 @@ class Solution(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """Gram matrices of the rows of [W | y], joint by joint."""
+    """Sums over the rows of [W | y] in B blocks of time, joint by joint.
 
-    matrices: Array  #: (n, p + 1, p + 1)
-    samples: NDArray[np.intp]  #: rows per joint (n,)
-    parameter_names: tuple[str, ...]  #: the p columns of W
+    Blocks give the scores of a cluster-robust covariance for any weights and parameters; estimates
+    need their sum only. Other columns than those of W are in
+    :mod:`identification.factor.columns`.
+    """
 
-    words: ClassVar[str] = ""
-    """Suffix of estimator names."""
-    smallest_noise: ClassVar[float] = 1e-6
-    """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
+    #: of joint j over its columns and the torque (B, c_j + 1, c_j + 1): the Gram matrix G of the
+    #: rows, or an upper triangle R with R'R = G
+    matrices: tuple[Array, ...]
+    columns: tuple[Indices, ...]  #: per joint the parameter indices of its columns (c_j,)
+    counts: Indices  #: rows (B, n)
+    parameter_names: tuple[str, ...]  #: (p,)
+    storage: Storage = "gram"
 
     @classmethod
-    def zero(cls, model: RobotModel) -> Self:
+    def zero(cls, model: RobotModel, blocks: int = 0, storage: Storage = "gram") -> Self:
         """Return the factor of no samples."""
-        n, p = model.n_joints, model.n_parameters
-        return cls(np.zeros((n, p + 1, p + 1)), np.zeros(n, dtype=np.intp), model.parameter_names)
+        counts = np.zeros((blocks, model.n_joints), dtype=np.intp)
+        return cls.of_rows((), counts, model.plan.columns, model.parameter_names, storage)
 
     @classmethod
-    def of(cls, model: RobotModel, samples: Samples) -> Self:
-        """Reduce the usable rows of a recording.
+    def of(
+        cls,
+        model: RobotModel,
+        samples: Samples,
+        storage: Storage = "gram",
+        index: Indices | None = None,
+    ) -> Self:
+        """Reduce the usable rows of a recording, by their rising blocks (m,) or to one block.
 
         Raises:
             ShapeError: wrong shape of an array.
         """
-        blocks = (rows.blocks for rows in augmented_rows(model, samples))
-        return cls.from_blocks(model, blocks, np.count_nonzero(samples.usable, axis=0))
+        index = np.zeros(len(samples.torque), dtype=np.intp) if index is None else index
+        chunks = ((index[part], tables) for part, tables in augmented_rows(model, samples))
+        counts = count_by_block(index, samples.usable)
+        return cls.of_rows(chunks, counts, model.plan.columns, model.parameter_names, storage)
+
+    @classmethod
+    def by_time(cls, model: RobotModel, samples: Samples) -> Self:
+        """Reduce the usable rows of a recording by :func:`fine_blocks`."""
+        return cls.of(model, samples, index=fine_blocks(samples))
 
     @classmethod
     def from_samples(
@@ -103,47 +127,79 @@ class Factor:
         return cls.of(model, Samples(motion, torque, usable, (), 0.0, nothing))
 
     @classmethod
-    def from_blocks(
-        cls, model: RobotModel, chunks: Iterable[Sequence[Array]], samples: NDArray[np.intp]
+    def of_rows(
+        cls,
+        chunks: Iterable[tuple[Indices, Iterable[Array]]],
+        counts: Indices,
+        columns: tuple[Indices, ...],
+        names: tuple[str, ...],
+        storage: Storage = "gram",
     ) -> Self:
-        """Reduce chunks of :func:`augmented_rows`, with numbers of usable rows (n,)."""
-        columns = model.plan.columns
-        sums = [np.zeros((len(c) + 1, len(c) + 1)) for c in columns]
-        for blocks in chunks:
-            for joint, block in enumerate(blocks):
-                sums[joint] = cls._accumulate(sums[joint], block)
-        factor = cls.zero(model)
-        for small, used, target in zip(sums, columns, factor.matrices, strict=True):
-            target[:] = cls._expanded(small, np.append(used, model.n_parameters), target)
-        factor.samples[:] = samples
+        """Reduce chunks of k rows: their rising block indices (k,), and a table for each joint.
+
+        A table (c_j + 1, k) has the columns and, last, the torque, zero for unusable rows; `counts`
+        (B, n) are the usable ones.
+        """
+        widths = [len(own) + 1 for own in columns]
+        matrices = tuple(np.zeros((len(counts), width, width)) for width in widths)
+        factor = cls(matrices, columns, counts, names, storage)
+        for index, tables in chunks:
+            factor.add_rows(index, tables)
         return factor
 
-    @property
+    @classmethod
+    def of_gram(cls, gram: Array, samples: Indices, names: tuple[str, ...]) -> Self:
+        """Return the factor of Gram matrices (n, p + 1, p + 1) of `samples` (n,) rows."""
+        return cls(tuple(gram[:, None]), (np.arange(len(names)),) * len(gram), samples[None], names)
+
+    def add_rows(self, index: Indices, tables: Iterable[Array]) -> None:
+        """Add a chunk of :meth:`of_rows` to the matrices, in place."""
+        if self.storage == "gram":
+            runs = equal_runs(index)
+            for total, table in zip(self.matrices, tables, strict=True):
+                add_grams(total, table, runs)
+            return
+        for total, table in zip(self.matrices, tables, strict=True):
+            for block, at in block_slices(index):
+                total[block] = _triangle(np.concatenate([total[block], table[:, at].T]))
+
+    # Sums over the blocks
+
+    @cached_property
+    def samples(self) -> Indices:
+        """Rows per joint (n,)."""
+        return np.asarray(self.counts.sum(axis=0))
+
+    @cached_property
     def gram(self) -> Array:
-        """The Gram matrices (n, p + 1, p + 1), symmetric."""
-        return self.matrices
+        """Gram matrices (n, p + 1, p + 1), symmetric; of triangles with loss of digits."""
+        width = self.n_parameters + 1
+        whole = np.zeros((self.n_joints, width, width))
+        for joint, own in enumerate(self.matrices):
+            small = own if self.storage == "gram" else own.transpose(0, 2, 1) @ own
+            place = self._places(joint)
+            whole[joint][np.ix_(place, place)] = small.sum(axis=0)
+        return whole
+
+    @property
+    def words(self) -> str:
+        """Suffix of estimator names."""
+        return " by QR" if self.storage == "qr" else ""
+
+    @property
+    def smallest_noise(self) -> float:
+        """Smallest noise as a share of the torque's RMS, for joints that fit exactly."""
+        return 1e-12 if self.storage == "qr" else 1e-6
 
     @property
     def n_joints(self) -> int:
         """Number n of joints."""
-        return int(self.matrices.shape[0])
+        return len(self.matrices)
 
     @property
     def n_parameters(self) -> int:
         """Number p of parameters."""
-        return int(self.matrices.shape[1]) - 1
-
-    def __add__(self, other: Self) -> Self:
-        """Return the factor of both sets of samples.
-
-        Raises:
-            IdentificationError: the two belong to different models.
-        """
-        same = self.matrices.shape == other.matrices.shape
-        if not same or self.parameter_names != other.parameter_names:
-            raise IdentificationError("factors with different joints or parameters cannot be added")
-        both = self._added(other)
-        return type(self)(both, self.samples + other.samples, self.parameter_names)
+        return len(self.parameter_names)
 
     def weighted(self, weights: Array) -> NormalEquations:
         """Return the normal equations with one weight per joint (n,): 1/variance."""
@@ -170,72 +226,199 @@ class Factor:
 
     def rows(self, weights: Array) -> tuple[Array, Array]:
         """Return equivalent rows (k, p) and target (k,) with joint weights (n,)."""
-        return rows_of(self.weighted(weights))
+        if self.storage == "gram":
+            return rows_of(self.weighted(weights))
+        wide = np.concatenate([self._wide(j) * np.sqrt(w) for j, w in enumerate(weights)])
+        triangle = _triangle(wide)
+        return triangle[:-1, :-1], triangle[:-1, -1]
 
     def solve(self, weights: Array) -> Solution:
-        """Solve the weighted least-squares problem, weights (n,)."""
-        return solve(self.weighted(weights))
+        """Solve the weighted least-squares problem, weights (n,); triangles without squaring."""
+        if self.storage == "gram":
+            return solve(self.weighted(weights))
+        return solve_rows(*self.rows(weights))
 
     def products(self, directions: Array) -> Array:
         """Return ``D' G_j D`` (n, k, k) for directions D (p, k), or (p + 1, k) with the torque."""
         size = len(directions)
-        return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
+        if self.storage == "gram":
+            return np.asarray(directions.T @ self.gram[:, :size, :size] @ directions)
+        moved = [self._wide(joint)[:, :size] @ directions for joint in range(self.n_joints)]
+        return np.array([own.T @ own for own in moved])
 
-    def _added(self, other: Self) -> Array:
-        return self.matrices + other.matrices
+    # Blocks
 
-    @staticmethod
-    def _accumulate(matrix: Array, block: Array) -> Array:
-        matrix += block @ block.T
-        return matrix
+    def __len__(self) -> int:
+        """Number B of blocks."""
+        return len(self.counts)
 
-    @staticmethod
-    def _expanded(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
-        target[np.ix_(place, place)] = matrix
-        return target
+    def __add__(self, other: Self) -> Self:
+        """Add blocks at equal times since the origin, as of repetitions of a motion.
+
+        Raises:
+            IdentificationError: the two belong to different models.
+        """
+        same = self.n_joints == other.n_joints and self.storage == other.storage
+        if not same or self.parameter_names != other.parameter_names:
+            raise IdentificationError("factors with different joints or parameters cannot be added")
+        add = _added if self.storage == "gram" else _triangles_of_both
+        matrices = tuple(add(a, b) for a, b in zip(self.matrices, other.matrices, strict=True))
+        return replace(self, matrices=matrices, counts=_added(self.counts, other.counts))
+
+    def by_block(self, weights: Array) -> Array:
+        """Return the Gram matrices of the blocks (B, p + 1, p + 1) with joint weights (n,)."""
+        width = self.n_parameters + 1
+        whole = np.zeros((len(self), width * width))
+        for joint, (weight, gram) in enumerate(zip(weights, self.matrices, strict=True)):
+            place = self._places(joint)
+            flat = (place[:, None] * width + place).ravel()
+            whole[:, flat] += weight * gram.reshape(len(gram), -1)
+        return whole.reshape(-1, width, width)
+
+    def scores(self, weights: Array, values: Array) -> Array:
+        """Return the scores ``W' w (y - W values)`` of each block (B, p)."""
+        pull = np.zeros((len(self), self.n_parameters))
+        for weight, gram, used in zip(weights, self.matrices, self.columns, strict=True):
+            pull[:, used] += weight * (gram[:, :-1] @ np.append(-values[used], 1.0))
+        return pull
+
+    def blocks(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Return some blocks, by slice or mask (B,)."""
+        matrices = tuple(own[which] for own in self.matrices)
+        return replace(self, matrices=matrices, counts=self.counts[which])
+
+    def occupied(self) -> Self:
+        """Return the blocks with rows."""
+        rows = np.asarray(self.counts.any(axis=1))
+        return self if rows.all() else self.blocks(rows)
+
+    def merged(self, length: int) -> Self:
+        """Merge runs of `length` blocks; the last one may be shorter."""
+        matrices = tuple(merged(own, length) for own in self.matrices)
+        return replace(self, matrices=matrices, counts=merged(self.counts, length))
+
+    def restricted(self, chosen: Indices) -> Self:
+        """Return the factor of the parameters `chosen` (k,), in that order."""
+        place = np.full(self.n_parameters, -1, dtype=np.intp)
+        place[chosen] = np.arange(len(chosen))
+        matrices, columns = [], []
+        for own, used in zip(self.matrices, self.columns, strict=True):
+            stays = np.flatnonzero(place[used] >= 0)
+            both = np.append(stays, len(used))
+            matrices.append(own[:, both[:, None], both])
+            columns.append(place[used[stays]])
+        names = tuple(self.parameter_names[k] for k in chosen)
+        return replace(
+            self, matrices=tuple(matrices), columns=tuple(columns), parameter_names=names
+        )
+
+    def _places(self, joint: int) -> Indices:
+        """Return the indices of a joint's columns among all p + 1, torque last."""
+        return np.append(self.columns[joint], self.n_parameters)
+
+    def _wide(self, joint: int) -> Array:
+        """Return the triangles of a joint as rows (k, p + 1)."""
+        stacked = self.matrices[joint].reshape(-1, self.matrices[joint].shape[-1])
+        wide = np.zeros((len(stacked), self.n_parameters + 1))
+        wide[:, self._places(joint)] = stacked
+        return wide
 
 
-class QRFactor(Factor):
-    """Upper triangular factors of [W | y], one per joint, instead of Gram matrices."""
+def joined(parts: Sequence[Factor]) -> Factor:
+    """Concatenate the blocks of several factors."""
+    grams = zip(*(part.matrices for part in parts), strict=True)
+    counts = np.concatenate([part.counts for part in parts])
+    return replace(parts[0], matrices=tuple(map(np.concatenate, grams)), counts=counts)
 
-    words = " by QR"
-    # Rounding of the residual by triangular factors.
-    smallest_noise = 1e-12
 
-    @property
-    def gram(self) -> Array:
-        """Gram matrices, with loss of digits."""
-        return np.asarray(self.matrices.transpose(0, 2, 1) @ self.matrices)
+def total_factor(model: RobotModel, recordings: Iterable[Samples]) -> Factor:
+    """Return the sum of the factors of recordings by time, each read once."""
+    return sum((Factor.by_time(model, samples) for samples in recordings), Factor.zero(model))
 
-    def rows(self, weights: Array) -> tuple[Array, Array]:
-        """Return the triangle of all joints."""
-        rows = np.sqrt(weights)[:, None, None] * self.matrices
-        triangle = _triangle(rows.reshape(-1, rows.shape[2]))
-        return triangle[:-1, :-1], triangle[:-1, -1]
 
-    def solve(self, weights: Array) -> Solution:
-        """Solve the rows, without squaring their condition."""
-        return solve_rows(*self.rows(weights))
+# Blocks of time
 
-    def products(self, directions: Array) -> Array:
-        """Return squares of the triangles times the directions."""
-        through = self.matrices[:, :, : len(directions)] @ directions
-        return np.asarray(through.transpose(0, 2, 1) @ through)
 
-    def _added(self, other: Self) -> Array:
-        stacked = np.concatenate([self.matrices, other.matrices], axis=1)
-        return np.array([_triangle(joint) for joint in stacked])
+def fine_blocks(samples: Samples) -> Indices:
+    """Return the block of each sample (m,), rising; rows before the origin belong to the first."""
+    since = samples.motion.time - samples.origin
+    return np.maximum(np.floor(since / FINE_BLOCK + 1e-9).astype(np.intp), 0)
 
-    @staticmethod
-    def _accumulate(matrix: Array, block: Array) -> Array:
-        return _triangle(np.concatenate([matrix, block.T]))
 
-    @staticmethod
-    def _expanded(matrix: Array, place: NDArray[np.intp], target: Array) -> Array:
-        wide = np.zeros((len(matrix), len(target)))
-        wide[:, place] = matrix
-        # Columns are not sorted, so the expanded rows are not triangular.
-        return _triangle(wide)
+def block_slices(index: Indices) -> Iterator[tuple[int, slice]]:
+    """Yield each value of a rising index with its slice."""
+    edges = np.flatnonzero(np.diff(index)) + 1
+    for start, stop in pairwise([0, *edges.tolist(), len(index)]):
+        if stop > start:
+            yield int(index[start]), slice(start, stop)
+
+
+class EqualRuns(NamedTuple):
+    """Consecutive blocks of equally many rows."""
+
+    first: int  # block
+    blocks: int
+    start: int  # first row
+    length: int  # rows per block
+
+
+def equal_runs(index: Indices) -> list[EqualRuns]:
+    """Group :func:`block_slices` of a rising index, for few large operations."""
+    groups: list[EqualRuns] = []
+    for block, at in block_slices(index):
+        length = at.stop - at.start
+        last = groups[-1] if groups else None
+        if last is not None and last.length == length and last.first + last.blocks == block:
+            groups[-1] = last._replace(blocks=last.blocks + 1)
+        else:
+            groups.append(EqualRuns(block, 1, at.start, length))
+    return groups
+
+
+def add_grams(total: Array, rows: Array, runs: Iterable[EqualRuns]) -> None:
+    """Add ``rows rows'`` of each block to the total (B, c, c), in place; rows is (c, k)."""
+    for first, count, start, length in runs:
+        own = rows[:, start : start + count * length].reshape(len(rows), count, length)
+        # A product with the own transpose takes half the work.
+        own = own.transpose(1, 0, 2)
+        total[first : first + count] += own @ own.transpose(0, 2, 1)
+
+
+def count_by_block(index: Indices, usable: NDArray[np.bool_]) -> Indices:
+    """Return usable rows per block (B, n) of a mask (m, n), by a rising index (m,)."""
+    if not len(index):
+        return np.zeros((0, usable.shape[1]), dtype=np.intp)
+    ends = np.searchsorted(index, np.arange(int(index[-1]) + 1), side="right")
+    sums = np.cumsum(usable, axis=0, dtype=np.intp)[np.maximum(ends - 1, 0)]
+    sums[ends == 0] = 0
+    return np.diff(sums, axis=0, prepend=0)
+
+
+def merged(blocks: Blocks, length: int) -> Blocks:
+    """Sum runs of `length` blocks along the first axis (B, ...); the last may be shorter."""
+    total = blocks[::length].copy()
+    for later in range(1, length):  # faster than np.add.reduceat
+        own = blocks[later::length]
+        total[: len(own)] += own
+    return total
+
+
+def _added(first: Blocks, second: Blocks) -> Blocks:
+    """Add blocks (B, ...) of possibly different number."""
+    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
+    total = longer.copy()
+    total[: len(shorter)] += shorter
+    return total
+
+
+def _triangles_of_both(first: Array, second: Array) -> Array:
+    """Add triangles (B, c, c) of possibly different number."""
+    longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
+    both = [_triangle(np.concatenate(own)) for own in zip(longer, shorter, strict=False)]
+    return np.array([*both, *longer[len(shorter) :]]).reshape(longer.shape)
+
+
+# Solutions
 
 
 def _triangle(rows: Array) -> Array:
@@ -336,7 +519,7 @@ class Estimate:
     values: Array  #: (p,)
     covariance: Array  #: (p, p); the variance of an undetermined parameter is infinite
     noise_std: Array  #: standard deviation of the torque residual per joint (n,) [N·m or N]
-    samples: NDArray[np.intp]  #: rows per joint (n,)
+    samples: Indices  #: rows per joint (n,)
     method: str  #: description of estimator and covariance
     condition: float  #: condition number of the weighted regressor with unit columns
     undetermined: tuple[str, ...] = ()  #: undetermined parameters, alone or in a combination
@@ -434,7 +617,8 @@ def reduced(model: RobotModel, recordings: Sequence[Samples], gram: Factor) -> F
     require_rows(model, gram)
     if not recordings or gram.solve(np.ones(model.n_joints)).condition <= QR_CONDITION:
         return gram
-    return sum((QRFactor.of(model, samples) for samples in recordings), QRFactor.zero(model))
+    triangles = (Factor.of(model, samples, "qr") for samples in recordings)
+    return sum(triangles, Factor.zero(model, storage="qr"))
 
 
 class Rows(NamedTuple):

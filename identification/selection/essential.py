@@ -24,10 +24,11 @@ from identification.factor.factor import (
     Factor,
     Solution,
     estimate_of,
+    joined,
     joint_weights,
+    merged,
     solve,
 )
-from identification.factor.phases import PhaseFactor, joined, merged
 from identification.model.robot import RobotModel
 
 Array = NDArray[np.float64]
@@ -111,26 +112,26 @@ class EssentialChoice(NamedTuple):
 
 
 def choose_essential(
-    model: RobotModel, training: PhaseFactor, held_out: Sequence[PhaseFactor]
+    model: RobotModel, training: Factor, held_out: Sequence[Factor]
 ) -> EssentialChoice:
     """Choose the essential parameters of fitted samples, and evaluate the choice.
 
     Raises:
         IdentificationError: nothing was fitted, or no row was held out.
     """
-    weights = joint_weights(training.total)
+    weights = joint_weights(training)
     # Blocks are merged to some hundred, enough for significance.
     longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)
     unseen = joined([factor.merged(longer) for factor in held_out]).occupied()
     return EssentialChoice(
         elimination=eliminate(model, training, unseen, weights=weights),
         by_spread=eliminate(model, training, unseen, weights=weights, rule=_BY_SPREAD).chosen,
-        blind=_choose_blind(model, training, unseen.total, weights),
+        blind=_choose_blind(model, training, unseen, weights),
     )
 
 
 def _choose_blind(
-    model: RobotModel, training: PhaseFactor, unseen: Factor, weights: Array
+    model: RobotModel, training: Factor, unseen: Factor, weights: Array
 ) -> BlindChoice | None:
     used = training.occupied()
     cut = round(_FITTED_SHARE * len(used))
@@ -138,7 +139,7 @@ def _choose_blind(
         return None
     first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
     chosen = np.flatnonzero(eliminate(model, first, last, weights=weights).values)
-    equations, values = training.total.weighted(weights), np.zeros(model.n_parameters)
+    equations, values = training.weighted(weights), np.zeros(model.n_parameters)
     values[chosen] = solve(equations.part(chosen)).values
     full = solve(equations).values
     return BlindChoice(len(chosen), unseen.relative_error(values), unseen.relative_error(full))
@@ -146,8 +147,8 @@ def _choose_blind(
 
 def eliminate(
     model: RobotModel,
-    training: PhaseFactor,
-    held_out: PhaseFactor,
+    training: Factor,
+    held_out: Factor,
     *,
     weights: Array | None = None,
     rule: CutRule = CutRule(),
@@ -162,15 +163,15 @@ def eliminate(
     for factor, what in ((training, "fitted"), (held_out, "held-out")):
         if not factor.samples.any():
             raise IdentificationError(f"no usable {what} sample")
-    total, names = training.total, training.parameter_names
+    names = training.parameter_names
     if weights is None:
-        weights = joint_weights(total)
-    path = _Path(total, held_out, weights, rule)
+        weights = joint_weights(training)
+    path = _Path(training, held_out, weights, rule)
     path.remove_guarded()
     cut, refused, chosen = len(path.steps) - 1, tuple(names[k] for k in path.refused), path.current
     path.remove_all()
     part, units = training.restricted(chosen.left), [model.units[k] for k in chosen.left]
-    classical = estimate_of(units, part.total, chosen.solution, weights, "")
+    classical = estimate_of(units, part, chosen.solution, weights, "")
     name = "essential parameters by weighted least squares"
     return Elimination(
         steps=tuple(path.steps),
@@ -202,10 +203,10 @@ class _Subset(NamedTuple):
 class _Path:
     """Elimination in progress."""
 
-    def __init__(self, total: Factor, held_out: PhaseFactor, weights: Array, rule: CutRule) -> None:
-        self._total, self._unseen, self._rule = total, held_out.total, rule
+    def __init__(self, total: Factor, held_out: Factor, weights: Array, rule: CutRule) -> None:
+        self._total, self._unseen, self._rule = total, held_out, rule
         self._equations = total.weighted(weights)
-        self._blocks = held_out.weighted(weights)[held_out.samples.any(axis=1)]
+        self._blocks = held_out.occupied().by_block(weights)
         self.refused: list[int] = []
         self.steps: list[EliminationStep] = []
         self.best = self.current = self._subset(np.arange(total.n_parameters))

@@ -22,7 +22,13 @@ from identification.estimators.consistent import (
     consistent_estimate,
     shrunk_values,
 )
-from identification.factor.factor import Factor, augmented_rows, joint_weights, solve
+from identification.factor.factor import (
+    Factor,
+    augmented_rows,
+    count_by_block,
+    joint_weights,
+    solve,
+)
 from identification.model.elements import Element, TorqueRipple
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -138,50 +144,42 @@ class Errors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Folds:
-    """Factors of each segment."""
+    """Factors by segment."""
 
-    fitted: tuple[Factor, ...]  # of usable rows
-    predicted: tuple[Factor, ...]  # of all rows
+    fitted: Factor  # of usable rows, a block for each segment
+    predicted: Factor  # of all rows
 
     @classmethod
     def of(cls, model: RobotModel, recordings: Iterable[Samples]) -> Folds:
         """Reduce recordings, each cut into `FOLDS` segments of equal length."""
-        fitted = [Factor.zero(model) for _ in range(FOLDS)]
-        predicted = [Factor.zero(model) for _ in range(FOLDS)]
-        places = [np.append(columns, model.n_parameters) for columns in model.plan.columns]
+        fitted, predicted = Factor.zero(model, FOLDS), Factor.zero(model, FOLDS)
         for samples in recordings:
             usable, m = samples.usable, len(samples.torque)
             edges = np.linspace(0, m, FOLDS + 1).round().astype(int)
+            index = np.repeat(np.arange(FOLDS), np.diff(edges))
+            predicted.counts[:] += np.diff(edges)[:, None]
+            fitted.counts[:] += count_by_block(index, usable)
             for part, rows in augmented_rows(model, replace(samples, usable=usable | True)):
-                for k in range(FOLDS):
-                    start, stop = max(edges[k], part.start), min(edges[k + 1], part.stop)
-                    if start >= stop:
-                        continue
-                    counts = usable[start:stop]
-                    for joint, (block, place) in enumerate(zip(rows, places, strict=True)):
-                        own = block[:, start - part.start : stop - part.start]
-                        used = own if counts[:, joint].all() else own[:, counts[:, joint]]
-                        index = np.ix_(place, place)
-                        predicted[k].gram[joint][index] += own @ own.T
-                        fitted[k].gram[joint][index] += used @ used.T
-                    predicted[k].samples[:] += stop - start
-                    fitted[k].samples[:] += np.count_nonzero(counts, axis=0)
-        return cls(tuple(fitted), tuple(predicted))
+                predicted.add_rows(index[part], rows)
+                for table, lost in zip(rows, ~usable[part].T, strict=True):
+                    table[:, lost] = 0.0
+                fitted.add_rows(index[part], rows)
+        return cls(fitted, predicted)
 
     def without(self, k: int) -> Factor:
         """Return the factor of all segments but k."""
-        others = [factor for index, factor in enumerate(self.fitted) if index != k]
-        return sum(others[1:], others[0])
+        return self.fitted.blocks(np.arange(FOLDS) != k)
 
     def errors(
         self, estimate: Callable[[int, Factor], Array], rows: Literal["all", "fitted"] = "all"
     ) -> Errors:
         """Return prediction errors of ``estimate(k, factor without segment k)`` on these rows."""
         targets = self.predicted if rows == "all" else self.fitted
-        squares = np.zeros((FOLDS, targets[0].n_joints))
-        for k, target in enumerate(targets):
-            squares[k] = target.squared_errors(estimate(k, self.without(k)))
-        torque = np.array([target.gram[:, -1, -1] for target in targets])
+        squares = np.zeros((FOLDS, targets.n_joints))
+        for k in range(FOLDS):
+            segment = targets.blocks(np.arange(FOLDS) == k)
+            squares[k] = segment.squared_errors(estimate(k, self.without(k)))
+        torque = np.array([own[:, -1, -1] for own in targets.matrices]).T
         if not torque.any():
             return Errors(math.nan, math.nan)
         return Errors(

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from identification.distributions import normal_limit, student_limit
 from identification.errors import IdentificationError
-from identification.factor.factor import Estimate, Factor, augmented_rows
-from identification.factor.phases import (
+from identification.factor.factor import (
     FINE_BLOCK,
-    PhaseFactor,
+    Estimate,
+    Factor,
+    augmented_rows,
     block_slices,
+    count_by_block,
     merged,
-    samples_by_cell,
 )
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import FOLDS
@@ -92,16 +93,16 @@ class Calibration:
 
 
 def calibrate(
-    estimate: Estimate, phase: PhaseFactor, fitted: TorqueMeans, held_out: TorqueMeans, refit: Refit
+    estimate: Estimate, factor: Factor, fitted: TorqueMeans, held_out: TorqueMeans, refit: Refit
 ) -> Calibration:
-    """Compare held-out mean torques with 95 % intervals from `phase` and `fitted` means.
+    """Compare held-out mean torques with 95 % intervals from `factor` and `fitted` means.
 
     Undetermined parameters are ignored.
 
     Raises:
         IdentificationError: fewer than `FEWEST_BLOCKS` blocks, or a fold cannot be fitted.
     """
-    inner = inner_errors(phase, fitted, refit)
+    inner = inner_errors(factor, fitted, refit)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.nansum(inner**2, axis=0) / np.count_nonzero(~np.isnan(inner), axis=0))
     # Repetitions share blocks: repeated errors are not independent.
@@ -127,14 +128,14 @@ def calibrate(
     return Calibration(blocks, inside, half_width, white_inside)
 
 
-def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
+def inner_errors(factor: Factor, means: TorqueMeans, refit: Refit) -> Array:
     """Return errors of mean torques (B, n), each fold predicted from the others.
 
     Folds have equally many rows and are cut at equal times of all recordings. NaN where a mean is
     unknown, infinite where the other folds have no row of the joint.
     """
     fine = round(BLOCK / FINE_BLOCK)
-    rows = merged(phase.samples, fine).sum(axis=1)
+    rows = merged(factor.counts, fine).sum(axis=1)
     if np.count_nonzero(rows) < FEWEST_BLOCKS:
         raise IdentificationError(
             f"the fitted motion of {BLOCK * len(rows):g} s is too short for inner prediction"
@@ -142,9 +143,9 @@ def inner_errors(phase: PhaseFactor, means: TorqueMeans, refit: Refit) -> Array:
     before = np.cumsum(rows) - 0.5 * rows
     # Blocks at rest after the last row belong to the last fold.
     fold = np.minimum(np.floor(FOLDS * before / rows.sum()).astype(np.intp), FOLDS - 1)
-    found = np.full((len(means.block), phase.n_joints), np.nan)
+    found = np.full((len(means.block), factor.n_joints), np.nan)
     for k in range(FOLDS):
-        others = phase.blocks(np.repeat(fold != k, fine)[: len(phase)]).total
+        others = factor.blocks(np.repeat(fold != k, fine)[: len(factor)])
         inside = fold[means.block] == k
         errors = means.errors(refit(others))[inside]
         errors[:, others.samples == 0] = np.inf
@@ -160,7 +161,7 @@ def _means(model: RobotModel, samples: Samples) -> tuple[Array, NDArray[np.intp]
             known &= ~samples.mask.reasons[reason]
     index, p = block_index(samples), model.n_parameters
     present = np.unique(index)
-    count = samples_by_cell(index, known)[present]
+    count = count_by_block(index, known)[present]
     places = [np.append(own, p) for own in model.plan.columns]
     sums = np.zeros((int(index[-1]) + 1, model.n_joints, p + 1))
     for part, chunk in augmented_rows(model, replace(samples, usable=known)):

@@ -14,8 +14,8 @@ from identification.errors import IdentificationError
 from identification.estimators.delay import DelayEstimate
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.estimators.payload import Run, mass_difference
+from identification.factor.columns import standard_factor, under_gravity
 from identification.factor.factor import Estimate, Factor, solve
-from identification.factor.phases import StandardGram
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
 from identification.signals.noise import noiseless_above
@@ -76,27 +76,25 @@ def _solved(factor: Factor, weights: Array) -> Array:
     return solve(factor.weighted(weights), _WORST_CONDITION).values
 
 
-def find_gravity(
-    model: RobotModel, training: StandardGram, held_out: StandardGram
-) -> GravityDirection:
+def find_gravity(model: RobotModel, training: Factor, held_out: Factor) -> GravityDirection:
     """Fit the training motion under all directions of gravity, and predict the held-out one."""
 
     def fitted(gravity: Array) -> tuple[Array, Array]:
         """Return parameters, joints weighted by their residuals, and the squared errors (n,)."""
-        factor = training.under(gravity)
+        factor = under_gravity(training, gravity)
         errors, values = factor.gram[:, -1, -1], np.empty(0)
         floor = 1e-12 * errors + 1e-300
         for _ in range(_PASSES):
-            values = _solved(factor, training.rows / np.maximum(errors, floor))
+            values = _solved(factor, training.samples / np.maximum(errors, floor))
             errors = factor.squared_errors(values)
         return values, np.maximum(errors, floor)
 
     def misfit(gravity: Array) -> float:
         """Return twice the negative log likelihood, maximised over the noise variances."""
-        return float(training.rows @ np.log(fitted(gravity)[1]))
+        return float(training.samples @ np.log(fitted(gravity)[1]))
 
     def unseen(gravity: Array) -> Array:
-        factor = held_out.under(gravity)
+        factor = under_gravity(held_out, gravity)
         errors = factor.squared_errors(fitted(gravity)[0])
         return np.maximum(np.maximum(errors, 1e-12 * factor.gram[:, -1, -1]), 1e-300)
 
@@ -118,7 +116,7 @@ def find_gravity(
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-3, "maxfev": 80},
     )
-    best, counts = pulled(found.x), held_out.rows > 0
+    best, counts = pulled(found.x), held_out.samples > 0
     change = np.log(unseen(best)) - np.log(unseen(model.gravity))
     ratio = float(np.exp(change[counts].mean())) if counts.any() else 1.0
     return GravityDirection(model.gravity, best, ratio)
@@ -164,23 +162,23 @@ def find_load(
     model: RobotModel,
     training: Sequence[Samples],
     held_out: Sequence[Samples],
-    fitted: StandardGram,
-    predicted: StandardGram,
+    fitted: Factor,
+    predicted: Factor,
 ) -> CarriedLoad:
     """Fit the training motion, then ten parameters of the last link to the unseen motion."""
-    seen, unseen = fitted.under(model.gravity), predicted.under(model.gravity)
-    values = _solved(seen, fitted.rows / np.maximum(seen.gram[:, -1, -1], 1e-300))
+    seen, unseen = (under_gravity(one, model.gravity) for one in (fitted, predicted))
+    values = _solved(seen, fitted.samples / np.maximum(seen.gram[:, -1, -1], 1e-300))
     # Squared error of the fit, scaled to as many rows.
     floor = 1e-12 * unseen.gram[:, -1, -1] + 1e-300
-    usual = seen.squared_errors(values) * predicted.rows / np.maximum(fitted.rows, 1.0)
-    weights = predicted.rows / np.maximum(usual, floor)
+    usual = seen.squared_errors(values) * predicted.samples / np.maximum(fitted.samples, 1.0)
+    weights = predicted.samples / np.maximum(usual, floor)
     before = unseen.squared_errors(values)
     last = model.layout.links[-1]
     # Columns [last link | residual].
     change = np.zeros((unseen.n_parameters + 1, len(last) + 1))
     change[last, range(len(last))] = 1.0
     change[:, -1] = np.append(-values, 1.0)
-    left = replace(unseen, matrices=unseen.products(change))
+    left = Factor.of_gram(unseen.products(change), unseen.samples, LINK_SYMBOLS)
     body = _solved(left, weights)
     after = left.squared_errors(body)
     beyond = weights @ np.maximum(before - usual, 0.0)
@@ -287,7 +285,7 @@ def gather(
     unseen = sum((Factor.of(model, run) for run in held_out), Factor.zero(model))
     error = pooled_error(prediction_error(model, values, held_out))
     few, unseen_few = training[:_MOST_RECORDINGS], held_out[:_MOST_RECORDINGS]
-    grams = StandardGram.of(model, few), StandardGram.of(model, unseen_few)
+    standard = standard_factor(model, few), standard_factor(model, unseen_few)
     repeated = same_motion and len(result.repetitions) > 1
     noise = repetition_noise(model, values, training, SLOW) if repeated else None
     evidence = Evidence(
@@ -296,8 +294,8 @@ def gather(
         training=pooled_error(prediction_error(model, values, training)),
         noise_floor=_noise_floor(model, values, few, noise),
         causes=find_causes(model, training, values, names),
-        gravity=find_gravity(model, *grams),
-        load=find_load(model, few, unseen_few, *grams),
+        gravity=find_gravity(model, *standard),
+        load=find_load(model, few, unseen_few, *standard),
         nominal=None
         if nominal is None
         else pooled_error(prediction_error(model, nominal, held_out)),

@@ -15,8 +15,7 @@ from hil.batch.types import LevelEstimate
 from hil.cell import Cell
 from identification import Motion, RobotModel
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.factor import estimate, joint_weights
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor, estimate, joint_weights
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import CELL_PATH, urdf_text
 
@@ -107,7 +106,7 @@ def noise_size() -> Array:
 def campaign(condition: Condition, k: int, random: np.random.Generator) -> LevelEstimate:
     arm, moved = model(), motion()
     clean, size = torque(condition), noise_size()
-    phase = PhaseFactor.zero(arm)
+    phase = Factor.zero(arm)
     for _ in range(2):
         # Coloured: residuals of torque models remember some tenths of a second.
         noise = lfilter([0.6], [1.0, -0.8], random.standard_normal(clean.shape), axis=0)
@@ -119,9 +118,9 @@ def campaign(condition: Condition, k: int, random: np.random.Generator) -> Level
             origin=0.0,
             position_bandwidth=np.full(6, np.inf),
         )
-        phase = phase + PhaseFactor.from_samples(arm, samples)
-    weights = joint_weights(phase.total)
-    found = with_block_covariance(estimate(arm, phase.total, weights), phase, weights)
+        phase = phase + Factor.by_time(arm, samples)
+    weights = joint_weights(phase)
+    found = with_block_covariance(estimate(arm, phase, weights), phase, weights)
     unknown = np.full(6, np.nan)
     return LevelEstimate(
         level="campaign",
@@ -139,7 +138,7 @@ def campaign(condition: Condition, k: int, random: np.random.Generator) -> Level
         interval_factor=found.interval_factor,
         samples=found.samples,
         noise_std=found.noise_std,
-        torque_rms=np.sqrt(phase.total.gram[:, -1, -1] / phase.total.samples),
+        torque_rms=np.sqrt(phase.gram[:, -1, -1] / phase.samples),
         unseen_rms=unknown,
         unseen_torque_rms=unknown,
         condition=found.condition,

@@ -17,8 +17,7 @@ from hil.identify.run import consistency_of
 from hil.outcome import Exports, exports_of
 from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
-from identification.factor.factor import estimate, joint_weights
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor, estimate, joint_weights
 from identification.selection.essential import EssentialChoice, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.plausibility import ConsistencyCheck
@@ -86,10 +85,10 @@ def identified_arm(
     friction = [{"f0": 2.0, "f1": 1.5, "fo": 0.1}.get(t.symbol, 0.3) for t in model.friction.terms]
     truth = np.concatenate([model.base.grouping @ standard, friction])
     runs = [_run(cell, truth, seed, still, noise) for seed in (1, 2, 3)]
-    training, *held_out = (PhaseFactor.from_samples(model, run) for run in runs)
-    weights = joint_weights(training.total)
-    free = with_block_covariance(estimate(model, training.total, weights), training, weights)
-    unseen = sum(held_out, PhaseFactor.zero(model)).total
+    training, *held_out = (Factor.by_time(model, run) for run in runs)
+    weights = joint_weights(training)
+    free = with_block_covariance(estimate(model, training, weights), training, weights)
+    unseen = sum(held_out, Factor.zero(model))
     consistency = consistency_of(model, training, unseen)
     assert isinstance(consistency, ConsistencyCheck), consistency
     essential = choose_essential(model, training, held_out)

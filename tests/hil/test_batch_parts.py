@@ -113,7 +113,7 @@ class TestCache:
         assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
         assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
 
-    @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "PhaseFactor"}, Bundle(), None])
+    @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "Factor"}, Bundle(), None])
     def test_forged_sums_are_ignored(self, tmp_path: Path, forged: object) -> None:
         settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
         key = sum_key([a_ref(0)], settings)

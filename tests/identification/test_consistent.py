@@ -21,8 +21,7 @@ from identification.estimators.consistent import (
 )
 from identification.estimators.least_squares import fit_least_squares
 from identification.export.urdf import NotConsistentError, write_urdf
-from identification.factor.factor import joint_weights, rows_of
-from identification.factor.phases import total_phase
+from identification.factor.factor import joint_weights, rows_of, total_factor
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
 from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
@@ -363,7 +362,7 @@ def samples():
 
 @pytest.fixture(scope="module")
 def equations(samples):
-    total = total_phase(MODEL, [samples]).total
+    total = total_factor(MODEL, [samples])
     return total.weighted(joint_weights(total))
 
 
@@ -375,7 +374,7 @@ class TestShrunkEstimate:
         np.testing.assert_allclose(shrunk.covariance, free.covariance, rtol=1e-6)
 
     def test_infinite_strength_is_the_consistent_solution(self, samples):
-        total = total_phase(MODEL, [samples]).total
+        total = total_factor(MODEL, [samples])
         centre = consistent_estimate(MODEL, total, prior_weight=0.1).estimate.values
         shrunk = fit_shrunk(MODEL, [samples], Shrinkage(math.inf))
         np.testing.assert_array_equal(shrunk.values, centre)

@@ -12,8 +12,7 @@ from identification.estimators.covariance import (
     with_block_covariance,
 )
 from identification.estimators.least_squares import estimate, estimate_repetitions, joint_weights
-from identification.factor.factor import NormalEquations, solve
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor, NormalEquations, solve
 from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
 
@@ -51,7 +50,7 @@ class TestRepeatedRecordings:
             motion=motion._replace(time=motion.time + 7.3),
             origin=early.origin + 7.3,
         )
-        one, two = (PhaseFactor.from_samples(MODEL, samples) for samples in (early, late))
+        one, two = (Factor.by_time(MODEL, samples) for samples in (early, late))
         for both, own in zip((one + two).gram, one.gram, strict=True):
             np.testing.assert_allclose(both, 2.0 * own, rtol=1e-9, atol=1e-8)
 
@@ -75,9 +74,9 @@ class TestBlocks:
         # CR3: corrected score is A times the change without the block.
         motion = a_motion(4.0)
         noise = coloured(np.random.default_rng(9), len(motion.time), 5e-3, 0.02)
-        phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
+        phase = Factor.by_time(MODEL, recording(noise, motion))
         weights = 1.0 / NOISE**2
-        weighted = phase.weighted(weights)
+        weighted = phase.by_block(weights)
         a_blocks, b_blocks = weighted[:, :-1, :-1], weighted[:, :-1, -1]
         a, b = a_blocks.sum(axis=0), b_blocks.sum(axis=0)
         values = np.linalg.solve(a, b)
@@ -85,7 +84,7 @@ class TestBlocks:
         np.testing.assert_allclose(phase.scores(weights, values), scores, atol=1e-8)
         without = np.linalg.solve(a - a_blocks, (b - b_blocks)[:, :, None])[:, :, 0]
         moved = values - without
-        rows = spread(a_blocks, scores, solve(phase.total.weighted(weights)).root)
+        rows = spread(a_blocks, scores, solve(phase.weighted(weights)).root)
         np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
 
     def test_variance_determined_by_few_blocks_is_correct(self):
@@ -161,8 +160,8 @@ class TestBlocks:
     def test_the_interval_factor_is_of_the_number_of_blocks(self):
         motion = a_motion()
         noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
-        phase = PhaseFactor.from_samples(MODEL, recording(noise, motion))
-        weights = joint_weights(phase.total)
-        result = with_block_covariance(estimate(MODEL, phase.total, weights), phase, weights)
+        phase = Factor.by_time(MODEL, recording(noise, motion))
+        weights = joint_weights(phase)
+        result = with_block_covariance(estimate(MODEL, phase, weights), phase, weights)
         assert "40 blocks of 0.25 s" in result.method
         assert result.interval_factor == pytest.approx(2.02, abs=0.01)  # Student's t, 39

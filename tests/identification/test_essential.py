@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from identification.errors import IdentificationError
 from identification.estimators.torque_channel import possible_low_passes
-from identification.factor.factor import estimate, joint_weights
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor, estimate, joint_weights
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -39,7 +38,7 @@ def a_motion(seed, n=2, duration=12.0, step=0.005):
 def factors(model, values, seed=0):
     """Return factors of a fitted and of another motion."""
     runs = (simulated(model, values, a_motion(k), NOISE, seed + k) for k in (1, 2))
-    return tuple(PhaseFactor.from_samples(model, run) for run in runs)
+    return tuple(Factor.by_time(model, run) for run in runs)
 
 
 class TestElimination:
@@ -58,7 +57,7 @@ class TestElimination:
 
     def test_a_step_is_the_least_squares_fit_of_the_columns_left(self):
         runs = [simulated(MODEL, TRUTH, a_motion(k), NOISE, k) for k in (1, 2)]
-        training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in runs)
+        training, unseen = (Factor.by_time(MODEL, run) for run in runs)
         weights = np.array([0.2, 3.0])
         result = eliminate(MODEL, training, unseen, weights=weights)
         left = [MODEL.parameter_names.index(name) for name in result.estimate.names]
@@ -84,7 +83,7 @@ class TestElimination:
     def test_the_path_removes_the_most_uncertain_parameter(self):
         training, unseen = factors(MODEL, TRUTH)
         result = eliminate(MODEL, training, unseen)
-        full = estimate(MODEL, training.total)
+        full = estimate(MODEL, training)
         relative = full.std / np.abs(full.values)
         assert result.steps[0].removed is None
         assert result.steps[0].spread == pytest.approx(relative.max() / relative.min(), rel=1e-9)
@@ -125,9 +124,9 @@ class TestElimination:
     def test_undetermined_parameters_are_removed_first(self):
         motion = a_motion(1)
         held = Motion(motion.time, *(part * [1.0, 0.0] for part in motion[1:4]))
-        training = PhaseFactor.from_samples(MODEL, simulated(MODEL, TRUTH, held, NOISE, 3))
+        training = Factor.by_time(MODEL, simulated(MODEL, TRUTH, held, NOISE, 3))
         result = eliminate(MODEL, training, training)
-        full = estimate(MODEL, training.total)
+        full = estimate(MODEL, training)
         lost = [
             after
             for before, after in pairwise(result.steps)
@@ -157,9 +156,7 @@ class TestElimination:
         values = ns16_values(model)
         noise = np.array([20.0, 20.0, 12.0, 2.0, 2.0, 1.5])
         training, unseen = (
-            PhaseFactor.from_samples(
-                model, simulated(model, values, a_motion(k, 6, step=0.01), noise, k)
-            )
+            Factor.by_time(model, simulated(model, values, a_motion(k, 6, step=0.01), noise, k))
             for k in (1, 2)
         )
         result = eliminate(model, training, unseen)
@@ -182,16 +179,15 @@ class TestElimination:
         fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
         options = possible_low_passes(fitted, model)[0]
         training, unseen = (
-            PhaseFactor.from_samples(model, prepare(part, model, options=options))
-            for part in (fitted, rest)
+            Factor.by_time(model, prepare(part, model, options=options)) for part in (fitted, rest)
         )
         result = eliminate(model, training, unseen)
         assert model.n_parameters == 58
         assert 20 <= result.chosen.left <= 30
         assert result.chosen.held_out < result.steps[0].held_out + 0.001
         # The error of each axis stays; relative standard deviations remove the offset of joint 6.
-        error = unseen.total.relative_errors
-        assert np.all(error(result.values) < error(estimate(model, training.total).values) + 0.005)
+        error = unseen.relative_errors
+        assert np.all(error(result.values) < error(estimate(model, training).values) + 0.005)
         blind = eliminate(model, training, unseen, rule=CutRule(overall=9.0, axis=9.0))
         assert blind.chosen.left < result.chosen.left
         assert error(blind.values)[5] > 2.0 * error(result.values)[5]
@@ -203,7 +199,7 @@ def runs_of(model, truth, seed, count):
 
 
 def factors_of(model, runs):
-    return [PhaseFactor.from_samples(model, run) for run in runs]
+    return [Factor.by_time(model, run) for run in runs]
 
 
 class TestChoice:
@@ -216,10 +212,10 @@ class TestChoice:
         fitted, *unseen = runs_of(arm, values, seed, 3)
         training, *held_out = factors_of(arm, [fitted, *unseen])
         found = choose_essential(arm, training, held_out)
-        weights = joint_weights(training.total)
+        weights = joint_weights(training)
         edge = round(0.7 * len(training)) * 25  # rows in a block of 0.125 s
         first, last = (
-            PhaseFactor.from_samples(arm, fitted.between(*rows))
+            Factor.by_time(arm, fitted.between(*rows))
             for rows in ((0, edge), (edge, len(fitted.torque)))
         )
         names = eliminate(arm, first, last, weights=weights).estimate.names
@@ -252,7 +248,7 @@ class TestChoice:
         """The error over merged blocks is the same sum."""
         training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
         found = choose_essential(MODEL, training, held_out)
-        total = sum(held_out, PhaseFactor.zero(MODEL)).total
+        total = sum(held_out, Factor.zero(MODEL))
         assert found.elimination.chosen.held_out == pytest.approx(
             total.relative_error(found.elimination.values), rel=1e-9
         )
@@ -260,6 +256,6 @@ class TestChoice:
     def test_empty_factors_raise(self):
         (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
         with pytest.raises(IdentificationError, match="no usable held-out sample"):
-            choose_essential(MODEL, training, [PhaseFactor.zero(MODEL)])
+            choose_essential(MODEL, training, [Factor.zero(MODEL)])
         with pytest.raises(IdentificationError, match="no usable fitted"):
-            eliminate(MODEL, PhaseFactor.zero(MODEL), training)
+            eliminate(MODEL, Factor.zero(MODEL), training)

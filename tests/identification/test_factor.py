@@ -18,7 +18,6 @@ from identification.estimators.robust import robust_estimate
 from identification.factor.factor import (
     QR_CONDITION,
     Factor,
-    QRFactor,
     augmented_rows,
     estimate,
     joint_weights,
@@ -26,8 +25,8 @@ from identification.factor.factor import (
     residual_variance,
     solve,
     solve_rows,
+    total_factor,
 )
-from identification.factor.phases import total_phase
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text
@@ -43,7 +42,7 @@ from tests.identification.two_link import (
     truth,
 )
 
-both = pytest.mark.parametrize("kind", [Factor, QRFactor])
+both = pytest.mark.parametrize("storage", ["gram", "qr"])
 
 
 @cache
@@ -80,8 +79,9 @@ def parts_of(samples, edges):
     return [samples.between(a, b) for a, b in pairwise(np.unique(edges).tolist())]
 
 
-def summed(kind, parts):
-    return sum((kind.of(MODEL, part) for part in parts), kind.zero(MODEL))
+def summed(storage, parts):
+    factors = (Factor.of(MODEL, part, storage) for part in parts)
+    return sum(factors, Factor.zero(MODEL, storage=storage))
 
 
 def exact_solution(samples):
@@ -122,13 +122,13 @@ class TestFactor:
     @both
     @given(pieces=st.integers(1, 300), seed=st.integers(0, 2**16))
     @settings(max_examples=6)
-    def test_that_of_a_union_is_the_sum(self, kind, pieces, seed):
+    def test_that_of_a_union_is_the_sum(self, storage, pieces, seed):
         """Gram matrices and triangles agree to nine digits, with any weights of joints."""
         samples = noisy(a_motion(1500), NOISE, seed)
         random = np.random.default_rng(seed)
         inner, weights = random.integers(0, 1501, pieces - 1), random.uniform(0.1, 20.0, 2)
-        many = summed(kind, parts_of(samples, np.concatenate([[0], inner, [1500]])))
-        whole = QRFactor.of(MODEL, samples)
+        many = summed(storage, parts_of(samples, np.concatenate([[0], inner, [1500]])))
+        whole = Factor.of(MODEL, samples, "qr")
         size = np.abs(whole.gram).max(axis=(1, 2), keepdims=True)
         assert np.abs((many.gram - whole.gram) / size).max() < 1e-13
         np.testing.assert_array_equal(many.samples, whole.samples)
@@ -139,7 +139,7 @@ class TestFactor:
                 np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=1e-9)
             scale = np.outer(one.std, one.std)
             assert np.abs((one.covariance - other.covariance) / scale).max() < 1e-9
-            assert ("QR" in one.method) == (kind is QRFactor)
+            assert ("QR" in one.method) == (storage == "qr")
 
     def test_the_dense_regressor_is_not_allocated(self):
         model, (motion, torque) = ns16(), some_samples(30_000)
@@ -150,11 +150,11 @@ class TestFactor:
         assert peak < 0.2 * 30_000 * 6 * 58 * 8
 
     @both
-    def test_factors_of_other_models_raise(self, kind):
+    def test_factors_of_other_models_raise(self, storage):
         samples = noisy(a_motion(50))
-        one = kind.of(MODEL, samples)
+        one = Factor.of(MODEL, samples, storage)
         with pytest.raises(IdentificationError, match="cannot be added"):
-            _ = one + kind.zero(RobotModel.from_urdf(URDF, rotor_inertia=False))
+            _ = one + Factor.zero(RobotModel.from_urdf(URDF, rotor_inertia=False), storage=storage)
 
     @pytest.mark.parametrize("bandwidth", [None, np.array([60.0, 80.0])])
     def test_rows_are_regressor_and_torque(self, bandwidth):
@@ -175,7 +175,7 @@ class TestFactor:
 class TestConditioning:
     def test_qr_is_more_accurate_than_gram(self):
         samples, ordinary = ill(), np.ones(2)
-        exact, found = exact_solution(samples), QRFactor.of(MODEL, samples).solve(ordinary)
+        exact, found = exact_solution(samples), Factor.of(MODEL, samples, "qr").solve(ordinary)
         assert 3e6 < found.condition < 1e8
         assert found.determined.all()
         np.testing.assert_allclose(found.values, exact, rtol=1e-7)
@@ -188,8 +188,8 @@ class TestConditioning:
         """A residual of 1e-9 of the torque, below the resolution of a Gram matrix."""
         samples, ordinary = noisy(a_motion(), 1e-9 * NOISE), np.ones(2)
         errors = []
-        for kind in (QRFactor, Factor):
-            factor = kind.of(MODEL, samples)
+        for storage in ("qr", "gram"):
+            factor = Factor.of(MODEL, samples, storage)
             found = factor.solve(ordinary)
             variance = residual_variance(factor, found.values, found.root, ordinary)
             errors.append(np.abs(np.sqrt(variance) / (1e-9 * NOISE) - 1.0).max())
@@ -198,9 +198,9 @@ class TestConditioning:
 
     def test_the_condition_selects_gram_or_qr(self):
         good, bad = noisy(a_motion(), NOISE), ill()
-        assert not isinstance(reduced(MODEL, [good], Factor.of(MODEL, good)), QRFactor)
-        factor = reduced(MODEL, [bad, bad], summed(Factor, [bad, bad]))
-        assert isinstance(factor, QRFactor)
+        assert reduced(MODEL, [good], Factor.of(MODEL, good)).storage == "gram"
+        factor = reduced(MODEL, [bad, bad], summed("gram", [bad, bad]))
+        assert factor.storage == "qr"
         assert factor.solve(np.ones(2)).condition > QR_CONDITION
         np.testing.assert_array_equal(factor.samples, 2 * np.count_nonzero(bad.usable, axis=0))
         found = fit_least_squares(MODEL, [bad])
@@ -209,10 +209,10 @@ class TestConditioning:
         assert "by QR" in robust_estimate(MODEL, [bad]).estimate.method
 
     @both
-    def test_undetermined_parameters_are_named(self, kind):
+    def test_undetermined_parameters_are_named(self, storage):
         motion = a_motion(held_elbow=True)
         samples = replace(noisy(motion), usable=np.ones((3000, 2), dtype=bool))
-        result = estimate(MODEL, kind.of(MODEL, samples))
+        result = estimate(MODEL, Factor.of(MODEL, samples, storage))
         # The elbow rests: no friction column, no own acceleration.
         assert {"f0_2", "f1_2", "I2m"} <= set(result.undetermined)
         assert {"f0_1", "f1_1"}.isdisjoint(result.undetermined)
@@ -232,29 +232,31 @@ class TestConditioning:
         gram[:, j, :] = 2.0 * gram[:, i, :]
         gram[:, :, j] = 2.0 * gram[:, :, i]
         gram[:, j, j] = 4.0 * factor.gram[:, i, i]
-        result = estimate(MODEL, replace(factor, matrices=gram))
+        result = estimate(MODEL, Factor.of_gram(gram, factor.samples, factor.parameter_names))
         assert set(result.undetermined) == {"f0_1", "f1_1"}
         assert result.condition > 1e6
 
     def test_the_condition_does_not_depend_on_units(self):
         factor = Factor.of(MODEL, noisy(a_motion(), NOISE))
         scale = np.append(np.logspace(-3, 3, P), 1.0)
-        scaled = replace(factor, matrices=factor.gram * np.outer(scale, scale))
+        scaled = Factor.of_gram(
+            factor.gram * np.outer(scale, scale), factor.samples, factor.parameter_names
+        )
         first, second = (estimate(MODEL, f) for f in (factor, scaled))
         assert second.condition == pytest.approx(first.condition, rel=1e-6)
         np.testing.assert_allclose(second.values, first.values / scale[:-1], rtol=1e-6)
 
     @both
-    def test_joints_without_rows_have_no_noise_and_no_weight(self, kind):
+    def test_joints_without_rows_have_no_noise_and_no_weight(self, storage):
         samples = noisy(a_motion(), NOISE)
         samples.usable[:, 1] = False
-        factor = kind.of(MODEL, samples)
+        factor = Factor.of(MODEL, samples, storage)
         assert joint_weights(factor)[1] == 0.0
         result = estimate(MODEL, factor)
         assert np.isnan(result.noise_std[1])
         assert "f0_2" in result.undetermined
         with pytest.raises(IdentificationError, match="not one usable sample"):
-            estimate(MODEL, kind.zero(MODEL))
+            estimate(MODEL, Factor.zero(MODEL, storage=storage))
 
     @given(k=st.integers(1, 12), p=st.integers(1, 8), seed=st.integers(0, 999))
     def test_rows_are_solved_as_by_the_pseudo_inverse(self, k, p, seed):
@@ -313,9 +315,9 @@ class TestEstimate:
     def test_covariance_from_rows_is_that_from_blocks(self, weighting):
         motion, rng = two_link.a_motion(), np.random.default_rng(9)
         runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.05), motion) for _ in range(3)]
-        phase = total_phase(MODEL, runs)
-        weights = np.ones(2) if weighting == "ordinary" else joint_weights(phase.total)
-        expected = with_block_covariance(estimate(MODEL, phase.total, weights), phase, weights)
+        factor = total_factor(MODEL, runs)
+        weights = np.ones(2) if weighting == "ordinary" else joint_weights(factor)
+        expected = with_block_covariance(estimate(MODEL, factor, weights), factor, weights)
         found = fit_least_squares(MODEL, runs, weighting)
         np.testing.assert_allclose(found.values, expected.values, rtol=1e-9)
         np.testing.assert_allclose(found.std, expected.std, rtol=1e-6)

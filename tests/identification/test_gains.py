@@ -5,7 +5,8 @@ import pytest
 
 from identification.errors import IdentificationError
 from identification.estimators.gains import identify_gains
-from identification.factor.phases import gain_factor, joined
+from identification.factor.columns import gain_factor
+from identification.factor.factor import joined
 from identification.model.friction import FrictionLaw
 from identification.model.payload import Load, Payload
 from identification.model.robot import RobotModel

@@ -13,8 +13,8 @@ from identification.estimators.instrumental import (
     planned_motion,
     same_plan,
 )
+from identification.factor.columns import instrument_factor, measured_part
 from identification.factor.factor import Factor, estimate
-from identification.factor.phases import instrument_factor, measured_part
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -116,7 +116,7 @@ class TestInstrumentalEstimate:
     def test_with_large_position_noise_it_beats_least_squares(self):
         runs = [fit(executed(s, position_noise=LARGE)) for s in range(30)]
         instrumental = np.array([run.estimate.values for _, run in runs]) - TRUTH
-        rows = [measured_part(factor).total for factor, _ in runs]
+        rows = [measured_part(factor) for factor, _ in runs]
         least = np.array([estimate(MODEL, one).values for one in rows]) - TRUTH
         inertias = [MODEL.parameter_names.index(name) for name in ("I1yy", "I2yy", "I2m")]
         # Least squares shrinks the coefficients of the acceleration, instruments do not, and their
@@ -140,10 +140,8 @@ class TestInstrumentalEstimate:
         factor = instrument_factor(MODEL, samples, PLAN)
         same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
         expected = Factor.of(MODEL, same_rows)
-        np.testing.assert_allclose(
-            measured_part(factor).total.gram, expected.gram, rtol=1e-9, atol=1e-7
-        )
-        np.testing.assert_array_equal(measured_part(factor).total.samples, expected.samples)
+        np.testing.assert_allclose(measured_part(factor).gram, expected.gram, rtol=1e-9, atol=1e-7)
+        np.testing.assert_array_equal(measured_part(factor).samples, expected.samples)
 
     def test_a_resting_instrument_determines_nothing(self):
         still = PLAN._replace(

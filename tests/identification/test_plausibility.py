@@ -10,7 +10,6 @@ import pytest
 from identification import Recording
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights
-from identification.factor.phases import PhaseFactor
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -110,10 +109,10 @@ def runs(**changes):
 
 
 def checked(recordings):
-    training, unseen = (PhaseFactor.from_samples(MODEL, run) for run in recordings)
-    weights = joint_weights(training.total)
-    free = with_block_covariance(estimate(MODEL, training.total, weights), training, weights)
-    return check_consistency(MODEL, training.total, unseen.total, free, weights=weights)
+    training, unseen = (Factor.by_time(MODEL, run) for run in recordings)
+    weights = joint_weights(training)
+    free = with_block_covariance(estimate(MODEL, training, weights), training, weights)
+    return check_consistency(MODEL, training, unseen, free, weights=weights)
 
 
 class TestConsistencyCheck:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from identification.errors import IdentificationError
 from identification.estimators.prior import GaussianPrior, fit_with_prior, nominal_prior, with_prior
-from identification.factor.factor import Factor, QRFactor, estimate
+from identification.factor.factor import Factor, estimate
 from identification.model.robot import RobotModel
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.two_link import MODEL, NOISE, P, coloured, one_sine, simulated, truth
@@ -70,16 +70,16 @@ class TestPosterior:
         posterior = np.linalg.inv(equations.A + precision)
         expected = posterior @ (equations.b + precision @ mean)
         prior = prior_of(mean, covariance)
-        for kind in (factor, QRFactor.of(MODEL, noisy())):
+        for kind in (factor, Factor.of(MODEL, noisy(), "qr")):
             found = with_prior(MODEL, kind, prior, weights)
             np.testing.assert_allclose(found.estimate.values, expected, rtol=1e-6, atol=1e-7)
             np.testing.assert_allclose(found.estimate.std, np.sqrt(np.diag(posterior)), rtol=1e-6)
             assert found.estimate.undetermined == ()
             assert (found.ratio < 1.0).all()
 
-    @pytest.mark.parametrize("kind", [Factor, QRFactor])
-    def test_an_infinite_prior_is_weighted_least_squares(self, kind):
-        factor = kind.of(MODEL, noisy())
+    @pytest.mark.parametrize("storage", ["gram", "qr"])
+    def test_an_infinite_prior_is_weighted_least_squares(self, storage):
+        factor = Factor.of(MODEL, noisy(), storage)
         expected = estimate(MODEL, Factor.of(MODEL, noisy()))
         for std in (1e7, np.inf):
             prior = independent(np.full(P, 3.0), np.full(P, std))
@@ -89,9 +89,9 @@ class TestPosterior:
             np.testing.assert_allclose(found.estimate.noise_std, expected.noise_std, rtol=1e-8)
             assert found.learned.all()
 
-    @pytest.mark.parametrize("kind", [Factor, QRFactor])
-    def test_without_data_it_is_the_prior(self, kind):
-        nothing = kind.zero(MODEL)
+    @pytest.mark.parametrize("storage", ["gram", "qr"])
+    def test_without_data_it_is_the_prior(self, storage):
+        nothing = Factor.zero(MODEL, storage=storage)
         prior = nominal_prior(MODEL, known=KNOWN)
         found = with_prior(MODEL, nothing, prior)
         np.testing.assert_allclose(found.estimate.values, prior.mean)

@@ -19,7 +19,8 @@ from identification.estimators.least_squares import fit_least_squares
 from identification.estimators.losses import Huber, Tukey
 from identification.estimators.prior import fit_with_prior, nominal_prior
 from identification.estimators.robust import robust_estimate
-from identification.factor.phases import PhaseFactor, instrument_factor, joined, total_phase
+from identification.factor.columns import instrument_factor
+from identification.factor.factor import Factor, joined, total_factor
 from identification.model.motion import Motion
 from identification.model.regressor import CHUNK
 from identification.selection.essential import eliminate
@@ -153,7 +154,7 @@ def instruments(pieces):
 
 
 def consistent(pieces):
-    factor = total_phase(MODEL, recordings(pieces)).total
+    factor = total_factor(MODEL, recordings(pieces))
     free = fit_least_squares(MODEL, recordings(pieces))
     return consistent_estimate(MODEL, factor, free).estimate
 
@@ -194,28 +195,28 @@ class TestParts:
         assert many.method.rpartition(", ")[2] == one.method.rpartition(", ")[2]  # the blocks
 
     def test_blocks_can_be_selected_joined_and_merged(self):
-        phase = total_phase(MODEL, recordings(cut([])))
+        phase = total_factor(MODEL, recordings(cut([])))
         half = len(phase) // 2
         again = joined([phase.blocks(slice(0, half)), phase.blocks(slice(half, None))])
         weights = np.array([0.5, 2.0])
-        np.testing.assert_array_equal(again.weighted(weights), phase.weighted(weights))
-        dense = np.tensordot(weights, phase.total.gram, axes=1)
+        np.testing.assert_array_equal(again.by_block(weights), phase.by_block(weights))
+        dense = np.tensordot(weights, phase.gram, axes=1)
         for length in (1, 3, len(phase)):
             merged = phase.merged(length)
             assert len(merged) == -(-len(phase) // length)
-            np.testing.assert_allclose(merged.weighted(weights).sum(axis=0), dense, rtol=1e-12)
+            np.testing.assert_allclose(merged.by_block(weights).sum(axis=0), dense, rtol=1e-12)
         order = np.array([5, 0, 3])
         place = np.append(order, MODEL.n_parameters)
         some = phase.restricted(order)
         assert some.parameter_names == tuple(MODEL.parameter_names[k] for k in order)
         np.testing.assert_allclose(
-            some.weighted(weights), phase.weighted(weights)[:, place[:, None], place], rtol=1e-12
+            some.by_block(weights), phase.by_block(weights)[:, place[:, None], place], rtol=1e-12
         )
 
     def test_blocks_without_rows_change_nothing(self):
         samples, _ = whole()
         late = replace(samples, origin=samples.origin - 3.0)
-        phase, same = (PhaseFactor.from_samples(MODEL, one) for one in (late, samples))
+        phase, same = (Factor.by_time(MODEL, one) for one in (late, samples))
         assert len(phase) == len(same) + 24
         assert len(phase.occupied()) == len(same)
         training = eliminate(MODEL, phase, same).estimate

@@ -11,7 +11,6 @@ from hypothesis.extra.numpy import arrays
 from identification.errors import IdentificationError
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Factor, joint_weights, solve
-from identification.factor.phases import PhaseFactor
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
 from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
@@ -131,7 +130,7 @@ def least_squares(factor):
 def calibrated(fitted, held_out):
     result = estimate_repetitions(MODEL, [fitted])
     means = [TorqueMeans.of(MODEL, [one]) for one in (fitted, held_out)]
-    return calibrate(result.pooled, result.phase, means[0], means[1], least_squares)
+    return calibrate(result.pooled, result.factor, means[0], means[1], least_squares)
 
 
 def split(error):
@@ -178,7 +177,7 @@ class TestIntervals:
         for runs in ([one], [one] * 4):
             result = estimate_repetitions(MODEL, runs)
             found = calibrate(
-                result.pooled, result.phase, TorqueMeans.of(MODEL, runs), rest, least_squares
+                result.pooled, result.factor, TorqueMeans.of(MODEL, runs), rest, least_squares
             )
             widths.append(found.half_width)
         np.testing.assert_allclose(widths[1], widths[0], rtol=1e-6)
@@ -199,7 +198,7 @@ class TestInnerFolds:
         """Equal to leaving out the first fold by hand."""
         noise = coloured(np.random.default_rng(4), LENGTH, 5e-3, 0.05)
         samples = replace(recording(noise, MOTION), usable=np.ones((LENGTH, 2), dtype=np.bool_))
-        phase, means = PhaseFactor.from_samples(MODEL, samples), TorqueMeans.of(MODEL, [samples])
+        phase, means = Factor.by_time(MODEL, samples), TorqueMeans.of(MODEL, [samples])
         errors = inner_errors(phase, means, least_squares)
         rest = least_squares(Factor.of(MODEL, samples.between(800, LENGTH)))
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]

@@ -5,7 +5,7 @@ import pytest
 
 from identification.estimators.delay import estimate_delay, rate_products, with_uncertain_delay
 from identification.estimators.least_squares import fit_least_squares
-from identification.factor.phases import PhaseFactor
+from identification.factor.factor import Factor
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from identification.selection.inner_prediction import Settings, choose_settings
@@ -37,10 +37,10 @@ def coverage(arm, model, recording, found):
     # Rows at a reversal depend on presliding.
     options = Preprocessing(torque_delay=found.applied, left_out="slow")
     samples = prepare(recording, model, options=options)
-    phase = PhaseFactor.from_samples(model, samples)
-    fitted = fit_least_squares(model, [samples], phase=phase)
+    phase = Factor.by_time(model, samples)
+    fitted = fit_least_squares(model, [samples], factor=phase)
     products = rate_products(model, samples)
-    fitted = with_uncertain_delay(fitted, phase.total, products, found.variance)
+    fitted = with_uncertain_delay(fitted, phase, products, found.variance)
     known = np.isfinite(fitted.std)
     inside = np.abs(fitted.values - truth) <= fitted.interval_factor * fitted.std
     return float(np.mean(inside[known]))

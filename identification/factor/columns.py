@@ -1,0 +1,152 @@
+"""Factors of other columns than those of the regressor W.
+
+Instrumental variables use [Z | W | y], gains [W | t | i], a search for the direction of gravity
+[W0 | Wx | Wy | Wz | y].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from identification.factor.factor import (
+    FINE_BLOCK,
+    Factor,
+    augmented_rows,
+    count_by_block,
+    fine_blocks,
+)
+from identification.model.motion import Motion
+from identification.model.payload import Load, Payload
+from identification.model.regressor import RegressorPlan
+from identification.model.robot import RobotModel
+from identification.signals.samples import Samples
+
+Array = NDArray[np.float64]
+
+_MOST_BLOCKS: Final = 400  # of one recording, for gains
+_MOST_ROWS: Final = 1000  # of one recording, in standard parameters
+_PARTS: Final = ("W0", "Wx", "Wy", "Wz")
+
+
+def instrument_factor(
+    model: RobotModel, samples: Samples, instrument: Motion, usable: NDArray[np.bool_] | None = None
+) -> Factor:
+    """Reduce a recording to blocks of [Z | W | y].
+
+    Rows count if the noise-free instrument, known where `usable` (m, n), moves as well.
+    """
+    rows = samples.usable & model.moving(instrument.velocity)
+    if usable is not None:
+        rows &= usable
+    columns = tuple(np.append(own, own + model.n_parameters) for own in model.plan.columns)
+    measured = augmented_rows(model, replace(samples, usable=rows))
+    # The same rows, with the same torque low-pass.
+    planned = augmented_rows(model, replace(samples, motion=instrument, usable=rows))
+    index = fine_blocks(samples)
+    both = (
+        (index[part], [np.concatenate([z[:-1], w]) for z, w in zip(quiet, noisy, strict=True)])
+        for (part, noisy), (_, quiet) in zip(measured, planned, strict=True)
+    )
+    names = (*(f"Z {name}" for name in model.parameter_names), *model.parameter_names)
+    return Factor.of_rows(both, count_by_block(index, rows), columns, names)
+
+
+def measured_part(factor: Factor) -> Factor:
+    """Return the part [W | y] of :func:`instrument_factor`, for least squares on equal rows."""
+    p = factor.n_parameters // 2
+    return factor.restricted(np.arange(p, 2 * p))
+
+
+def gain_factor(
+    model: RobotModel,
+    samples: Samples,
+    motor_current: Array,
+    *,
+    payload: Payload | None = None,
+    transmission: Array | None = None,
+) -> Factor:
+    """Reduce a recording to blocks of [W | t | i], one Gram matrix for each motor.
+
+    A motor's current (m, n) [A] counts if the rows of all its joints do; t is the payload torque.
+    `transmission`: motor angles per joint angle (n, n); identity: gains include gear ratios.
+    """
+    n, p, m = model.n_joints, model.n_parameters, len(samples.motion.time)
+    turns = np.eye(n) if transmission is None else np.asarray(transmission, dtype=np.float64)
+    blocks, columns = samples.regressor(model)
+    load = model.elements.known(samples.motion.position)
+    if payload is not None:
+        load = load + Load(model.chain, model.gravity, payload).torque(*samples.motion[1:4])
+    time = samples.motion.time - samples.motion.time[0]
+    index = np.floor(time / max(FINE_BLOCK, time[-1] / _MOST_BLOCKS) + 1e-9).astype(np.intp)
+    usable, tables = np.zeros((m, n), dtype=np.bool_), np.zeros((n, p + 2, m))
+    for motor, share in enumerate(np.linalg.inv(turns).T):
+        acting = np.flatnonzero(share).tolist()
+        usable[:, motor] = samples.usable[:, acting].all(axis=1)
+        for joint in acting:
+            tables[motor, columns[joint]] += share[joint] * blocks[joint].T
+            tables[motor, p] += share[joint] * samples.as_measured(joint, load[:, [joint]])[:, 0]
+        tables[motor, p + 1] = motor_current[:, motor]
+        tables[motor][:, ~usable[:, motor]] = 0.0
+    names = (*model.parameter_names, "torque of the payload")
+    every = (np.arange(p + 1),) * n
+    return Factor.of_rows([(index, tables)], count_by_block(index, usable), every, names)
+
+
+def standard_factor(model: RobotModel, recordings: Sequence[Samples]) -> Factor:
+    """Reduce about a thousand usable rows of each recording to [W0 | Wx | Wy | Wz | y].
+
+    The columns are of s standard parameters, friction, springs and balancers; the regressor is
+    affine in gravity: W(g) = W0 + gx Wx + gy Wy + gz Wz, so one pass serves any.
+    """
+    n, s = model.n_joints, model.layout.size
+    s += len(model.friction.names) + len(model.elements.names)
+    plans = [
+        RegressorPlan(
+            model.chain,
+            gravity,
+            [list(range(10))] * n,
+            [model.layout.rotor_inertia] * n,
+            model.friction,
+            model.layout.pairs,
+            model.elements,
+        )
+        for gravity in (np.zeros(3), *np.eye(3))
+    ]
+    gram, rows = np.zeros((n, 4 * s + 1, 4 * s + 1)), np.zeros(n, dtype=np.intp)
+    for samples in recordings:
+        every = max(1, len(samples.torque) // _MOST_ROWS)
+        filtered = samples.torque_bandwidth is not None
+        part = slice(None, None, 1 if filtered else every)  # filters need all rows
+        found = [plan.evaluate(*(one[part] for one in samples.motion[1:4])) for plan in plans]
+        for joint in range(n):
+            usable = samples.usable[::every, joint]
+            table = np.zeros((len(usable), 4 * s + 1))
+            for k, (blocks, columns) in enumerate(found):
+                block = blocks[joint]
+                if filtered:
+                    block = samples.as_measured(joint, block)[::every]
+                table[:, k * s + columns[joint]] = block
+            for k in (1, 2, 3):
+                table[:, k * s : (k + 1) * s] -= table[:, :s]
+            table[:, -1] = samples.torque[::every, joint]
+            table = table[usable]
+            gram[joint] += table.T @ table
+            rows[joint] += len(table)
+    return Factor.of_gram(gram, rows, tuple(f"{part} {k}" for part in _PARTS for k in range(s)))
+
+
+def under_gravity(factor: Factor, gravity: Array) -> Factor:
+    """Return the part [W | y] of a :func:`standard_factor` under a gravity (3,) [m/s²]."""
+    share, n, s = np.append(1.0, gravity), factor.n_joints, factor.n_parameters // 4
+    parts = factor.gram[:, :-1, :-1].reshape(n, 4, s, 4, s)
+    found = np.empty((n, s + 1, s + 1))
+    found[:, :s, :s] = np.einsum("a,jasbt,b->jst", share, parts, share, optimize=True)
+    found[:, :s, s] = share @ factor.gram[:, :-1, -1].reshape(n, 4, s)
+    found[:, s, :s] = found[:, :s, s]
+    found[:, s, s] = factor.gram[:, -1, -1]
+    return Factor.of_gram(found, factor.samples, factor.parameter_names[:s])
