@@ -1,17 +1,12 @@
 """Robot descriptions and bodies for tests of the model."""
 
-import sqlite3
-from importlib import metadata
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identification.model.friction import FrictionLaw
 from identification.model.pseudo_inertia import Body, inertial_parameters
-from identification.model.robot import RobotModel
-from identification.signals.recording import Recording
 from sim_fixtures.ns16 import load_truth
 from tests.identification.two_link import values_of
 
@@ -111,31 +106,3 @@ NS16_TURNS = np.diag([-120.0, 150.0, -130.0, -80.0, 80.0, -50.0]) @ (
     np.eye(6) + np.array([[0.0] * 6] * 4 + [[0, 0, 0, -0.2, 0, 0], [0, 0, 0, 0.16, -0.3, 0]])
 )
 """Turns of the motors per turn of the joints; motors 5 and 6 turn with the joints before them."""
-
-ALL_TERMS = FrictionLaw(offset=True)
-
-
-def ur10(folder, friction=ALL_TERMS):
-    """Model with this friction, and 27.5 s at 125 Hz; skips where either is missing."""
-    typesys = pytest.importorskip("rosbags.typesys")
-    files = metadata.files("example-robot-data") or ()
-    urdf = next((f.locate() for f in files if f.name == "ur10_robot.urdf"), None)
-    if urdf is None:
-        pytest.skip("the package example-robot-data, which has the UR10's URDF, is not installed")
-    bag = folder / "ur10_unisa" / "ur10_exciting_trajectory.db3"
-    if not bag.is_file():
-        pytest.skip(f"no {bag.name} beside this checkout")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    database = sqlite3.connect(f"file:{bag}?mode=ro&immutable=1", uri=True)
-    rows = database.execute("select data from messages order by timestamp").fetchall()
-    database.close()
-    states = [store.deserialize_cdr(data, "sensor_msgs/msg/JointState") for (data,) in rows]
-    model = RobotModel.from_urdf(Path(str(urdf)).read_text(), friction=friction)
-    order = [states[0].name.index(name) for name in model.joint_names]
-    stamps = [s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in states]
-    return model, Recording(
-        time=np.array(stamps) - stamps[0],
-        position=np.array([s.position for s in states])[:, order],
-        joint_names=model.joint_names,
-        torque=np.array([s.effort for s in states])[:, order],
-    )

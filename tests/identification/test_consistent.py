@@ -24,7 +24,6 @@ from identification.export.urdf import NotConsistentError, write_urdf
 from identification.factor.factor import joint_weights, rows_of, total_factor
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
-from sim_fixtures.ns16 import load_truth, standard_parameters, urdf_text
 from tests.identification import two_link
 from tests.identification.robots import robot_text
 from tests.identification.two_link import (
@@ -208,39 +207,6 @@ class TestConsistentEstimate:
         assert np.all(np.isfinite(found.standard))
         np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
 
-    def test_missing_nominal_bodies_are_assumed(self):
-        bare = URDF
-        while "<inertial>" in bare:
-            start, end = bare.index("<inertial>"), bare.index("</inertial>") + len("</inertial>")
-            bare = bare[:start] + bare[end:]
-        empty = RobotModel.from_urdf(bare, friction=FrictionLaw(third=None))
-        motion = a_motion(MODEL, 12)
-        found = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
-        assert all(words.startswith("assumed") for words in found.reference)
-        assert_consistent(empty, found)
-        assert error_rise(found) < 1e-3
-
-    @pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
-    def test_ns16_predicts_unseen_motion_equally_well(self, noise):
-        """The nominal bodies are 5 to 20 % wrong, without rotors."""
-        model, planted_rotors = RobotModel.from_urdf(urdf_text()), load_truth()
-        named = standard_parameters()
-        standard = np.array([named[name] for name in model.layout.names]).reshape(6, 11)
-        rng = np.random.default_rng(0)
-        standard[:, :10] *= 1.0 + rng.uniform(0.05, 0.2, (6, 1)) * rng.choice([-1.0, 1.0], (6, 1))
-        friction = (planted_rotors.coulomb, planted_rotors.viscous, planted_rotors.third)
-        values = np.concatenate([model.base.grouping @ standard.reshape(-1), *friction])
-        other = a_motion(model, 2)
-        found = simulated(values, noise, 1, model=model)
-        assert_consistent(model, found)
-        unseen = measured(model, other, values, noise, 4)
-
-        def error(values):
-            wrong = model.torque(values, *other[1:]) - unseen
-            return float(np.linalg.norm(wrong) / np.linalg.norm(unseen))
-
-        assert error(found.estimate.values) < error(found.unconstrained.values) + 1e-3
-
     @pytest.mark.parametrize(
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
     )
@@ -386,9 +352,3 @@ class TestShrunkEstimate:
         penalised = equations.A + 0.3 * np.diag(np.diag(equations.A))
         residual = equations.b - equations.A @ far - penalised @ (values - far)
         assert np.abs(residual).max() < 1e-8 * np.abs(equations.b).max()
-
-    def test_without_data_it_stays_at_the_centre(self, equations):
-        unseen = equations.A.copy()
-        unseen[:, 0] = unseen[0, :] = 0.0
-        blind = equations._replace(A=unseen, b=np.append(0.0, equations.b[1:]))
-        assert shrunk_values(blind, np.full(MODEL.n_parameters, 7.0), 0.1)[0] == 7.0

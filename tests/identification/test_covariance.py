@@ -2,10 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from identification.estimators.covariance import (
-    block_length,
     cluster_covariance,
     leverage_corrected,
     spread,
@@ -148,14 +146,6 @@ class TestBlocks:
         found = cluster_covariance(information, scores, solution)
         assert found.blocks == blocks // 2
         assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
-
-    def test_they_grow_with_the_correlation_of_the_scores(self):
-        rng = np.random.default_rng(5)
-        white = rng.standard_normal((400, 30))
-        slow = lfilter([1.0], [1.0, -0.8], white, axis=0)
-        assert block_length(white) == 2
-        assert 4 <= block_length(slow) <= 20
-        assert block_length(white[:25]) == 1  # enough blocks remain
 
     def test_the_interval_factor_is_of_the_number_of_blocks(self):
         motion = a_motion()

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hil.cell import Cell
 from identification.errors import IdentificationError
 from identification.estimators.delay import (
     LONGEST_DELAY,
@@ -20,27 +19,7 @@ from identification.model.robot import RobotModel
 from identification.signals.recording import Recording
 from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import low_pass
-from sim_fixtures import ControllerSettings, SimulatedController, ns16
-from tests.identification.robots import ur10
 from tests.identification.two_link import MODEL, URDF, four_sines, truth
-from tests.sim_fixtures.bench import DRIVE, MinimalPC
-from tests.sim_fixtures.bench import TRUTH as PLANT
-
-
-def ns16_model():
-    return RobotModel.from_urdf(ns16.urdf_text(), friction=FrictionLaw(third=None, standstill=0.1))
-
-
-def smooth_positions(duration):
-    """Positions (m, 6), DH angles: sines in and out of rest."""
-    t = np.arange(round(duration / STEP) + 1) * STEP
-    window = np.clip(np.minimum(t, duration - t), 0.0, 1.0)
-    soft = window**3 * (10.0 - 15.0 * window + 6.0 * window**2)
-    swing = np.radians([12.0, 8.0, 10.0, 22.0, 20.0, 25.0])
-    centre = np.radians([10.0, -100.0, 170.0, -30.0, 60.0, 20.0])
-    angle = np.array([4.1, 4.7, 5.5, 7.3, 8.1, 9.0]) * t[:, None] + np.arange(6)
-    return centre + swing * soft[:, None] * (np.sin(angle) + 0.4 * np.sin(2.3 * angle))
-
 
 TRUTH = truth()
 STEP = 1e-3
@@ -73,28 +52,6 @@ def a_recording(
         joint_names=model.joint_names,
         torque=torque + torque_noise * np.array([1.0, 0.2]) * rng.standard_normal(shape),
     )
-
-
-@pytest.fixture(scope="module")
-def simulated():
-    """A recording of the simulated cell, and the delay of its currents [s]."""
-    cell, position = Cell.load(ns16.CELL_PATH), smooth_positions(6.0)
-    train, noise = cell.drive_train, cell.simulation
-    settings = ControllerSettings(
-        current_noise=noise.current_noise, current_resolution=noise.current_resolution
-    )
-    controller = SimulatedController(
-        ns16.urdf_text(), DRIVE, PLANT, settings, seed=3, initial_position=position[0]
-    )
-    deltas = train.motor_revolutions_per_cycle(np.gradient(position, STEP, axis=0), STEP)
-    axes = MinimalPC(controller, train.motor_revolutions(position), deltas).run(settle=50).axes
-    recording = Recording(
-        time=np.arange(len(axes)) * STEP,
-        position=train.joint_position(axes["d"][:, :, 2].astype(float)),
-        joint_names=ns16_model().joint_names,
-        torque=train.joint_torque(axes["d"][:, :, 4].astype(float)),
-    )
-    return recording, controller.current_delay_cycles * STEP
 
 
 class TestDelay:
@@ -158,12 +115,6 @@ class TestDelay:
         )
         assert estimate_delay(recording, model).delay == pytest.approx(0.005, abs=5e-5)
 
-    def test_encoder_noise_in_a_servo_loop_biases_it_little(self, simulated):
-        """Simulated cell in closed loop: within 0.05 ms of the true 0.2 ms."""
-        recording, planted = simulated
-        found = estimate_delay(recording, ns16_model())
-        assert found.delay == pytest.approx(planted, abs=5e-5)
-
     def test_a_resting_axis_does_not_matter(self):
         time = np.arange(6000) * STEP
         keep = np.array([1.0, 0.0])
@@ -202,14 +153,6 @@ class TestUndeterminedDelay:
         still = a_recording(0.0, speed=0.0)
         with pytest.raises(IdentificationError, match="not one usable sample"):
             estimate_delay(still, MODEL)
-
-    @pytest.mark.slow
-    def test_a_low_passed_torque_leaves_it_undetermined(self, shared_data):
-        """The effort of a real UR10 is filtered at 2 Hz."""
-        model, recording = ur10(shared_data)
-        found = estimate_delay(recording, model)
-        assert not found.determined
-        assert found.applied == 0.0
 
 
 class TestDelayUncertainty:

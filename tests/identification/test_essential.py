@@ -7,16 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification.errors import IdentificationError
-from identification.estimators.torque_channel import possible_low_passes
 from identification.factor.factor import Factor, estimate, joint_weights
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
 from identification.selection.essential import CutRule, choose_essential, eliminate
-from identification.signals.samples import prepare
 from identification.validation.prediction import pooled_error, prediction_error
 from sim_fixtures.ns16 import urdf_text
-from tests.identification.robots import ns16_values, ur10
+from tests.identification.robots import ns16_values
 from tests.identification.two_link import URDF, simulated, sine_motion, truth
 
 NOISE = np.array([3.0, 0.6])
@@ -172,25 +170,6 @@ class TestElimination:
             eliminate(model, training, unseen)
             took.append(time.process_time() - begin)
         assert min(took) < 0.3  # 0.07 s on a quiet machine
-
-    def test_a_real_ur10_needs_20_to_30_of_58_parameters(self, shared_data):
-        model, recording = ur10(shared_data, FrictionLaw(third=None, offset=True))
-        cut = round(0.7 * recording.n_samples)
-        fitted, rest = recording.between(0, cut), recording.between(cut, recording.n_samples)
-        options = possible_low_passes(fitted, model)[0]
-        training, unseen = (
-            Factor.by_time(model, prepare(part, model, options=options)) for part in (fitted, rest)
-        )
-        result = eliminate(model, training, unseen)
-        assert model.n_parameters == 58
-        assert 20 <= result.chosen.left <= 30
-        assert result.chosen.held_out < result.steps[0].held_out + 0.001
-        # The error of each axis stays; relative standard deviations remove the offset of joint 6.
-        error = unseen.relative_errors
-        assert np.all(error(result.values) < error(estimate(model, training).values) + 0.005)
-        blind = eliminate(model, training, unseen, rule=CutRule(overall=9.0, axis=9.0))
-        assert blind.chosen.left < result.chosen.left
-        assert error(blind.values)[5] > 2.0 * error(result.values)[5]
 
 
 def runs_of(model, truth, seed, count):

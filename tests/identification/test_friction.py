@@ -11,21 +11,6 @@ from tests.identification.robots import NS16_TURNS
 from tests.identification.two_link import MODEL, a_motion, truth
 from tests.identification.two_link import URDF as TWO_LINK
 
-
-class TestFrictionTable:
-    """Laws and their tables `[robot.friction]`."""
-
-    @pytest.mark.parametrize(
-        "law", [FrictionLaw(), FrictionLaw(third=None, stribeck=0.1, zone="linear", offset=True)]
-    )
-    def test_laws_come_back_from_their_tables(self, law):
-        assert None not in law.table().values()
-        assert FrictionLaw.from_table(law.table()) == law
-
-    def test_a_speed_of_zero_means_no_stribeck_term(self):
-        assert FrictionLaw.from_table({"stribeck": 0.0}).stribeck is None
-
-
 LAWS = st.builds(
     FrictionLaw,
     coulomb=st.booleans(),

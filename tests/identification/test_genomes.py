@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.stats import kstest
 
 from identification.excitation import (
@@ -33,12 +32,6 @@ RAMPED = SineGenome(
 GENOMES = pytest.mark.parametrize(
     "genome", [OPEN, CLOSED, BARE, RAMPED], ids=lambda g: repr(g)[:20]
 )
-
-
-def genes_of(genome, rows=1):
-    """Genes with frequent ends of their range."""
-    one = st.one_of(st.sampled_from([0.0, 0.5, 1.0]), st.floats(0.0, 1.0))
-    return arrays(np.float64, (rows, genome.n_genes), elements=one)
 
 
 def some_genes(genome, rows, seed=5):

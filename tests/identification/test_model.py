@@ -1,4 +1,3 @@
-import pickle
 from xml.etree import ElementTree
 
 import numpy as np
@@ -111,14 +110,6 @@ class TestRobotModel:
         assert model.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
         assert model.units == ("kg", "N", "N·s/m", "N·s²/m²")
         assert model.base.expressions() == ("m1 + I1m",)
-
-    def test_a_pickled_model_gives_the_same_torque(self):
-        model = RobotModel.from_urdf(urdf_text())
-        q, qd, qdd = np.random.default_rng(0).normal(size=(3, 10, 6))
-        values = np.arange(58.0)
-        before = model.torque(values, q, qd, qdd)
-        again = pickle.loads(pickle.dumps(model))
-        assert np.array_equal(again.torque(values, q, qd, qdd), before)
 
     @pytest.mark.parametrize(
         ("text", "locked", "words"),

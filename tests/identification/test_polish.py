@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification.excitation import KINDS, Scale, Scores
+from identification.excitation import KINDS, Scores
 from identification.excitation.searches.run import dominating, polish
 from identification.excitation.searches.scores import unplanned
 
@@ -70,9 +70,6 @@ def polished(population, genes, fitness=size_of, **others):
 def failing(genes):
     """As if every process was killed."""
     return Scores.of_rows(np.tile(unplanned(), (len(genes), 1)))
-
-
-SPREADS = Scale((20.0, 150.0), (10.0, 30.0))
 
 
 SCRIPT = """

@@ -172,13 +172,6 @@ class TestPosterior:
         others = np.delete(result.normalized_change, at)
         assert np.nanmax(np.abs(others)) < 4.0
 
-    def test_the_method_names_the_prior(self):
-        result = fit_with_prior(MODEL, [noisy()], nominal_prior(MODEL, known=ROTORS))
-        assert "Gaussian prior (nominal parameters to 10 %, 2 given)" in result.estimate.method
-        empty = replace(noisy(), usable=np.zeros_like(noisy().usable))
-        with pytest.raises(IdentificationError, match="not one usable sample"):
-            fit_with_prior(MODEL, [empty], nominal_prior(MODEL))
-
 
 class TestNominalPrior:
     def test_it_is_that_of_sampled_arms(self):

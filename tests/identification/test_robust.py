@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,9 +7,6 @@ from scipy.optimize import minimize
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.robust import robust_estimate
 from identification.factor.factor import Factor, estimate
-from identification.signals.samples import prepare
-from identification.validation.prediction import prediction_error
-from tests.identification.robots import ur10
 from tests.identification.two_link import (
     MODEL,
     NOISE,
@@ -178,20 +173,3 @@ class TestRobustEstimate:
         error[:, 1] += 3.0 * (motion.position[:, 1] > 0.3) * (motion.velocity[:, 1] > 0.0)
         result = robust_estimate(MODEL, [recording(error, motion)], Tukey())
         assert result.doubtful.tolist() == [False, True]
-
-    def test_outliers_on_a_real_arm_have_little_effect(self, shared_data):
-        model, recorded = ur10(shared_data)
-        cut = round(0.7 * recorded.n_samples)
-        first = prepare(recorded.between(0, cut), model)
-        last = prepare(recorded.between(cut, recorded.n_samples), model)
-        rng, rms = np.random.default_rng(0), np.sqrt(np.mean(first.torque**2, axis=0))
-        gross = 3.0 * rms * rng.uniform(0.5, 1.5, first.torque.shape)
-        bad = replace(first, torque=first.torque + gross * (rng.random(gross.shape) < 0.05))
-
-        def error(values):
-            (one,) = prediction_error(model, values, [last], all_rows=True)
-            return one.overall
-
-        untouched = error(estimate(model, Factor.of(model, first)).values)
-        assert error(estimate(model, Factor.of(model, bad)).values) > 2.0 * untouched
-        assert error(robust_estimate(model, [bad], Huber()).estimate.values) < untouched + 0.005

@@ -235,9 +235,6 @@ class TestRun:
         assert design.excitation.tried == 2
 
 
-PLANNING = KINDS.index("planning")
-
-
 def genes(count, n_genes=8, seed=0):
     return np.random.default_rng(seed).random((count, n_genes))
 

@@ -440,10 +440,6 @@ class TestCausesOfWholeRecordings:
         if size := SIZES.get(kind):
             assert cause.size == pytest.approx(size, abs=4.0 * cause.std + 0.02 * size)
 
-    def test_two_faults_are_found_in_sequence(self):
-        found = causes([FAULTS["torque sign"][1](late(recorded(1)))])
-        assert {one.fault.kind for one in found} == {"torque sign", "delay"}
-
 
 class TestCausesOfParts:
     """Faults of some recordings."""
