@@ -1,10 +1,14 @@
 """Settings are chosen by predicting parts of the fitted data from the rest."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt, sosfiltfilt
 
+from identification import Factor, Preprocessing, Recording, estimate, prepare
+from identification.estimators.torque_channel import possible_low_passes
 from identification.model.elements import TorqueRipple
 from identification.selection.inner_prediction import (
     DELAY,
@@ -13,38 +17,45 @@ from identification.selection.inner_prediction import (
     Settings,
     choose_settings,
 )
-from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, prepare
-from identification.signals.smoothing import LowPassShape, low_passed
-from tests.identification.two_link import MODEL, a_motion, truth
+from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
+from tests.identification.two_link import MODEL, NOISE, a_motion, truth
 
 CAUSAL = LowPassShape(order=2, causal=True)
-CUT = 1400  # of 2000 rows: what is fitted
+RATE = 200.0  # Hz
+BANDWIDTH = 3.0  # Hz
 
 
-def a_recording(model=MODEL, values=None):
-    """Simulate a motion of the arm with noise on torque and position."""
-    motion = a_motion()
+def a_recording(model=MODEL, values=None, *, noise=0.05, duration=10.0, shape=None, seed=5):
+    """Simulate a motion with noise on torque and position, through a Butterworth low-pass."""
+    motion = a_motion(duration)
     direction = model.friction.direction(*motion[:3])
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(seed)
     torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
-    return Recording(
-        motion.time,
-        motion.position + 1e-6 * rng.standard_normal(motion.position.shape),
-        MODEL.joint_names,
-        torque + 0.05 * rng.standard_normal(torque.shape),
-    )
+    position = motion.position + 1e-6 * rng.standard_normal(torque.shape)
+    torque += noise * rng.standard_normal(torque.shape)
+    if shape is not None:
+        sections = butter(shape.order, BANDWIDTH, fs=RATE, output="sos")
+        torque = (sosfilt if shape.causal else sosfiltfilt)(sections, torque, axis=0)
+    return Recording(motion.time, position, MODEL.joint_names, torque)
 
 
-def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=()):
-    """Choose settings on the rows before CUT, or on all of them with a leak."""
+def cut(recording):
+    """Return the number of rows that are fitted."""
+    return round(0.7 * recording.n_samples)
+
+
+def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=None):
+    """Choose settings on the fitted rows, or on all of them with a leak."""
+    fitted = recording if leaks else recording.between(0, cut(recording))
 
     def ready(model, how):
-        samples = prepare(recording, model, options=how)
-        return [samples if leaks else samples.between(0, CUT)]
+        return [prepare(fitted, model, options=how)]
+
+    def possible(model, how):
+        return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
 
     start = Settings(MODEL, Preprocessing())
-    return choose_settings(ready, start, questions, lambda *_: low_passes, ripples=[ripple])
+    return choose_settings(ready, start, questions, possible, ripples=[ripple])
 
 
 class TestChosenSettings:
@@ -96,7 +107,7 @@ class TestChosenSettings:
         """Joints that move one after the other have segments without rows."""
         recording = a_recording()
         position = recording.position.copy()
-        position[: CUT // 4, 0] = position[CUT // 4, 0]
+        position[:350, 0] = position[350, 0]
         rested = replace(recording, position=position)
         _, choices = chosen(rested, {"presliding", "rows", "estimator"})
         assert [one.name for one in choices][-1] == "estimator"
@@ -117,7 +128,8 @@ class TestHeldOutRows:
     @staticmethod
     def corrupted(recording):
         torque = recording.torque.copy()
-        torque[CUT:] += 40.0 * np.sign(np.sin(7.0 * recording.time[CUT:, None]))
+        rest = slice(cut(recording), None)
+        torque[rest] += 40.0 * np.sign(np.sin(7.0 * recording.time[rest, None]))
         return replace(recording, torque=torque)
 
     def errors(self, recording, *, leaks):
@@ -132,3 +144,73 @@ class TestHeldOutRows:
         recording = a_recording()
         sound = self.errors(recording, leaks=True)
         assert sound != self.errors(self.corrupted(recording), leaks=True)
+
+
+def held_out_error(recording, settings):
+    """Return ||tau - tau_hat|| / ||tau|| of the held-out rows."""
+    model = settings.model
+    fitted, rest = (
+        prepare(recording.between(*part), model, options=settings.preprocessing)
+        for part in ((0, cut(recording)), (cut(recording), recording.n_samples))
+    )
+    values = estimate(model, Factor.of(model, fitted)).values
+    error = rest.torque - rest.predicted_torque(model, values)
+    return float(np.linalg.norm(error) / np.linalg.norm(rest.torque))
+
+
+def low_pass_of(shape, seed=0):
+    """Return a filtered recording and the chosen settings."""
+    questions = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
+    recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape, seed=seed)
+    return recording, chosen(recording, questions)[0]
+
+
+@cache
+def unfiltered_error():
+    return held_out_error(*low_pass_of(None))
+
+
+class TestLowPass:
+    @pytest.mark.parametrize("causal", [False, True])
+    @pytest.mark.parametrize("order", [1, 2, 4])
+    def test_a_planted_one_is_found(self, order, causal):
+        """Its bandwidth within 20 %; the error rises by at most 30 %."""
+        recording, settings = low_pass_of(LowPassShape(order, causal))
+        assert settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert settings.preprocessing.torque_shape.causal == causal
+        assert held_out_error(recording, settings) < 1.3 * unfiltered_error()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_none_is_found_in_unfiltered_torque(self, seed):
+        assert low_pass_of(None, seed)[1].preprocessing.torque_bandwidth is None
+
+
+class TestLowPassShape:
+    """Gain at the bandwidth: 1/2 without phase, 1/sqrt(2) if causal."""
+
+    @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
+    def test_gain_at_the_bandwidth(self, shape):
+        time = np.arange(4000) / RATE
+        sine = np.sin(2.0 * np.pi * BANDWIDTH * time)[:, None]
+        inner = low_passed(time, sine, BANDWIDTH, shape)[1000:3000]
+        gain = inner.std() / sine[1000:3000].std()
+        assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
+
+    def test_uneven_times_are_interpolated(self):
+        time = np.arange(4000) / RATE
+        uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
+        shape = LowPassShape(order=2, causal=True)
+        smooth = low_passed(time, np.sin(4.0 * time)[:, None], BANDWIDTH, shape)
+        found = low_passed(uneven, np.sin(4.0 * uneven)[:, None], BANDWIDTH, shape)
+        expected = np.interp(uneven, time, smooth[:, 0])
+        assert found[500:-10, 0] == pytest.approx(expected[500:-10], abs=2e-3)
+
+    def test_samples_filter_their_regressor_by_it(self):
+        shape = LowPassShape(order=1, causal=True)
+        how = Preprocessing(torque_bandwidth=BANDWIDTH, torque_shape=shape)
+        samples = prepare(a_recording(duration=20.0), MODEL, options=how)
+        unfiltered = replace(samples, torque_bandwidth=None)
+        expected = low_passed(
+            samples.motion.time, unfiltered.predicted_torque(MODEL, truth()), BANDWIDTH, shape
+        )
+        assert samples.predicted_torque(MODEL, truth()) == pytest.approx(expected, abs=1e-9)

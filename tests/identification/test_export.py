@@ -1,24 +1,57 @@
-"""Untrusted robot descriptions: refused with a message; writing of URDFs."""
+"""Robot descriptions: untrusted ones are refused; files for other tools restore every number."""
 
+import csv
 import gc
 import itertools
+import json
 import math
 import struct
 import time
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.excitation import CollisionChecker, Workspace
-from identification.excitation.errors import CollisionModelError
-from identification.export.urdf import NotConsistentError, WriteBackError, write_urdf
+from identification import (
+    Anchors,
+    Coupling,
+    Factor,
+    FrictionLaw,
+    GasCylinder,
+    ModelError,
+    Motion,
+    Payload,
+    RobotModel,
+    ShapeError,
+    TorsionSpring,
+    consistent_estimate,
+    estimate,
+    parameters_csv,
+    parameters_json,
+    write_urdf,
+)
+from identification.excitation import CollisionChecker, CollisionModelError, Workspace
+from identification.export.friction import friction_curve, friction_torque
+from identification.export.simulators import (
+    AGREES,
+    FORMATS,
+    Arm,
+    Ranges,
+    compare,
+    mjcf,
+    random_states,
+)
+from identification.export.urdf import NotConsistentError, WriteBackError
+from identification.model.elements import TorqueRipple
 from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
+from identification.signals.noise import noiseless_above
+from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
-from tests.identification.robots import robot_text, some_bodies
+from tests.identification.robots import random_urdf, robot_text, some_bodies
+from tests.identification.two_link import URDF, as_samples, one_sine, values_of
 from tests.identification.two_link import URDF as TWO_LINK
 
 INERTIAL = (
@@ -457,3 +490,252 @@ class TestWriting:
         assert [e.get("name") for e in urdf_tree(written)] == [
             e.get("name") for e in urdf_tree(urdf)
         ]
+
+
+PROVENANCE = {"recording": "run_1.mcap\nsha256 0a1b", "made by": "hil 0.1.0"}
+DRY = FrictionLaw(third=None)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    model = RobotModel.from_urdf(URDF, friction=DRY)
+    rng = np.random.default_rng(0)
+    q, qd, qdd = rng.normal(size=(3, 300, 2))
+    values = np.concatenate([model.base.grouping @ model.nominal, [4.0, 2.0, 1.5, 0.8]])
+    torque = model.torque(values, q, qd, qdd) + rng.normal(size=(300, 2))
+    factor = Factor.from_samples(model, Motion(np.arange(300.0), q, qd, qdd), torque)
+    found = estimate(model, factor)
+    return model, found, consistent_estimate(model, factor, found)
+
+
+def table(text):
+    return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
+
+class TestParameters:
+    def test_json_restores_every_number(self, fit):
+        model, found, consistent = fit
+        text = parameters_json(model, found, consistent=consistent, provenance=PROVENANCE)
+        read = json.loads(text)
+        assert [p["value"] for p in read["parameters"]] == found.values.tolist()
+        assert [p["std"] for p in read["parameters"]] == found.std.tolist()
+        assert [p["unit"] for p in read["parameters"]] == list(found.units)
+        np.testing.assert_array_equal(read["covariance"], found.covariance)
+        assert read["provenance"] == PROVENANCE
+        assert read["parameters"][0]["expression"] == "I1yy + I1m + 0.25 m2"
+        links = read["standard"]["links"]
+        assert [link["joint"] for link in links] == ["shoulder", "elbow"]
+        assert [link["rotor_inertia"] for link in links] == consistent.standard[[10, 21]].tolist()
+        assert links[1]["friction"] == {"f0": consistent.friction[1], "f1": consistent.friction[3]}
+
+    def test_json_has_texts_for_undetermined_values(self, fit):
+        model, found, _ = fit
+        covariance = found.covariance.copy()
+        covariance[0, :] = covariance[:, 0] = 0.0
+        covariance[0, 0] = np.inf
+        unknown = replace(found, covariance=covariance, condition=np.inf, undetermined=("I1yy",))
+        read = json.loads(parameters_json(model, unknown))
+        assert read["parameters"][0]["std"] == read["condition"] == "Infinity"
+        assert (read["undetermined"], read["standard"]) == (["I1yy"], None)
+
+    def test_csv_restores_values_and_covariance(self, fit):
+        model, found, _ = fit
+        text = parameters_csv(model, found, provenance=PROVENANCE)
+        assert "# recording: run_1.mcap sha256 0a1b" in text.splitlines()
+        rows = table(text)
+        assert [row["name"] for row in rows] == list(found.names)
+        assert [float(row["value"]) for row in rows] == found.values.tolist()
+        covariance = [[float(row[f"cov({name})"]) for name in found.names] for row in rows]
+        np.testing.assert_array_equal(covariance, found.covariance)
+
+    def test_no_remark_is_a_formula_or_breaks_its_row(self, fit):
+        model, found, _ = fit
+        text = parameters_csv(model, found, provenance={"archives": "a,=1+1.mcap;@b, -3"})
+        assert len(table(text)) == model.n_parameters
+        assert "a,'=1+1.mcap;'@b, -3" in text
+
+
+LAW = FrictionLaw(asymmetric=True, stribeck=0.1, presliding=1e-3)
+WRIST = np.eye(6)
+WRIST[5, 4] = 0.5
+
+
+def an_arm(urdf, **options):
+    """Random consistent bodies, and friction of all kinds."""
+    model = RobotModel.from_urdf(urdf, **options)
+    n = model.n_joints
+    standard = np.zeros(model.layout.size)
+    standard[: 11 * n] = some_bodies(n)
+    standard[model.layout.rotors] += 1.0
+    for k, (i, j) in enumerate(model.layout.pairs):
+        rotors = model.layout.rotors[[i, j]]
+        standard[model.layout.couplings[k]] = 0.3 * np.sqrt(np.prod(standard[rotors]))
+    others = np.random.default_rng(1).uniform(0.5, 2.5, model.n_parameters - model.base.rank)
+    values = np.concatenate([model.base.grouping @ standard, others])
+    infinite = np.full(n, np.inf)
+    return Arm(urdf, model, standard, values, Ranges(-infinite, infinite, infinite, infinite))
+
+
+def compared(form, arm, remarks=(), samples=20):
+    """Compare the file of an arm with its model; skips without a reader of the form."""
+    if form == "mjcf":
+        pytest.importorskip("mujoco", reason="the extra mujoco is not installed")
+    text = FORMATS[form].write(arm, "arm", list(remarks))
+    return compare(text, FORMATS[form], arm, random_states(arm, samples))
+
+
+FORMS = pytest.mark.parametrize("form", FORMATS)
+
+
+class TestReadBack:
+    """Inverse dynamics of the file agree with the supported parts of the model."""
+
+    @FORMS
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_trees_of_any_joints(self, form, seed):
+        arm = an_arm(random_urdf(seed), friction=FrictionLaw(third="cubic"))
+        assert compared(form, arm).difference < AGREES
+
+    @FORMS
+    def test_a_published_description(self, form):
+        """With rounded angles and locked joints."""
+        locked = dict.fromkeys(("panda_finger_joint1", "panda_finger_joint2"), 0.02)
+        arm = an_arm(robot_text("panda_description/urdf/panda.urdf"), locked=locked)
+        assert compared(form, arm, ["a -- remark"]).difference < AGREES
+
+    @FORMS
+    def test_everything_that_an_arm_can_have(self, form):
+        arm = an_arm(
+            urdf_text(),
+            friction=LAW,
+            gravity=(0.0, 3.0, -9.0),
+            coupling=Coupling(WRIST),
+            payload=Payload(4.0, (0.0, 0.1, 0.2)),
+            elements=[
+                TorsionSpring("joint_2", 0.3, 50.0),
+                TorsionSpring("joint_2", -0.1, identified=True),
+                GasCylinder("joint_3", Anchors(0.8, 0.2, 0.1), 0.6, 1e-3, 1e6, 1e-3),
+                TorqueRipple("joint_1", (("joint_1", 100.0),), (1,)),
+            ],
+        )
+        left = set(compared(form, arm, samples=200).left_out)
+        everywhere = {"half the difference fd of viscous friction forwards and backwards",
+                      "additional friction fs at low speed (Stribeck)", "a constant offset fo",
+                      "TorqueRipple of joint_1", "GasCylinder of joint_3"}  # fmt: skip
+        rotors = {"rotor inertias", "inertia of coupled motors", "friction of coupled motors"}
+        assert left >= everywhere
+        assert (left >= rotors) == (form != "mjcf")
+        assert ("the payload" in left) == (form == "urdf")
+        assert ("TorsionSpring of joint_2" in left) == (form == "urdf")
+        assert ("a term f2 with the speed squared" in left) == (form != "mjcf")
+
+    @FORMS
+    def test_a_changed_text_is_refused(self, form):
+        arm = an_arm(urdf_text())
+        compared(form, arm)
+        other = replace(arm, standard=1.01 * arm.standard)
+        text = FORMATS[form].write(other, "arm", [])
+        with pytest.raises(WriteBackError, match="joint_"):
+            compare(text, FORMATS[form], arm, random_states(arm, 5))
+
+
+class TestTexts:
+    """Content of the files beside the inertia."""
+
+    def test_limits_springs_and_names(self):
+        arm = an_arm(urdf_text(), elements=[TorsionSpring("joint_2", 0.3, 50.0)])
+        n = arm.model.n_joints
+        ranges = Ranges(-np.ones(n), np.full(n, 2.0), np.full(n, 3.0), np.full(n, 40.0))
+        arm = replace(arm, ranges=ranges)
+        model = ElementTree.fromstring(mjcf(arm, "arm"))
+        joint = model.find(".//joint[@name='joint_2']")
+        assert joint.get("range") == "-1.0 2.0"
+        assert joint.get("actuatorfrcrange") == "-40.0 40.0"
+        assert (joint.get("stiffness"), joint.get("springref")) == ("50.0", "0.3")
+        assert [one.get("ctrlrange") for one in model.iter("motor")] == ["-40.0 40.0"] * n
+        assert "gravcomp" not in mjcf(arm, "arm")
+
+    @FORMS
+    def test_dry_friction_is_written_as_it_was_identified(self, form):
+        arm = an_arm(urdf_text())
+        f0 = [row["f0"] for row in arm.friction]
+        root = ElementTree.fromstring(FORMATS[form].write(arm, "arm", []))
+        where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
+        found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
+        assert found == f0
+
+
+F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
+
+
+def model_with(**law):
+    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, offset=True, **law))
+
+
+def planted(model):
+    return values_of(model, np.concatenate([F0, F1, FO]), (0.4, 0.1))
+
+
+def samples_of(model, bandwidth=None):
+    motion = one_sine(np.arange(3000) * 2e-3, phase=(0.0, 0.0))
+    samples = as_samples(
+        model,
+        motion,
+        np.zeros((3000, 2)),
+        usable=np.ones((3000, 2), dtype=np.bool_),
+        position_bandwidth=np.full(2, 10.0),
+        torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
+    ).with_friction_direction(model)
+    return replace(samples, torque=samples.predicted_torque(model, planted(model)))
+
+
+class TestFrictionCurve:
+    """Friction of a joint over speed."""
+
+    def test_jumps_at_zero_and_has_the_offset(self):
+        model = model_with()
+        curve = friction_curve(model, planted(model), 1, -2.0, 3.0)
+        assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
+        ends = [-F0[1] - 2.0 * F1[1] + FO[1], F0[1] + 3.0 * F1[1] + FO[1]]
+        np.testing.assert_allclose(curve.torque[[0, -1]], ends)
+        middle = len(curve.speed) // 2
+        jump = curve.torque[middle] - curve.torque[middle - 1]
+        assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
+
+    def test_agrees_with_the_data(self):
+        """Torque minus the other parts is on the curve for a perfect model."""
+        model = model_with()
+        values, samples = planted(model), samples_of(model)
+        speed = samples.motion.velocity[:, 0]
+        curve = friction_curve(model, values, 0, float(speed.min()), float(speed.max()))
+        on_it = np.interp(speed, curve.speed, curve.torque)
+        sliding = np.abs(speed) > 1e-3
+        data = friction_torque(model, values, samples)[:, 0]
+        np.testing.assert_allclose(data[sliding], on_it[sliding], atol=1e-6)
+
+
+class TestNoise:
+    """Measured torque has noise at every frequency, unless it is low-passed."""
+
+    TIME = np.arange(4000) * 0.005
+    SHAPE = LowPassShape(order=4)
+
+    def torque(self, noise):
+        slow = 20.0 * np.sin(2.0 * np.pi * np.array([0.3, 0.9]) * self.TIME[:, None])
+        return np.asarray(slow + noise * np.random.default_rng(3).standard_normal(slow.shape))
+
+    def above(self, torque):
+        return noiseless_above(self.TIME, torque, [slice(0, len(torque))])
+
+    def test_of_half_a_per_cent_is_seen(self):
+        assert self.above(self.torque(0.1)) is None
+
+    @pytest.mark.parametrize("bandwidth", [2.0, 5.0, 10.0])
+    def test_ends_above_a_low_pass(self, bandwidth):
+        found = self.above(low_passed(self.TIME, self.torque(0.5), bandwidth, self.SHAPE))
+        assert bandwidth < found < 2.5 * bandwidth
+
+    def test_of_one_joint_is_enough_for_the_channel(self):
+        torque = self.torque(0.1)
+        torque[:, 1] = low_passed(self.TIME, torque[:, 1:], 5.0, self.SHAPE)[:, 0]
+        assert self.above(torque) is None

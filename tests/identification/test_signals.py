@@ -1,0 +1,652 @@
+"""Recordings and their checks, smoothing, noise, and samples with excluded rows."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import BSpline
+from scipy.signal import butter, sosfiltfilt
+
+from identification import (
+    Coupling,
+    FrictionLaw,
+    Preprocessing,
+    Recording,
+    RecordingError,
+    RobotModel,
+    ShapeError,
+    prepare,
+    standstill_variance,
+    time_base,
+)
+from identification.signals.masks import (
+    EDGE,
+    END_PERIODS,
+    LONGEST_END,
+    REVERSAL,
+    SATURATED,
+    STANDSTILL,
+    flat_topped,
+    mask_rows,
+)
+from identification.signals.noise import difference_variance
+from identification.signals.recording import offsets_of_repetitions, without_repeats
+from identification.signals.smoothing import fit_smoothing_spline, low_pass
+from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
+
+NAMES = ("shoulder", "elbow", "wrist")
+
+
+def a_recording(samples=200, *, commanded=True):
+    time = np.arange(samples) * 1e-3
+    phase = 8.0 * time[:, None] + np.arange(3)
+    command = 0.5 * np.sin(phase)
+    return Recording(
+        time=time,
+        position=0.5 * np.sin(phase - 0.01),
+        joint_names=NAMES,
+        torque=np.cos(phase),
+        commanded_position=command if commanded else None,
+    )
+
+
+def changed(name, rows, joint, value):
+    """Return a valid recording with other readings of a joint."""
+    recording = a_recording()
+    values = getattr(recording, name).copy()
+    values[rows, joint] = values[0, joint] if value is None else value
+    return replace(recording, **{name: values})
+
+
+def leaping(sample, step):
+    """Return a recording with another time step at a sample [s]."""
+    time = a_recording().time.copy()
+    time[sample:] += time[sample - 1] + step - time[sample]
+    return replace(a_recording(), time=time)
+
+
+RESTING = changed("commanded_position", slice(None), 1, 0.3).commanded_position
+
+
+class TestChecks:
+    def test_a_valid_recording_is_unchanged(self):
+        recording = a_recording()
+        assert recording.checked(NAMES) is recording
+
+    @given(
+        channel=st.sampled_from(["position", "torque"]),
+        sample=st.integers(0, 199),
+        joint=st.integers(0, 2),
+        value=st.sampled_from([np.nan, np.inf, -np.inf]),
+    )
+    def test_nan_and_infinity_raise(self, channel, sample, joint, value):
+        where = f"{channel} of joint {NAMES[joint]} is {value} at sample {sample} "
+        with pytest.raises(RecordingError, match=where):
+            changed(channel, sample, joint, value).checked()
+
+    @pytest.mark.parametrize(
+        ("recording", "words"),
+        [
+            (leaping(50, np.nan), "time is nan at sample 50"),
+            (leaping(50, 0.0), "repeats at sample 50"),
+            (leaping(50, -5e-3), "falls back at sample 50"),
+            (leaping(50, 601.0), r"time step is .* at sample 50, limit .* cut the recording"),
+            (leaping(50, 2e9), r"time step is .* at sample 50, limit .* cut the recording"),
+            (changed("position", slice(None), 1, None), "elbow is stuck.* from sample 0 on"),
+            (changed("position", slice(120, None), 2, 0.3), "wrist is stuck.* from sample 120 on"),
+            (a_recording(1), "has 1 samples"),
+        ],
+    )
+    def test_invalid_recordings_raise(self, recording, words):
+        with pytest.raises(RecordingError, match=words):
+            recording.checked()
+
+    @pytest.mark.parametrize(
+        "recording",
+        [
+            changed("commanded_position", slice(20, 30), 1, np.nan),
+            replace(changed("position", slice(None), 1, 0.3), commanded_position=RESTING),
+            leaping(50, 599.0),
+            replace(a_recording(commanded=False), position=np.full((200, 3), 0.3)),
+        ],
+        ids=["cycles without a set-point", "commanded to rest", "a long pause", "standstill"],
+    )
+    def test_valid_recordings_pass(self, recording):
+        assert recording.checked() is recording
+
+    def test_a_constant_reading_must_be_declared(self):
+        recording = replace(changed("position", slice(None), 0, 0.3), commanded_position=None)
+        with pytest.raises(RecordingError, match=r"shoulder is stuck.*declare it as held"):
+            recording.checked()
+        replace(recording, held_joints=("shoulder",)).checked()
+
+    def test_quantised_readings_of_a_slow_joint_are_not_stuck(self):
+        slow = 0.01 * a_recording().time[:, None] + np.zeros(3)
+        coarse = np.round(slow / 1e-3) * 1e-3
+        replace(a_recording(), position=coarse, commanded_position=slow).checked()
+
+    @pytest.mark.parametrize(
+        "expected",
+        [("elbow", "shoulder", "wrist"), ("shoulder", "elbow", "hand"), ("shoulder", "elbow")],
+    )
+    def test_other_joints_than_the_model_raise(self, expected):
+        with pytest.raises(RecordingError, match=f"the model's are {', '.join(expected)}"):
+            a_recording().checked(expected)
+
+
+class TestRecording:
+    def test_gaps_split_it_but_jitter_does_not(self):
+        recording = a_recording()
+        gap = np.zeros(200, dtype=bool)
+        gap[30] = True
+        time = recording.time.copy()
+        time[100:] += 0.5
+        parts = [slice(0, 30), slice(30, 100), slice(100, 200)]
+        assert replace(recording, time=time, gap_before=gap).segments() == parts
+        jitter = np.random.default_rng(1).uniform(-4e-4, 4e-4, 200)
+        assert replace(recording, time=recording.time + jitter).segments() == [slice(0, 200)]
+
+    def test_arrays_of_other_shapes_raise(self):
+        recording = a_recording()
+        with pytest.raises(ShapeError, match="torque"):
+            replace(recording, torque=recording.torque[:-1])
+        with pytest.raises(ShapeError, match="gap_before"):
+            replace(recording, gap_before=np.zeros(3, dtype=bool))
+
+    def test_a_motion_starts_with_its_command(self):
+        recording = a_recording()
+        command = recording.commanded_position.copy()
+        command[:40] = command[40]
+        assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+        command[:10] = np.nan
+        assert replace(recording, commanded_position=command).motion_start == recording.time[41]
+        assert a_recording(commanded=False).motion_start == 0.0
+
+
+STEP = 2e-3
+
+
+def recorded(seed, *, start=0.0, clock=0.0, pace=1.0, noise=0):
+    """Return eight seconds of a motion from `start`, with a clock offset [s]."""
+    rng = np.random.default_rng(seed)
+    amplitude, rate = rng.uniform(0.2, 1.0, (3, 2)), rng.uniform(0.5, 3.0, (3, 2))
+    time = start + STEP * np.arange(4000)
+    angle = pace * rate * time[:, None, None] + rng.uniform(0.0, 6.0, (3, 2))
+    position = (amplitude * np.sin(angle)).sum(axis=1)
+    position += 1e-4 * np.random.default_rng(noise).standard_normal(position.shape)
+    return Recording(time=time + clock, position=position, joint_names=("a", "b"))
+
+
+class TestRepetitions:
+    @settings(max_examples=20, deadline=None)
+    @given(
+        seed=st.integers(0, 50),
+        clock=st.floats(-1e3, 1e3),
+        start=st.floats(-0.4, 0.4).map(lambda one: round(one / STEP) * STEP),
+    )
+    def test_offsets_of_clocks_are_found(self, seed, clock, start):
+        runs = [recorded(seed), recorded(seed, start=start, clock=clock, noise=1)]
+        offsets = offsets_of_repetitions(runs)
+        np.testing.assert_allclose(offsets, [0.0, clock], atol=2e-3)
+
+    @pytest.mark.parametrize(
+        "runs",
+        [
+            [recorded(1)],
+            *([recorded(seed), recorded(seed + 100)] for seed in range(5)),
+            [recorded(1), recorded(1, pace=1.05)],
+            [recorded(1), recorded(1, start=4.0)],
+            [recorded(1), recorded(1, noise=1), recorded(2)],
+        ],
+    )
+    def test_other_motions_are_no_repetitions(self, runs):
+        assert offsets_of_repetitions(runs) is None
+
+
+class TestTimeBase:
+    @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
+    def test_an_even_clock_is_uniform(self, rate):
+        base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
+        assert base.uniform
+        assert base.rate == pytest.approx(rate, rel=1e-4)
+        assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
+        assert len(base.describe()) == 1
+
+    def test_jitter_is_measured_against_the_usual_step(self):
+        rng = np.random.default_rng(1)
+        steps = 0.002 * (1.0 + 0.2 * rng.uniform(-1.0, 1.0, 20000))
+        base = time_base(np.cumsum(steps))
+        assert base.jitter == pytest.approx(0.2 / np.sqrt(3.0), rel=0.02)
+        assert base.largest_deviation == pytest.approx(0.2, rel=0.02)
+        assert not base.uniform
+        assert "uneven" in base.describe()[1]
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_late_stamps_are_not_missing_samples(self, seed):
+        random = np.random.default_rng(seed)
+        late = 0.01 * (np.arange(4000) + random.uniform(-0.3, 0.3, 4000))
+        lost = np.sort(random.choice(np.arange(100, 3900, 40), 25, replace=False))
+
+        for base, dropped in ((time_base(late), 0), (time_base(np.delete(late, lost)), 25)):
+            assert base.dropped == dropped
+            assert base.rate == pytest.approx(100.0, rel=1e-3)
+
+    def test_repeats_falls_drops_and_gaps_are_distinguished(self):
+        index = np.arange(1000.0)
+        index[100] = index[99]  # repeats
+        index[200] = index[199] - 0.5  # falls back
+        index = np.delete(index, [300, 301, 400])  # two and one samples missing
+        index[600:] += 50.0  # a gap
+        base = time_base(index * 1e-3)
+        assert (base.repeated, base.backward, base.gaps) == (1, 1, 1)
+        # Long steps after the repeat and the fall compensate the short ones.
+        assert base.dropped == 3
+        assert not base.uniform
+        words = " ".join(base.describe())
+        for part in ("repeat", "older", "missing", "gaps"):
+            assert part in words
+        reported = np.arange(100) == 50  # without a time step
+        assert time_base(np.arange(100) * 1e-3, reported).gaps == 1
+        with pytest.raises(RecordingError, match="same time stamp"):
+            time_base(np.full(5, 3.0))
+
+    def test_samples_of_one_stamp_are_averaged(self):
+        time = np.array([0.0, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0])
+        torque = np.arange(14.0).reshape(7, 2)
+        merged = without_repeats(
+            Recording(time=time, position=torque, joint_names=("a", "b"), torque=torque)
+        )
+        np.testing.assert_array_equal(merged.time, [0.0, 1.0, 2.0, 3.0])
+        np.testing.assert_array_equal(merged.position, [[0, 1], [3, 4], [6, 7], [10, 11]])
+        even = Recording(np.arange(7.0), torque, ("a", "b"))
+        assert without_repeats(even) is even
+        with pytest.raises(RecordingError, match="falls back at sample 2"):
+            without_repeats(Recording(np.array([0.0, 1.0, 0.5, 2.0]), np.zeros((4, 1)), ("a",)))
+
+
+def noisy_sines(sigma, *, jitter=0.0):
+    """Time and two channels of a few hertz."""
+    rng = np.random.default_rng(3)
+    time = np.arange(8000) * 1e-3 + jitter * rng.uniform(-1.0, 1.0, 8000)
+    return time, sines(time) + sigma * rng.standard_normal((8000, 2))
+
+
+def sines(time, derivative=0):
+    w = 2.0 * np.pi * np.array([[0.7, 1.9], [2.3, 3.1]])
+    a = np.array([[0.9, 0.4], [0.2, 0.3]])
+    phase = w * time[:, None, None] + a + derivative * np.pi / 2.0
+    return np.asarray((a * w**derivative * np.sin(phase)).sum(axis=1))
+
+
+class TestLowPass:
+    def test_it_is_a_zero_phase_butterworth(self):
+        # |H|^2 of a third-order Butterworth is 1 / (1 + (w/w_c)^6), the smoother's own gain.
+        time, values = noisy_sines(0.1)
+        sections = butter(3, 6.0, fs=1000.0, output="sos")
+        expected = sosfiltfilt(sections, values, axis=0)
+        inner = slice(1000, -1000)
+        np.testing.assert_allclose(low_pass(time, values, 6.0)[inner], expected[inner], atol=2e-4)
+
+    @given(st.floats(1.0, 60.0), st.integers(0, 2**16))
+    def test_it_is_linear_and_keeps_constants(self, bandwidth, seed):
+        rng = np.random.default_rng(seed)
+        time = np.arange(400) * 2e-3
+        x, y = rng.standard_normal((2, 400, 3))
+        combined = low_pass(time, 2.0 * x - 0.5 * y, bandwidth)
+        apart = 2.0 * low_pass(time, x, bandwidth) - 0.5 * low_pass(time, y, bandwidth)
+        np.testing.assert_allclose(combined, apart, atol=1e-9)
+        np.testing.assert_allclose(low_pass(time, np.ones((400, 1)), bandwidth), 1.0, atol=1e-9)
+
+
+class TestSmoothingSpline:
+    @given(
+        coefficients=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
+        tolerance=st.floats(1e-12, 1e-2),
+        seed=st.integers(0, 2**16),
+    )
+    def test_parabolas_pass_unchanged(self, coefficients, tolerance, seed):
+        # The roughness of a parabola is zero.
+        time = np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 300))
+        polynomial = np.polynomial.Polynomial(coefficients)
+        spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([tolerance]))
+        np.testing.assert_allclose(spline(time)[:, 0], polynomial(time), atol=1e-7)
+        np.testing.assert_allclose(spline(time, 1)[:, 0], polynomial.deriv()(time), atol=1e-5)
+        np.testing.assert_allclose(spline(time, 2)[:, 0], polynomial.deriv(2)(time), atol=1e-3)
+
+    def test_quintics_are_reproduced_with_small_tolerance(self):
+        time = np.linspace(0.0, 1.0, 400)
+        polynomial = np.polynomial.Polynomial([0.2, -1.0, 3.0, 2.0, -4.0, 1.5])
+        spline = fit_smoothing_spline(time, polynomial(time)[:, None], np.array([1e-24]))
+        # Rounding, divided by the knot spacing once per derivative.
+        for derivative, tolerance in ((0, 1e-12), (1, 1e-8), (2, 1e-4)):
+            expected = polynomial.deriv(derivative)(time) if derivative else polynomial(time)
+            np.testing.assert_allclose(spline(time, derivative)[:, 0], expected, atol=tolerance)
+
+    @pytest.mark.parametrize(
+        ("sigma", "jitter"), [(1e-6, 0.0), (1e-4, 0.0), (1e-2, 0.0), (1e-4, 4e-4)]
+    )
+    def test_the_mean_squared_residual_is_the_tolerance(self, sigma, jitter):
+        time, values = noisy_sines(sigma, jitter=jitter)
+        spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
+        measured = np.mean((values - spline(time)) ** 2, axis=0)
+        np.testing.assert_allclose(measured, sigma**2, rtol=1e-3)
+        if jitter:
+            error = (spline(time, 2) - sines(time, 2))[200:-200]
+            assert np.std(error) < 0.01 * np.std(sines(time, 2))
+
+    def test_derivatives_are_better_than_differences(self):
+        sigma = 1e-5
+        time, values = noisy_sines(sigma)
+        spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
+        inner = slice(200, -200)
+        error = [np.std((spline(time, d) - sines(time, d))[inner]) for d in range(3)]
+        assert error[0] < 0.4 * sigma
+        assert error[1] < 2e-3 * np.std(sines(time, 1))
+        assert error[2] < 5e-3 * np.std(sines(time, 2))
+        differences = np.gradient(np.gradient(values, time, axis=0), time, axis=0)
+        assert np.std((differences - sines(time, 2))[inner]) > 50 * error[2]
+
+    def test_it_minimises_squares_plus_roughness(self):
+        # Small enough for a dense solution by SciPy splines and quadrature.
+        rng = np.random.default_rng(5)
+        time = np.sort(rng.uniform(0.0, 1.0, 40))
+        values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
+        spline = fit_smoothing_spline(time, values[:, None], np.array([0.05**2]))
+        k = len(spline.coefficients)
+        knots = spline.start + spline.spacing * np.arange(-5, k + 1)
+        basis = BSpline(knots, np.eye(k), 5)
+        third = basis.derivative(3)
+        roughness = np.zeros((k, k))
+        for i in range(k):
+            for j in range(max(0, i - 5), i + 1):
+                pieces = [
+                    quad(lambda t, i=i, j=j: third(t)[i] * third(t)[j], *knots[p : p + 2])[0]
+                    for p in range(max(i, 5), min(j + 6, k))
+                ]
+                roughness[i, j] = roughness[j, i] = sum(pieces)
+        density = len(time) / (time[-1] - time[0])
+        penalty = density / (2.0 * np.pi * spline.bandwidth[0]) ** 6
+        rows = basis(time)
+        dense = np.linalg.solve(rows.T @ rows + penalty * roughness, rows.T @ values)
+        np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
+
+    def test_knots_are_refined_to_the_tolerance(self):
+        # 120 Hz at 1 kHz: one knot per four samples cannot follow, one per sample can.
+        time = np.arange(2000) * 1e-3
+        values = np.sin(2.0 * np.pi * 120.0 * time)[:, None]
+        spline = fit_smoothing_spline(time, values, np.array([1e-8]))
+        assert spline.spacing < 3e-3
+        assert np.mean((values - spline(time)) ** 2) <= 1.001e-8
+
+
+TRUTH = truth()
+
+RESOLUTION = 2e-6  # rad, of the encoders
+
+
+def motion(time):
+    return one_sine(time)[1:4]
+
+
+def smooth_recording(*, noise=0.0, delay=0.0):
+    time = np.arange(6000) * 1e-3
+    rng = np.random.default_rng(8)
+    torque = MODEL.torque(TRUTH, *motion(time - delay))
+    return Recording(
+        time=time,
+        position=np.round(motion(time)[0] / RESOLUTION) * RESOLUTION,
+        joint_names=MODEL.joint_names,
+        torque=torque + noise * rng.standard_normal(torque.shape),
+    )
+
+
+QUANTISATION = np.full(2, RESOLUTION**2 / 12.0)
+
+
+class TestNoise:
+    @settings(max_examples=30)
+    @given(
+        sigma=st.floats(1e-6, 1e-2),
+        jitter=st.sampled_from([0.0, 3e-4]),
+        seed=st.integers(0, 2**16),
+    )
+    def test_differences_measure_it(self, sigma, jitter, seed):
+        """Not the jitter of the clock."""
+        rng = np.random.default_rng(seed)
+        time = np.arange(5000) * 1e-3 + jitter * rng.uniform(-1.0, 1.0, 5000)
+        values = motion(time)[0] + max(sigma, 0.03 * jitter) * rng.standard_normal((5000, 2))
+        found = difference_variance(time, values)
+        np.testing.assert_allclose(np.sqrt(found), max(sigma, 0.03 * jitter), rtol=0.1)
+
+    @pytest.mark.parametrize("creeps", [False, True])
+    def test_variance_at_standstill_is_that_of_the_noise(self, creeps):
+        time, size = np.arange(5000) * 1e-3, np.array([1e-6, 1e-3])
+        noise = size * np.random.default_rng(6).standard_normal((5000, 2))
+        slip = 3e-4 * (time > 3.0) * (1.0 - np.exp(-(time - 3.0) / 0.2))
+        values = 0.4 + creeps * (1e-4 * time + slip)[:, None] + noise
+        np.testing.assert_allclose(np.sqrt(standstill_variance(time, values)), size, rtol=0.1)
+
+    def test_a_constant_reading_has_no_variance(self):
+        assert standstill_variance(np.arange(500) * 1e-3, np.full((500, 1), 0.4))[0] < 1e-40
+        with pytest.raises(RecordingError, match="20 samples"):
+            standstill_variance(np.arange(19) * 1e-3, np.zeros((19, 2)))
+
+
+class TestSamples:
+    def test_smoothed_motion_is_accurate_in_usable_rows(self):
+        recording = smooth_recording()
+        samples = prepare(recording, MODEL, noise_variance=QUANTISATION)
+        for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
+            error = (smoothed - exact)[samples.usable.all(axis=1)]
+            assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
+
+    def test_the_torque_is_left_as_measured(self):
+        recording = smooth_recording(noise=0.5)
+        assert prepare(recording, MODEL).torque is recording.torque
+
+    def test_derivatives_do_not_cross_a_gap(self):
+        whole = smooth_recording()
+        keep = np.r_[0:2000, 2300:6000]
+        gap = np.zeros(len(keep), dtype=bool)
+        gap[2000] = True
+        # Time that continues through a gap: only the flag reports it.
+        gapped = replace(
+            whole,
+            time=whole.time[: len(keep)],
+            position=whole.position[keep],
+            torque=whole.torque[keep],
+            gap_before=gap,
+        )
+        samples = prepare(gapped, MODEL, noise_variance=QUANTISATION)
+        exact = [part[keep] for part in motion(whole.time)]
+        rows = samples.usable.all(axis=1)
+        assert not samples.usable[1995:2005].any()
+        assert np.abs(samples.motion.velocity - exact[1])[rows].max() < 0.02
+        unflagged = prepare(replace(gapped, gap_before=None), MODEL, noise_variance=QUANTISATION)
+        assert np.abs(unflagged.motion.velocity - exact[1])[1995:2005].max() > 1.0
+
+    @pytest.mark.parametrize("delay", [0.004, -0.0025])
+    def test_a_known_torque_delay_is_compensated(self, delay):
+        recording = smooth_recording(delay=delay)
+
+        def worst(assumed):
+            options = Preprocessing(torque_delay=assumed)
+            samples = prepare(recording, MODEL, noise_variance=QUANTISATION, options=options)
+            error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
+            moving = np.abs(samples.motion.velocity) > 0.1  # away from reversals
+            return float(np.abs(error[samples.usable & moving]).max())
+
+        assert worst(delay) < 0.1
+        assert worst(0.0) > 5 * worst(delay)
+
+    def test_a_torque_low_pass_cancels_with_the_regressor(self):
+        recording = smooth_recording()
+        # Filtered by a zero-phase Butterworth filter, not by the smoother.
+        logged = sosfiltfilt(butter(3, 4.0, fs=1000.0, output="sos"), recording.torque, axis=0)
+
+        def misfit(options):
+            samples = prepare(
+                replace(recording, torque=logged),
+                MODEL,
+                noise_variance=QUANTISATION,
+                options=options,
+            )
+            error = samples.torque - samples.predicted_torque(MODEL, TRUTH)
+            return float(np.sqrt(np.mean(error[1000:-1000] ** 2)))
+
+        assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
+
+    def test_smooth_torque_filters_the_regressor_equally(self):
+        recording = smooth_recording(noise=0.5)
+        known = {"noise_variance": QUANTISATION, "torque_variance": np.full(2, 0.25)}
+        samples = prepare(recording, MODEL, **known, options=Preprocessing(smooth_torque=True))
+        removed = recording.torque - samples.torque
+        np.testing.assert_allclose(np.mean(removed**2, axis=0), 0.25, rtol=0.1)
+        # The residual contains the noise that the smoother passes.
+        error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
+        assert np.sqrt(np.mean(error**2)) < 0.2
+
+    def test_invalid_recordings_and_bandwidths_raise(self):
+        valid = smooth_recording()
+        with pytest.raises(RecordingError, match="no joint torque"):
+            prepare(replace(valid, torque=None), MODEL)
+        with pytest.raises(RecordingError, match="order"):
+            prepare(replace(valid, joint_names=("elbow", "shoulder")), MODEL)
+        with pytest.raises(ValueError, match="positive"):
+            Preprocessing(torque_bandwidth=0.0)
+
+
+TIME = np.arange(4000) * 1e-3
+EVERYWHERE = np.ones((1, 1), dtype=np.bool_)
+
+
+SLIDING = RobotModel.from_urdf(URDF, friction=FrictionLaw(standstill=0.05))
+
+
+def motion_and_recording(clip=np.inf):
+    rate, rng = np.array([2.0, 3.1]), np.random.default_rng(2)
+    angle, motion = rate * TIME[:, None] + 0.4, sine_motion(TIME, np.ones(2), rate, np.full(2, 0.4))
+    torque = 20.0 * np.sin(angle * 1.7) + 0.2 * rng.standard_normal(angle.shape)
+    return motion, Recording(
+        time=TIME,
+        position=motion.position + 1e-6 * rng.standard_normal(angle.shape),
+        joint_names=SLIDING.joint_names,
+        torque=np.clip(torque, -clip, clip),
+    )
+
+
+class TestClipping:
+    def test_clipped_torque_is_found(self):
+        _, whole = motion_and_recording()
+        _, clipped = motion_and_recording(clip=15.0)
+        true = np.abs(whole.torque) > 15.0
+        found = flat_topped(clipped.torque, EVERYWHERE)
+        assert not np.any(found & ~true)
+        # Noise interrupts the limit; short runs are not detected.
+        assert np.count_nonzero(found) > 0.9 * np.count_nonzero(true)
+        assert not flat_topped(whole.torque, EVERYWHERE).any()
+
+    @given(
+        resolution=st.sampled_from([1.0, 0.1, 0.01]),
+        rate=st.floats(0.5, 20.0),
+        phase=st.floats(0.0, 6.0),
+    )
+    def test_a_coarse_smooth_peak_is_not_clipped(self, resolution, rate, phase):
+        smooth = np.round(20.0 * np.sin(rate * TIME + phase) / resolution) * resolution
+        assert not flat_topped(smooth[:, None], EVERYWHERE).any()
+
+    def test_a_constant_channel_at_rest_is_not_clipped(self):
+        channel = np.concatenate([np.full(500, 12.0), 12.0 * np.cos(TIME[:2000] * 4.0)])[:, None]
+        moving = np.arange(len(channel))[:, None] > 500
+        assert not flat_topped(channel, moving).any()
+        assert not flat_topped(np.full((100, 1), 3.0), EVERYWHERE).any()
+
+
+class TestExcludedRows:
+    def test_each_has_a_reason(self):
+        motion, recording = motion_and_recording(clip=15.0)
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0))
+        reasons = np.any(list(mask.reasons.values()), axis=0)
+        np.testing.assert_array_equal(mask.usable, ~reasons)
+        lost = np.sum(list(mask.counts.values()), axis=0)
+        np.testing.assert_array_equal(lost + mask.usable.sum(axis=0), len(TIME))
+        for reason in (EDGE, STANDSTILL, REVERSAL, SATURATED):
+            assert np.all(mask.counts[reason] > 0)
+
+    def test_rests_exclude_two_rows_at_a_reversal(self):
+        motion, recording = motion_and_recording()
+        mask = mask_rows(recording, SLIDING, motion, np.full(2, 40.0), left_out="rests")
+        for joint, speed in enumerate(motion.velocity.T):
+            last = np.flatnonzero(speed[1:] * speed[:-1] < 0.0)
+            assert last.size
+            np.testing.assert_array_equal(
+                np.flatnonzero(mask.reasons[REVERSAL][:, joint]), np.sort([*last, *(last + 1)])
+            )
+
+    @pytest.mark.parametrize("friction", [True, False])
+    def test_reversals_of_coupled_motors_are_excluded(self, friction):
+        turns = np.array([[1.0, 0.0], [-0.8, 1.0]])
+        model = RobotModel.from_urdf(
+            URDF, friction=FrictionLaw(standstill=0.05), coupling=Coupling(turns, friction=friction)
+        )
+        motion, recording = motion_and_recording()
+        reversals = mask_rows(recording, model, motion, np.array([40.0, 20.0])).reasons[REVERSAL]
+        motor = motion.velocity @ turns[1]
+        assert model.friction.motors == ((1,) if friction else ())
+
+        def beside(speed, reach):
+            at = TIME[:-1][speed[1:] * speed[:-1] < 0.0]
+            assert len(at)
+            return np.asarray(np.abs(TIME[:, None] - at).min(axis=1) <= reach)
+
+        # By the bandwidth of the slower joint; the joints' own reversals as usual.
+        for joint, reach in enumerate((1.0 / 40.0, 1.0 / 20.0)):
+            own = beside(motion.velocity[:, joint], reach)
+            expected = own | beside(motor, 1.0 / 20.0) if friction else own
+            apart = np.flatnonzero(expected != reversals[:, joint])
+            # Except the sample at the edge.
+            assert len(apart) <= 2 * np.count_nonzero(np.diff(expected))
+            assert np.count_nonzero(expected) > 10 * len(apart)
+            assert (np.count_nonzero(expected & ~own) > 50) == friction
+
+    @pytest.mark.parametrize("delay", [-0.08, 0.0, 0.08])
+    def test_delayed_rows_near_an_edge_are_excluded(self, delay):
+        """The motion `delay` earlier must be known and away from an end."""
+        _, recording = motion_and_recording()
+        samples = prepare(recording, SLIDING, options=Preprocessing(torque_delay=delay))
+        end = min(LONGEST_END, END_PERIODS / float(samples.position_bandwidth.min()))
+        read = recording.time - delay
+        inside = (read >= recording.time[0] + end) & (read <= recording.time[-1] - end)
+        np.testing.assert_array_equal(samples.mask.reasons[EDGE][:, 0], ~inside)
+        assert not samples.usable[~inside].any()
+
+    def test_edges_of_a_low_passed_torque_are_excluded(self):
+        _, recording = motion_and_recording()
+        samples = prepare(recording, SLIDING, options=Preprocessing(torque_bandwidth=10.0))
+        beside = recording.time < recording.time[0] + END_PERIODS / 10.0
+        assert not samples.usable[beside].any()
+        assert samples.usable[recording.time > recording.time[0] + LONGEST_END][:100].any()
+
+    def test_edges_of_gaps_and_short_segments_are_excluded(self):
+        motion, recording = motion_and_recording()
+        gap = np.zeros(len(TIME), dtype=np.bool_)
+        gap[[2000, 2040]] = True
+        gapped = Recording(
+            time=TIME, position=recording.position, joint_names=SLIDING.joint_names, gap_before=gap
+        )
+        rows = mask_rows(gapped, SLIDING, motion, np.full(2, 40.0)).reasons[EDGE][:, 0]
+        assert rows[1950:2090].all()
+        assert not rows[100:1940].any()
+        assert not rows[2100:3900].any()
+
+    def test_rows_at_the_current_limit_are_excluded(self):
+        motion, recording = motion_and_recording()
+        driven = replace(recording, motor_current=recording.torque, torque=None)
+        limit = np.array([18.0, 100.0])
+        mask = mask_rows(driven, SLIDING, motion, np.full(2, 40.0), current_limit=limit)
+        saturated = mask.reasons[SATURATED]
+        np.testing.assert_array_equal(saturated[:, 0], np.abs(driven.motor_current[:, 0]) >= 17.91)
+        assert not saturated[:, 1].any()
