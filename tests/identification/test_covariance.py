@@ -9,8 +9,8 @@ from identification.estimators.covariance import (
     spread,
     with_block_covariance,
 )
-from identification.estimators.least_squares import estimate, estimate_repetitions, joint_weights
-from identification.factor.factor import Factor, NormalEquations, solve
+from identification.estimators.least_squares import estimate_repetitions
+from identification.factor.factor import Factor, NormalEquations, estimate, joint_weights, solve
 from tests.identification.two_link import MODEL, NOISE, a_motion, coloured, recording, truth
 
 

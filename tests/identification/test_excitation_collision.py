@@ -12,15 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from identification import ShapeError
-from identification.excitation import (
-    Box,
-    CollisionChecker,
-    CollisionModelError,
-    Workspace,
-    WorkspaceError,
-)
-from identification.excitation.collision.bodies import joint_poses, link_bodies
+from identification.errors import ShapeError
+from identification.excitation.collision.bodies import Box, Workspace, joint_poses, link_bodies
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.errors import CollisionModelError, WorkspaceError
 from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text

@@ -14,26 +14,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification import (
-    Anchors,
-    Coupling,
-    Factor,
-    FrictionLaw,
-    GasCylinder,
-    ModelError,
-    Motion,
-    Payload,
-    RobotModel,
-    ShapeError,
-    TorsionSpring,
-    consistent_estimate,
-    estimate,
-    parameters_csv,
-    parameters_json,
-    write_urdf,
-)
+from identification.errors import ModelError, ShapeError
+from identification.estimators.consistent import consistent_estimate
 from identification.excitation import CollisionChecker, CollisionModelError, Workspace
 from identification.export.friction import friction_curve, friction_torque
+from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import (
     AGREES,
     FORMATS,
@@ -43,9 +28,15 @@ from identification.export.simulators import (
     mjcf,
     random_states,
 )
-from identification.export.urdf import NotConsistentError, WriteBackError
-from identification.model.elements import TorqueRipple
+from identification.export.urdf import NotConsistentError, WriteBackError, write_urdf
+from identification.factor.factor import Factor, estimate
+from identification.model.coupling import Coupling
+from identification.model.elements import Anchors, GasCylinder, TorqueRipple, TorsionSpring
+from identification.model.friction import FrictionLaw
 from identification.model.kinematics import MOST_JOINTS, chain_from_urdf
+from identification.model.motion import Motion
+from identification.model.payload import Payload
+from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
 from identification.signals.noise import noiseless_above
 from identification.signals.smoothing import LowPassShape, low_passed

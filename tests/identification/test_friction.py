@@ -3,9 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.model.coupling import Coupling
-from identification.model.friction import JointFriction, dissipation, presliding_state
+from identification import Coupling, FrictionLaw, JointFriction, ModelError, RobotModel, ShapeError
+from identification.model.friction import dissipation, presliding_state
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import NS16_TURNS
 from tests.identification.two_link import MODEL, a_motion, truth

@@ -8,15 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from identification.excitation import (
-    Box,
-    CollisionChecker,
-    DesignError,
-    Excitation,
-    Workspace,
-    check_motion,
-)
+from identification.excitation.collision.bodies import Box, Workspace
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.constraints import check_motion
 from identification.excitation.criteria import Criteria
+from identification.excitation.errors import DesignError
+from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
 from planner import FourierSeries, JointLimits, WorkerProcess, check_limits, plan, plan_moves
 from sim_fixtures.ns16 import urdf_text

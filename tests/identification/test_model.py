@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from identification import FrictionLaw, ModelError, RobotModel, ShapeError
-from identification.export.urdf import write_urdf
+from identification import FrictionLaw, ModelError, RobotModel, ShapeError, write_urdf
 from identification.model.kinematics import FROM_PINOCCHIO, chain_from_urdf
 from identification.model.pseudo_inertia import (
     AS_GIVEN,

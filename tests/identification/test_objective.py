@@ -7,23 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import RobotModel
-from identification.excitation import (
-    CRITERIA,
-    KINDS,
+from identification.excitation import CRITERIA, KINDS
+from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
+from identification.excitation.criteria import (
     Criteria,
-    DesignError,
-    Front,
-    Objective,
-    Scale,
-    Scores,
     correlation,
     coupling_index,
     coupling_index_max,
+    fitness_eq7,
     log10_det,
 )
-from identification.excitation.constraints import SAMPLE_PERIOD, midpoints, sampled
-from identification.excitation.criteria import fitness_eq7
+from identification.excitation.errors import DesignError
+from identification.excitation.objective import Objective
+from identification.excitation.searches.scores import Front, Scale, Scores
+from identification.model.robot import RobotModel
 from planner import FourierSeries, JointLimits, plan
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.searching import NS16_VELOCITY

@@ -7,12 +7,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from identification import Recording
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
+from identification.signals.recording import Recording
 from identification.validation.plausibility import (
     Implausible,
     check_consistency,

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification import RobotModel
 from identification.estimators.consistent import consistent_estimate
 from identification.estimators.instrumental import estimate_instrumental
 from identification.estimators.least_squares import fit_least_squares
@@ -23,6 +22,7 @@ from identification.factor.columns import instrument_factor
 from identification.factor.factor import Factor, joined, total_factor
 from identification.model.motion import Motion
 from identification.model.regressor import CHUNK
+from identification.model.robot import RobotModel
 from identification.selection.essential import eliminate
 from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from identification.validation.finding import Thresholds
+from identification import Thresholds
 from identification.validation.residuals import (
     FEWEST_BLOCKS,
     HARMONICS,

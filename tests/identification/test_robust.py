@@ -4,9 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from identification.estimators.losses import Huber, Loss, Tukey
-from identification.estimators.robust import robust_estimate
-from identification.factor.factor import Factor, estimate
+from identification import Factor, Huber, Tukey, estimate, robust_estimate
+from identification.estimators.losses import Loss
 from tests.identification.two_link import (
     MODEL,
     NOISE,

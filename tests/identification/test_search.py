@@ -7,25 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identification.excitation import (
-    KINDS,
-    CurrentModel,
-    Front,
-    Journal,
-    NoFeasibleMotionError,
-    Population,
-    Scale,
-    Scores,
-    SearchSettings,
-    SineGenome,
-    check_motion,
-    coupling_index_max,
-    midpoints,
-    most_evaluations,
-    search,
-)
-from identification.excitation.searches.scores import unplanned
-from identification.excitation.violation import excess_by_kind
+from identification.excitation import KINDS
+from identification.excitation.constraints import CurrentModel, check_motion, midpoints
+from identification.excitation.criteria import coupling_index_max
+from identification.excitation.genomes import SineGenome
+from identification.excitation.searches.journal import Journal
+from identification.excitation.searches.population import Population, SearchSettings
+from identification.excitation.searches.run import most_evaluations, search
+from identification.excitation.searches.scores import Front, Scale, Scores, unplanned
+from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
 from tests.identification.searching import LIMITS, bits, faulty, problem

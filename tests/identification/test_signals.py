@@ -10,18 +10,11 @@ from scipy.integrate import quad
 from scipy.interpolate import BSpline
 from scipy.signal import butter, sosfiltfilt
 
-from identification import (
-    Coupling,
-    FrictionLaw,
-    Preprocessing,
-    Recording,
-    RecordingError,
-    RobotModel,
-    ShapeError,
-    prepare,
-    standstill_variance,
-    time_base,
-)
+from identification.errors import ShapeError
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
+from identification.signals.clock import time_base
 from identification.signals.masks import (
     EDGE,
     END_PERIODS,
@@ -32,8 +25,14 @@ from identification.signals.masks import (
     flat_topped,
     mask_rows,
 )
-from identification.signals.noise import difference_variance
-from identification.signals.recording import offsets_of_repetitions, without_repeats
+from identification.signals.noise import difference_variance, standstill_variance
+from identification.signals.recording import (
+    Recording,
+    RecordingError,
+    offsets_of_repetitions,
+    without_repeats,
+)
+from identification.signals.samples import Preprocessing, prepare
 from identification.signals.smoothing import fit_smoothing_spline, low_pass
 from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
 

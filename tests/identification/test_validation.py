@@ -8,19 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from identification.errors import IdentificationError
-from identification.estimators.least_squares import estimate_repetitions
-from identification.factor.factor import Factor, joint_weights, solve
+from identification import (
+    Factor,
+    IdentificationError,
+    PredictionError,
+    Samples,
+    estimate_repetitions,
+    prediction_error,
+)
+from identification.factor.factor import joint_weights, solve
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
-from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repetition_noise
-from identification.validation.prediction import (
-    PredictionError,
-    pooled_error,
-    prediction_error,
-    slow_error,
-)
+from identification.validation.prediction import pooled_error, slow_error
 from tests.identification.two_link import (
     MODEL,
     NOISE,

@@ -5,18 +5,13 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from identification import RobotModel
-from identification.excitation import (
-    Box,
-    CollisionChecker,
-    CurrentModel,
-    NoFeasibleMotionError,
-    Workspace,
-    check_motion,
-    random_validation_motions,
-    validation_motions,
-)
-from identification.excitation.collision.bodies import joint_poses
+from identification.excitation import validation_motions
+from identification.excitation.collision.bodies import Box, Workspace, joint_poses
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.constraints import CurrentModel, check_motion
+from identification.excitation.validation_motions import random_validation_motions
+from identification.excitation.violation import NoFeasibleMotionError
+from identification.model.robot import RobotModel
 from planner import PlannerCrashed, plan, plan_moves
 from sim_fixtures.ns16 import load_truth, urdf_text
 from tests.identification.searching import NS16_HOME as HOME
