@@ -14,6 +14,7 @@ import sys
 import time
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -80,9 +81,7 @@ class UdpController:
         self.drive_offs = 0
         self.unanswered = 0
         self.cycle_time = 0.0
-
-    def close(self) -> None:
-        self.socket.close()
+        self.close = self.socket.close
 
     def start(self) -> None:
         """The init packet, and one closed cycle."""
@@ -169,19 +168,19 @@ class UdpController:
         """Way of joint 1 so far, rad."""
         return abs(float(self.path[-1, 0] - self.path[0, 0])) if self.targets else 0.0
 
-    def assert_stopped_on_its_path(self, period: float) -> None:
+    def assert_stopped_on_its_path(self) -> None:
         """The arm came to rest without a jerk, then open mode was left as it should be."""
         path = self.path
         assert (self.exits, self.drive_offs) == (1, 0), f"{self.unanswered} cycles unanswered"
-        speed = np.abs(np.diff(path[:, 0])) / period
+        speed = np.abs(np.diff(path[:, 0])) / PERIOD
         assert speed.max() > 0.25, "it was moving"
         assert speed[-1] < 1e-3, "it is at rest"
         # The wire rounds motor revolutions to float32; differences blow that up.
         motor = np.abs(np.array(self.targets)[:, 0]).max()
         step = float(np.spacing(np.float32(motor))) * 2 * np.pi / abs(self.train.gear_ratio[0])
         for order, bound in ((2, 2.0 * 8.0), (3, 3.0 * 100.0)):
-            rate = np.abs(np.diff(path[:, 0], order)) / period**order
-            assert rate.max() < bound + 2 ** (order - 1) * step / period**order
+            rate = np.abs(np.diff(path[:, 0], order)) / PERIOD**order
+            assert rate.max() < bound + 2 ** (order - 1) * step / PERIOD**order
         np.testing.assert_allclose(
             path[:, 1:], np.broadcast_to(START[1:], path[:, 1:].shape), atol=1e-5
         )
@@ -296,21 +295,16 @@ def test_motion_of_many_megabytes_is_handed_over():
 class TestRefusedMotions:
     def test_refusal_of_the_session_is_raised(self):
         with running() as (exchange, controller):
+            with pytest.raises(RequestError, match="cannot be read"):
+                exchange.submit(Trap())
             exchange.submit(still(10))
             with pytest.raises(RequestError, match="another motion was requested") as caught:
                 exchange.submit(still(10))
             assert caught.value.state == "closed"
             status = exchange.status()
-            assert (status.program_accepted, status.program_refused) == (1, 2)
+            assert (status.program_accepted, status.program_refused) == (2, 3)
             controller.cycle(5)
             assert exchange.alive
-
-    def test_motion_that_cannot_be_unpickled_is_refused(self):
-        with (
-            running() as (exchange, _),
-            pytest.raises(RequestError, match="cannot be read"),
-        ):
-            exchange.submit(Trap())
 
     def test_motion_without_archive_is_refused(self):
         with running(needs_archive=True) as (exchange, _):
@@ -327,61 +321,58 @@ class TestRefusedMotions:
 
             exchange.submit(still(10), confirm)
 
+    def test_motion_not_accepted_in_time_does_not_begin_later(self, monkeypatch):
+        with running() as (exchange, controller):
+            os.kill(exchange.pid, signal.SIGSTOP)
+            with monkeypatch.context() as impatient:
+                impatient.setattr(process, "ANSWER_TIMEOUT", 0.3)
+                with pytest.raises(ExchangeError, match=r"not answer within 0\.3 s"):
+                    exchange.submit(smooth_move(MOVE, 300))
+            os.kill(exchange.pid, signal.SIGCONT)
+            assert_nothing_moves(controller)
+            assert exchange.status().program_refused == 1
+            controller.open = False
+            controller.cycle(2)
+            assert exchange.submit(still(10)) == 2
 
-def test_motion_not_accepted_in_time_does_not_begin_later(monkeypatch):
-    with running() as (exchange, controller):
-        os.kill(exchange.pid, signal.SIGSTOP)
-        with monkeypatch.context() as impatient:
-            impatient.setattr(process, "ANSWER_TIMEOUT", 0.3)
-            with pytest.raises(ExchangeError, match=r"not answer within 0\.3 s"):
-                exchange.submit(smooth_move(MOVE, 300))
-        os.kill(exchange.pid, signal.SIGCONT)
-        controller.open = True
-        controller.cycle(100)
-        assert exchange.status().program_refused == 1
-        assert controller.moved == 0.0
-        controller.open = False
-        controller.cycle(2)
-        assert exchange.submit(still(10)) == 2
+    def test_motion_can_be_withdrawn_after_it_was_read(self):
+        with running(preload=(__name__,)) as (exchange, controller):
+            begin = time.monotonic()
+            controller.open = True
+            for confirmed in (False, True):
+
+                def confirm(confirmed=confirmed):
+                    assert time.monotonic() - begin > Lengthy.READING  # it was read
+                    return confirmed
+
+                with nullcontext() if confirmed else pytest.raises(WithdrawnError):
+                    exchange.submit(Lengthy(), confirm)
+                controller.cycle(20)
+                assert (controller.moved > 0.0) is confirmed
 
 
-def test_motion_can_be_withdrawn_after_it_was_read():
-    with running(preload=(__name__,)) as (exchange, controller):
-        begin = time.monotonic()
-        controller.open = True
-        for confirmed in (False, True):
-
-            def confirm(confirmed=confirmed):
-                assert time.monotonic() - begin > Lengthy.READING  # it was read
-                return confirmed
-
-            with nullcontext() if confirmed else pytest.raises(WithdrawnError):
-                exchange.submit(Lengthy(), confirm)
-            controller.cycle(20)
-            assert (controller.moved > 0.0) is confirmed
+def assert_nothing_moves(controller: UdpController) -> None:
+    controller.open = True
+    controller.cycle(50)
+    assert controller.moved == 0.0
 
 
 class TestBetweenReadingAndBegin:
     """Whatever comes in between, a motion begins only as it was meant to."""
 
-    @staticmethod
-    def assert_nothing_moves(controller: UdpController) -> None:
-        controller.open = True
-        controller.cycle(50)
-        assert controller.moved == 0.0
-
-    def test_a_stop(self):
+    @pytest.mark.parametrize(
+        ("event", "reason"),
+        [
+            (lambda exchange, _: exchange.stop(), "a stop was requested"),
+            (lambda _, controller: controller.start(), "new session since"),
+        ],
+        ids=["stop", "new session of the controller"],
+    )
+    def test_refused(self, event, reason):
         with running() as (exchange, controller):
-            controller.open = True
-            with pytest.raises(RequestError, match="a stop was requested"):
-                exchange.submit(Cruise(), lambda: exchange.stop() is None)
-            self.assert_nothing_moves(controller)
-
-    def test_a_new_session_of_the_controller(self):
-        with running() as (exchange, controller):
-            with pytest.raises(RequestError, match="new session since"):
-                exchange.submit(Cruise(), lambda: controller.start() is None)
-            self.assert_nothing_moves(controller)
+            with pytest.raises(RequestError, match=reason):
+                exchange.submit(Cruise(), lambda: event(exchange, controller) is None)
+            assert_nothing_moves(controller)
 
     def test_withdrawal_while_the_exchange_is_stopped(self):
         with running() as (exchange, controller):
@@ -395,7 +386,7 @@ class TestBetweenReadingAndBegin:
             with pytest.raises(WithdrawnError):
                 exchange.submit(Cruise(), confirm)
             assert list(signals) == []
-            self.assert_nothing_moves(controller)
+            assert_nothing_moves(controller)
 
     def test_interrupted_submission_leaves_no_motion(self, monkeypatch):
         hand_over = process.hand_over
@@ -409,7 +400,7 @@ class TestBetweenReadingAndBegin:
                 patch.setattr(process, "hand_over", interrupted)
                 exchange.submit(Cruise())
             exchange.submit(still(10))
-            self.assert_nothing_moves(controller)
+            assert_nothing_moves(controller)
 
 
 class Lengthy(Cruise):
@@ -438,7 +429,9 @@ class TestStall:
         with running(session={"max_gap": 100}) as (exchange, controller):
             start_cruise(exchange, controller)
             os.kill(exchange.pid, signal.SIGSTOP)
-            while _process_state(exchange.pid) != "T":
+            while (
+                Path(f"/proc/{exchange.pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"
+            ):
                 time.sleep(0.001)
             for _ in range(90):
                 controller.post()
@@ -505,7 +498,7 @@ class TestStops:
             events = exchange.events()
             assert exchange.alive
             reason = the(MotionEnded, events).reason
-        controller.assert_stopped_on_its_path(PERIOD)
+        controller.assert_stopped_on_its_path()
         assert the(MotionEnded, events).outcome == "stopped"
         assert by in reason
         return events
@@ -524,8 +517,14 @@ class TestStops:
             ask(exchange)
             self.stopped(exchange, controller, by=reason, ends=ends)
 
-    @pytest.mark.parametrize("end", ["silent", "failed"])
-    def test_end_of_the_archive(self, end):
+    @pytest.mark.parametrize(
+        ("end", "reason"),
+        [
+            ("silent", "the archive process sends no heartbeat"),
+            ("failed", "the archive cannot be written"),
+        ],
+    )
+    def test_end_of_the_archive(self, end, reason):
         with running(needs_archive=True) as (exchange, controller):
             control = ControlBlock(exchange.control_fd)
 
@@ -540,10 +539,8 @@ class TestStops:
             controller.cycle_time = PERIOD
             if end == "silent":
                 controller.beat = exchange.send_heartbeat
-                reason = "the archive process sends no heartbeat"
             else:
                 control.archive_state = ArchiveState.FAILED
-                reason = "the archive cannot be written"
             self.stopped(exchange, controller, by=reason, ends=False)
 
     def test_silent_supervisor(self):
@@ -566,14 +563,6 @@ class TestStops:
             assert controller.open
             assert controller.moved == pytest.approx(moved + 200 * PERIOD * Cruise.SPEED, rel=0.01)
             assert not [event for event in exchange.events() if isinstance(event, MotionEnded)]
-
-
-def _process_state(pid: int) -> str:
-    """As ps shows it; empty for a process that is gone."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except (FileNotFoundError, ProcessLookupError):
-        return ""
 
 
 class FaultySpec(UdpSpec):
@@ -614,37 +603,33 @@ class TestProcessEnd:
 
 
 class TestStart:
-    def test_port_in_use_is_raised(self):
+    def test_refusals_are_raised(self):
         with running() as (_, controller), pytest.raises(TransportError, match="another program"):
             ExchangeProcess.start(settings(controller.socket.getpeername()[1]))
-
-    def test_failed_import_is_raised(self):
         with pytest.raises(ModuleNotFoundError, match="no_such_module"):
             ExchangeProcess.start(settings(free_port(), preload=("no_such_module",)))
+
+    def test_process_that_cannot_be_started_leaves_nothing_open(self, monkeypatch):
+        def refuse(*_, **__):
+            raise BlockingIOError(11, "no more processes")
+
+        monkeypatch.setattr(subprocess, "Popen", refuse)
+        gc.collect()  # what earlier tests left is closed now, not in between
+        before = set(Path("/proc/self/fd").iterdir())
+        with pytest.raises(ExchangeError, match="no more processes"):
+            ExchangeProcess.start(settings(free_port()))
+        assert set(Path("/proc/self/fd").iterdir()) == before
 
 
 def test_override_that_a_motion_cannot_make_is_refused():
     with running() as (exchange, controller):
         start_cruise(exchange, controller)
-        exchange.override(0.5)
-        controller.cycle(5)
-        assert the(OverrideRefused, exchange.events()).fraction == 0.5
-        exchange.override(float("nan"))
-        controller.cycle(5)
-        assert np.isnan(the(OverrideRefused, exchange.events()).fraction)
+        for fraction in (0.5, float("nan")):
+            exchange.override(fraction)
+            controller.cycle(5)
+            refused = the(OverrideRefused, exchange.events())
+            np.testing.assert_equal(refused.fraction, fraction)
         assert controller.open
-
-
-def test_process_that_cannot_be_started_leaves_nothing_open(monkeypatch):
-    def refuse(*_, **__):
-        raise BlockingIOError(11, "no more processes")
-
-    monkeypatch.setattr(subprocess, "Popen", refuse)
-    gc.collect()  # what earlier tests left is closed now, not in between
-    before = set(Path("/proc/self/fd").iterdir())
-    with pytest.raises(ExchangeError, match="no more processes"):
-        ExchangeProcess.start(settings(free_port()))
-    assert set(Path("/proc/self/fd").iterdir()) == before
 
 
 ENTER = """
@@ -657,6 +642,9 @@ report = enter(RealTimeSettings({arguments}))
 mmap.mmap(-1, 64 << 20).close()
 print(json.dumps([dataclasses.asdict(report), gc.isenabled(), sorted(os.sched_getaffinity(0))]))
 """
+
+
+NO_OTHERS = "lock_memory=False, hold_cpu_awake=False"
 
 
 def enter(arguments: str = "", *, unprivileged=False, memlock=8 << 20):
@@ -673,17 +661,10 @@ needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs the right to dr
 class TestRealTimeSettings:
     def test_each_setting_is_granted_or_refused(self):
         report, _, _ = enter("priority=37")
-        granted = (
-            report.scheduling == "SCHED_FIFO 37",
-            report.memory_locked,
-            report.cpu_awake,
-        )
+        granted = report.scheduling == "SCHED_FIFO 37", report.memory_locked, report.cpu_awake
         assert sum(granted) + len(report.refused) == 3
-
-    def test_processor_without_other_settings(self):
         cpu = max(os.sched_getaffinity(0))
-        options = f"priority=0, lock_memory=False, hold_cpu_awake=False, cpu={cpu}"
-        report, collecting, cpus = enter(options)
+        report, collecting, cpus = enter(f"priority=0, cpu={cpu}, {NO_OTHERS}")
         assert report == RealTimeReport("ordinary", False, False, [])
         assert (collecting, cpus) == (False, [cpu])
 
@@ -706,25 +687,16 @@ class TestRealTimeSettings:
     def test_future_memory_is_locked_only_without_a_limit(
         self, monkeypatch, user, limit, flags, locked
     ):
-        class C:
-            """Grants everything."""
-
-            asked = None
-
-            def mallopt(self, *_):
-                return 1
-
-            def mlockall(self, confirm):
-                self.asked = confirm
-                return 0
-
-        c = C()
+        asked = []
+        c = SimpleNamespace(
+            mallopt=lambda *_: 1, mlockall=lambda flags: asked.append(flags) or 0
+        )  # grants everything
         monkeypatch.setattr(realtime.ctypes, "CDLL", lambda *_, **__: c)
         monkeypatch.setattr(realtime.os, "geteuid", lambda: user)
         monkeypatch.setattr(realtime.resource, "getrlimit", lambda _: (limit, limit))
         refused = []
         assert realtime._lock_memory(refused) is locked
-        assert c.asked == flags
+        assert asked == [flags]
         assert len(refused) == (not locked)
 
     @pytest.mark.parametrize(
@@ -732,7 +704,7 @@ class TestRealTimeSettings:
         [("priority=0, cpu=4096", "choose one of"), ("priority=100", ""), ("priority=1000", "")],
     )
     def test_unknown_processor_or_priority_is_refused(self, impossible, remedy):
-        report, _, _ = enter(f"{impossible}, lock_memory=False, hold_cpu_awake=False")
+        report, _, _ = enter(f"{impossible}, {NO_OTHERS}")
         assert report.scheduling == "ordinary"
         assert len(report.refused) == 1
         assert remedy in report.refused[0]
