@@ -31,8 +31,7 @@ from typing import Any
 from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.cache import CacheLocation
-from hil.batch.run import reidentify
-from hil.batch.types import BatchResult
+from hil.batch.run import BatchResult, reidentify
 from hil.batch.workers import LocalWorkers, Workers
 from hil.identify.options import FIXED
 from hil.progress import Silent

@@ -20,9 +20,9 @@ from scipy.optimize import brentq
 from scipy.stats import t as student
 
 from hil.batch import run
-from hil.batch.factors import cell_in, open_ref
-from hil.batch.types import ArchiveRef, Arm, LevelEstimate, Unused
-from hil.batch.workers import Workers
+from hil.batch.discovery import ArchiveRef, cell_in, open_ref
+from hil.batch.run import Arm, LevelEstimate
+from hil.batch.workers import Unused, Workers
 from hil.errors import InputError
 from hil.identify.options import Options
 from hil.identify.sources import arm_differences

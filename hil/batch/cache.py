@@ -10,8 +10,7 @@ import json
 import math
 import os
 import struct
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -25,9 +24,8 @@ from numpy.typing import NDArray
 import drivers
 import hil
 import identification
-from hil.cell import Cell
+from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file
-from hil.identify.options import Options
 from hil.identify.settings import Settings
 from hil.reading import open_file
 from identification.estimators.consistent import Shrinkage
@@ -36,8 +34,6 @@ from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing
 from identification.signals.smoothing import LowPassShape
 from planner.arrays import DAMAGED
-
-from .types import ArchiveRef, Bundle, CacheError, Summary
 
 T = TypeVar("T")
 
@@ -48,70 +44,68 @@ _HEAD: Final = struct.Struct("<8sII")  # magic, length of the JSON text, checksu
 _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
     kind.__name__: kind
-    for kind in (
-        *(ArchiveRef, Bundle, Summary, Estimate, Factor),
-        *(Settings, Preprocessing, LowPassShape, Shrinkage, Choice),
-    )
+    for kind in (Estimate, Factor, Settings, Preprocessing, LowPassShape, Shrinkage, Choice)
 }
 
 LIBRARIES: Final = ("numpy", "scipy", "pin")  # that determine the numbers
 
 
+class CacheError(InputError):
+    """The cache folder cannot be written to."""
+
+
+def cacheable(kind: type[T]) -> type[T]:
+    """Register a dataclass of which entries may consist."""
+    _TYPES[kind.__name__] = kind
+    return kind
+
+
 @dataclass(frozen=True)
 class CacheLocation:
-    """Location of the cache of an archive."""
+    """Cache of the results of archives: a folder for those in the same folder."""
 
     #: folder of the whole cache; None: beside each archive, or in the user's cache folder (XDG)
     #: where that is not writable or not a folder
     root: str | None = None
     keep: bool = True  #: whether to cache at all
 
-    def store(self, location: str) -> Store:
-        """Return the cache folder of the archives in the same folder as this one."""
-        if not self.keep:
-            return Store(None)
+    def folder(self, location: str) -> Path:
+        """Return the cache folder of an archive, which need not exist."""
         folder = location.rsplit("/", 1)[0]
         if self.root is None:
             beside = Path(folder) / BESIDE
             there = os.path.lexists(beside)
             usable = beside.is_dir() or not there
             if usable and os.access(beside if there else folder, os.W_OK | os.X_OK):
-                return Store(beside)
+                return beside
         xdg = Path(os.environ.get("XDG_CACHE_HOME", ""))
         own = (xdg if xdg.is_absolute() else Path.home() / ".cache") / "hil"
-        return Store((own if self.root is None else Path(self.root)) / digest(folder)[:16])
+        return (own if self.root is None else Path(self.root)) / digest(folder)[:16]
 
-
-@dataclass(frozen=True)
-class Store:
-    """A cache folder, which need not exist. None is empty."""
-
-    folder: Path | None
-
-    def get(self, key: str, kind: type[T]) -> T | None:
+    def get(self, location: str, key: str, kind: type[T]) -> T | None:
         """Return the content of a key; None if there is no intact entry of this type."""
-        if self.folder is None:
+        if not self.keep:
             return None
         try:
-            with open_file(self._path(key)) as file:
+            with open_file(self._path(location, key)) as file:
                 found = decoded(file.read(), key)
         except OSError:
             return None
         return found if isinstance(found, kind) else None
 
-    def has(self, key: str) -> bool:
+    def has(self, location: str, key: str) -> bool:
         """Return whether there is a file for the key, intact or not."""
-        return self.folder is not None and self._path(key).is_file()
+        return self.keep and self._path(location, key).is_file()
 
-    def put(self, key: str, content: Any) -> None:
-        """Write JSON with arrays of numbers and dataclasses of `_TYPES`.
+    def put(self, location: str, key: str, content: Any) -> None:
+        """Write JSON with arrays of numbers and registered dataclasses.
 
         Raises:
             CacheError: the file cannot be written.
         """
-        if self.folder is None:
+        if not self.keep:
             return
-        path = self._path(key)
+        path = self._path(location, key)
         # No fsync: an entry damaged by a power cut fails its checksum and is computed again.
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -122,9 +116,8 @@ class Store:
             remedy = "name another folder with --cache, or none"
             raise CacheError(path, problem, remedy=remedy) from error
 
-    def _path(self, key: str) -> Path:
-        assert self.folder is not None
-        return self.folder / key[:2] / key
+    def _path(self, location: str, key: str) -> Path:
+        return self.folder(location) / key[:2] / key
 
 
 def encoded(key: str, content: Any) -> bytes:
@@ -199,9 +192,6 @@ def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return row, column
 
 
-# Keys
-
-
 @cache
 def code_digest() -> str:
     """Return the digest of the source code and of the versions of `LIBRARIES`."""
@@ -211,44 +201,3 @@ def code_digest() -> str:
         paths = sorted(root.rglob("*.py"))
         found += [(str(path.relative_to(root)), digest(path.read_bytes())) for path in paths]
     return json_digest(found)
-
-
-def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
-    """Return the digest that identifies a robot: links, joints, friction law, drives.
-
-    Payload and delay are not part of it (see :func:`hil.batch.discovery.describe_setup`). The drive
-    train of the archive has precedence over that of the cell.
-    """
-    drives = cell.file.drive_train
-    parts = {
-        "urdf": digest(cell.urdf),
-        "simulated": simulated,
-        "robot": cell.file.robot.model_dump(mode="json", exclude={"payload"}),
-        "drives": drives.model_dump(mode="json") if drives is not None else None,
-        "in force": None if drive_train is None else digest(drive_train),
-    }
-    # Users store it in tables, so the text must not change.
-    return digest(json.dumps(parts, sort_keys=True, separators=(",", ":")))
-
-
-def settings_digest(settings: Settings) -> str:
-    """Return the digest of the settings that determine the factor of an archive."""
-    entries = asdict(settings)
-    for later in ("shrinkage", "choices"):  # of the estimate only
-        del entries[later]
-    return json_digest([entries, code_digest()])
-
-
-def decision_digest(options: Options, arms: Settings | None, refs: Sequence[ArchiveRef]) -> str:
-    """Return the digest of the inputs of a decision: options or the arm's settings, archives, code.
-
-    Of the estimators only the automatic one influences the settings.
-    """
-    asked = asdict(options) | {"estimator": options.estimator == "auto"}
-    known = None if arms is None else asdict(arms)
-    return json_digest([asked, known, [ref.sha256 for ref in refs], code_digest()])
-
-
-def sum_key(refs: Sequence[ArchiveRef], settings: Settings) -> str:
-    """Return the key of the sum over archives, added in this order."""
-    return json_digest(["sum", [ref.sha256 for ref in refs], settings_digest(settings)])

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from hil.archive import ArchiveName, ArchiveOutcome, open_archive
+from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.archive.header import KINDS
 from hil.campaign.errors import CampaignFolderError
 from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
-from hil.files import digest, json_digest
-from hil.identify.settings import stated_delay
+from hil.files import digest, file_digest, json_digest
+from hil.identify.settings import Settings, stated_delay
 from hil.progress import Reporter
 
-from .cache import BESIDE, CacheLocation, arm_digest, code_digest
-from .factors import cell_in, changed_error, digest_of, require_complete, stamp_of
-from .types import ArchiveRef, Unused, folder_of, name_of
-from .workers import ArchiveTask, Workers
+from .cache import BESIDE, CacheLocation, cacheable, code_digest
+from .workers import ArchiveTask, Unused, Workers
 
 USES: Final = ("excitation", "validation", "standstill")
 """Uses of archives in a batch; archives of other kinds are skipped."""
@@ -33,7 +33,6 @@ _SUFFIX: Final = ".mcap"
 _ARCHIVES: Final = "/archives"  # folder of a campaign's archives
 _REHEARSAL: Final = "/rehearsal/"  # see `hil.campaign.folder`
 _LOADED: Final = re.compile(r"/payload/[^/]+/loaded/")  # campaigns of earlier versions
-_FOR_VIEWERS: Final = "/annotated"  # copies that earlier versions wrote
 _COMPLETED: Final = "completed"
 _NEVER_FITTED: Final = frozenset(KINDS) - {*USES, "imported"}
 _UNCHECKED: Final = (
@@ -42,6 +41,74 @@ _UNCHECKED: Final = (
 )
 _UNTOUCHED: Final = 2_000_000_000
 """Age of time stamps [ns] from which on they show the next change; some have steps of 2 s."""
+_FIELDS: Final = (
+    *("cycle", "gap", "position", "torque"),
+    *("target_current", "motor_current", "commanded_position"),
+)
+
+
+class GroupKey(NamedTuple):
+    """Key of archives that are fitted together."""
+
+    arm: str  #: digest of URDF, model, friction law and drive train
+    campaign: str  #: the folder the archives were recorded into
+    setup: str = ""  #: delay and payload stated by their cells, as text; "" for neither
+
+
+def name_of(location: str) -> str:
+    """Return the file name of a path."""
+    return location.rsplit("/", 1)[-1]
+
+
+def folder_of(location: str) -> str:
+    """Return the folder of a path."""
+    return location.rsplit("/", 1)[0]
+
+
+@cacheable
+@dataclass(frozen=True, slots=True)
+class ArchiveRef:
+    """Location and properties of an archive, without its samples."""
+
+    location: str  #: path
+    sha256: str  #: of all bytes
+    #: "excitation" (fitted), "validation" (predicted), "standstill" (noise), or the kind of an
+    #: archive that a batch does not use, for which `arm` and `cell` are ""
+    use: str
+    #: see :class:`GroupKey`
+    arm: str
+    campaign: str
+    index: int  #: of the interval within its kind; 0 for imported ones
+    cell: str  #: digest of the texts of cell file and URDF
+    motion: str  #: digest of the planned motion, "" where unknown
+    when: str = ""  #: time of recording, ISO 8601; "" in simulation
+    setup: str = ""
+    stamp: tuple[int, ...] = ()  #: size, times [ns] and inode of the file when it was hashed
+    kind: str = ""  #: as in its metadata
+    attempt: int = 0  #: 0 where the archive does not number them
+    outcome: str = "completed"  #: how the recording ended
+    record: str = ""  #: digest of the metadata
+    simulated: bool = False  #: whether only a simulated arm moved
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        return name_of(self.location)
+
+    @property
+    def folder(self) -> str:
+        """Folder of the file."""
+        return folder_of(self.location)
+
+    @property
+    def key(self) -> GroupKey:
+        """Group of the archive."""
+        return GroupKey(self.arm, self.campaign, self.setup)
+
+    @property
+    def order(self) -> tuple[str, str, str, int, str, str]:
+        """Sort key: sums are added in this order."""
+        return *self.key, self.index, self.name, self.sha256
 
 
 class Discovery(NamedTuple):
@@ -126,7 +193,100 @@ def find_archives(roots: Sequence[str]) -> tuple[list[str], list[Unused]]:
     return sorted(found), refused
 
 
-# Metadata
+# An archive
+
+
+def open_ref(ref: ArchiveRef) -> Archive:
+    """Open an archive with the columns that identification reads.
+
+    Raises:
+        ArchiveError: it cannot be read, is damaged, or has changed since it was found.
+    """
+    path = Path(ref.location)
+    _require_same(path, ref)
+    try:
+        archive = open_archive(path, fields=_FIELDS)
+        if archive.header.by_controller_program:
+            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
+    finally:  # an error may be due to a change
+        _require_same(path, ref)
+    require_complete(archive, ref.location)
+    return archive
+
+
+def open_only(ref: ArchiveRef) -> None:
+    """Open an archive, to find out whether that fails or ends this process."""
+    open_ref(ref)
+
+
+def require_complete(archive: Archive, location: str) -> None:
+    """Raise an `ArchiveError` with the command of the repair if an archive is damaged."""
+    if archive.damage is not None:
+        remedy = f"hil archive repair {location}"
+        raise ArchiveError(location, str(archive.damage), remedy=remedy)
+
+
+def _require_same(path: Path, ref: ArchiveRef) -> None:
+    if stamp_of(path) != ref.stamp:
+        raise changed_error(ref.location)
+
+
+def changed_error(location: str) -> ArchiveError:
+    """Return the error about an archive that was written to while the batch ran."""
+    return ArchiveError(location, "was changed while it was read", remedy="run the batch again")
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file, or raise an `ArchiveError`."""
+    try:
+        return file_digest(path)
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+
+
+def stamp_of(path: Path) -> tuple[int, ...]:
+    """Return size, times and inode of a file, or raise an `ArchiveError`."""
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
+    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
+
+
+def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
+    """Return the cell of an archive, with the friction law of settings if given.
+
+    Raises:
+        ArchiveError: the archive has no cell or no URDF, or they are not text.
+        CellError: the cell is invalid.
+    """
+    friction = {} if settings is None else settings.friction
+    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
+
+
+@lru_cache(maxsize=8)
+def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
+    """Return the cell of these texts, with a friction law of these entries if given."""
+    cell = Cell.from_texts(text, urdf, Path("cell.toml"))
+    return cell.with_friction(**dict(friction)) if friction else cell
+
+
+def arm_digest(cell: Cell, drive_train: bytes | None, *, simulated: bool = False) -> str:
+    """Return the digest that identifies a robot: links, joints, friction law, drives.
+
+    Payload and delay are not part of it (see :func:`describe_setup`). The drive
+    train of the archive has precedence over that of the cell.
+    """
+    drives = cell.file.drive_train
+    parts = {
+        "urdf": digest(cell.urdf),
+        "simulated": simulated,
+        "robot": cell.file.robot.model_dump(mode="json", exclude={"payload"}),
+        "drives": drives.model_dump(mode="json") if drives is not None else None,
+        "in force": None if drive_train is None else digest(drive_train),
+    }
+    # Users store it in tables, so the text must not change.
+    return digest(json.dumps(parts, sort_keys=True, separators=(",", ":")))
 
 
 def describe_setup(cell: Cell) -> str:
@@ -153,7 +313,7 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     """
     if (known := _known(place, cache)) is not None:
         return known
-    path, store = Path(place), cache.store(place)
+    path = Path(place)
     begun, stamp, sha256 = time.time_ns(), stamp_of(path), digest_of(path)
     # Of an intact file this reads summary, metadata, attachments and one chunk.
     archive = open_archive(path, fields=(), stop=-1.0)
@@ -183,20 +343,20 @@ def inspect_archive(place: str, cache: CacheLocation) -> ArchiveRef:
     if ref.use in USES:
         cell, drives = cell_in(archive), archive.attachments.get("drive_train.json")
         key = json_digest([cell.text, cell.urdf])
-        if not store.has(key):
-            store.put(key, [cell.text, cell.urdf])
+        if not cache.has(place, key):
+            cache.put(place, key, [cell.text, cell.urdf])
         arm = arm_digest(cell, drives, simulated=ref.simulated)
         ref = replace(ref, arm=arm, cell=key, setup=describe_setup(cell))
     if stamp_of(path) != stamp:
         raise changed_error(place)
     if begun - max(stamp[1:3]) > _UNTOUCHED:
-        store.put(_key(place), {"code": code_digest(), "ref": ref})
+        cache.put(place, _key(place), {"code": code_digest(), "ref": ref})
     return ref
 
 
 def _known(place: str, cache: CacheLocation) -> ArchiveRef | None:
     """Return the cached reference of an archive whose file has not changed; None if none."""
-    note = cache.store(place).get(_key(place), dict)
+    note = cache.get(place, _key(place), dict)
     if note is None or note.get("code") != code_digest():
         return None
     ref: ArchiveRef = note["ref"]
@@ -279,8 +439,6 @@ def _manifests(places: Iterable[str]) -> tuple[dict[str, dict[str, Entry]], list
 def _not_needed(place: str, latest: _Attempts) -> str:
     """Return why an unusable archive, such as one of a killed run, is not needed; "" if it is."""
     name = ArchiveName.parse(name_of(place))
-    if folder_of(place).endswith(_FOR_VIEWERS):
-        return "is a copy for viewers"
     if name is None:
         return ""
     if name.kind in _NEVER_FITTED:

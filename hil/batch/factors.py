@@ -1,19 +1,17 @@
-"""Tasks of a worker: open an archive, decide settings, reduce archives to factors."""
+"""Tasks of a worker: decide settings, reduce archives to factors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
-from typing import Any, Final
+from dataclasses import asdict, dataclass, replace
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hil.archive import Archive, open_archive
-from hil.cell import Cell
+from hil.archive import Archive
 from hil.errors import ArchiveError
-from hil.files import file_digest
+from hil.files import json_digest
 from hil.identify.options import Options
 from hil.identify.settings import (
     MAX_RECORDINGS,
@@ -32,95 +30,66 @@ from identification.factor.factor import Estimate, Factor, joint_weights
 from identification.model.robot import RobotModel
 from identification.signals.samples import Samples
 
-from .cache import CacheLocation, decision_digest, sum_key
-from .types import ArchiveRef, Bundle, Summary, Unused
-from .workers import reason_of
+from .cache import CacheLocation, cacheable, code_digest
+from .discovery import ArchiveRef, cell_in, open_ref
+from .workers import Unused, reason_of
+
+Array = NDArray[np.float64]
 
 BUNDLE: Final = 16
 """Archives in one entry of the cache: a summary of each and one sum, fifty times its size."""
 
-_FIELDS: Final = (
-    *("cycle", "gap", "position", "torque"),
-    *("target_current", "motor_current", "commanded_position"),
-)
+
+@cacheable
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Cached results of one archive, beside the sum of several."""
+
+    ref: ArchiveRef
+    total: Factor  #: its factor as one block
+    #: the estimate from it alone, with cluster-robust covariance; None of a validation run
+    fit: Estimate | None
+    design_effect: float  #: ratio of its mean variance to that of white residuals
+    warnings: tuple[str, ...] = ()  #: about the archive
+    #: (n, p, p + 1), see :func:`identification.estimators.delay.rate_products`; None where the
+    #: delay is known, or the archive is not fitted
+    products: Array | None = None
 
 
-# An archive
+@cacheable
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Results of several archives of one campaign."""
+
+    summaries: tuple[Summary, ...] = ()  #: of the readable ones, in their order
+    #: sum of the factors of those that are fitted; None if there are none
+    total: Factor | None = None
+    broken: tuple[Unused, ...] = ()  #: the others
+    read: int = 0  #: number of archives that were read, broken ones included
+    cached: int = 0  #: number of the others
 
 
-def open_ref(ref: ArchiveRef) -> Archive:
-    """Open an archive with the columns that identification reads.
+def settings_digest(settings: Settings) -> str:
+    """Return the digest of the settings that determine the factor of an archive."""
+    entries = asdict(settings)
+    for later in ("shrinkage", "choices"):  # of the estimate only
+        del entries[later]
+    return json_digest([entries, code_digest()])
 
-    Raises:
-        ArchiveError: it cannot be read, is damaged, or has changed since it was found.
+
+def decision_digest(options: Options, arms: Settings | None, refs: Sequence[ArchiveRef]) -> str:
+    """Return the digest of the inputs of a decision: options or the arm's settings, archives, code.
+
+    Of the estimators only the automatic one influences the settings.
     """
-    path = Path(ref.location)
-    _require_same(path, ref)
-    try:
-        archive = open_archive(path, fields=_FIELDS)
-        if archive.header.by_controller_program:
-            archive = open_archive(path, fields=(*_FIELDS, "target_position", "status"))
-    finally:  # an error may be due to a change
-        _require_same(path, ref)
-    require_complete(archive, ref.location)
-    return archive
+    asked = asdict(options) | {"estimator": options.estimator == "auto"}
+    known = None if arms is None else asdict(arms)
+    return json_digest([asked, known, [ref.sha256 for ref in refs], code_digest()])
 
 
-def open_only(ref: ArchiveRef) -> None:
-    """Open an archive, to find out whether that fails or ends this process."""
-    open_ref(ref)
-
-
-def require_complete(archive: Archive, location: str) -> None:
-    """Raise an `ArchiveError` with the command of the repair if an archive is damaged."""
-    if archive.damage is not None:
-        remedy = f"hil archive repair {location}"
-        raise ArchiveError(location, str(archive.damage), remedy=remedy)
-
-
-def _require_same(path: Path, ref: ArchiveRef) -> None:
-    if stamp_of(path) != ref.stamp:
-        raise changed_error(ref.location)
-
-
-def changed_error(location: str) -> ArchiveError:
-    """Return the error about an archive that was written to while the batch ran."""
-    return ArchiveError(location, "was changed while it was read", remedy="run the batch again")
-
-
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file, or raise an `ArchiveError`."""
-    try:
-        return file_digest(path)
-    except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-
-
-def stamp_of(path: Path) -> tuple[int, ...]:
-    """Return size, times and inode of a file, or raise an `ArchiveError`."""
-    try:
-        found = path.stat()
-    except OSError as error:
-        raise ArchiveError(path, f"cannot be read: {error.strerror}") from error
-    return found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino
-
-
-def cell_in(archive: Archive, settings: Settings | None = None) -> Cell:
-    """Return the cell of an archive, with the friction law of settings if given.
-
-    Raises:
-        ArchiveError: the archive has no cell or no URDF, or they are not text.
-        CellError: the cell is invalid.
-    """
-    friction = {} if settings is None else settings.friction
-    return cell_from(archive.text("cell.toml"), archive.text("robot.urdf"), *friction.items())
-
-
-@lru_cache(maxsize=8)
-def cell_from(text: str, urdf: str, *friction: tuple[str, Any]) -> Cell:
-    """Return the cell of these texts, with a friction law of these entries if given."""
-    cell = Cell.from_texts(text, urdf, Path("cell.toml"))
-    return cell.with_friction(**dict(friction)) if friction else cell
+def sum_key(refs: Sequence[ArchiveRef], settings: Settings) -> str:
+    """Return the key of the sum over archives, added in this order."""
+    return json_digest(["sum", [ref.sha256 for ref in refs], settings_digest(settings)])
 
 
 def load_source(ref: ArchiveRef, *, to_fit: bool = True) -> tuple[Archive, Source]:
@@ -159,7 +128,7 @@ def cached_settings(
     """Return the settings that were decided from these archives before."""
     if not refs:
         return None
-    return cache.store(refs[0].location).get(decision_digest(options, arms, refs), Settings)
+    return cache.get(refs[0].location, decision_digest(options, arms, refs), Settings)
 
 
 def decide_settings(
@@ -194,7 +163,7 @@ def decide_settings(
     else:
         settings = carried_over(arms, sources, options)
     if not broken:
-        cache.store(refs[0].location).put(decision_digest(options, arms, refs), settings)
+        cache.put(refs[0].location, decision_digest(options, arms, refs), settings)
     return settings, broken
 
 
@@ -266,7 +235,7 @@ def reduce_bundle(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLo
                 total = own if total is None else total + own
     found = Bundle(tuple(summaries), total)
     if not broken:
-        cache.store(refs[0].location).put(sum_key(refs, settings), found)
+        cache.put(refs[0].location, sum_key(refs, settings), found)
     return replace(found, broken=tuple(broken), read=len(refs))
 
 
@@ -274,7 +243,7 @@ def cached_bundle(
     refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation
 ) -> Bundle | None:
     """Return the cached bundle of these archives; None unless all are in the cache."""
-    found = cache.store(refs[0].location).get(sum_key(refs, settings), Bundle)
+    found = cache.get(refs[0].location, sum_key(refs, settings), Bundle)
     if found is None or len(found.summaries) != len(refs):
         return None
     pairs = zip(found.summaries, refs, strict=True)  # the archives may have been moved
@@ -284,4 +253,4 @@ def cached_bundle(
 
 def is_cached(refs: Sequence[ArchiveRef], settings: Settings, cache: CacheLocation) -> bool:
     """Return whether there is a cache entry of these archives, intact or not."""
-    return cache.store(refs[0].location).has(sum_key(refs, settings))
+    return cache.has(refs[0].location, sum_key(refs, settings))

@@ -1,70 +1,68 @@
-"""Tables of the result of a batch: CSV, and Parquet with pyarrow.
-
-`parameters` has a row per estimate and parameter, `axes` a row per estimate and joint, `not_used` a
-row per archive that was left out. `docs/batch.md` describes every column.
-"""
+"""Tables of the result of a batch as CSV; `docs/batch.md` describes every column."""
 
 from __future__ import annotations
 
 import csv
-import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from datetime import datetime
-from importlib.util import find_spec
-from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from hil.files import replace_file
 from hil.reading import parse_time
 from hil.version import software
 
-from .estimates import relative_error
-from .types import BatchResult, LevelEstimate
-
-SCHEMA_VERSION: Final = 1
-"""Increased when a column changes its meaning or is removed, not when one is added."""
+from .run import BatchResult, LevelEstimate, relative_error
 
 Row = dict[str, Any]
 
-_PORTION: Final = 20_000  # rows in memory at a time
-
-
-class Table(NamedTuple):
-    """A table: file name without suffix, kind of each column, rows of a result."""
-
-    name: str
-    kinds: dict[str, str]
-    rows: Callable[[BatchResult], Iterator[Row]]
-
-    @property
-    def csv_columns(self) -> list[str]:
-        """Columns of CSV: all but lists."""
-        return [name for name, kind in self.kinds.items() if kind != "numbers"]
+_ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when"
+COLUMNS: Final = {
+    "parameters": (
+        f"{_ESTIMATE} parameter kind axis unit value std low high determined archives samples"
+        " condition relative_error unseen_relative_error method warnings estimator settings code"
+        " software"
+    ).split(),
+    "axes": (
+        f"{_ESTIMATE} axis unit samples torque_rms error_std unseen_torque_rms unseen_error_rms"
+    ).split(),
+    "not_used": ["path", "kind", "reason"],
+}
+"""Columns by table: estimates by parameter, estimates by joint, archives that were left out."""
 
 
 def write_tables(folder: Path, result: BatchResult) -> list[Path]:
     """Write all tables into an existing folder, and return their paths.
 
-    Parquet files are written if pyarrow is installed. Each file is replaced atomically.
+    Numbers have full precision, times are in ISO 8601, and unknown values are empty. Each file is
+    replaced atomically.
 
     Raises:
         OSError: a file cannot be written.
     """
-    writers = {".csv": _write_csv} | ({".parquet": _write_parquet} if has_parquet() else {})
+    rows = {
+        "parameters": _parameter_rows(result),
+        "axes": _axis_rows(result),
+        "not_used": (
+            {**one._asdict(), "kind": kind}
+            for kind, ones in (("broken", result.broken), ("skipped", result.skipped))
+            for one in ones
+        ),
+    }
     paths = []
-    for table in TABLES:
-        for ending, write in writers.items():
-            paths.append(folder / f"{table.name}{ending}")
-            with replace_file(paths[-1]) as temporary:
-                write(temporary, table, result)
+    for name, columns in COLUMNS.items():
+        paths.append(folder / f"{name}.csv")
+        with (
+            replace_file(paths[-1]) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(
+                {key: _text(value) for key, value in row.items()} for row in rows[name]
+            )
     return paths
-
-
-def has_parquet() -> bool:
-    """Return whether pyarrow is installed, so that Parquet can be written."""
-    return find_spec("pyarrow") is not None
 
 
 def _levels(result: BatchResult) -> Iterator[tuple[LevelEstimate, Row]]:
@@ -102,7 +100,7 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
         }
         axes = {term.name: model.joint_names[term.owner] for term in model.friction.terms}
         columns = (level.names, level.units, level.values.tolist(), level.std.tolist())
-        for k, (name, unit, value, std) in enumerate(zip(*columns, strict=True)):
+        for name, unit, value, std in zip(*columns, strict=True):
             half = level.interval_factor * std
             yield {
                 **shared,
@@ -115,7 +113,6 @@ def _parameter_rows(result: BatchResult) -> Iterator[Row]:
                 "low": value - half,
                 "high": value + half,
                 "determined": math.isfinite(std),
-                "covariance": None if level.covariance is None else level.covariance[k],
             }
 
 
@@ -135,82 +132,10 @@ def _axis_rows(result: BatchResult) -> Iterator[Row]:
             }
 
 
-def _unused_rows(result: BatchResult) -> Iterator[Row]:
-    for kind, ones in (("broken", result.broken), ("skipped", result.skipped)):
-        for one in ones:
-            yield {"path": one.path, "kind": kind, "reason": one.reason}
-
-
-def _kinds(columns: str) -> dict[str, str]:
-    """Return the kind of each column by name: after a colon, or text."""
-    pairs = (one.partition(":") for one in columns.split())
-    return {name: kind or "text" for name, _, kind in pairs}
-
-
-_ESTIMATE: Final = "level arm arm_digest campaign setup archive archive_sha256 when:time"
-TABLES: Final = (
-    Table(
-        "parameters",
-        _kinds(
-            f"{_ESTIMATE} parameter kind axis unit value:number std:number low:number high:number "
-            "determined:truth archives:count samples:count condition:number relative_error:number "
-            "unseen_relative_error:number method warnings estimator settings code software "
-            "covariance:numbers"
-        ),
-        _parameter_rows,
-    ),
-    Table(
-        "axes",
-        _kinds(
-            f"{_ESTIMATE} axis unit samples:count torque_rms:number error_std:number "
-            "unseen_torque_rms:number unseen_error_rms:number"
-        ),
-        _axis_rows,
-    ),
-    Table("not_used", _kinds("path kind reason"), _unused_rows),
-)
-
-
-def _write_csv(path: Path, table: Table, result: BatchResult) -> None:
-    """Write numbers in full precision, times in ISO 8601, and nothing for unknown values."""
-
-    def text(value: Any) -> Any:
-        if isinstance(value, datetime):
-            return value.isoformat()
-        return str(value).lower() if isinstance(value, bool) else _clean(value)
-
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(table.csv_columns)
-        writer.writerows(
-            [text(row[name]) for name in table.csv_columns] for row in table.rows(result)
-        )
-
-
-def _write_parquet(path: Path, table: Table, result: BatchResult) -> None:
-    # Takes half a second to import, and is optional.
-    import pyarrow
-    import pyarrow.parquet
-
-    types = {
-        "text": pyarrow.string(),
-        "number": pyarrow.float64(),
-        "count": pyarrow.int64(),
-        "truth": pyarrow.bool_(),
-        "time": pyarrow.timestamp("us", tz="UTC"),
-        "numbers": pyarrow.list_(pyarrow.float64()),
-    }
-    facts = {"schema_version": SCHEMA_VERSION, "code": result.code, "software": software()}
-    schema = pyarrow.schema(
-        [(name, types[kind]) for name, kind in table.kinds.items()],
-        metadata={"hil": json.dumps(facts)},
-    )
-    rows = ({name: _clean(value) for name, value in row.items()} for row in table.rows(result))
-    with pyarrow.parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        while portion := list(islice(rows, _PORTION)):
-            writer.write_table(pyarrow.Table.from_pylist(portion, schema=schema))
-
-
-def _clean(value: Any) -> Any:
-    """Return text without the bytes of a file name that are not UTF-8."""
+def _text(value: Any) -> Any:
+    """Return a value for CSV; text without the bytes of a file name that are not UTF-8."""
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, bool):
+        return str(value).lower()
     return value.encode("utf-8", "replace").decode("utf-8") if isinstance(value, str) else value

@@ -1,4 +1,7 @@
-"""Workers that execute the tasks of a batch: child processes here, or those of a cluster."""
+"""Workers that execute the tasks of a batch: child processes here, or those of a Dask cluster.
+
+Workers of a cluster may join, leave and die.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +11,22 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from socket import gethostname
-from typing import Any, Final, Generic, Self, TypeVar
+from typing import Any, Final, Generic, NamedTuple, Self, TypeVar
 
-from hil.errors import HilError
+from hil.errors import HilError, InputError
+from hil.version import install_command
 from identification import IdentificationError
 from planner.errors import PlannerCrashed, PlanningTimedOut
 from planner.worker import WorkerProcess
 
-from .cache import LIBRARIES, code_digest
-from .types import CacheError, Unused
+from .cache import LIBRARIES, CacheError, code_digest
 
 T = TypeVar("T")
 T_co = TypeVar("T_co", covariant=True)
@@ -30,6 +34,15 @@ Done = Callable[[int], None]
 
 TIMEOUT: Final = 300.0  # s, of one bundle of archives
 _AHEAD: Final = 4  # tasks submitted per worker
+_RETRIES: Final = 3  # of a task whose worker in a cluster failed
+_CLUSTER_AHEAD: Final = 64  # tasks submitted to a cluster, or more with more workers
+
+
+class Unused(NamedTuple):
+    """An archive or campaign that was not used, and why."""
+
+    path: str
+    reason: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +174,88 @@ class ChildExecutor(ThreadPoolExecutor):
         super().shutdown(wait=True)
         for child in self._children:
             child.close()
+
+
+class ClusterError(HilError):
+    """The cluster is lost or cannot be used."""
+
+
+class DaskWorkers(Workers):
+    """The workers of a Dask cluster, which is imported when this is used.
+
+    Args:
+        address: of the scheduler, such as ``tcp://host:8786``.
+        patience: longest wait for scheduler and workers [s].
+
+    Raises:
+        InputError: Dask is not installed, or no scheduler answers at the address.
+        ClusterError: no worker joins in time.
+    """
+
+    local = False
+
+    def __init__(self, address: str, *, patience: float = 30.0) -> None:
+        if find_spec("distributed") is None:
+            problem = "a cluster needs the package distributed, which is not installed"
+            remedy = f"install it with: {install_command('cluster')}"
+            raise InputError(None, problem, field="--dask", remedy=remedy)
+        from distributed import Client, KilledWorker
+
+        client: Any = Client
+        try:
+            self._client = client(address, timeout=patience, set_as_default=False)
+        except (OSError, ValueError) as error:
+            problem = f"no Dask scheduler answers at {address} ({error or type(error).__name__})"
+            remedy = "start one with: dask scheduler"
+            raise InputError(None, problem, field="--dask", remedy=remedy) from error
+        try:
+            self._client.wait_for_workers(1, timeout=patience)
+        except TimeoutError:
+            self._client.close()
+            raise ClusterError(
+                f"the Dask scheduler at {address} has no worker after {patience:g} s; start some: "
+                f"dask worker {address} --nthreads 1"
+            ) from None
+        threads = int(sum(self._client.nthreads().values()))
+        executor = self._client.get_executor(pure=False, retries=_RETRIES)
+        super().__init__(executor, max(_CLUSTER_AHEAD, _AHEAD * threads))
+        self.died, self.software = (KilledWorker,), software_versions()
+
+    def close(self) -> None:
+        """Disconnect from the cluster."""
+        self._executor.shutdown(wait=False)  # cancels what has not ended
+        self._client.close()
+
+    def require_folders(self, folders: Sequence[Path]) -> None:
+        """Check that every worker has these folders under the same names.
+
+        Raises:
+            ClusterError: one does not.
+        """
+        for folder in folders:
+            path = folder.resolve()
+            for worker, seen in self._client.run(Path.exists, path, on_error="return").items():
+                if seen is not True:
+                    raise ClusterError(
+                        f"the worker {worker} does not see {path}; share it with the workers under"
+                        " the same name"
+                    )
+
+    def _result(self, task: ArchiveTask[T], future: Future[T | Unused]) -> T | Unused:
+        try:
+            return super()._result(task, future)
+        except HilError:
+            raise
+        except CancelledError as error:
+            raise ClusterError(
+                "the Dask scheduler dropped the work: it was ended or restarted; finished results"
+                " are in the cache"
+            ) from error
+        except Exception as error:
+            raise ClusterError(
+                f"a worker cannot run a task ({type(error).__name__}: {error}); install the same"
+                " hil and constraints.txt on all machines"
+            ) from error
 
 
 # In a worker

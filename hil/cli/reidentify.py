@@ -13,11 +13,9 @@ import typer
 
 from hil.batch import run
 from hil.batch.cache import CacheLocation
-from hil.batch.cluster import DaskWorkers
-from hil.batch.estimates import relative_error
+from hil.batch.run import BatchEstimator, BatchResult, LevelEstimate, relative_error
 from hil.batch.table import write_tables
-from hil.batch.types import BatchEstimator, BatchResult, LevelEstimate, Unused
-from hil.batch.workers import LocalWorkers
+from hil.batch.workers import DaskWorkers, LocalWorkers, Unused
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
 from hil.files import convert_write_errors, make_folder
@@ -54,7 +52,7 @@ def reidentify(
 
     Options:
         places: Folders with archives at any depth, or archives.
-        output: Folder for the tables (CSV, Parquet). Default: none.
+        output: Folder for the tables (CSV). Default: none.
         estimator: Estimator that needs no samples: see `hil identify --estimator`.
         workers: Number of processes. Default: one per core.
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hil.batch.types import Unused
-from hil.batch.workers import ArchiveTask, LocalWorkers
+from hil.batch.workers import ArchiveTask, LocalWorkers, Unused
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import plan_around

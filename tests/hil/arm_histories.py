@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from hil.batch.types import LevelEstimate
+from hil.batch.run import LevelEstimate
 from hil.cell import Cell
 from identification import Motion, RobotModel
 from identification.estimators.covariance import with_block_covariance

@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-from hil.batch.types import ArchiveRef, Unused
-from hil.batch.workers import ArchiveTask, Workers, run_task
+from hil.batch.discovery import ArchiveRef
+from hil.batch.workers import ArchiveTask, Unused, Workers, run_task
 from hil.errors import ArchiveError
 
 NOTHING_OPEN: Final = (
@@ -84,3 +84,26 @@ def hang(_: int) -> None:
 
 def task(function, argument) -> ArchiveTask:
     return ArchiveTask(f"{function.__name__}-{argument}.mcap", function, (argument,))
+
+
+def tasks_with_failures(count, **more):
+    """Return tasks of which some fail, and the number and reason of those."""
+    reasons = {
+        "crash": "ended its process, twice",
+        "absent": "No such file",
+        "faulty": "IndexError",
+    }
+    places = {"crash": 2, "absent": 4, "faulty": 7} | more
+    tasks = [task(number, k) for k in range(count)]
+    for name, k in places.items():
+        tasks[k] = task(globals()[name], k)
+    return tasks, {k: reasons.get(name, "took too long") for name, k in places.items()}
+
+
+def check_failures(tasks, found, failing, others=None) -> None:
+    for k, one in enumerate(found):
+        if k in failing:
+            assert isinstance(one, Unused)
+            assert (one.path, failing[k] in one.reason) == (tasks[k].path, True), one
+        else:
+            assert one == (others or {}).get(k, k)

@@ -10,18 +10,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from hil.batch import cluster as dask_cluster
 from hil.batch import run
+from hil.batch import workers as batch_workers
 from hil.batch.cache import CacheLocation
-from hil.batch.cluster import ClusterError, DaskWorkers
-from hil.batch.types import Unused
-from hil.batch.workers import LocalWorkers, Workers, WorkerSoftwareError
+from hil.batch.workers import (
+    ClusterError,
+    DaskWorkers,
+    LocalWorkers,
+    Workers,
+    WorkerSoftwareError,
+)
 from hil.campaign import Campaign
 from hil.errors import InputError
 from hil.identify.options import FIXED
@@ -124,20 +128,8 @@ class TestResults:
     def test_of_failed_tasks_and_of_those_that_kill_their_worker(
         self, workers: DaskWorkers
     ) -> None:
-        tasks = tasks_of(work.number, 20)
-        errors = {
-            3: (work.absent, "No such file"), 8: (work.crash, "ended its process, twice"),
-            9: (work.faulty, "IndexError"),
-        }  # fmt: skip
-        for k, (function, _) in errors.items():
-            tasks[k] = work.task(function, k)
-        for k, one in enumerate(workers.results(tasks)):
-            if k in errors:
-                assert isinstance(one, Unused)
-                assert one.path == tasks[k].path
-                assert errors[k][1] in one.reason
-            else:
-                assert one == k
+        tasks, failing = work.tasks_with_failures(20)
+        work.check_failures(tasks, workers.results(tasks), failing)
 
     def test_with_other_code_are_refused(
         self, workers: DaskWorkers, monkeypatch: pytest.MonkeyPatch
@@ -167,17 +159,6 @@ def test_folders_must_exist_on_the_workers(workers: DaskWorkers, tmp_path: Path)
         workers.require_folders([tmp_path, tmp_path / "absent"])
 
 
-def test_a_missing_scheduler_is_an_error_with_the_address() -> None:
-    with pytest.raises(InputError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"):
-        DaskWorkers("tcp://127.0.0.1:9", patience=1.0)
-
-
-@pytest.mark.slow
-def test_a_scheduler_without_workers_is_an_error(tmp_path: Path) -> None:
-    with running(tmp_path) as own, pytest.raises(ClusterError, match="has no worker after"):
-        DaskWorkers(own.address, patience=5.0)
-
-
 @pytest.mark.slow
 def test_estimates_equal_those_of_local_workers(campaign: Campaign, workers: DaskWorkers) -> None:
     def figures(workers: Workers) -> list[bytes]:
@@ -191,7 +172,19 @@ def test_estimates_equal_those_of_local_workers(campaign: Campaign, workers: Das
         assert figures(workers) == figures(local)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("workers", "message"),
+    [(None, "no Dask scheduler answers at tcp://127.0.0.1:9"), (0, "has no worker after")],
+)
+def test_a_cluster_that_cannot_be_used_is_an_error(tmp_path, workers, message):
+    with nullcontext() if workers is None else running(tmp_path) as own:
+        address = "tcp://127.0.0.1:9" if own is None else own.address
+        with pytest.raises((InputError, ClusterError), match=message):
+            DaskWorkers(address, patience=1.0 if own is None else 5.0)
+
+
 def test_without_dask_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dask_cluster, "find_spec", lambda _: None)
+    monkeypatch.setattr(batch_workers, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         DaskWorkers("tcp://127.0.0.1:9")

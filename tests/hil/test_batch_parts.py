@@ -12,7 +12,6 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,33 +19,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from isal.isal_zlib import crc32
 
-from hil.batch import table
 from hil.batch.cache import (
     _HEAD,
     _MAGIC,
+    CacheError,
     CacheLocation,
-    Store,
-    arm_digest,
     code_digest,
     decoded,
     encoded,
+)
+from hil.batch.discovery import ArchiveRef, arm_digest
+from hil.batch.factors import (
+    BUNDLE,
+    Bundle,
+    cached_bundle,
     settings_digest,
+    split_bundles,
     sum_key,
 )
-from hil.batch.factors import BUNDLE, cached_bundle, split_bundles
-from hil.batch.table import TABLES, write_tables
-from hil.batch.types import (
-    ArchiveRef,
-    Arm,
-    BatchResult,
-    Bundle,
-    CacheError,
-    LevelEstimate,
-    Unused,
-)
-from hil.batch.workers import LocalWorkers
+from hil.batch.run import Arm, BatchResult
+from hil.batch.table import COLUMNS, write_tables
+from hil.batch.workers import LocalWorkers, Unused
 from hil.cell import Cell
-from hil.cell.schema import PayloadTable, RobotTable, TorsionSpringTable
+from hil.cell.schema import PayloadTable, TorsionSpringTable
 from hil.identify.settings import Settings
 from identification.estimators.consistent import Shrinkage
 from identification.selection.inner_prediction import Choice
@@ -60,13 +55,13 @@ from .arm_histories import cell, history, model, steady
 KEY = "0123456789abcdef"
 
 
-def a_ref(index: int, campaign: str = "/data/one") -> ArchiveRef:
-    name = f"{campaign}/archives/excitation_{index:03d}_a1.mcap"
-    return ArchiveRef(name, f"{index:064x}", "excitation", "arm", campaign, index, "cell", "motion")
+def a_ref(index):
+    name = f"/data/one/archives/excitation_{index:03d}_a1.mcap"
+    return ArchiveRef(name, f"{index:064x}", "excitation", "arm", "/data/one", index, "cell", "")
 
 
 @given(st.permutations(range(40)))
-def test_bundles_do_not_depend_on_the_order_of_archives(order: list[int]) -> None:
+def test_bundles_do_not_depend_on_the_order_of_archives(order):
     found = split_bundles([a_ref(k) for k in order])
     assert [len(one) for one in found] == [BUNDLE, BUNDLE, 40 - 2 * BUNDLE]
     assert [ref.index for one in found for ref in one] == list(range(40))
@@ -74,7 +69,7 @@ def test_bundles_do_not_depend_on_the_order_of_archives(order: list[int]) -> Non
 
 class TestCache:
     @given(st.data())
-    def test_entries_with_one_wrong_bit_are_ignored(self, data: st.DataObject) -> None:
+    def test_entries_with_one_wrong_bit_are_ignored(self, data):
         content = {"a": [1.5, "x"], "values": np.arange(7.0), "none": [np.zeros((0, 3))]}
         intact = encoded(KEY, content)
         found = decoded(intact, KEY)
@@ -96,54 +91,55 @@ class TestCache:
             *({"array": "f", "shape": [1], "at": -1}, {"array": ["a", "<f8"]}, {"array": "f"}),
         ],
     )
-    def test_forged_arrays_with_valid_checksum_are_ignored(self, array: dict[str, object]) -> None:
+    def test_forged_arrays_with_valid_checksum_are_ignored(self, array):
         text = json.dumps({"key": KEY, "content": array}).encode()
         body = text + bytes(-len(text) % 8)
         assert decoded(_HEAD.pack(_MAGIC, len(text), crc32(body)) + body, KEY) is None
 
-    def test_entries_of_two_writers_are_intact(self, tmp_path: Path) -> None:
-        store, contents = Store(tmp_path), [np.full(20_000, number) for number in (1.0, 2.0)]
+    @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "Factor"}, Bundle(), None])
+    def test_forged_sums_are_ignored(self, tmp_path, forged):
+        settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
+        cache.put(a_ref(0).location, sum_key([a_ref(0)], settings), forged)
+        assert cached_bundle([a_ref(0)], settings, cache) is None
+
+    def test_entries_of_two_writers_are_intact(self, tmp_path):
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        contents = [np.full(20_000, number) for number in (1.0, 2.0)]
         with ThreadPoolExecutor(2) as pool:
             writing = [
-                pool.submit(lambda c=one: [store.put(KEY, c) for _ in range(100)])
+                pool.submit(lambda c=one: [cache.put(place, KEY, c) for _ in range(100)])
                 for one in contents
             ]
-            found = [store.get(KEY, np.ndarray) for _ in range(100)]
+            found = [cache.get(place, KEY, np.ndarray) for _ in range(100)]
         assert all(one.exception() is None for one in writing)
         assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
         assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
 
-    @pytest.mark.parametrize("forged", [[{"gram": 3}], {"type": "Factor"}, Bundle(), None])
-    def test_forged_sums_are_ignored(self, tmp_path: Path, forged: object) -> None:
-        settings, cache = Settings(Preprocessing()), CacheLocation(str(tmp_path))
-        key = sum_key([a_ref(0)], settings)
-        cache.store(a_ref(0).location).put(key, forged)
-        assert cached_bundle([a_ref(0)], settings, cache) is None
-
     @given(st.integers(1, 6), st.booleans())
-    def test_square_matrices_are_restored_exactly(self, size: int, symmetric: bool) -> None:
+    def test_square_matrices_are_restored_exactly(self, size, symmetric):
         square = np.random.default_rng(size).normal(size=(3, size, size))
         square = square + square.swapaxes(1, 2) if symmetric else square
         data = encoded(KEY, [square])
         assert decoded(data, KEY)[0].tobytes() == square.tobytes()
         assert not symmetric or len(data) < 300 + 8 * 3 * size * (size + 1) / 2
 
-    def test_unwritable_stores_are_refused_with_a_remedy(self, tmp_path: Path) -> None:
+    def test_unwritable_folders_are_refused_with_a_remedy(self, tmp_path):
         (tmp_path / "file").write_text("")
+        cache = CacheLocation(str(tmp_path / "file"))
         with pytest.raises(CacheError, match="--cache"):
-            Store(tmp_path / "file").put(KEY, {})
-        assert Store(tmp_path / "file").get(KEY, dict) is None
+            cache.put("/data/a.mcap", KEY, {})
+        assert cache.get("/data/a.mcap", KEY, dict) is None
 
-    def test_archives_of_a_folder_share_a_store(self, tmp_path: Path) -> None:
+    def test_archives_of_a_folder_share_a_folder(self, tmp_path):
         here, there = str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")
         for place in (CacheLocation(), CacheLocation(str(tmp_path / "elsewhere"))):
-            assert place.store(here) == place.store(there)
-            assert place.store(here) != place.store(str(tmp_path / "sub" / "a.mcap"))
-        assert CacheLocation().store(here).folder == tmp_path / ".hil-cache"
+            assert place.folder(here) == place.folder(there)
+            assert place.folder(here) != place.folder(str(tmp_path / "sub" / "a.mcap"))
+        assert CacheLocation().folder(here) == tmp_path / ".hil-cache"
         (tmp_path / ".hil-cache").write_text("not a folder")
-        assert tmp_path not in CacheLocation().store(here).folder.parents
+        assert tmp_path not in CacheLocation().folder(here).parents
 
-    def test_settings_are_restored_exactly(self, tmp_path: Path) -> None:
+    def test_settings_are_restored_exactly(self, tmp_path):
         settings = Settings(
             Preprocessing(torque_bandwidth=1.0 / 3.0, torque_shape=LowPassShape(2, causal=True)),
             friction={"presliding": 1e-4, "third": "none"},
@@ -151,119 +147,90 @@ class TestCache:
             shrinkage=Shrinkage(np.inf),
             choices=(Choice("rows", ("slow", "rests"), (0.1, np.inf), 0),),
         )
-        store = Store(tmp_path)
-        store.put(KEY, settings)
-        assert store.get(KEY, Settings) == settings
-        store.put(KEY, {"velocity": "position", "torque_delay": 0.0})
-        assert store.get(KEY, Settings) is None
+        cache, place = CacheLocation(str(tmp_path)), "/data/a.mcap"
+        cache.put(place, KEY, settings)
+        assert cache.get(place, KEY, Settings) == settings
+        cache.put(place, KEY, {"velocity": "position", "torque_delay": 0.0})
+        assert cache.get(place, KEY, Settings) is None
 
 
-@pytest.mark.parametrize(
-    "name", ["batch/discovery.py", "batch/factors.py", "signals/samples.py", "record.py"]
-)
-def test_a_change_of_the_programs_changes_their_digest(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here, read = code_digest(), Path.read_bytes
+class TestDigests:
+    @pytest.mark.parametrize(
+        "name", ["batch/discovery.py", "batch/factors.py", "signals/samples.py", "record.py"]
+    )
+    def test_that_of_the_programs_depends_on_each(self, name, monkeypatch):
+        here, read = code_digest(), Path.read_bytes
 
-    def changed(path: Path) -> bytes:
-        return read(path) + (b"\n" if path.as_posix().endswith(name) else b"")
+        def changed(path):
+            return read(path) + (b"\n" if path.as_posix().endswith(name) else b"")
 
-    monkeypatch.setattr(Path, "read_bytes", changed)
-    assert code_digest.__wrapped__() != here
+        monkeypatch.setattr(Path, "read_bytes", changed)
+        assert code_digest.__wrapped__() != here
 
+    def test_that_of_an_arm_ignores_payload_and_campaign(self):
+        cell = Cell.load(CELL_PATH)
+        own = arm_digest(cell, b"drives")
+        assert arm_digest(cell.with_campaign(repetitions=7), b"drives") == own
 
-# Digests
+        def changed(**robot):
+            file = cell.file.model_copy(update={"robot": cell.file.robot.model_copy(update=robot)})
+            return arm_digest(replace(cell, file=file), b"drives")
 
+        spring = {"kind": "torsion_spring", "joint": "joint_2", "rest_deg": 0.0, "stiffness": 9.0}
+        assert changed(payload=PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])) == own
+        assert changed(gravity=[0.0, 1.0, -9.8]) != own
+        assert changed(elements=[TorsionSpringTable(**spring)]) != own
+        assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
+        assert arm_digest(cell, b"other drives") != own
 
-def with_robot(cell: Cell, robot: RobotTable) -> Cell:
-    return replace(cell, file=cell.file.model_copy(update={"robot": robot}))
-
-
-def test_digest_of_an_arm_ignores_payload_and_campaign() -> None:
-    cell = Cell.load(CELL_PATH)
-    own = arm_digest(cell, b"drives")
-    assert arm_digest(cell.with_campaign(repetitions=7), b"drives") == own
-
-    def changed(**robot: Any) -> str:
-        table = cell.file.robot.model_copy(update=robot)
-        return arm_digest(with_robot(cell, table), b"drives")
-
-    assert changed(payload=PayloadTable(mass=2.0, centre=[0.0, 0.0, 0.1])) == own
-    assert changed(gravity=[0.0, 1.0, -9.8]) != own
-    spring = TorsionSpringTable(kind="torsion_spring", joint="joint_2", rest_deg=0.0, stiffness=9.0)
-    assert changed(elements=[spring]) != own
-    assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
-    assert arm_digest(cell, b"other drives") != own
-
-
-def test_digest_of_settings_ignores_those_of_the_estimate() -> None:
-    stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
-    estimate = replace(stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),))
-    assert settings_digest(stated) == settings_digest(estimate)
-    others = [
-        stated.preprocessed(velocity="measured"),
-        stated.preprocessed(torque_delay=0.004),
-        stated.preprocessed(torque_bandwidth=30.0),
-        replace(stated, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
-        replace(stated, noise_variance=None),
-        replace(stated, friction={"presliding": 1e-4}),
-        replace(stated, delay_variance=1e-9),
-    ]
-    assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
-    assert sum_key([a_ref(0), a_ref(1)], stated) != sum_key([a_ref(1), a_ref(0)], stated)
+    def test_that_of_settings_ignores_those_of_the_estimate(self):
+        stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
+        estimate = replace(stated, shrinkage=Shrinkage(0.1), choices=(Choice("rows", (), (), 0),))
+        assert settings_digest(stated) == settings_digest(estimate)
+        others = [
+            stated.preprocessed(velocity="measured"),
+            stated.preprocessed(torque_delay=0.004),
+            stated.preprocessed(torque_bandwidth=30.0),
+            replace(stated, noise_variance=(1e-9 * (1 + 2e-16),) * 6),
+            replace(stated, noise_variance=None),
+            replace(stated, friction={"presliding": 1e-4}),
+            replace(stated, delay_variance=1e-9),
+        ]
+        assert len({settings_digest(one) for one in (stated, *others)}) == 1 + len(others)
+        assert sum_key([a_ref(0), a_ref(1)], stated) != sum_key([a_ref(1), a_ref(0)], stated)
 
 
-# Workers
+class TestWorkers:
+    def test_tasks_that_kill_or_hang_their_process_do_not_affect_others(self, tmp_path):
+        """A task whose process ends is run once more."""
+        tasks, failing = work.tasks_with_failures(12, hang=5)
+        tasks[9] = work.task(work.once, str(tmp_path / "ran"))
+        finished = []
+        with LocalWorkers(2, timeout=4.0) as workers:
+            found = list(workers.results(tasks, finished.append))
+        assert sum(finished) == 12
+        work.check_failures(tasks, found, failing, {9: "again"})
 
+    def test_closing_ends_tasks_at_work(self):
+        begin = time.monotonic()
+        with LocalWorkers(2) as workers:
+            found = workers.results([work.task(work.number, 0), *[work.task(work.hang, 1)] * 20])
+            assert next(found) == 0
+        assert time.monotonic() - begin < 60.0
 
-def test_tasks_that_kill_or_hang_their_process_do_not_affect_others(tmp_path: Path) -> None:
-    """A task whose process ends is run once more."""
-    tasks = [work.task(work.number, k) for k in range(12)]
-    failing = {
-        2: (work.crash, "ended its process, twice, with status -11"),
-        4: (work.absent, "No such file"),
-        5: (work.hang, "took too long"),
-        7: (work.faulty, "IndexError"),
-    }
-    for k, (function, _) in failing.items():
-        tasks[k] = work.task(function, k)
-    tasks[9] = work.task(work.once, str(tmp_path / "ran"))
-    finished: list[int] = []
-    with LocalWorkers(2, timeout=4.0) as workers:
-        found = list(workers.results(tasks, finished.append))
-    assert sum(finished) == 12
-    for k, one in enumerate(found):
-        if k in failing:
-            assert isinstance(one, Unused)
-            assert (one.path, failing[k][1] in one.reason) == (tasks[k].path, True), one
-        else:
-            assert one == ("again" if k == 9 else k)
-
-
-def test_closing_ends_tasks_at_work() -> None:
-    begin = time.monotonic()
-    with LocalWorkers(2) as workers:
-        found = workers.results([work.task(work.number, 0), *[work.task(work.hang, 1)] * 20])
-        assert next(found) == 0
-    assert time.monotonic() - begin < 60.0
-
-
-# Tables
 
 DOCS = Path(__file__).parents[2] / "docs" / "batch.md"
-FILE_NAME = 'line "3", spring/\udcff.mcap'
 
 
 @cache
-def result() -> BatchResult:
+def result():
     one, other = history(steady, 2, seed=2)
     undetermined = one.std.copy()
     undetermined[3] = np.inf
     repetition = replace(
         one,
         level="repetition",
-        archive=FILE_NAME,
+        archive='line "3", spring/\udcff.mcap',
         sha256="ab" * 32,
         covariance=None,
         std=undetermined,
@@ -286,26 +253,23 @@ def result() -> BatchResult:
     )
 
 
-def levels() -> list[LevelEstimate]:
-    found = result()
-    return [*found.repetitions, *found.campaigns, *found.pooled]
+def levels():
+    return [*result().repetitions, *result().campaigns, *result().pooled]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("tables")
-    write_tables(path, result())
-    return path
+def tables(tmp_path_factory):
+    """Rows of the tables by name."""
+    found = {}
+    for path in write_tables(tmp_path_factory.mktemp("tables"), result()):
+        with path.open(encoding="utf-8", newline="") as file:
+            found[path.stem] = list(csv.DictReader(file))
+    return found
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-class TestCsv:
-    def test_has_a_row_per_estimate_and_parameter(self, folder: Path) -> None:
-        rows = rows_of(folder / "parameters.csv")
+class TestTables:
+    def test_have_a_row_per_estimate_and_parameter(self, tables):
+        rows = tables["parameters"]
         columns = [
             (level.level, level.campaign, name, value, std)
             for level in levels()
@@ -326,9 +290,12 @@ class TestCsv:
         assert re.search(r"\bhil \d", row["software"])
         assert row["warnings"] == "stood still at first; two gaps"
         assert row["arm"].endswith("-digest")
+        dated = next(row for row in rows if row["level"] == "campaign")
+        assert datetime.fromisoformat(dated["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)
+        assert row["when"] == ""
 
-    def test_has_kinds_of_parameters_and_errors_of_all_joints(self, folder: Path) -> None:
-        rows = rows_of(folder / "parameters.csv")
+    def test_have_kinds_of_parameters_and_errors_of_all_joints(self, tables):
+        rows = tables["parameters"]
         by_name = {row["parameter"]: (row["kind"], row["axis"]) for row in rows}
         assert by_name["f1_3"] == ("friction", "joint_3")
         assert by_name["mc2x"] == ("inertial", "")
@@ -340,76 +307,26 @@ class TestCsv:
         assert math.isnan(float(campaign["unseen_relative_error"]))
         assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
 
-    def test_has_axes_and_what_was_not_used(self, folder: Path) -> None:
-        rows = rows_of(folder / "axes.csv")
+    def test_have_axes_and_what_was_not_used(self, tables):
+        rows = tables["axes"]
         assert len(rows) == len(levels()) * model().n_joints
         assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
         assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
-        assert [tuple(row.values()) for row in rows_of(folder / "not_used.csv")] == [
+        assert [tuple(row.values()) for row in tables["not_used"]] == [
             ("a/truncated.mcap", "broken", "its footer is missing"),
             ("a/slow.mcap", "skipped", "holds a validation run"),
         ]
 
+    def test_are_replaced_atomically(self, tmp_path):
+        write_tables(tmp_path, result())
+        before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+        with pytest.raises(KeyError):
+            write_tables(tmp_path, replace(result(), arms={}))
+        assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
-def test_parquet_has_the_same_rows_with_types(folder: Path) -> None:
-    """Also covariances, and times as such."""
-    parquet = pytest.importorskip("pyarrow.parquet")
-    for one in TABLES:
-        read: Any = parquet.read_table(folder / f"{one.name}.parquet")
-        assert read.column_names == list(one.kinds)
-        texts, typed = rows_of(folder / f"{one.name}.csv"), read.to_pylist()
-        for text, row in zip(texts, typed, strict=True):
-            assert all(same(text[name], row[name]) for name in one.csv_columns), text
-    read = parquet.read_table(folder / "parameters.parquet")
-    rows = [row for row in read.to_pylist() if row["level"] == "campaign"][: model().n_parameters]
-    np.testing.assert_array_equal(
-        [row["covariance"] for row in rows], result().campaigns[0].covariance
-    )
-    assert rows[0]["when"] == datetime(2026, 1, 1, 8, tzinfo=UTC)
-    assert read.column("covariance").to_pylist()[0] is None
-    facts = json.loads(read.schema.metadata[b"hil"])
-    assert facts["schema_version"] == table.SCHEMA_VERSION
-    assert facts["code"] == "c0de"
-
-
-def same(text: str, value: object) -> bool:
-    if isinstance(value, float):
-        return float(text) == value or (math.isnan(float(text)) and math.isnan(value))
-    if isinstance(value, datetime):
-        return datetime.fromisoformat(text) == value
-    expected = "" if value is None else str(value)
-    return text == (expected.lower() if isinstance(value, bool) else expected)
-
-
-def test_rows_are_written_in_portions(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
-    monkeypatch.setattr(table, "_PORTION", 7)
-    write_tables(tmp_path, result())
-    path = "parameters.parquet"
-    assert parquet.ParquetFile(tmp_path / path).num_row_groups > 1
-    portions, expected = (parquet.read_table(at / path).to_pylist() for at in (tmp_path, folder))
-    assert repr(portions) == repr(expected)
-
-
-def test_without_pyarrow_there_is_csv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "has_parquet", lambda: False)
-    written = write_tables(tmp_path, result())
-    assert [path.name for path in written] == [f"{one.name}.csv" for one in TABLES]
-
-
-def test_tables_are_replaced_atomically(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_tables(tmp_path, result())
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(KeyError):
-        write_tables(tmp_path, replace(result(), arms={}))
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_every_column_is_documented_and_no_other() -> None:
-    text = DOCS.read_text(encoding="utf-8")
-    for one in TABLES:
-        part = text.split(f"### `{one.name}`")[1].split("###")[0]
-        rows = re.findall(r"^\| (`.+?`(?:, `.+?`)*) \|", part, flags=re.MULTILINE)
-        assert re.findall(r"`(\w+)`", " ".join(rows)) == list(one.kinds)
+    def test_have_the_documented_columns_and_no_other(self):
+        text = DOCS.read_text(encoding="utf-8")
+        for name, columns in COLUMNS.items():
+            part = text.split(f"### `{name}`")[1].split("###")[0]
+            rows = re.findall(r"^\| (`.+?`(?:, `.+?`)*) \|", part, flags=re.MULTILINE)
+            assert re.findall(r"`(\w+)`", " ".join(rows)) == columns

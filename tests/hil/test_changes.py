@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from hil.batch.types import Arm, LevelEstimate
+from hil.batch.run import Arm, LevelEstimate
 from hil.batch.workers import LocalWorkers
 from hil.campaign import Campaign, CampaignPlan
 from hil.campaign.plan import design
