@@ -36,7 +36,7 @@ def write_outcome(folder: Path, found: Identification, reporter: Reporter) -> Re
         found.cell,
         found.estimate.pooled,
         consistency if isinstance(consistency, str) else consistency.consistent,
-        essential=None if isinstance(essential, str) else essential.elimination.estimate.names,
+        essential=None if isinstance(essential, str) else essential.estimate.names,
         provenance=provenance_of(found.results, found.paths),
     )
     results = found.results.model_copy(update={"exports": exports.result})

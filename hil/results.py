@@ -16,7 +16,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from hil.errors import InputError
 from hil.reading import parse_json, read_text
 from identification.excitation.criteria import Criteria
-from identification.selection.essential import BlindChoice, EliminationStep
+from identification.selection.essential import EliminationStep
 from identification.selection.inner_prediction import Choice
 from identification.validation.finding import Finding
 
@@ -182,10 +182,6 @@ class EssentialResult(Frozen):
     refused: list[str]
     """Parameters with a large relative standard deviation that the held-out motion needs."""
     parameters: list[EssentialParameter]
-    by_spread_left: int
-    """Number of parameters by relative standard deviation alone (Pham and Gautier)."""
-    by_spread_held_out: float  #: Held-out error of these
-    blind: BlindChoice | None
 
 
 class LinkResult(Frozen):

@@ -23,7 +23,7 @@ from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.export.friction import friction_curve, friction_torque
 from identification.factor.factor import joint_weights
-from identification.selection.essential import EssentialChoice, choose_essential
+from identification.selection.essential import Elimination, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.evidence import gather
 from identification.validation.plausibility import ConsistencyCheck, check_consistency
@@ -54,7 +54,7 @@ class Identification:
     paths: tuple[Path, ...]  #: of the archives
     prepared: Prepared
     estimation: Estimation
-    essential: EssentialChoice | str  #: essential parameters, or the reason why there are none
+    essential: Elimination | str  #: essential parameters, or the reason why there are none
     consistency: ConsistencyCheck | str  #: consistent parameters, or the reason why there are none
     verdict: Verdict
     results: Results  #: content of `results.json`
@@ -177,7 +177,7 @@ def identify_archives(
             elif consistency.costly:
                 sources = sources.with_warning(consistency.sentence)
         task.advance(1, "essential parameters")
-        essential: EssentialChoice | str = "they are chosen on held-out data, and there is none"
+        essential: Elimination | str = "they are chosen on held-out data, and there is none"
         if not sources.in_sample:
             try:
                 essential = choose_essential(cell.model, result.factor, estimation.held_out)

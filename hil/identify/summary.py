@@ -24,7 +24,7 @@ from identification.excitation import (
     information,
 )
 from identification.model.elements import TorqueRipple
-from identification.selection.essential import EssentialChoice
+from identification.selection.essential import Elimination
 from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate
 from identification.validation.evidence import Evidence
@@ -50,7 +50,7 @@ def summarise(
     verdict: Verdict,
     evidence: Evidence,
     nominal: str | None,
-    essential: EssentialChoice | str,
+    essential: Elimination | str,
     consistency: ConsistencyCheck | str,
 ) -> results.Results:
     """Return the results; `nominal` describes the nominal model.
@@ -158,17 +158,14 @@ def consistency_result(model: RobotModel, check: ConsistencyCheck) -> results.Co
     )
 
 
-def essential_result(choice: EssentialChoice) -> results.EssentialResult:
+def essential_result(choice: Elimination) -> results.EssentialResult:
     """Return the result of a choice of essential parameters."""
-    left = choice.elimination.estimate
+    left = choice.estimate
     return results.EssentialResult.of(
-        choice.elimination,
+        choice,
         parameters=results.EssentialParameter.rows(
             name=left.names, unit=left.units, estimate=left.values, std=left.std
         ),
-        by_spread_left=choice.by_spread.left,
-        by_spread_held_out=choice.by_spread.held_out,
-        blind=choice.blind,
     )
 
 

@@ -2,8 +2,7 @@
 
 The parameter of the largest relative standard deviation is removed (Pham and Gautier 1991) unless
 that raises the error on held-out motion by more than :class:`CutRule` allows; refused removals are
-tried once more at the end. :class:`BlindChoice` evaluates the choice on motion that was not used
-for it.
+tried once more at the end.
 """
 
 from __future__ import annotations
@@ -36,8 +35,6 @@ Indices = NDArray[np.intp]
 
 _CHANCE: Final = 0.05
 _TINY: Final = 1e-300
-_FITTED_SHARE: Final = 0.7  # share of the fitted motion used for the fit of a blind choice
-_FEWEST_BLOCKS: Final = 10  # minimum blocks for an error
 _MOST_BLOCKS: Final = 150
 
 
@@ -52,10 +49,6 @@ class CutRule:
     overall: float = 0.001
     axis: float = 0.005  # the same for one joint
     noticeable: float = 0.1  # share of both allowed for a significant rise
-
-
-# Elimination by Pham and Gautier, without held-out error.
-_BY_SPREAD: Final = CutRule(overall=np.inf, axis=np.inf)
 
 
 @dataclass(frozen=True)
@@ -94,55 +87,18 @@ class Elimination:
         return self.steps[self.cut]
 
 
-@dataclass(frozen=True)
-class BlindChoice:
-    """Parameters chosen within the fitted motion, evaluated on the held-out motion."""
-
-    left: int  # parameters
-    essential: float  # relative torque error on the held-out motion
-    full: float  # the same of all parameters
-
-
-class EssentialChoice(NamedTuple):
-    """Essential parameters of a robot, with their evaluation."""
-
-    elimination: Elimination  # chosen on the held-out motion
-    by_spread: EliminationStep  # last step by standard deviations alone, for comparison
-    blind: BlindChoice | None  # None if the fitted motion is too short
-
-
 def choose_essential(
     model: RobotModel, training: Factor, held_out: Sequence[Factor]
-) -> EssentialChoice:
-    """Choose the essential parameters of fitted samples, and evaluate the choice.
+) -> Elimination:
+    """Choose the essential parameters of fitted samples.
 
     Raises:
         IdentificationError: nothing was fitted, or no row was held out.
     """
-    weights = joint_weights(training)
     # Blocks are merged to some hundred, enough for significance.
     longer = max(1, sum(len(factor) for factor in held_out) // _MOST_BLOCKS)
     unseen = joined([factor.merged(longer) for factor in held_out]).occupied()
-    return EssentialChoice(
-        elimination=eliminate(model, training, unseen, weights=weights),
-        by_spread=eliminate(model, training, unseen, weights=weights, rule=_BY_SPREAD).chosen,
-        blind=_choose_blind(model, training, unseen, weights),
-    )
-
-
-def _choose_blind(
-    model: RobotModel, training: Factor, unseen: Factor, weights: Array
-) -> BlindChoice | None:
-    used = training.occupied()
-    cut = round(_FITTED_SHARE * len(used))
-    if len(used) - cut < _FEWEST_BLOCKS:
-        return None
-    first, last = used.blocks(slice(0, cut)), used.blocks(slice(cut, None))
-    chosen = np.flatnonzero(eliminate(model, first, last, weights=weights).values)
-    equations, values = training.weighted(weights), np.zeros(model.n_parameters)
-    values[chosen] = solve(equations.part(chosen)).values
-    full = solve(equations).values
-    return BlindChoice(len(chosen), unseen.relative_error(values), unseen.relative_error(full))
+    return eliminate(model, training, unseen, weights=joint_weights(training))
 
 
 def eliminate(

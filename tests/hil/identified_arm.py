@@ -18,7 +18,7 @@ from hil.outcome import Exports, exports_of
 from identification import Estimate, Motion
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Factor, estimate, joint_weights
-from identification.selection.essential import EssentialChoice, choose_essential
+from identification.selection.essential import Elimination, choose_essential
 from identification.signals.samples import Samples
 from identification.validation.plausibility import ConsistencyCheck
 
@@ -41,7 +41,7 @@ class IdentifiedArm:
     truth: Array
     estimate: Estimate
     consistency: ConsistencyCheck
-    essential: EssentialChoice
+    essential: Elimination
 
 
 def write_exports(folder: Path, *args: Any, **kwargs: Any) -> Exports:

@@ -57,7 +57,7 @@ def arm() -> IdentifiedArm:
 
 
 def exported(arm: IdentifiedArm, folder: Path) -> Exports:
-    names, consistent = arm.essential.elimination.estimate.names, arm.consistency.consistent
+    names, consistent = arm.essential.estimate.names, arm.consistency.consistent
     return write_exports(
         folder, arm.cell, arm.estimate, consistent, essential=names, provenance=PROVENANCE
     )

@@ -557,8 +557,7 @@ class TestNumbers:
 
 
 ESSENTIAL = {
-    "reason": "2 of 58 are essential", "cut": 1, "refused": ["f1_1"], "by_spread_left": 7,
-    "by_spread_held_out": 0.0412, "blind": {"left": 7, "essential": 0.0612, "full": 0.0534},
+    "reason": "2 of 58 are essential", "cut": 1, "refused": ["f1_1"],
     "steps": [{"removed": name, "left": 2, "spread": 3.0, "in_sample": 0.02, "held_out": 0.02,
                "largest_relative_std": 0.1} for name in (None, "f0_2")],
     "parameters": [{"name": "f1_1", "unit": "N·m·s/rad", "estimate": 8.0, "std": 0.1}],
@@ -588,7 +587,6 @@ class TestTrust:
         page = rendered(make_results(essential=ESSENTIAL, consistency=CONSISTENCY))
         for words in (
             "2 of 58 are essential",
-            "7 parameters predict the held-out motion with an error of 6.12%",
             "left out: f0_2",
             "needed for held-out motion",
             "by more than three standard deviations: mc2x, f0_1.",
