@@ -1,35 +1,73 @@
-"""Prediction errors, and coverage of intervals of held-out torque."""
+"""Prediction errors, intervals of held-out torque, patterns of residuals, and plausibility."""
 
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
+import pinocchio as pin
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.signal import lfilter
 
-from identification import (
-    Factor,
-    IdentificationError,
-    PredictionError,
-    Samples,
-    estimate_repetitions,
-    prediction_error,
-)
-from identification.factor.factor import joint_weights, solve
+from identification.errors import IdentificationError
+from identification.estimators.covariance import with_block_covariance
+from identification.estimators.least_squares import estimate_repetitions
+from identification.factor.factor import Estimate, Factor, estimate, joint_weights, solve
+from identification.model.coupling import Coupling
+from identification.model.friction import FrictionLaw
+from identification.model.robot import RobotModel
 from identification.signals.masks import EDGE, SATURATED, STANDSTILL, RowMask
+from identification.signals.recording import Recording
+from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repetition_noise
-from identification.validation.prediction import pooled_error, slow_error
+from identification.validation.finding import Thresholds
+from identification.validation.plausibility import (
+    Implausible,
+    check_consistency,
+    implausibilities,
+    inertia_matrices,
+    inertia_ratio,
+    nominal_scale,
+)
+from identification.validation.position_jumps import position_jumps
+from identification.validation.prediction import (
+    PredictionError,
+    pooled_error,
+    prediction_error,
+    slow_error,
+)
+from identification.validation.residuals import (
+    FEWEST_BLOCKS,
+    HARMONICS,
+    BlockMean,
+    FrictionDrift,
+    Ripple,
+    autocorrelation,
+    block_mean,
+    check_residuals,
+    find_outliers,
+)
+from tests.hil.identified_arm import a_motion as sines
+from tests.hil.identified_arm import packaged_urdf
+from tests.identification.test_essential import NOISE as PLANTED_NOISE
+from tests.identification.test_essential import a_motion as three_sines
+from tests.identification.test_verdict import an_error, finding_of, judged
 from tests.identification.two_link import (
     MODEL,
     NOISE,
+    URDF,
     a_motion,
     as_samples,
     coloured,
     one_sine,
     recording,
+    simulated,
+    sine_motion,
     truth,
+    values_of,
 )
 
 torques = arrays(np.float64, (20, 2), elements=st.floats(-100, 100, width=32))
@@ -222,3 +260,526 @@ class TestTorqueMeans:
         means = TorqueMeans.of(MODEL, [samples])
         np.testing.assert_array_equal(means.count[:2], [[80, 80], [100, 100]])
         np.testing.assert_allclose(means.errors(truth())[:2], [[0.25] * 2, [0.0] * 2], atol=1e-9)
+
+
+STEP = 4e-3
+VALUES = values_of(MODEL, [4.0, 2.0, 1.5, 0.8])
+GEAR = np.diag([100.0, -80.0])
+RESIDUAL_NOISE = 0.5
+MEMORY = 0.05  # s, of the unit_noise noise
+
+
+def unit_noise(rng, shape, memory=MEMORY):
+    """Return first-order noise of unit variance, correlated over `memory` seconds."""
+    decay = np.exp(-STEP / memory)
+    white = np.sqrt(1.0 - decay**2) * rng.standard_normal(shape)
+    return np.asarray(lfilter([1.0], [1.0, -decay], white, axis=0))
+
+
+def a_run(seed, disturbance=None, *, duration=12.0, noise=RESIDUAL_NOISE):
+    time = np.arange(round(duration / STEP)) * STEP
+    rng = np.random.default_rng(seed)
+    amplitude, rate = rng.uniform(0.3, 0.9, (3, 2)), rng.uniform(0.7, 3.0, (3, 2))
+    motion = sine_motion(time, amplitude, rate, rng.uniform(0.0, 6.0, (3, 2)))
+    torque = MODEL.torque(VALUES, *motion[1:])
+    torque = torque + noise * unit_noise(rng, torque.shape)
+    if disturbance is not None:
+        torque = torque + disturbance(motion, seed)
+    return as_samples(MODEL, motion, torque)
+
+
+def patterns_of(disturbance=None, *, first_seed=0, noise=RESIDUAL_NOISE):
+    runs = [a_run(first_seed + k, disturbance, noise=noise) for k in range(6)]
+    return check_residuals(MODEL, VALUES, runs[:5], runs[5:], motor_from_joint=GEAR)
+
+
+class TestCorrelation:
+    @pytest.mark.parametrize("memory", [0.01, 0.05])
+    def test_its_time_is_that_of_theory(self, memory):
+        rng = np.random.default_rng(2)
+        residual = unit_noise(rng, (200_000, 2), memory)
+        found = autocorrelation([(residual, np.ones(residual.shape, dtype=bool))], STEP)
+        decay = np.exp(-STEP / memory)
+        expected = 0.5 * STEP * (1.0 + decay) / (1.0 - decay)
+        np.testing.assert_allclose(found.time, expected, rtol=0.15)
+        # White noise: half a step, all samples independent.
+        rows = 0.5 * STEP * len(residual) / expected
+        np.testing.assert_allclose(found.effective_rows, rows, rtol=0.15)
+
+    @given(st.integers(20, 60), st.integers(0, 2**32 - 1), st.integers(1, 3))
+    @settings(max_examples=25, deadline=None)
+    def test_it_is_that_of_counting_pairs(self, rows, seed, runs):
+        rng = np.random.default_rng(seed)
+        parts = [(rng.standard_normal((rows, 1)), rng.random((rows, 1)) > 0.3) for _ in range(runs)]
+        found = autocorrelation(parts, STEP, longest=10 * STEP)
+        masked = [np.where(usable, left, np.nan)[:, 0] for left, usable in parts]
+        products = [
+            np.concatenate([one[: rows - lag] * one[lag:] for one in masked]) for lag in range(11)
+        ]
+        expected = [np.nansum(one) / max(1, np.isfinite(one).sum()) for one in products]
+        if expected[0] > 0.0:
+            np.testing.assert_allclose(
+                found.correlation[:, 0], np.array(expected) / expected[0], atol=1e-9
+            )
+
+    def test_block_means_cover_unlike_independent_samples(self):
+        blocks, per_block, seeds = 60, 125, 400
+        inside, naive = 0, 0
+        for seed in range(seeds):
+            noise = unit_noise(np.random.default_rng(seed), (blocks * per_block,))
+            sums = noise.reshape(blocks, per_block).sum(axis=1, keepdims=True)
+            found = block_mean([np.array([sums, np.full((blocks, 1), float(per_block))])])
+            inside += abs(found.mean[0]) < 1.96 * found.std[0]
+            naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
+        assert 0.90 < inside / seeds < 0.98
+        assert naive / seeds < 0.6
+
+    def test_repeated_errors_are_not_more_certain(self):
+        rng = np.random.default_rng(3)
+        motion = np.array([rng.standard_normal((40, 1)), np.ones((40, 1))])
+        once, thrice = block_mean([motion]), block_mean([motion] * 3, repeated=3)
+        other = block_mean([motion] * 3)
+        assert thrice.mean[0] == pytest.approx(once.mean[0])
+        assert thrice.std[0] == pytest.approx(once.std[0])
+        assert other.std[0] == pytest.approx(once.std[0] / np.sqrt(3.0), rel=0.02)
+        assert np.isnan(block_mean([np.ones((2, FEWEST_BLOCKS - 1, 1))]).mean).all()
+
+
+class TestResidualChecks:
+    def test_coloured_noise_is_not_reported(self):
+        alarms = np.zeros(4)
+        campaigns = 25
+        for campaign in range(campaigns):
+            checks = patterns_of(first_seed=100 * campaign)
+            assert checks.ripple is not None and checks.drift is not None
+            for k, check in enumerate((checks.speed, checks.position, checks.ripple, checks.drift)):
+                alarms[k] += np.count_nonzero(check.significant)
+        # 50 joints at 0.001 each: two findings have a probability of 0.1 %.
+        assert (alarms <= 1).all(), alarms
+
+    def test_wrong_friction_shows_over_speed(self):
+        def stribeck(motion, _):
+            extra = 1.0 * np.sign(motion.velocity) * np.exp(-((motion.velocity / 0.5) ** 2))
+            return np.asarray(extra * np.array([0.0, 1.0]))
+
+        checks = patterns_of(stribeck)
+        assert checks.speed.significant.tolist() == [False, True]
+        at, size = checks.speed.worst(1)
+        assert abs(at) < 0.6 and np.sign(size) == np.sign(at)
+
+    def test_a_position_dependent_torque_shows_over_position(self):
+        checks = patterns_of(lambda motion, _: 0.6 * np.cos(3.0 * motion.position) * [1.0, 0.0])
+        assert checks.position.significant.tolist() == [True, False]
+        # RMS of the true wave, within binning and noise.
+        assert checks.position.rms[0] == pytest.approx(0.6 / np.sqrt(2.0), rel=0.25)
+
+    @pytest.mark.parametrize("harmonic", HARMONICS)
+    def test_ripple_is_found_with_its_harmonic_and_amplitude(self, harmonic):
+        planted = np.array([0.0, 0.4])
+
+        def ripple(motion, _):
+            return np.asarray(planted * np.sin(harmonic * motion.position @ GEAR.T + 0.7))
+
+        found = patterns_of(ripple).ripple
+        assert found.significant.tolist() == [False, True]
+        assert found.strongest(1) == harmonic
+        amplitude = found.amplitude[1, HARMONICS.index(harmonic)]
+        assert amplitude == pytest.approx(0.4, abs=0.05)
+        assert found.rms[1] == pytest.approx(0.4 / np.sqrt(2.0), abs=0.05)
+
+    def test_friction_drift_is_measured(self):
+        friction = np.where(MODEL.friction_columns, VALUES, 0.0)
+
+        def cooling(motion, seed):
+            # Five fitted recordings: from +4 % to -4 % of the second joint's friction.
+            change = 0.04 - 0.02 * seed
+            return np.asarray(change * MODEL.torque(friction, *motion[1:]) * np.array([0.0, 1.0]))
+
+        drift = patterns_of(cooling, noise=0.1).drift
+        assert drift is not None and len(drift.share) == 15
+        assert drift.significant.tolist() == [False, True]
+        assert drift.change[1] == pytest.approx(-0.08, abs=4.0 * drift.change_std[1])
+        assert drift.change_std[1] < 0.02
+
+    def test_drift_is_measured_within_one_recording(self):
+        found = check_residuals(MODEL, VALUES, [a_run(1, duration=30.0)])
+        assert found.drift is not None and len(found.drift.share) >= 4
+        assert found.ripple is None  # without gear ratios
+
+    def test_outliers_are_found_and_removed(self):
+        random = np.random.default_rng(5)
+        torque, residual = 10.0 * random.standard_normal((2, 5000, 2))
+        residual *= 0.01
+        hit = random.permutation(5000)[:25]
+        residual[hit, 1] += 20.0
+        usable = np.ones((5000, 2), dtype=np.bool_)
+        usable[hit[:5], 1] = False  # unusable rows are no outliers
+        found = find_outliers(torque, residual, usable)
+        np.testing.assert_allclose(found.share, [0.0, 20 / 4995])
+        assert found.power[0] == 0.0 and found.power[1] > 0.9
+        np.testing.assert_allclose(found.without.rms, [0.1, 0.1], rtol=0.05)
+        assert found.without.rows.tolist() == [5000, 4975]
+        noise = np.random.default_rng(6).standard_normal((20000, 3)) * [1e-6, 1.0, 1e6]
+        found = find_outliers(noise, noise, np.ones(noise.shape, dtype=np.bool_))
+        np.testing.assert_array_equal(found.share, 0.0)
+
+
+NAMES = ("shoulder", "elbow")
+LIMIT = Thresholds()
+
+
+def ripple(size):
+    mean = np.zeros((2, len(HARMONICS), 2))
+    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
+    std = np.full_like(mean, 1e-6)
+    return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
+
+
+def drift(*change):
+    """Return a drift over ten parts with small scatter."""
+    total = np.array(change)
+    return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
+
+
+@pytest.fixture(scope="module")
+def valid():
+    return replace(patterns_of(), ripple=None, drift=None, rms=np.full(2, 0.01))
+
+
+class TestPatterns:
+    """Findings of a verdict on patterns."""
+
+    def found(self, valid, check, **changes):
+        return finding_of(check, NAMES, residuals=replace(valid, **changes))
+
+    def test_untested_patterns_have_no_finding(self, valid):
+        checks = {one.check for one in judged(NAMES, residuals=valid).findings}
+        assert "whiteness" in checks and not {"torque ripple", "friction over time"} & checks
+
+    @pytest.mark.parametrize(
+        ("share", "level"),
+        [(0.0, "good"), (0.9 * LIMIT.ripple, "information"), (1.1 * LIMIT.ripple, "doubtful")],
+    )
+    def test_large_ripple_is_doubtful(self, valid, share, level):
+        found = self.found(valid, "torque ripple", ripple=ripple(share * valid.torque_rms[1]))
+        assert found.level == level and "shoulder" not in found.words
+        expected = f"elbow (4 per motor turn, {share:.1%} of its torque)"
+        assert (expected in found.words) == (level != "good")
+
+    @pytest.mark.parametrize(
+        ("change", "share", "level", "words"),
+        [
+            ((1e-5, -1e-5), 1.0, "good", "did not change"),
+            ((0.02, 0.0), 1.0, "information", "shoulder by +2.0%, at most 2.0% of an axis"),
+            ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
+            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: elbow by -20.0%"),
+        ],
+    )
+    def test_drift_is_judged_by_its_torque(self, valid, change, share, level, words):
+        friction = np.array([share, 1.0])
+        found = self.found(
+            valid, "friction over time", drift=drift(*change), friction_share=friction
+        )
+        assert found.level == level and words in found.words
+        assert (found.role == "cause") == (level == "doubtful")
+
+
+def parameters(model=MODEL, **changes):
+    """Parameters of the URDF with rotors and friction, and with changes by name."""
+    standard = dict(zip(model.layout.names, model.nominal, strict=True))
+    standard |= {"I1m": 0.4, "I2m": 0.1}
+    names = model.parameter_names[model.base.rank :]
+    friction = dict(zip(names, [4, 2, 1.5, 0.8, 1.0, 1.0], strict=False))
+    for name, value in changes.items():
+        (friction if name in friction else standard)[name] = value
+    return np.concatenate([model.base.grouping @ list(standard.values()), list(friction.values())])
+
+
+def known(values, model=MODEL, std=0.01):
+    """Estimate with a relative standard deviation."""
+    return Estimate(
+        names=model.parameter_names, units=model.units, values=values,
+        covariance=np.diag((std * np.maximum(np.abs(values), 0.1)) ** 2), noise_std=np.ones(2),
+        samples=np.full(2, 1000), method="", condition=10.0,
+    )  # fmt: skip
+
+
+def with_value(name, value, std=0.01):
+    """Estimate of the arm with another value of one parameter."""
+    values = parameters()
+    values[MODEL.parameter_names.index(name)] = value
+    return replace(known(parameters(), std=std), values=values)
+
+
+def signs(found, model=MODEL, *, error=0.1):
+    motion = one_sine(np.arange(2000) * 2e-3)
+    return implausibilities(
+        model,
+        found,
+        Factor.from_samples(model, motion, np.zeros((2000, 2))),
+        np.full(2, error),
+        speed=np.abs(motion.velocity).max(axis=0),
+    )
+
+
+class TestSigns:
+    @pytest.mark.parametrize(
+        ("found", "words"),
+        [
+            (with_value("f0_1", -4.0), "Coulomb friction of shoulder is negative"),
+            (with_value("f1_2", -1.0), "friction of elbow is"),
+            (with_value("I2m", -0.1), "I2m is negative"),
+        ],
+    )
+    def test_impossible_signs_are_named(self, found, words):
+        assert any(words in one for one in signs(found).impossible)
+
+    def test_signs_within_the_uncertainty_are_possible(self):
+        """So are undetermined parameters, and friction that falls from 2 to 1.3 N·m."""
+        unknown = with_value("I2m", -0.1)
+        index = unknown.names.index("I2m")
+        covariance = unknown.covariance.copy()
+        covariance[index, index] = np.inf
+        assert signs(replace(unknown, covariance=covariance)) == Implausible((), ())
+        assert signs(with_value("I2m", -0.1, std=1.0)) == Implausible((), ())
+        assert signs(with_value("f1_2", -0.15)).impossible == ()
+        assert signs(known(parameters())) == Implausible((), ())
+
+    def test_signs_of_a_torque_below_the_error_are_doubtful(self):
+        found = signs(with_value("I2m", -0.01), error=5.0)
+        assert found.impossible == ()
+        assert any("I2m is negative" in words for words in found.doubtful)
+
+    def test_negative_friction_of_a_coupled_motor_is_named(self):
+        coupling = Coupling(np.array([[1.0, 0.0], [0.5, 1.0]]), inertia=False)
+        coupled = RobotModel.from_urdf(URDF, friction=MODEL.friction.laws[0], coupling=coupling)
+        arm = partial(parameters, coupled)
+        (words,) = signs(known(arm(f1_m2=-1.0), coupled), coupled).impossible
+        assert words.startswith("friction f1_m2 of motor 2 is negative: -1")
+        assert signs(known(arm(), coupled), coupled) == Implausible((), ())
+
+
+def runs(**changes):
+    return [
+        simulated(MODEL, parameters(**changes), three_sines(k), PLANTED_NOISE, k) for k in (1, 2)
+    ]
+
+
+def consistency_of(recordings):
+    training, unseen = (Factor.by_time(MODEL, run) for run in recordings)
+    weights = joint_weights(training)
+    free = with_block_covariance(estimate(MODEL, training, weights), training, weights)
+    return check_consistency(MODEL, training, unseen, free, weights=weights)
+
+
+class TestConsistencyCheck:
+    """Rise of the held-out error by physical consistency, and the active bounds."""
+
+    def test_consistent_data_cost_nothing(self):
+        found = consistency_of(runs())
+        assert abs(found.cost) < 0.001
+        assert not found.costly and not found.impossible
+        assert found.bounds == () and np.all(found.room > 0.5)
+        assert "consistent parameters predict as well" in found.sentence
+
+    def test_the_cost_is_the_rise_of_the_error(self):
+        recordings = runs(I2m=-0.1)
+        found, run = consistency_of(recordings), recordings[1]
+        torque = np.where(run.usable, run.torque, 0.0)
+        both = found.consistent.estimate.values, found.consistent.unconstrained.values
+        errors = [
+            torque - np.where(run.usable, MODEL.torque(one, *run.motion[1:]), 0.0) for one in both
+        ]
+        ours, free = (np.linalg.norm(one) / np.linalg.norm(torque) for one in errors)
+        assert found.cost == pytest.approx(ours - free, rel=1e-6)
+        size = np.linalg.norm(torque, axis=0)
+        ours, free = (np.linalg.norm(one, axis=0) / size for one in errors)
+        np.testing.assert_allclose(found.held_out_rise, ours - free, rtol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"I2m": -0.6}, "elbow"),
+            ({"f0_2": -2.0}, "Coulomb friction of elbow would be negative"),
+            ({"f1_1": -1.5}, "viscous friction of shoulder would be negative"),
+        ],
+    )
+    def test_active_bounds_are_named_with_their_joint(self, change, words):
+        found = consistency_of(runs(**change))
+        assert found.costly and words in found.sentence
+        assert any(words in bound for bound in found.bounds)
+
+    def test_a_torque_of_the_wrong_sign_is_impossible(self):
+        found = consistency_of([replace(run, torque=run.torque * [-1.0, 1.0]) for run in runs()])
+        assert found.impossible and "shoulder" in found.sentence
+        assert found.sentence.startswith("no physically consistent parameters fit")
+
+    def test_a_negative_second_moment_is_an_active_bound(self):
+        """That of the elbow's link about its own centre."""
+        found = consistency_of(runs(I2yy=0.05, I2m=0.0))
+        assert found.room[1] < 0.01
+        assert any("link of elbow" in bound for bound in found.bounds)
+
+
+def uneven(rate, *, jitter=0.0, seed=0):
+    rng = np.random.default_rng(seed)
+    time = np.cumsum((1.0 + jitter * rng.uniform(-1.0, 1.0, int(12 * rate))) / rate)
+    q = np.column_stack([0.8 * np.sin(w * time + w) + 0.3 * np.sin(3.1 * w * time) for w in (2, 3)])
+    q += 2e-5 * rng.standard_normal(q.shape)
+    return Recording(time, q, ("hip", "knee"), torque=np.zeros_like(q))
+
+
+def with_jump(one, size, rows):
+    position = one.position.copy()
+    position[rows, 1] += size
+    return replace(one, position=position)
+
+
+def sudden_stop():
+    """From 1 rad/s to rest within one sample."""
+    time = np.arange(0.0, 8.0, 0.002)
+    q = np.column_stack([np.minimum(time, 4.0), np.sin(time)])
+    q += 1e-5 * np.random.default_rng(1).standard_normal(q.shape)
+    return Recording(time, q, ("a", "b"), torque=np.zeros_like(q))
+
+
+def jump_in_a_gap():
+    one = with_jump(uneven(500.0), 0.3, slice(2500, None))
+    return replace(one, gap_before=np.arange(len(one.time)) == 2500)
+
+
+class TestPositionJumps:
+    @pytest.mark.parametrize("rate", [100.0, 125.0, 500.0, 1000.0])
+    @pytest.mark.parametrize("size", [0.2, 0.02, -0.02])
+    def test_a_lasting_jump_is_found(self, rate, size):
+        one, at = uneven(rate), int(5 * rate)
+        (jump,) = position_jumps(with_jump(one, size, slice(at, None)), "log.mcap")
+        assert (jump.recording, jump.joint) == ("log.mcap", "knee")
+        assert jump.time == pytest.approx(one.time[at] - one.time[0])
+        assert jump.size == pytest.approx(size, abs=2e-3)
+        finding = finding_of("position jumps", ("hip", "knee"), jumps=(jump,))
+        assert finding.level == "wrong" and "knee" in finding.words and "knee" in finding.next_step
+
+    @pytest.mark.parametrize("rate", [100.0, 500.0, 5000.0])
+    @pytest.mark.parametrize("jitter", [0.0, 0.3])
+    def test_motion_with_an_uneven_clock_has_no_jump(self, rate, jitter):
+        assert position_jumps(uneven(rate, jitter=jitter, seed=3)) == []
+
+    @pytest.mark.parametrize(
+        "one",
+        [sudden_stop(), jump_in_a_gap(), with_jump(uneven(500.0), 0.2, slice(2500, 2501))],
+        ids=["sudden stop", "gap", "glitch of one sample"],
+    )
+    def test_other_steps_are_no_jumps(self, one):
+        assert position_jumps(one) == []
+
+
+LOADED_AXES = range(1, 4)  # of the UR5, whose rigid torque exceeds their friction
+
+
+def findings(model, **context):
+    """Findings of a verdict with this context."""
+    error = an_error(0.05, joints=model.n_joints)
+    known = judged(model.joint_names, held_out=error, training=error).findings
+    found = judged(model.joint_names, held_out=error, training=error, **context).findings
+    return [one for one in found if one not in known]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return RobotModel.from_urdf(packaged_urdf("ur5_robot.urdf"), friction=FrictionLaw(offset=True))
+
+
+def standard(model, wrong, seed):
+    """Nominal parameters with every link off by its own share, and rotors."""
+    values = model.nominal.copy()
+    rng = np.random.default_rng(seed)
+    for link in range(model.n_joints):
+        rows = model.layout.links[link]
+        values[rows] *= 1.0 + wrong * rng.uniform(-1.0, 1.0)
+    values[model.layout.rotors] = 0.2
+    return values
+
+
+def runs_of(model, values, seed):
+    friction = [{"f0": 3.0, "f1": 2.0, "fo": 0.2}.get(t.symbol, 0.3) for t in model.friction.terms]
+    truth = np.concatenate([model.base.grouping @ values, friction])
+    motions = [sines(model.n_joints, 10 * seed + number) for number in range(2)]
+    noise = [0.02 * model.torque(truth, *motion[1:]).std(axis=0) for motion in motions]
+    return [simulated(model, truth, *one, seed) for one in zip(motions, noise, strict=True)]
+
+
+def nominal(model):
+    return values_of(model, np.zeros(model.n_parameters - model.base.rank))
+
+
+class TestNominalScale:
+    @pytest.mark.parametrize("seed", range(10))
+    def test_links_off_by_a_tenth_are_no_finding(self, model, seed):
+        found = nominal_scale(
+            model, nominal(model), runs_of(model, standard(model, 0.1, seed), seed)
+        )
+        assert np.isfinite(found.scale[2])
+        assert findings(model, nominal_scale=found) == []
+
+    @pytest.mark.parametrize("axis", LOADED_AXES)
+    @pytest.mark.parametrize("factor", [0.6, 1.5])
+    def test_a_wrong_torque_constant_is_a_finding(self, model, axis, factor):
+        scaled = []
+        for run in runs_of(model, standard(model, 0.05, axis), axis):
+            torque = run.torque.copy()
+            torque[:, axis] *= factor
+            scaled.append(replace(run, torque=torque))
+        found = nominal_scale(model, nominal(model), scaled)
+        assert np.flatnonzero(found.off).tolist() == [axis]
+        assert found.scale[axis] == pytest.approx(factor, rel=0.1)
+        (finding,) = findings(model, nominal_scale=found)
+        name = model.joint_names[axis]
+        assert finding.level == "doubtful" and name in finding.words and name in finding.next_step
+
+    @pytest.mark.parametrize("factor", [0.01, 1000.0, -1.0])
+    def test_torques_with_another_factor_are_wrong(self, model, factor):
+        """Another unit, motor torques, or all of them negated; nothing is known without masses."""
+        runs = runs_of(model, standard(model, 0.05, 1), 1)
+        scaled = [replace(run, torque=factor * run.torque) for run in runs]
+        (finding,) = findings(model, nominal_scale=nominal_scale(model, nominal(model), scaled))
+        assert finding.level == "wrong"
+        if factor > 0.0:
+            assert "unit" in finding.next_step and "side" in finding.next_step
+        else:
+            assert finding.check == "direction of axes"
+            assert "all torques have the opposite sign" in finding.words
+        massless = nominal_scale(model, 0.0 * nominal(model), scaled)
+        assert np.isnan(massless.scale).all() and findings(model, nominal_scale=massless) == []
+
+
+@cache
+def arm():
+    """Model, parameters, postures, and the diagonal by pinocchio, rotors of 0.2 included."""
+    urdf = packaged_urdf("ur5_robot.urdf")
+    model = RobotModel.from_urdf(urdf)
+    values = values_of(model, np.full(model.n_parameters - model.base.rank, 3.0), 0.2)
+    position = np.random.default_rng(1).uniform(-2.0, 2.0, (20, 6))
+    reference = pin.buildModelFromXML(urdf)
+    data = reference.createData()
+    diagonal = np.array([np.diag(pin.crba(reference, data, q)) for q in position]) + 0.2
+    return model, values, position, diagonal
+
+
+class TestInertia:
+    def test_inertia_matrices_are_those_of_pinocchio(self):
+        model, values, position, diagonal = arm()
+        matrices = inertia_matrices(model, values, position)
+        np.testing.assert_allclose(np.diagonal(matrices, axis1=1, axis2=2), diagonal, rtol=1e-9)
+
+    def test_another_inertia_of_the_controller_is_a_finding(self):
+        """A joint without one is not."""
+        model, values, position, diagonal = arm()
+        theirs = diagonal * np.array([1.0, 1.1, 0.9, 1.0, 0.0, 1.0 / 0.7])
+        found = inertia_ratio(model, values, position, theirs)
+        np.testing.assert_allclose(found.ratio, [1.0, 1.1, 0.9, 1.0, np.nan, 1.0 / 0.7], rtol=1e-9)
+        np.testing.assert_allclose(found.spread[:4], 0.0, atol=1e-9)
+        (finding,) = findings(model, controller_inertia=found)
+        assert finding.level == "doubtful"
+        assert "wrist_3_joint 1.43" in finding.words and "wrist_2_joint" not in finding.words
+        assert inertia_ratio(model, values, position, 0.0 * diagonal) is None
