@@ -160,18 +160,15 @@ def run_design(
         identity = {"settings": _flat(settings), "cell": fingerprint(cell)}
         with folder.opened_journal() as file:
             journal = _journal(file, identity, reporter)
-            try:
-                design = run_search(
-                    cell,
-                    settings,
-                    reporter,
-                    workers=workers,
-                    stop=stop,
-                    problem=problem,
-                    journal=journal,
-                )
-            finally:
-                journal.close()
+            design = run_search(
+                cell,
+                settings,
+                reporter,
+                workers=workers,
+                stop=stop,
+                problem=problem,
+                journal=journal,
+            )
         if journal.error is not None:
             reporter.say(
                 f"the last scores are not in the journal ({journal.error.strerror}); a resumed "

@@ -1,20 +1,29 @@
+"""Searches, their scores, the polish of their best motion, and journals of scores."""
+
+import errno
 import io
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from identification.excitation import KINDS
 from identification.excitation.constraints import CurrentModel, check_motion, midpoints
 from identification.excitation.criteria import coupling_index_max
+from identification.excitation.errors import JournalError
 from identification.excitation.genomes import SineGenome
+from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import Population, SearchSettings
-from identification.excitation.searches.run import most_evaluations, search
-from identification.excitation.searches.scores import Front, Scale, Scores, unplanned
+from identification.excitation.searches.run import dominating, most_evaluations, polish, search
+from identification.excitation.searches.scores import ROW, Front, Scale, Scores, unplanned
 from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded
@@ -81,7 +90,7 @@ def population(shared):
     return shared.begin()
 
 
-def settings(method, **others):
+def asked(method, **others):
     return replace(SETTINGS, method=method, **others)
 
 
@@ -102,7 +111,7 @@ class TestChoice:
     @pytest.mark.parametrize("weights", [(0.7, 0.3), (0.0, 1.0)])
     def test_the_largest_fitness_is_chosen(self, population, method, weights):
         """Determinant, eq. 7, or both measures in units of their spread over 200 random motions."""
-        chosen = settings(method, weights=weights)
+        chosen = asked(method, weights=weights)
         design = search(population, chosen)
         random = Scores.of_rows(population.rows[0])
         assert len(random.duration) == (200 if method == "balanced" else 12)
@@ -111,7 +120,7 @@ class TestChoice:
         assert best.tobytes() == design.genes.tobytes()
 
     def test_the_front_is_not_dominated_and_its_knee_is_chosen(self, population):
-        design = search(population, settings("front"))
+        design = search(population, asked("front"))
         best = Front.of(np.concatenate(population.genes), population.everything)
         assert design.front.measures.tolist() == best.measures.tolist()
         assert design.chosen == design.front.knee(Scale.of(Scores.of_rows(population.rows[0])))
@@ -119,8 +128,8 @@ class TestChoice:
 
     @pytest.mark.parametrize("method", METHODS)
     def test_a_polish_is_never_worse(self, population, method):
-        unpolished = search(population, settings(method))
-        chosen = settings(method, polish=60)
+        unpolished = search(population, asked(method))
+        chosen = asked(method, polish=60)
         polished = search(population, chosen)
         assert polished.excitation.tried > unpolished.excitation.tried
         # The front stays as the search found it.
@@ -144,13 +153,13 @@ class TestChoice:
         """Method A of the paper, eq. 8, with a ramp so that it can be run."""
         sines = problem(SineGenome(LIMITS, length=6.0, ramp=1.0))
         with Population(sines) as population:
-            design = search(population, settings("a"))
+            design = search(population, asked("a"))
         assert isinstance(design.excitation.trajectory, FourierSeries)
         assert design.excitation.method == "a"
         assert not check_motion(design.excitation.trajectory, LIMITS)
 
 
-def opened(file, chosen):
+def journal_of(file, chosen):
     return Journal(file, {"settings": asdict(chosen)})
 
 
@@ -158,7 +167,7 @@ class TestRun:
     @pytest.mark.parametrize("method", METHODS)
     def test_a_seed_determines_every_bit(self, population, method, capsys):
         """With any number of processes, whatever the generator that everybody shares."""
-        chosen = settings(method, polish=40)
+        chosen = asked(method, polish=40)
         np.random.seed(1)  # noqa: NPY002
         first = search(population, chosen)
         between = np.random.get_state()  # noqa: NPY002
@@ -179,17 +188,17 @@ class TestRun:
     )
     def test_resumed_it_equals_an_uninterrupted_one(self, population, method, stop, interrupt):
         """After a request to stop, or an interrupt that loses one generation."""
-        chosen = settings(method, polish=60)
+        chosen = asked(method, polish=60)
         whole = bits(search(population, chosen))
         sizes = [len(genes) for genes in population.genes]
         file, first = io.BytesIO(), population.begin(interrupt)
         try:
-            half = search(first, chosen, journal=opened(file, chosen), stop=Stop(stop))
+            half = search(first, chosen, journal=journal_of(file, chosen), stop=Stop(stop))
             assert not half.complete and half.generations == min(stop, 4)
         except KeyboardInterrupt:
             assert len(population.genes) == interrupt
         done = len(population.genes)
-        journal = opened(file, chosen)
+        journal = journal_of(file, chosen)
         resumed = search(population.begin(), chosen, journal=journal)
         assert bits(resumed) == whole and resumed.complete
         assert journal.recalled == sum(sizes[:done])
@@ -199,18 +208,18 @@ class TestRun:
         seen, counts = [], []
         with Population(problem()) as population:
             design = search(
-                population, settings("front", polish=40), progress=seen.append, scored=counts.append
+                population, asked("front", polish=40), progress=seen.append, scored=counts.append
             )
         assert [each.phase for each in seen] == ["sample"] + 4 * ["search"] + 2 * ["polish"]
         assert [each.generation for each in seen] == [0, 1, 2, 3, 4, 4, 4]
         assert [each.evaluated for each in seen][:5] == [200, 212, 224, 236, 248]
         assert seen[-1].evaluated == design.excitation.tried == sum(counts)
-        assert design.excitation.tried <= most_evaluations(settings("front", polish=40)) == 288
+        assert design.excitation.tried <= most_evaluations(asked("front", polish=40)) == 288
         assert all(each.feasible == each.evaluated for each in seen)
         assert list(seen[4].best) == design.front.measures[design.origin].tolist()
 
     def test_a_motion_that_crashes_its_process_does_not_win(self, population):
-        small = settings("b", population=6, generations=1)
+        small = asked("b", population=6, generations=1)
         best = search(population, small).genes[0]
         crashing = faulty(crash=(best - 0.01, best + 0.01))
         with Population(problem(crashing), workers=2) as others:
@@ -219,7 +228,7 @@ class TestRun:
         assert abs(design.genes[0] - best) > 0.01
 
     def test_a_search_without_new_motions_ends_as_exhausted(self, population):
-        design = search(population, settings("b", population=2, crossover=0.0, mutation=0.0))
+        design = search(population, asked("b", population=2, crossover=0.0, mutation=0.0))
         assert design.complete and design.exhausted
         assert design.generations == 1
         assert design.excitation.tried == 2
@@ -318,9 +327,7 @@ class TestInfeasibleMotions:
         bound = float(np.quantile(random.duration, 0.005))
         seen = []
         with Population(problem(max_duration=bound)) as narrow:
-            design = search(
-                narrow, settings("b", generations=25, mutation=0.1), progress=seen.append
-            )
+            design = search(narrow, asked("b", generations=25, mutation=0.1), progress=seen.append)
         assert seen[0].feasible == 0
         assert design.excitation.trajectory.duration <= bound
         excitation = design.excitation
@@ -337,7 +344,7 @@ class TestInfeasibleMotions:
         )
         with RecordingPopulation(problem(limits=slow, max_duration=0.5)) as impossible:
             with pytest.raises(NoFeasibleMotionError) as caught:
-                search(impossible, settings("front"))
+                search(impossible, asked("front"))
             scores = impossible.everything
         error = caught.value
         assert error.tried == len(scores.duration)
@@ -357,20 +364,325 @@ class TestInfeasibleMotions:
 
     def test_an_early_stop_is_reported(self, population):
         with pytest.raises(NoFeasibleMotionError, match=r"no motion was tried.*stopped") as caught:
-            search(population, settings("a"), stop=lambda: True)
+            search(population, asked("a"), stop=lambda: True)
         assert (caught.value.tried, caught.value.stopped) == (0, True)
         assert population.genes == []
         with (
             Population(problem(max_duration=0.5)) as impossible,
             pytest.raises(NoFeasibleMotionError, match=r"none of 12 .*stopped before its end"),
         ):
-            search(impossible, settings("a"), stop=Stop(1))
+            search(impossible, asked("a"), stop=Stop(1))
 
     def test_motions_that_excite_too_little_are_no_result(self):
         """The elbow rests: all constraints are satisfied, its friction is not excited."""
         with Population(problem(faulty(elbow_at_rest=True))) as population:
             for method in METHODS:
                 with pytest.raises(NoFeasibleMotionError, match="without excitation") as caught:
-                    search(population, settings(method, generations=2))
+                    search(population, asked(method, generations=2))
                 assert caught.value.unexciting == caught.value.tried
                 assert caught.value.rejected == {}
+
+
+N = 12
+TARGET = np.linspace(0.2, 0.8, N)
+START = TARGET + 0.05
+# Ten times as long as wide, and not along the axes.
+DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((N, N)))[0]
+STIFFNESS = np.logspace(0, 2, N)
+
+
+def bowl(genes):
+    return np.sum(STIFFNESS * ((genes - TARGET) @ DIRECTIONS) ** 2, axis=1)
+
+
+def scores_of(log10_det, coupling_index, excess=0.0):
+    measures = np.column_stack(np.broadcast_arrays(log10_det, coupling_index))
+    broken = np.zeros((len(measures), len(KINDS)))
+    broken[:, 3] = excess
+    return Scores(measures, np.full(len(measures), 5.0), broken)
+
+
+class Bowl:
+    """Motions with a maximum of the determinant, 100, at the target."""
+
+    def __init__(self, excess=lambda genes: 0.0):
+        self.scored = []
+        self.excess = excess
+
+    def score(self, genes):
+        self.scored.append(genes.copy())
+        found = scores_of(100.0 - bowl(genes), 80.0, self.excess(genes))
+        genes.fill(np.nan)  # callers must pass copies
+        return found
+
+
+class TwoGoals:
+    """Larger determinants near one point, less coupling near another."""
+
+    def score(self, genes):
+        return scores_of(
+            100.0 - 30.0 * np.sum((genes - TARGET) ** 2, axis=1),
+            80.0 + 50.0 * np.sum((genes - TARGET[::-1]) ** 2, axis=1),
+        )
+
+
+def size_of(scores):
+    return scores.measure("log10_det")
+
+
+def polished(population, genes, fitness=size_of, **others):
+    """Polish from genes whose scores are known; returns genes and scores."""
+    scores = population.score(np.array(genes, dtype=np.float64, ndmin=2))
+    if hasattr(population, "scored"):
+        population.scored.clear()
+    others = {"evaluations": 200, "seed": 1} | others
+    return polish(population.score, genes, scores, fitness, **others)
+
+
+def failing(genes):
+    """As if every process was killed."""
+    return Scores.of_rows(np.tile(unplanned(), (len(genes), 1)))
+
+
+SCRIPT = """
+import numpy as np
+from identification.excitation.searches.run import polish
+from tests.identification.test_search import scores_of, size_of
+
+def score(genes):
+    size = 100.0 - np.sum(np.arange(1, 91) * (genes - 0.4) ** 2 * (2 + np.roll(genes, 1, 1)), 1)
+    return scores_of(size, 80.0)
+
+start = np.full(90, 0.5)
+genes, _ = polish(score, start, score(start[None]), size_of, evaluations=1200, seed=1)
+print(genes.tobytes().hex())
+"""
+
+
+class TestPolish:
+    def test_it_finds_the_maximum_of_a_narrow_ridge(self):
+        genes, scores = polished(Bowl(), START, evaluations=6000)
+        np.testing.assert_allclose(genes, TARGET, atol=1e-3)
+        assert scores.rows.tobytes() == Bowl().score(genes[None].copy()).rows.tobytes()
+
+    @pytest.mark.parametrize(
+        ("score", "start", "fitness"),
+        [
+            (Bowl().score, TARGET, size_of),
+            (Bowl().score, START, lambda scores: np.zeros(len(scores.duration))),
+            (failing, START, size_of),
+        ],
+    )
+    def test_only_improvements_replace_the_start(self, score, start, fitness):
+        known = Bowl().score(start[None].copy())
+        genes, scores = polish(score, start, known, fitness, evaluations=200, seed=1)
+        assert genes.tobytes() == start.tobytes()
+        assert scores.rows.tobytes() == known.rows.tobytes()
+
+    @pytest.mark.parametrize("corner", [0.0, 1.0])
+    def test_genes_stay_within_bounds_from_a_corner_too(self, corner):
+        population = Bowl()
+        polished(population, np.full(N, corner), evaluations=1500)
+        tried = np.concatenate(population.scored)
+        assert np.all((tried >= 0.0) & (tried <= 1.0)) and np.all(np.ptp(tried, axis=0) > 0.0)
+
+    def test_constraints_come_before_the_fitness(self):
+        def beyond(genes):  # excludes the target
+            return np.maximum(0.0, START[0] - 0.02 - genes[:, 0])
+
+        genes, scores = polished(Bowl(beyond), START, evaluations=2000)
+        assert scores.feasible.all() and size_of(scores)[0] > 100.0 - bowl(START[None])[0]
+        assert genes[0] == pytest.approx(START[0] - 0.02, abs=2e-3)  # at the constraint
+
+        def around(genes):
+            return np.maximum(0.0, genes[:, 0] - START[0] + 0.03)
+
+        assert polished(Bowl(around), START, evaluations=1000)[1].feasible.all()
+        everywhere = Bowl(lambda genes: 1.0 + bowl(genes))
+        _, scores = polished(everywhere, START, lambda scores: -size_of(scores), evaluations=600)
+        assert scores.excess.sum() < 1.0 + 0.1 * bowl(START[None])[0]
+
+    @settings(max_examples=20, deadline=None)
+    @given(st.integers(0, 2**32), st.lists(st.floats(0, 1), min_size=N, max_size=N))
+    def test_it_is_never_worse_than_its_start(self, seed, genes):
+        def rugged(scores):
+            return np.sin(1e4 * size_of(scores))
+
+        population = Bowl(lambda genes: np.maximum(0.0, np.sin(50.0 * genes.sum(axis=1)) - 0.5))
+        before = population.score(np.array([genes]))
+        _, after = polished(population, np.array(genes), rugged, evaluations=60, seed=seed)
+        excess = before.excess.sum(), after.excess.sum()
+        assert excess[1] <= excess[0]
+        if excess[1] == excess[0]:
+            assert rugged(after)[0] >= rugged(before)[0]
+
+    def test_it_ends_on_request_and_when_steps_are_tiny(self):
+        population = Bowl()
+
+        def enough():
+            return len(population.scored) > 5
+
+        _, scores = polished(population, START, evaluations=10_000, stop=enough)
+        assert len(population.scored) == 6
+        assert size_of(scores)[0] == max(100.0 - bowl(genes).min() for genes in population.scored)
+        polished(population, START, evaluations=100_000)
+        assert sum(map(len, population.scored)) < 50_000
+
+    def test_a_compromise_improves_in_all_measures_or_stays(self):
+        genes = np.clip(0.5 * (TARGET + TARGET[::-1]) + 0.1, 0.0, 1.0)
+        before = TwoGoals().score(genes[None])
+        _, after = polished(TwoGoals(), genes, dominating(before), evaluations=2000)
+        assert size_of(after)[0] > size_of(before)[0]
+        assert after.measure("coupling_index")[0] < before.measure("coupling_index")[0]
+        largest = TwoGoals().score(TARGET[None])
+        found, _ = polished(TwoGoals(), TARGET, dominating(largest), evaluations=500)
+        assert found.tobytes() == TARGET.tobytes()
+
+    @pytest.mark.slow
+    def test_the_threads_of_linear_algebra_change_nothing(self):
+        genes = [
+            subprocess.run(
+                [sys.executable, "-c", SCRIPT],
+                env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
+                capture_output=True,
+                text=True,
+                check=True,
+            ).stdout
+            for threads in ("1", "2")
+        ]
+        assert len(genes[0]) > 90
+        assert genes[0] == genes[1]
+
+
+SEARCH = {"settings": {"seed": 1, "population": 4}, "cell": {"urdf": "a"}}
+
+
+def generation(seed, count=4):
+    random = np.random.default_rng(seed)
+    rows = random.normal(size=(count, ROW))
+    rows[1] = unplanned()
+    return random.random((count, 8)), Scores.of_rows(rows)
+
+
+def opened(file):
+    return Journal(file, SEARCH)
+
+
+def written(count):
+    """Return a journal of some generations, and its lengths, first without any."""
+    file = io.BytesIO()
+    opened_journal = opened(file)
+    lengths = [len(file.getvalue())]
+    for seed in range(count):
+        opened_journal.record(*generation(seed))
+        lengths.append(len(file.getvalue()))
+    return file, lengths
+
+
+def known(file):
+    """Return the number of generations in a journal, each bit for bit."""
+    opened_journal = opened(file)
+    count = 0
+    while (scores := opened_journal.recall(generation(count)[0])) is not None:
+        assert scores.rows.tobytes() == generation(count)[1].rows.tobytes()
+        count += 1
+    return count
+
+
+class TestRecall:
+    def test_a_truncated_journal_loses_one_generation(self):
+        file, lengths = written(3)
+        content = file.getvalue()
+        assert known(io.BytesIO(content)) == 3
+        for length in {*range(0, lengths[0], 7), *range(lengths[2], len(content), 31), *lengths}:
+            truncated = io.BytesIO(content[:length])
+            count = known(truncated)
+            assert count == sum(length >= end for end in lengths[1:])
+            opened(truncated).record(*generation(count))
+            assert known(truncated) == count + 1
+
+    def test_records_after_a_damaged_one_are_dropped(self):
+        file, lengths = written(4)
+        for offset in range(lengths[1], lengths[2], 97):
+            damaged = bytearray(file.getvalue())
+            damaged[offset] ^= 0x10
+            again = io.BytesIO(bytes(damaged))
+            opened_journal = opened(again)
+            found = [opened_journal.recall(generation(seed)[0]) is not None for seed in range(4)]
+            assert found == [True, False, False, False]
+            assert opened_journal.damaged == lengths[4] - lengths[1]
+            opened_journal.record(*generation(1))
+            assert known(again) == 2
+
+    def test_other_genes_are_not_recalled(self):
+        file, _ = written(3)
+        opened_journal = opened(file)
+        others, scores = generation(7)
+        moved, _ = generation(1)
+        moved[2, 3] = np.nextafter(moved[2, 3], 2.0)
+        for genes in (others, moved, moved[:3]):
+            assert opened_journal.recall(genes) is None
+        opened_journal.record(others, scores)
+        again = opened(file)
+        for genes in (others, generation(2)[0], generation(0)[0]):
+            assert again.recall(genes) is not None
+        assert (again.recalled, again.damaged) == (12, 0)
+
+
+class FullDisk(io.BytesIO):
+    """A file with partial writes, and errors while there is no room."""
+
+    room = True
+
+    def write(self, content):
+        if not self.room:
+            super().write(bytes(content)[:50])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return super().write(bytes(content)[:1000])
+
+
+class TestWriting:
+    def test_a_record_that_the_disk_refuses_is_left_out(self):
+        file = FullDisk()
+        opened_journal = opened(file)
+        opened_journal.record(*generation(0))
+        file.room = False
+        opened_journal.record(*generation(7))
+        assert opened_journal.error is not None and opened_journal.error.errno == errno.ENOSPC
+        assert known(io.BytesIO(file.getvalue())) == 1
+        file.room = True
+        opened_journal.record(*generation(1))
+        assert opened_journal.error is None
+        assert known(io.BytesIO(file.getvalue())) == 2
+
+
+FIRST_LINE = b"hil search journal 2\n"
+
+
+class TestOtherFiles:
+    @pytest.mark.parametrize(
+        ("other", "words"),
+        [
+            ({"settings": {"seed": 2, "population": 4}}, "settings seed was 1, is 2"),
+            ({"cell": {"urdf": "b"}}, "cell urdf was 'a', is 'b'"),
+            ({"earlier": {"x.mcap": "00"}}, "earlier x.mcap was None, is '00'"),
+            ({}, "versions pymoo was .*, is '0.5.0'"),
+        ],
+    )
+    def test_the_journal_of_another_search_is_refused(self, monkeypatch, other, words):
+        """Or of another release."""
+        file, _ = written(1)
+        before = file.getvalue()
+        if not other:
+            ours = journal.versions()
+            monkeypatch.setattr(journal, "versions", lambda: {**ours, "pymoo": "0.5.0"})
+        with pytest.raises(JournalError, match=words):
+            Journal(file, SEARCH | other)
+        assert file.getvalue() == before
+
+    @pytest.mark.parametrize("content", [b"x", FIRST_LINE + b"{}" * 50, FIRST_LINE])
+    def test_another_file_is_refused_and_unchanged(self, content):
+        file = io.BytesIO(content + b" ")
+        with pytest.raises(JournalError):
+            opened(file)
+        assert file.getvalue() == content + b" "

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import struct
 import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
-from time import monotonic
 from typing import Any, BinaryIO, Final
 
 import numpy as np
@@ -31,7 +29,6 @@ Array = NDArray[np.float64]
 _DISTRIBUTIONS: Final = ("hil", "numpy", "scipy", "pymoo", "cma", "ruckig", "pin", "coal")
 _FIRST_LINE: Final = b"hil search journal 2\n"
 _FRAME: Final = struct.Struct("<QI")
-_SYNC_PERIOD: Final = 5.0  # s
 
 
 def versions() -> dict[str, str]:
@@ -48,12 +45,12 @@ class Journal:
 
     The file is unbuffered, empty or an earlier journal of this search, and closed by the caller.
     `search` has tables by name of all that scores depend on, for JSON. Records after a damaged one
-    are dropped; records that the disk refuses are written with the next one.
+    are dropped; a record that the disk refuses is left out.
 
     Attributes:
         recalled: number of motions whose scores were read from the file.
         damaged: number of dropped bytes after the last valid record.
-        error: why records are pending in memory, None if none are.
+        error: why the last record was not written, None if it was.
 
     Raises:
         JournalError: the file is not a journal, or is that of another search or software.
@@ -65,8 +62,6 @@ class Journal:
         self.recalled = self.damaged = 0
         self.error: OSError | None = None
         self._rows: dict[bytes, Array] = {}
-        self._pending = b""
-        self._synced = monotonic()
         identity = json.dumps({**search, "versions": versions()}, sort_keys=True).encode()
         head = _FIRST_LINE + _framed(identity)
         file.seek(0)
@@ -103,21 +98,8 @@ class Journal:
         content = io.BytesIO()
         for array in (genes, scores.rows):
             np.save(content, np.asarray(array, dtype="<f8"), allow_pickle=False)
-        self._pending += _framed(content.getvalue())
-        self._write(sync=monotonic() - self._synced >= _SYNC_PERIOD)
-
-    def close(self) -> None:
-        """Write pending records and sync; the file stays open."""
-        self._write(sync=True)
-
-    def _write(self, *, sync: bool) -> None:
         try:
-            self._append(self._pending)
-            self._pending = b""
-            if sync:
-                with suppress(io.UnsupportedOperation):  # a file in memory
-                    os.fsync(self._file.fileno())
-                self._synced = monotonic()
+            self._append(_framed(content.getvalue()))
             self.error = None
         except OSError as error:
             self.error = error
