@@ -33,6 +33,10 @@ START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
 STEP = 5e-4
 
 
+def rigid_plant(truth: PlantTruth = TRUTH, **options) -> Plant:
+    return Plant(ns16.urdf_text(), truth, position=START, **options)
+
+
 def full_inertia(plant: Plant) -> Array:
     upper = np.triu(pin.crba(plant.model, plant.model.createData(), plant.position))
     return upper + np.triu(upper, 1).T
@@ -44,28 +48,35 @@ def gravity_torque(plant: Plant) -> Array:
     )
 
 
-def swing(truth: PlantTruth, step: float, duration: float = 1.0) -> tuple[Plant, float]:
-    """Let the arm fall freely; return it and the largest error of its energy [J]."""
-    plant = Plant(ns16.urdf_text(), truth, position=START)
+def steps(plant: Plant, count: int, torque: Array | None = None) -> Plant:
+    """Step with this torque, or with that of gravity."""
+    for _ in range(count):
+        plant.step(gravity_torque(plant) if torque is None else torque, STEP)
+    return plant
+
+
+def swing(step: float) -> tuple[Plant, float]:
+    """Let the arm fall freely for a second; return it and the largest error of its energy [J]."""
+    plant = rigid_plant(FRICTIONLESS)
     before, worst = plant.energy(), 0.0
-    for _ in range(round(duration / step)):
+    for _ in range(round(1.0 / step)):
         plant.step(np.zeros(6), step)
         worst = max(worst, abs(plant.energy() - before))
     return plant, worst
 
 
 def test_energy_is_conserved_to_second_order_in_the_step() -> None:
-    plant, worst = swing(FRICTIONLESS, STEP)
+    plant, worst = swing(STEP)
     kinetic = 0.5 * plant.velocity @ full_inertia(plant) @ plant.velocity
     assert kinetic > 100.0  # the fall is a real one
     assert worst < 2e-5 * kinetic
-    _, coarse = swing(FRICTIONLESS, 2.0 * STEP)
+    _, coarse = swing(2.0 * STEP)
     assert coarse / worst == pytest.approx(4.0, rel=0.2)
 
 
 def test_inverse_dynamics_of_a_step_give_the_applied_torque() -> None:
     """At the middle of a step: applied torque = rigid bodies + friction."""
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
+    plant = rigid_plant()
     rng = np.random.default_rng(3)
     plant.set_state(START, rng.uniform(0.3, 1.5, 6) * rng.choice([-1.0, 1.0], 6))
     torque = rng.uniform(-1.0, 1.0, 6) * [400.0, 600.0, 200.0, 30.0, 40.0, 30.0]
@@ -91,81 +102,65 @@ def test_inverse_dynamics_of_a_step_give_the_applied_torque() -> None:
 
 
 def test_rotors_count_as_armature() -> None:
-    with_rotors = Plant(ns16.urdf_text(), FRICTIONLESS, position=START)
-    without = Plant(ns16.urdf_text(), PlantTruth.frictionless(np.zeros(6)), position=START)
-    difference = full_inertia(with_rotors) - full_inertia(without)
+    plants = rigid_plant(FRICTIONLESS), rigid_plant(PlantTruth.frictionless(np.zeros(6)))
+    difference = full_inertia(plants[0]) - full_inertia(plants[1])
     np.testing.assert_allclose(difference, np.diag(TRUTH.rotor_inertia), atol=1e-12)
-    torque = gravity_torque(with_rotors) + 10.0
-    for plant in (with_rotors, without):
-        plant.step(torque, 1e-6)
-        np.testing.assert_allclose(
-            plant.acceleration, np.linalg.solve(full_inertia(plant), np.full(6, 10.0)), rtol=1e-4
-        )
+    for plant in plants:
+        plant.step(gravity_torque(plant) + 10.0, 1e-6)
+        expected = np.linalg.solve(full_inertia(plant), np.full(6, 10.0))
+        np.testing.assert_allclose(plant.acceleration, expected, rtol=1e-4)
 
 
-def test_stiction_holds_a_resting_arm() -> None:
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
-    push = 0.95 * TRUTH.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
-    torque = gravity_torque(plant) + push
-    for _ in range(4000):
-        plant.step(torque, STEP)
-    np.testing.assert_array_equal(plant.position, START)
-    np.testing.assert_array_equal(plant.velocity, 0.0)
-    np.testing.assert_allclose(plant.friction_torque, push, rtol=1e-9)
+class TestStandstill:
+    def test_stiction_holds_a_resting_arm(self) -> None:
+        plant = rigid_plant()
+        push = 0.95 * TRUTH.coulomb * [1.0, -1.0, 1.0, -1.0, 1.0, -1.0]
+        steps(plant, 4000, gravity_torque(plant) + push)
+        np.testing.assert_array_equal(plant.position, START)
+        np.testing.assert_array_equal(plant.velocity, 0.0)
+        np.testing.assert_allclose(plant.friction_torque, push, rtol=1e-9)
 
+    @pytest.mark.parametrize("joint", range(6))
+    @pytest.mark.parametrize(("factor", "moves"), [(0.999, False), (1.02, True)])
+    def test_an_axis_breaks_loose_just_above_its_coulomb_torque(
+        self, joint: int, factor: float, moves: bool
+    ) -> None:
+        plant = rigid_plant()
+        torque = gravity_torque(plant)
+        torque[joint] += factor * TRUTH.coulomb[joint]
+        assert bool(steps(plant, 10, torque).velocity[joint] > 0.0) is moves
 
-def test_an_axis_breaks_loose_just_above_its_coulomb_torque() -> None:
-    for joint in range(6):
-        for factor, moves in ((0.999, False), (1.02, True)):
-            plant = Plant(ns16.urdf_text(), TRUTH, position=START)
-            torque = gravity_torque(plant)
-            torque[joint] += factor * TRUTH.coulomb[joint]
-            for _ in range(10):
-                plant.step(torque, STEP)
-            assert bool(plant.velocity[joint] > 0.0) is moves, (joint, factor)
+    def test_a_pushed_arm_comes_to_rest_and_stays_there(self) -> None:
+        plant = rigid_plant()
+        plant.set_state(START, [0.4, -0.3, 0.5, 1.0, -1.0, 2.0])
+        crossings = np.zeros(6)
+        for _ in range(4000):
+            before = np.sign(plant.velocity)
+            crossings += before * np.sign(steps(plant, 1).velocity) < 0.0
+        np.testing.assert_array_equal(plant.velocity, 0.0)
+        assert crossings.max() <= 1  # no chatter about zero
+        at_rest = plant.position.copy()
+        np.testing.assert_array_equal(steps(plant, 100).position, at_rest)
 
-
-def test_a_pushed_arm_comes_to_rest_and_stays_there() -> None:
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
-    plant.set_state(START, [0.4, -0.3, 0.5, 1.0, -1.0, 2.0])
-    crossings = np.zeros(6)
-    for _ in range(4000):
-        before = np.sign(plant.velocity)
-        plant.step(gravity_torque(plant), STEP)
-        crossings += before * np.sign(plant.velocity) < 0.0
-    np.testing.assert_array_equal(plant.velocity, 0.0)
-    assert crossings.max() <= 1  # no chatter about zero
-    at_rest = plant.position.copy()
-    for _ in range(100):
-        plant.step(gravity_torque(plant), STEP)
-    np.testing.assert_array_equal(plant.position, at_rest)
-
-
-def test_closed_brakes_stop_and_hold_the_arm() -> None:
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START, brake_torque=2000.0)
-    plant.set_state(START, np.full(6, 2.0))
-    plant.close_brakes(True)
-    for _ in range(1000):
-        plant.step(np.zeros(6), STEP)
-    np.testing.assert_array_equal(plant.velocity, 0.0)
-    plant.close_brakes(False)
-    for _ in range(20):
-        plant.step(np.zeros(6), STEP)
-    assert plant.velocity.any()
+    def test_closed_brakes_stop_and_hold_the_arm(self) -> None:
+        plant = rigid_plant(brake_torque=2000.0)
+        plant.set_state(START, np.full(6, 2.0))
+        plant.close_brakes(True)
+        np.testing.assert_array_equal(steps(plant, 1000, np.zeros(6)).velocity, 0.0)
+        plant.close_brakes(False)
+        assert steps(plant, 20, np.zeros(6)).velocity.any()
 
 
 def test_a_state_that_is_not_finite_is_an_error() -> None:
-    plant = Plant(ns16.urdf_text(), TRUTH, position=START)
     with pytest.raises(PlantDiverged):
-        for _ in range(10):
-            plant.step(np.full(6, np.nan), STEP)
+        steps(rigid_plant(), 10, np.full(6, np.nan))
 
 
 def test_the_inertia_scale_applies_to_mass_moment_and_tensor() -> None:
     scale = np.array([1.2, 0.8, 1.1, 0.9, 1.15, 0.85])
     truths = TRUTH, replace(TRUTH, inertia_scale=scale)
     unscaled, scaled = (
-        [body.toDynamicParameters() for body in list(Plant(ns16.urdf_text(), t).model.inertias)[1:]]
+        [body.toDynamicParameters() for body in list(rigid_plant(t).model.inertias)[1:]]
         for t in truths
     )
     np.testing.assert_allclose(scaled, scale[:, None] * unscaled, rtol=1e-12, atol=1e-14)
@@ -200,70 +195,56 @@ def test_friction_falls_from_cold_to_hot_by_the_stated_share() -> None:
 SOFT = (1.0e-6, 1.0e-6, 2.5e-6, 0.0, 0.0, 0.0)
 
 
-def elastic(truth: PlantTruth, compliance: tuple[float, ...] = SOFT) -> ElasticPlant:
-    return ElasticPlant(ns16.urdf_text(), truth, elasticity=compliance, step=STEP, position=START)
+def elastic(
+    truth: PlantTruth = TRUTH, compliance: tuple[float, ...] = SOFT, **options
+) -> ElasticPlant:
+    return ElasticPlant(
+        ns16.urdf_text(), truth, elasticity=compliance, step=STEP, position=START, **options
+    )
 
 
-def test_springs_carry_gravity_from_the_start() -> None:
-    plant = elastic(TRUTH)
-    gravity = pin.computeGeneralizedGravity(plant.model, plant.model.createData(), START)
-    np.testing.assert_allclose(plant.motor_position - START, gravity * SOFT, atol=1e-15)
-    for _ in range(200):
-        plant.step(gravity, STEP)
-    np.testing.assert_allclose(plant.position, START, atol=1e-9)
+class TestElasticGears:
+    def test_springs_carry_gravity_from_the_start(self) -> None:
+        plant = elastic()
+        gravity = gravity_torque(plant)
+        np.testing.assert_allclose(plant.motor_position - START, gravity * SOFT, atol=1e-15)
+        np.testing.assert_allclose(steps(plant, 200, gravity).position, START, atol=1e-9)
 
+    def test_a_stiff_gear_is_a_rigid_one(self) -> None:
+        stiff, rigid = elastic(compliance=(5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0)), rigid_plant()
+        for k in range(1000):
+            torque = np.array([900.0, -300.0, 0.0, 5.0, 15.0, 8.0]) * np.sin(0.01 * k)
+            steps(stiff, 1, torque)
+            steps(rigid, 1, torque)
+        assert np.abs(rigid.velocity).max() > 0.3
+        np.testing.assert_allclose(stiff.velocity, rigid.velocity, atol=2e-2)
+        np.testing.assert_allclose(stiff.position, rigid.position, atol=2e-3)
 
-def test_a_stiff_gear_is_a_rigid_one() -> None:
-    stiff = elastic(TRUTH, (5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0))
-    rigid = Plant(ns16.urdf_text(), TRUTH, position=START)
-    for k in range(1000):
-        torque = np.array([900.0, -300.0, 0.0, 5.0, 15.0, 8.0]) * np.sin(0.01 * k)
-        stiff.step(torque, STEP)
-        rigid.step(torque, STEP)
-    assert np.abs(rigid.velocity).max() > 0.3
-    np.testing.assert_allclose(stiff.velocity, rigid.velocity, atol=2e-2)
-    np.testing.assert_allclose(stiff.position, rigid.position, atol=2e-3)
+    def test_damped_springs_lose_energy_and_never_gain_it(self) -> None:
+        plant = elastic(FRICTIONLESS)
+        start = plant.energy()
+        energies = [steps(plant, 1, np.zeros(6)).energy() for _ in range(2000)]
+        assert plant.velocity @ plant.velocity > 1.0  # it did swing
+        assert max(energies) < start + 0.01  # J; of some hundred in motion
+        assert start - 20.0 < energies[-1] < start
 
-
-def test_damped_springs_lose_energy_and_never_gain_it() -> None:
-    plant = elastic(FRICTIONLESS)
-    start = plant.energy()
-    energies = []
-    for _ in range(2000):
-        plant.step(np.zeros(6), STEP)
-        energies.append(plant.energy())
-    assert plant.velocity @ plant.velocity > 1.0  # it did swing
-    assert max(energies) < start + 0.01  # J; of some hundred in motion
-    assert start - 20.0 < energies[-1] < start
-
-
-def test_a_struck_link_rings_at_the_frequency_of_its_spring() -> None:
-    """Motor held by its brake, link free: an oscillator with the link's own inertia."""
-    plant = ElasticPlant(
-        ns16.urdf_text(), TRUTH, elasticity=(1e-6, 0.0, 0.0, 0.0, 0.0, 0.0), step=STEP,
-        position=START, brake_torque=1e5,
-    )  # fmt: skip
-    plant.close_brakes(True)
-    plant.set_state(START, [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    swing = []
-    for _ in range(1000):
-        plant.step(np.zeros(6), STEP)
-        swing.append(plant.position[0] - START[0])
-    inertia = pin.crba(plant.model, plant.model.createData(), START)[0, 0]
-    crossings = np.nonzero(np.diff(np.sign(swing)) != 0)[0]
-    period = 2.0 * np.mean(np.diff(crossings)) * STEP
-    assert 2.0 * np.pi / period == pytest.approx(np.sqrt(1e6 / inertia), rel=0.02)
-
-
-def random_inverse_inertia(rng: np.random.Generator, n: int) -> Array:
-    root = rng.normal(size=(n, n))
-    return root @ root.T + 0.1 * np.eye(n)
+    def test_a_struck_link_rings_at_the_frequency_of_its_spring(self) -> None:
+        """Motor held by its brake, link free: an oscillator with the link's own inertia."""
+        plant = elastic(compliance=(1e-6, 0.0, 0.0, 0.0, 0.0, 0.0), brake_torque=1e5)
+        plant.close_brakes(True)
+        plant.set_state(START, [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
+        swing = [steps(plant, 1, np.zeros(6)).position[0] - START[0] for _ in range(1000)]
+        inertia = pin.crba(plant.model, plant.model.createData(), START)[0, 0]
+        crossings = np.nonzero(np.diff(np.sign(swing)) != 0)[0]
+        period = 2.0 * np.mean(np.diff(crossings)) * STEP
+        assert 2.0 * np.pi / period == pytest.approx(np.sqrt(1e6 / inertia), rel=0.02)
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 6), push=st.floats(0.01, 100.0))
 def test_friction_holds_what_it_can_and_opposes_what_slides(seed: int, n: int, push: float) -> None:
     rng = np.random.default_rng(seed)
-    inverse = random_inverse_inertia(rng, n)
+    root = rng.normal(size=(n, n))
+    inverse = root @ root.T + 0.1 * np.eye(n)
     coulomb = rng.uniform(0.0, 50.0, n) * rng.integers(0, 2, n)
     free = STEP * push * rng.normal(size=n)
     guess = rng.uniform(-60.0, 60.0, n)
@@ -285,35 +266,26 @@ def test_a_joint_slides_on_when_its_coulomb_torque_grows_a_little() -> None:
     assert result.velocity[0] > 0.9
 
 
-GRAVITY = (0.0, 0.0, -9.81)
 POSTURE = [0.2, -1.2, 2.5, 0.3, 1.0, 0.2]
 
 
-def nominal(low: float, high: float) -> NominalModel:
+def nominal(*error: float) -> NominalModel:
     rng = np.random.default_rng(3)
-    return NominalModel(ns16.urdf_text(), TRUTH, gravity=GRAVITY, error=(low, high), rng=rng)
+    return NominalModel(ns16.urdf_text(), TRUTH, gravity=(0.0, 0.0, -9.81), error=error, rng=rng)
 
 
-def make_servo(resolution: float = 0.0) -> Servo:
+@pytest.fixture
+def servo() -> Servo:
     settings = ServoSettings()
     model = nominal(*settings.model_error)
-    servo = Servo(DRIVE, model, settings, period=0.001, current_resolution=resolution)
+    servo = Servo(DRIVE, model, settings, period=0.001, current_resolution=0.0)
     servo.start_at(DRIVE.motor_revolutions(POSTURE))
     return servo
 
 
-def hold(servo: Servo) -> list[float]:
-    return servo.advance(servo.target, [0.0] * 6)
-
-
-def test_the_current_of_a_servo_at_rest_is_that_of_the_model() -> None:
-    servo = make_servo()
-    assert hold(servo) == servo.model_current
+def test_current_is_that_of_the_model_at_rest_limited_and_without_wind_up(servo: Servo) -> None:
+    assert servo.advance(servo.target, [0.0] * 6) == servo.model_current
     assert servo.model_current[1] != 0.0  # gravity
-
-
-def test_current_stays_within_its_limit_and_does_not_wind_up() -> None:
-    servo = make_servo()
     home = list(servo.measured)
     far = [p + 20.0 for p in home]
     for _ in range(500):
@@ -362,32 +334,22 @@ angles = st.lists(st.floats(-7.0, 7.0), min_size=6, max_size=6)
 numbers = st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6)
 
 
-@given(q=angles)
-def test_motor_positions_follow_the_formulas(q: list[float]) -> None:
+@given(q=angles, currents=numbers)
+def test_drive_follows_its_formulas_and_their_inverse(
+    q: list[float], currents: list[float]
+) -> None:
     controller = np.array(q) * DRIVE.joint_sign + DRIVE.joint_offset
     expected = motor_matrix(DRIVE) @ controller + DRIVE.calibration
     np.testing.assert_allclose(DRIVE.motor_revolutions(q), expected, rtol=1e-12, atol=1e-11)
-
-
-@given(q=angles)
-def test_motor_to_joint_undoes_joint_to_motor(q: list[float]) -> None:
     np.testing.assert_allclose(DRIVE.joint_angles(DRIVE.motor_revolutions(q)), q, atol=1e-12)
     np.testing.assert_allclose(DRIVE.joint_speeds(DRIVE.motor_speeds(q)), q, atol=1e-12)
-
-
-@given(qd=angles, currents=numbers)
-def test_power_at_the_motors_is_power_at_the_joints(qd: list[float], currents: list[float]) -> None:
+    # power at the motors is power at the joints
     motor_torque = np.array(currents) * DRIVE.torque_constant
-    motor_speed = 2.0 * pi * np.array(DRIVE.motor_speeds(qd))
-    joint_power = np.dot(DRIVE.joint_torques(currents), qd)
+    motor_speed = 2.0 * pi * np.array(DRIVE.motor_speeds(q))
+    joint_power = np.dot(DRIVE.joint_torques(currents), q)
     assert joint_power == pytest.approx(motor_torque @ motor_speed, rel=1e-10, abs=1e-6)
-
-
-@given(torques=numbers)
-def test_joint_torques_invert_currents(torques: list[float]) -> None:
-    np.testing.assert_allclose(
-        DRIVE.joint_torques(DRIVE.currents(torques)), torques, rtol=1e-12, atol=1e-10
-    )
+    torques = DRIVE.joint_torques(DRIVE.currents(currents))
+    np.testing.assert_allclose(torques, currents, rtol=1e-12, atol=1e-10)
 
 
 def test_encoders_read_whole_counts() -> None:
