@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Final, Literal
 
 from drivers.errors import DriverError
+from drivers.transports.base import TransportError
 from hil.errors import ControllerFault, InputError
 from hil.reading import parse_port
 from sim_fixtures import ControllerSettings, SimulatedController, serve
@@ -29,19 +30,24 @@ def open_controller_link(
     """Open the controller's end: UDP ("HOST:PORT") or CAN ("INTERFACE:CHANNEL[:fd|classic]").
 
     Raises:
-        InputError: neither or both links, or an invalid one.
-        ControllerLinkError: it cannot be opened, or cannot carry the session.
+        InputError: neither or both links, or an invalid one, that cannot be opened or cannot carry
+            the session.
     """
     if (udp is None) == (can is None):
         remedy = "give --udp or --can, not both"
         raise InputError(None, "one link is needed", remedy=remedy)
-    if can is not None:
-        return _bus(can, settings, n_axes)
-    host, _, port_text = (udp or "").rpartition(":")
+    try:
+        return _bus(can, settings, n_axes) if can is not None else _udp(udp or "")
+    except TransportError as error:
+        raise InputError(None, str(error)) from error
+
+
+def _udp(text: str) -> serve.UdpControllerLink:
+    host, _, port_text = text.rpartition(":")
     port = parse_port(port_text)
     if not host or port is None:
         remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
-        raise InputError(None, f"--udp {udp!r} is not an address", remedy=remedy)
+        raise InputError(None, f"--udp {text!r} is not an address", remedy=remedy)
     return serve.UdpControllerLink(host, port)
 
 

@@ -12,10 +12,8 @@ from typing import Final
 
 import can
 
-from drivers.transports.base import TransportError
 from drivers.transports.can.profile import BusRates, ControllerEnd
 from drivers.transports.can.transport import CanLink, CanSpec, open_bus
-from sim_fixtures.serve import ControllerLinkError
 
 START_PATIENCE: Final = 0.25
 """Least timeout for the answer to a packet sent as segments [s]."""
@@ -75,15 +73,11 @@ def open_controller_link(
     """Open the controller's end on a bus of python-can; `mode` is None where no axis is opened.
 
     Raises:
-        ControllerLinkError: it cannot be opened, or cannot carry the session (`CanError` as cause).
+        TransportError: it cannot be opened, or (`CanError`) cannot carry the session.
     """
-    rates = spec.rates
-    try:
-        spec.check(mode)
-        bus = open_bus(spec.interface, spec.channel, rates, spec.options)
-    except TransportError as error:
-        raise ControllerLinkError(error.link, f"{error.reason}; {error.remedy}") from error
-    return CanControllerLink(bus, rates, start_patience=start_patience)
+    spec.check(mode)
+    bus = open_bus(spec.interface, spec.channel, spec.rates, spec.options)
+    return CanControllerLink(bus, spec.rates, start_patience=start_patience)
 
 
 __all__ = ["START_PATIENCE", "CanControllerLink", "CanSpec", "open_controller_link"]

@@ -13,7 +13,6 @@ counts and times, in memory of fixed size.
 from __future__ import annotations
 
 import socket
-import struct
 import time
 from collections import deque
 from collections.abc import Callable
@@ -25,6 +24,7 @@ from select import select
 from typing import Final, Protocol
 
 from drivers.errors import PacketError
+from drivers.exchange.control import BINS, bin_of, quantile
 from drivers.packets import (
     AXIS_LENGTH,
     HEADER_LENGTH,
@@ -33,13 +33,10 @@ from drivers.packets import (
     next_number,
     packet_number,
 )
+from drivers.transports.base import TransportError
 from drivers.transports.simulated import Peer
-from sim_fixtures.settings import SimulationError
 
 LARGEST_DATAGRAM: Final = 65536
-_SO_TIMESTAMPNS: Final = 35  # of asm-generic/socket.h, which the socket module does not name
-_TIMESPEC: Final = struct.Struct("@ll")
-_CONTROL_SPACE: Final = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 class ControllerLink(Protocol):
@@ -55,18 +52,6 @@ class ControllerLink(Protocol):
         """Close the link."""
 
 
-class ControllerLinkError(SimulationError):
-    """The controller's end of a link, at an address or device, cannot be opened."""
-
-    def __init__(self, place: str, problem: str) -> None:
-        self.place = place
-        self.problem = problem
-        super().__init__(f"{place}: {problem}")
-
-    def __reduce__(self) -> tuple[type[ControllerLinkError], tuple[str, str]]:
-        return type(self), (self.place, self.problem)
-
-
 class UdpControllerLink:
     """Link to a PC program that listens at `host`:`port` (IPv4), one datagram per packet.
 
@@ -75,29 +60,26 @@ class UdpControllerLink:
 
     Attributes:
         foreign: number of datagrams from other addresses.
-        waited: time of the last packet in the kernel's queue [s].
 
     Raises:
-        ControllerLinkError: no such host, or the local port is in use.
+        TransportError: no such host, or the local port is in use.
     """
 
     def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:
         self.foreign = 0
-        self.waited = 0.0
         try:
             self._pc = (socket.gethostbyname(host), port)
         except (OSError, UnicodeError) as error:
-            raise ControllerLinkError(f"{host}:{port}", f"no such IPv4 host ({error})") from error
+            reason = f"there is no such IPv4 host ({error})"
+            raise TransportError(f"UDP to {host}:{port}", reason, "check the address") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         try:
             self._socket.setblocking(False)
             self._socket.bind(("", source_port or 0))
         except (OSError, OverflowError) as error:
             self._socket.close()
-            raise ControllerLinkError(
-                f"local UDP port {source_port}", f"cannot be used ({error})"
-            ) from error
+            place = f"local UDP port {source_port}"
+            raise TransportError(place, str(error), "use another port") from error
 
     @property
     def source_port(self) -> int:
@@ -118,11 +100,10 @@ class UdpControllerLink:
             if not select([self._socket], [], [], max(0.0, until - time.monotonic()))[0]:
                 return None
             try:
-                packet, control, _, sender = self._socket.recvmsg(LARGEST_DATAGRAM, _CONTROL_SPACE)
+                packet, sender = self._socket.recvfrom(LARGEST_DATAGRAM)
             except OSError:  # dropped for a bad checksum, or an ICMP error
                 continue
             if sender == self._pc:
-                self.waited = _waited(control)
                 return packet
             self.foreign += 1
             if time.monotonic() > until:
@@ -133,43 +114,24 @@ class UdpControllerLink:
         self._socket.close()
 
 
-def _waited(control: list[tuple[int, int, bytes]]) -> float:
-    """Return the age of a datagram by the kernel's time stamp [s]."""
-    for _, kind, data in control:
-        if kind == _SO_TIMESTAMPNS and len(data) == _TIMESPEC.size:
-            seconds, nanoseconds = _TIMESPEC.unpack(data)
-            return max(0.0, time.time() - float(seconds) - 1e-9 * float(nanoseconds))
-    return 0.0
-
-
 REMEMBERED: Final = 1000
 
 
-class Histogram:
-    """Durations in bins of 5 µs up to 50 ms, and the largest one."""
+@dataclass(eq=False)
+class Latencies:
+    """Durations in the bins of `drivers.exchange.control`, and the largest one, s."""
 
-    BIN: Final = 5e-6
-    BINS: Final = 10_000
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.largest = 0.0
-        self._bins = [0] * (self.BINS + 1)
+    largest: float = 0.0
+    counts: list[int] = field(default_factory=lambda: [0] * BINS)
 
     def add(self, seconds: float) -> None:
         """Count one duration."""
-        self.count += 1
         self.largest = max(self.largest, seconds)
-        self._bins[min(self.BINS, int(max(0.0, seconds) / self.BIN))] += 1
+        self.counts[bin_of(seconds)] += 1
 
-    def quantile(self, fraction: float) -> float:
-        """Return the upper edge of the bin of a quantile [s]; 0 without durations."""
-        wanted, seen = fraction * self.count, 0
-        for index, entries in enumerate(self._bins):
-            seen += entries
-            if entries and seen >= wanted:
-                return min(self.largest, (index + 1) * self.BIN)
-        return 0.0
+    def quantile(self, share: float) -> float:
+        """Return a quantile, s, at most 19 % too long; 0 without durations."""
+        return min(self.largest, quantile(self.counts, share) or 0.0)
 
 
 @dataclass(eq=False)
@@ -192,8 +154,8 @@ class ServeCounts:
     slips: int = 0
     ended: bool = False  # whether the controller has ended its session (504)
     stretch_max: float = 0.0  # longest extension of a cycle, s
-    answer: Histogram = field(default_factory=Histogram)  # times from the packet to its answer
-    cost: Histogram = field(default_factory=Histogram)  # computing times of a cycle
+    answer: Latencies = field(default_factory=Latencies)  # times from the packet to its answer
+    cost: Latencies = field(default_factory=Latencies)  # computing times of a cycle
     _unanswered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _answered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
@@ -289,163 +251,149 @@ def serve(
     cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer within an
     extension is not waited for until it answers again.
     """
-    server = _Server(peer, link, clock, watch, stretch)
-    if server.await_pc(request):
-        server.run(request, patience)
+    server = _Server(peer, link, request, watch, clock, patience, stretch)
+    if server.await_pc():
+        server.run()
     return server.counts
 
 
+@dataclass(eq=False)
 class _Server:
     """One session of one controller."""
 
-    def __init__(
-        self,
-        peer: ServedPeer,
-        link: ControllerLink,
-        clock: Clock,
-        watch: Callable[[ServeCounts], None],
-        stretch: float,
-    ) -> None:
-        self.counts = ServeCounts()
-        self._peer = peer
-        self._link = link
-        self._clock = clock
-        self._watch = watch
-        self._period = peer.period
-        self._stretch = stretch
-        self._due = 0.0
-        self._finish_by: float | None = None
-        self._patience = 0.0
-        self._unanswered = False
+    peer: ServedPeer
+    link: ControllerLink
+    request: Callable[[], Request]
+    watch: Callable[[ServeCounts], None]
+    clock: Clock
+    patience: float
+    stretch: float
+    counts: ServeCounts = field(default_factory=ServeCounts)
+    due: float = 0.0
+    finish_by: float | None = None
+    unanswered: bool = False
 
-    def await_pc(self, request: Callable[[], Request]) -> bool:
+    def await_pc(self) -> bool:
         """Repeat the first packet until it is answered; False if the end is requested before."""
-        packet = self._peer.next_packet()
+        packet = self.peer.next_packet()
         if packet is None:
             self.counts.ended = True
             return False
-        while request() is Request.CONTINUE:
-            sent = self._clock.monotonic()
-            self._link.send(packet)
+        while self.request() is Request.CONTINUE:
+            sent = self.clock.monotonic()
+            self.link.send(packet)
             self.counts.knocks += 1
-            reply = self._first_reply(packet, sent + KNOCK_INTERVAL, request)
+            reply = self._first_reply(packet, sent + KNOCK_INTERVAL)
             if reply is not None:
                 self.counts.cycles += 1
-                self._due = max(sent + self._period, self._clock.monotonic())
+                self.due = max(sent + self.peer.period, self.clock.monotonic())
                 self._hand_over(packet, reply)
                 return True
         return False
 
-    def _first_reply(
-        self, packet: bytes, until: float, request: Callable[[], Request]
-    ) -> bytes | None:
+    def _first_reply(self, packet: bytes, until: float) -> bytes | None:
         """Return the answer to the first packet, checking for requests every 0.1 s."""
-        while request() is Request.CONTINUE and (now := self._clock.monotonic()) < until:
+        while self.request() is Request.CONTINUE and (now := self.clock.monotonic()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
-            self._watch(self.counts)
+            self.watch(self.counts)
             if reply is not None:
                 return reply
         return None
 
-    def run(self, request: Callable[[], Request], patience: float) -> None:
+    def run(self) -> None:
         """Run cycle by cycle to the end."""
         late_by_missing = False
         while True:
-            if not self._apply(request(), patience):
+            if not self._apply(self.request()):
                 return
-            self._sleep_until(self._due)
+            self._sleep_until(self.due)
             self._count_lateness(excused=late_by_missing)
-            packet = self._peer.next_packet()
+            packet = self.peer.next_packet()
             if packet is None:
                 self.counts.ended = True
                 return
             stretched = self.counts.stretched
             answered = self._exchange(packet) if packet else self._stay_silent()
             late_by_missing = not answered or self.counts.stretched > stretched
-            self._due += self._period
-            self._watch(self.counts)
+            self.due += self.peer.period
+            self.watch(self.counts)
 
     def _exchange(self, packet: bytes) -> bool:
         """Run one cycle with a packet; return whether it was answered."""
-        sent = self._clock.monotonic()
+        sent = self.clock.monotonic()
         self.counts.cycles += 1
-        self._link.send(packet)
-        reply = self._reply(packet, sent + self._period)
-        ending = self._finish_by is not None
-        if reply is None and self._stretch and not (self._unanswered and ending):
-            until = sent + self._period
-            reply = self._reply(packet, until + self._stretch)
-            self.counts.count_stretched(self._clock.monotonic() - until)
-        self._unanswered = reply is None
+        self.link.send(packet)
+        reply = self._reply(packet, sent + self.peer.period)
+        ending = self.finish_by is not None
+        if reply is None and self.stretch and not (self.unanswered and ending):
+            until = sent + self.peer.period
+            reply = self._reply(packet, until + self.stretch)
+            self.counts.count_stretched(self.clock.monotonic() - until)
+        self.unanswered = reply is None
         if reply is not None:
-            # By the kernel's time stamp: the time in the queue is not the PC's.
-            waited = getattr(self._link, "waited", 0.0)
-            self.counts.answer.add(max(0.0, self._clock.monotonic() - sent - waited))
+            self.counts.answer.add(self.clock.monotonic() - sent)
         self._hand_over(packet, reply)
         return reply is not None
 
     def _sleep_until(self, moment: float) -> None:
-        while (now := self._clock.monotonic()) < moment:
-            self._clock.sleep(moment - now)
+        while (now := self.clock.monotonic()) < moment:
+            self.clock.sleep(moment - now)
 
     def _stay_silent(self) -> bool:
         """Run one cycle of a booting controller, without a packet."""
         self.counts.cycles += 1
-        self._peer.accept(None)
+        self.peer.accept(None)
         return True
 
-    def _apply(self, request: Request, patience: float) -> bool:
+    def _apply(self, request: Request) -> bool:
         """Apply a request of the operator; return False to stop at once."""
         if request is Request.END:
-            now = self._clock.monotonic()
-            if self._finish_by is None:
-                self._finish_by = now + patience
-                self._patience = patience
-                self._peer.finish()
-            elif now > self._finish_by:
-                self._finish_by = inf
-                self._peer.lose_drive(
-                    f"the arm did not stand within {self._patience:g} s of the end"
-                )
+            now = self.clock.monotonic()
+            if self.finish_by is None:
+                self.finish_by = now + self.patience
+                self.peer.finish()
+            elif now > self.finish_by:
+                self.finish_by = inf
+                self.peer.lose_drive(f"the arm did not stand within {self.patience:g} s of the end")
         return request is not Request.ABORT
 
     def _count_lateness(self, *, excused: bool) -> None:
         """Count a cycle that begins late; shift later ones after a delay of a period or more."""
-        late = self._clock.monotonic() - self._due
-        if late >= 0.1 * self._period and not excused:
+        late = self.clock.monotonic() - self.due
+        if late >= 0.1 * self.peer.period and not excused:
             self.counts.own_late += 1
-        if late >= self._period:
+        if late >= self.peer.period:
             self.counts.slips += not excused
-            self._due += late
+            self.due += late
 
     def _reply(self, packet: bytes, until: float) -> bytes | None:
         """Return the first answer with the next number; count others."""
         wanted = next_number(packet_number(packet))
         stray = 0
         while stray < _MOST_STRAY:
-            answer = self._link.receive(max(0.0, until - self._clock.monotonic()))
+            answer = self.link.receive(max(0.0, until - self.clock.monotonic()))
             if answer is None:
                 return None
             number = _number(answer)
             if number == wanted:
                 return answer
             self.counts.count_discarded(number)
-            if self._clock.monotonic() > until:
+            if self.clock.monotonic() > until:
                 stray += 1
         return None
 
     def _hand_over(self, packet: bytes, reply: bytes | None) -> None:
         """Simulate a cycle of controller and arm."""
-        begun = self._clock.monotonic()
-        rejected = self._peer.rejected_replies
-        self._peer.accept(reply)
-        self.counts.cost.add(self._clock.monotonic() - begun)
+        begun = self.clock.monotonic()
+        rejected = self.peer.rejected_replies
+        self.peer.accept(reply)
+        self.counts.cost.add(self.clock.monotonic() - begun)
         number = next_number(packet_number(packet))
         if reply is None:
             if not _ends_the_session(packet):
                 self.counts.count_missing(number)
         else:
-            self.counts.count_reply(number, valid=self._peer.rejected_replies == rejected)
+            self.counts.count_reply(number, valid=self.peer.rejected_replies == rejected)
 
 
 def _ends_the_session(packet: bytes) -> bool:

@@ -21,7 +21,7 @@ from hil.terminal_text import plural, printable
 from sim_fixtures import ControllerSettings, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import PATIENCE, Histogram, ServeCounts
+from sim_fixtures.serve import PATIENCE, Latencies, ServeCounts
 
 WORDS: Final = {
     Phase.START: "starting: sync and init packets",
@@ -239,6 +239,6 @@ def _sentences(served: Served) -> list[str]:
     return [f"{end}{': ' if reason else ''}{reason}", ", ".join(figures)]
 
 
-def _parts(times: Histogram) -> tuple[float, float, float]:
+def _parts(times: Latencies) -> tuple[float, float, float]:
     """Return median, 99 % quantile and maximum, s."""
     return times.quantile(0.5), times.quantile(0.99), times.largest

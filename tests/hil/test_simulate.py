@@ -33,7 +33,7 @@ from hil.serving import Buttons, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
 from sim_fixtures.ns16 import CELL_PATH
 from sim_fixtures.program import Phase
-from sim_fixtures.serve import ControllerLinkError, Request
+from sim_fixtures.serve import Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]
 SLOW_MACHINE = ["--missed", "300"]
@@ -401,7 +401,7 @@ def test_a_bus_is_named_as_python_can_names_it():
         link = link_at(can=text)
         assert link.receive(0.001) is None
         link.close()
-    with pytest.raises(ControllerLinkError, match="no-such-bus"):
+    with pytest.raises(InputError, match="no-such-bus"):
         link_at(can="no-such-bus:0")
 
 
