@@ -18,8 +18,8 @@ from hil.archive.header import (
     is_supported,
     motion_name,
 )
-from hil.archive.reader import open_archive, scan_file
-from hil.archive.repair import has_valid_index
+from hil.archive.reader import open_archive, scan_archive, scan_file
+from hil.archive.repair import is_intact
 from hil.archive.scan import Scan
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
@@ -47,11 +47,13 @@ class Check:
 def check_archive(path: str | PathLike[str]) -> Check:
     """Check whether all of a file can be used; ArchiveError if it is no archive or unreadable."""
     path = Path(path)
-    found = scan_file(path, past_damage=True)
+    found = scan_file(path, all_channels=True)
     if found.metadata is None:
         open_archive(path, fields=())  # raises with the reason
-    faults = [*found.faults, *_entry_faults(path, found)]
-    if not faults and not has_valid_index(path, found):
+    faults = [*_entry_faults(path, found)]
+    if found.damage is not None and found.header is not None:
+        faults.append(f"the record at byte {found.damage.offset} {found.damage.reason}")
+    if not faults and not is_intact(path, found):
         faults.append("the message indexes or the summary do not fit the content")
     return Check(
         path=path,
@@ -130,7 +132,7 @@ class Overview:
 
 def read_overview(path: str | PathLike[str]) -> Overview:
     """Return the overview of an archive; ArchiveError if it cannot be read."""
-    archive, found = open_archive(path, fields=()), scan_file(Path(path), past_damage=True)
+    archive, found = scan_archive(path, all_channels=True)
     header, stamp = archive.header, archive.columns["stamp"]
     outcome = archive.outcome or ArchiveOutcome(outcome="missing")
     entries = {**header.entries, **{f"outcome.{k}": text for k, text in outcome.entries.items()}}

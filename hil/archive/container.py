@@ -1,16 +1,15 @@
 """The MCAP container (https://mcap.dev/spec): records in file order, each verified.
 
-The `mcap` library reads and writes single records; files are read here, twice as fast, and a
+The fields of records are read and written by the `mcap` library. Its stream reader parses every
+message index and does not tell where a record is; the walk is therefore here, twice as fast, and a
 truncated or forged record becomes `Damage` with its place.
 """
 
 from __future__ import annotations
 
-import os
 import struct
 import threading
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 from io import BytesIO
 from typing import Any, BinaryIO, NamedTuple, TypeVar
@@ -22,14 +21,12 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import EndOfFile
 from mcap.records import (
     Attachment,
-    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
     Footer,
     McapRecord,
     Metadata,
-    MetadataIndex,
     Schema,
 )
 
@@ -37,12 +34,10 @@ MAGIC = b"\x89MCAP0\r\n"
 LARGEST_CHUNK = 1 << 24  # bytes; own chunks have a tenth of a megabyte
 MOST_INFLATION = 1000  # times what is compressed; an arm at rest reaches a tenth
 LARGEST_RECORD = 1 << 28  # bytes; attachments and summaries are far smaller
-_FARTHEST = 1 << 62  # bytes, less than the end of any file
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX = range(9, 14)
 SUMMARY_OFFSET, DATA_END = 14, 15
-BUT_INDEXES = frozenset(range(256)) - {MESSAGE_INDEX}
 
 RECORD = struct.Struct("<BQ")  # opcode, length of the body
 FOOTER_SIZE = RECORD.size + 20
@@ -50,15 +45,12 @@ _CHUNK_HEAD = struct.Struct("<QQQII")  # times, size, checksum, length of the co
 _LENGTH = struct.Struct("<Q")
 _CRC = struct.Struct("<I")
 _NO_CRC = 0
-_SMALL = 4096  # bytes that are read faster than skipped
 _UNCOVERED = _CRC.size + len(MAGIC)  # bytes at the end of a file, not covered by the checksum
 _KINDS: dict[int, type[McapRecord]] = {
     SCHEMA: Schema,
     CHANNEL: Channel,
     METADATA: Metadata,
     CHUNK_INDEX: ChunkIndex,
-    METADATA_INDEX: MetadataIndex,
-    ATTACHMENT_INDEX: AttachmentIndex,
 }
 _Parsed = TypeVar("_Parsed", bound=McapRecord)
 
@@ -70,6 +62,14 @@ class Damage(Exception):  # noqa: N818 - also passed on as a finding
         super().__init__(reason)
         self.offset = offset
         self.reason = reason
+
+
+class Head(NamedTuple):
+    """Kind and place of a record, with its head."""
+
+    opcode: int
+    offset: int
+    end: int
 
 
 class Record(NamedTuple):
@@ -88,11 +88,6 @@ class Record(NamedTuple):
     def end(self) -> int:
         """Where the next record begins."""
         return self.offset + self.size
-
-    @property
-    def data(self) -> bytes:
-        """Its bytes as in the file."""
-        return RECORD.pack(self.opcode, len(self.body)) + self.body
 
 
 class _Body(ReadDataStream):
@@ -145,44 +140,22 @@ def split_records(data: bytes, offset: int) -> Iterator[Record]:
         at = end
 
 
-def record_at(stream: BinaryIO, offset: int, length: int) -> Record:
-    """Read the record that an index places at `offset`, `length` with its head."""
-    if RECORD.size <= length <= LARGEST_RECORD and offset <= _FARTHEST:
-        stream.seek(offset)
-        data = stream.read(length)
-        if len(data) < length:
-            raise Damage(offset, "is cut off")
-        opcode, body_length = RECORD.unpack_from(data)
-        if body_length == length - RECORD.size:
-            return Record(offset, opcode, data[RECORD.size :])
-    raise Damage(offset, "is not of the length in the index")
+def heads(stream: BinaryIO, size: int, only: Collection[int] = range(256)) -> Iterator[Head]:
+    """Yield the heads of the records of the data section up to DataEnd, that one included.
 
-
-def records(
-    stream: BinaryIO,
-    size: int,
-    *,
-    only: Collection[int] = BUT_INDEXES,
-    skip: Collection[int] = (),
-    check_end: bool = True,
-) -> Iterator[Record]:
-    """Yield the records of the data section up to DataEnd; then check the end of the file.
-
-    Args:
-        stream: the file, at its beginning.
-        size: its length.
-        only: opcodes of the records that are read; others are skipped.
-        skip: places of records of which only the head is read.
-        check_end: whether to check summary and footer.
+    `size` is the length of the file; records of other kinds than `only` are skipped. The stream may
+    be moved meanwhile.
 
     Raises:
         Damage: the file is truncated, or its bytes violate the format.
     """
+    stream.seek(0)
     if stream.read(len(MAGIC)) != MAGIC:
         raise Damage(0, "is not the beginning of an MCAP file")
     offset, opcode = len(MAGIC), -1
-    read, seek = stream.read, stream.seek
+    seek, read = stream.seek, stream.read
     while opcode != DATA_END:
+        seek(offset)
         head = read(RECORD.size)
         if not head:
             raise Damage(offset, "is missing: the file ends before its footer")
@@ -191,25 +164,64 @@ def records(
         opcode, length = RECORD.unpack(head)
         if not opcode:  # a sparse file would have as many records as bytes
             raise Damage(offset, "is zeros, where one must begin")
-        if length > size - offset - RECORD.size:
+        end = offset + RECORD.size + length
+        if end > size:
             raise Damage(offset, "is cut off, or its length is corrupt")
-        if opcode not in only and length <= _SMALL:
-            read(length)
-        elif opcode not in only:
-            seek(length, os.SEEK_CUR)
-        elif offset in skip:
-            yield Record(offset, opcode, b"")
-            seek(length, os.SEEK_CUR)
-        elif length > LARGEST_RECORD:
-            raise Damage(offset, f"claims {length} bytes of content")
-        else:
-            yield Record(offset, opcode, read(length))
-        offset += RECORD.size + length
-    if check_end:
-        tail = read(min(size - offset, LARGEST_RECORD))
-        footer = _footer(tail)
-        if footer is None or footer.summary_crc not in (_NO_CRC, crc32(tail[:-_UNCOVERED])):
-            raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
+        if opcode in only or opcode == DATA_END:
+            yield Head(opcode, offset, end)
+        offset = end
+
+
+def read_record(stream: BinaryIO, head: Head) -> Record:
+    """Read the record with this head; `Damage` if it is too large, or the file has shrunk."""
+    start = head.offset + RECORD.size
+    length = head.end - start
+    if length > LARGEST_RECORD:
+        raise Damage(head.offset, f"claims {length} bytes of content")
+    stream.seek(start)
+    body = stream.read(length)
+    if len(body) < length:
+        raise Damage(head.offset, "is cut off")
+    return Record(head.offset, head.opcode, body)
+
+
+def records(stream: BinaryIO, size: int, *, only: Collection[int] = range(256)) -> Iterator[Record]:
+    """Yield the records of the data section whose opcodes are in `only`, see `heads`."""
+    for head in heads(stream, size, only):
+        if head.opcode in only:
+            yield read_record(stream, head)
+
+
+def check_end(stream: BinaryIO, size: int, offset: int) -> None:
+    """Check summary and footer, which follow DataEnd at `offset`; else `Damage`."""
+    stream.seek(offset)
+    tail = stream.read(min(size - offset, LARGEST_RECORD))
+    footer = _footer(tail)
+    if footer is None or footer.summary_crc not in (_NO_CRC, crc32(tail[:-_UNCOVERED])):
+        raise Damage(offset, "(index and footer) is cut off, or fails its checksum")
+
+
+def read_chunk_index(stream: BinaryIO, size: int) -> list[ChunkIndex]:
+    """Return the index of chunks in the summary; empty where it is missing or damaged."""
+    last = size - FOOTER_SIZE - len(MAGIC)
+    if last < 0:
+        return []
+    stream.seek(last)
+    footer = _footer(stream.read(size - last))
+    if footer is None or footer.summary_crc == _NO_CRC:
+        return []
+    if not len(MAGIC) <= footer.summary_start <= last <= footer.summary_start + LARGEST_RECORD:
+        return []
+    stream.seek(footer.summary_start)
+    data = stream.read(size - footer.summary_start)
+    if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
+        return []
+    summary = data[: last - footer.summary_start]
+    try:
+        found = [one for one in split_records(summary, 0) if one.opcode == CHUNK_INDEX]
+        return [parse(ChunkIndex, one) for one in found]
+    except Damage:
+        return []
 
 
 def _footer(tail: bytes) -> Footer | None:
@@ -222,7 +234,7 @@ def _footer(tail: bytes) -> Footer | None:
 
 
 def parse_item(record: Record) -> Any:
-    """Return a schema, channel, metadata record, attachment or entry of an index."""
+    """Return a schema, channel, metadata record or attachment, its checksum verified."""
     if record.opcode == ATTACHMENT:
         return parse_attachment(record)
     if record.opcode not in _KINDS:
@@ -299,58 +311,3 @@ def decompress(head: Chunk, offset: int, *, largest: int = LARGEST_CHUNK) -> byt
 @lru_cache(maxsize=16)
 def _decompressor(thread: int) -> zstandard.ZstdDecompressor:  # noqa: ARG001 - one of each thread
     return zstandard.ZstdDecompressor()
-
-
-@dataclass(frozen=True)
-class Summary:
-    """The records of a file's summary, parsed on demand."""
-
-    records: Sequence[Record]
-
-    @classmethod
-    def read(cls, stream: BinaryIO, size: int, *, start: int | None = None) -> Summary | None:
-        """Read the summary; None where it is missing or incomplete.
-
-        `start` is where the data section ends, of a file in which records may have moved: the
-        places in the summary may then be wrong.
-        """
-        last = size - FOOTER_SIZE - len(MAGIC)
-        if last < 0:
-            return None
-        stream.seek(last)
-        footer = _footer(stream.read(size - last))
-        if footer is None or footer.summary_crc == _NO_CRC:
-            return None
-        start = footer.summary_start if start is None else start
-        if not len(MAGIC) <= start <= last <= start + LARGEST_RECORD:
-            return None
-        stream.seek(start)
-        data = stream.read(size - start)
-        if crc32(data[:-_UNCOVERED]) != footer.summary_crc:
-            return None
-        try:
-            return cls([*split_records(data[: last - start], 0)])
-        except Damage:
-            return None
-
-    @property
-    def definitions(self) -> list[Record]:
-        """Schema and channel records."""
-        return [record for record in self.records if record.opcode in (SCHEMA, CHANNEL)]
-
-    def entries(self, opcode: int) -> list[Any]:
-        """Return the entries of one kind of index; none where one of them is damaged."""
-        try:
-            return [parse_item(record) for record in self.records if record.opcode == opcode]
-        except Damage:
-            return []
-
-    @property
-    def places(self) -> list[tuple[int, int]]:
-        """Offset and length of the records in an index, in the order of the file."""
-        others = [*self.entries(METADATA_INDEX), *self.entries(ATTACHMENT_INDEX)]
-        chunks = self.entries(CHUNK_INDEX)
-        return sorted(
-            [(one.offset, one.length) for one in others]
-            + [(one.chunk_start_offset, one.chunk_length) for one in chunks]
-        )

@@ -1,8 +1,8 @@
 """Writer of MCAP files that adds whole batches of messages at a time.
 
-It writes the records of `mcap.writer.Writer` (https://mcap.dev/spec). The library adds messages
-singly, at some microseconds each, too slow for three messages a millisecond; here a batch of
-messages of constant size is one structured array.
+It writes the bytes of `mcap.writer.Writer`, and the records are the library's. The library adds
+messages singly, at some microseconds each, too slow for three messages a millisecond, and its level
+of compression is fixed; here a batch of messages of constant size is one structured array.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from numpy.typing import NDArray
 from hil.archive import container
 from hil.archive.cdr import Rows
 from hil.archive.chunk import HEAD, Messages
-from hil.archive.container import MAGIC, MESSAGE, RECORD, Record, encode
+from hil.archive.container import MAGIC, MESSAGE, RECORD, encode
+from hil.archive.schema import Channel as CdrChannel
 
 _ENTRY = np.dtype([("stamp", "<u8"), ("offset", "<u8")])
 _HEAD = struct.Struct("<BQHIQQ")
@@ -93,40 +94,28 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._counts: dict[int, int] = {}
         self._put(MAGIC)
-        self.put(encode(Header(profile, library)))
+        self.put(Header(profile, library))
 
-    def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
-        """Add a metadata record, in front of the chunk in progress."""
-        self.put(encode(Metadata(name, dict(entries))))
-
-    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Add an attachment without times, in front of the chunk in progress."""
-        self.put(encode(Attachment(0, 0, name, media_type, data)))
-
-    def put(self, data: bytes) -> None:
-        """Add an encoded record other than a chunk, and list it in the summary."""
-        record, place = Record(self.position, data[0], data[RECORD.size :]), self.position
-        if record.opcode == container.METADATA:
-            name, _ = container.parse_metadata(record)
-            self._metadata.append(MetadataIndex(place, len(data), name))
-        elif record.opcode == container.ATTACHMENT:
-            item = container.parse_attachment(record)
-            times, size = (item.log_time, item.create_time), len(item.data)
+    def put(self, record: McapRecord) -> None:
+        """Add a record other than a chunk in front of the chunk in progress, and index it."""
+        data, place = encode(record), self.position
+        if isinstance(record, Metadata):
+            self._metadata.append(MetadataIndex(place, len(data), record.name))
+        elif isinstance(record, Attachment):
+            times, size = (record.log_time, record.create_time), len(record.data)
             self._attachments.append(
-                AttachmentIndex(place, len(data), *times, size, item.name, item.media_type)
+                AttachmentIndex(place, len(data), *times, size, record.name, record.media_type)
             )
-        elif record.opcode in (container.SCHEMA, container.CHANNEL):
-            self.note(container.parse_item(record))
+        else:
+            self.note(record)
         self._put(data)
 
-    def register(
-        self, topic: str, message_encoding: str, schema: str, encoding: str, definition: bytes
-    ) -> int:
+    def register(self, channel: CdrChannel) -> int:
         """Define a channel and the schema of its messages; return the channel's id."""
         number = len(self._channels) + 1
         for item in (
-            Schema(number, definition, encoding, schema),
-            Channel(number, topic, message_encoding, {}, number),
+            Schema(number, channel.definition.encode(), "ros2msg", channel.schema),
+            Channel(number, channel.topic, "cdr", {}, number),
         ):
             self.note(item)
             self._append(encode(item))

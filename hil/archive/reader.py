@@ -151,34 +151,45 @@ def open_archive(
         ArchiveVersionError: written by a newer version of the profile.
         ArchiveError: the file cannot be read.
     """
-    path = Path(path)
     times = (
         ALWAYS[0] if start is None else round(start * 1e9),
         ALWAYS[1] if stop is None else round(stop * 1e9),
     )
-    scan = scan_file(path, fields=fields, times=times)
-    damage = scan.damage
+    return scan_archive(path, fields=fields, times=times)[0]
+
+
+def scan_archive(path: str | PathLike[str], **options: Any) -> tuple[Archive, Scan]:
+    """Scan an archive with the options of `Scan`; errors as `open_archive`."""
+    path = Path(path)
+    scan = scan_file(path, **options)
     if scan.header is None:
         raise _unreadable(path, scan)
-    columns, text = scan.columns, None
-    if damage is not None:
-        text = f"the record at byte {damage.offset} {damage.reason}"
-        text += f" ({scan.size - damage.offset} bytes from there on are unused)"
-        text += f"; {len(columns['stamp'])} samples could be read"
-        text += "; the outcome is missing" if scan.outcome is None else ""
-    return Archive(
+    columns = scan.columns
+    archive = Archive(
         path=path,
         header=scan.header,
         outcome=scan.outcome,
         attachments=scan.attachments,
         columns=columns,
         events=tuple(scan.events),
-        damage=text,
+        damage=_describe(scan, len(columns["stamp"])),
     )
+    return archive, scan
+
+
+def _describe(scan: Scan, read: int) -> str | None:
+    """Return a sentence about the damage, with the number of samples that were read."""
+    damage = scan.damage
+    if damage is None:
+        return None
+    text = f"the record at byte {damage.offset} {damage.reason}"
+    text += f" ({scan.size - damage.offset} bytes from there on are unused)"
+    text += f"; {read} samples could be read"
+    return text + ("; the outcome is missing" if scan.outcome is None else "")
 
 
 def scan_file(path: Path, **options: Any) -> Scan:
-    """Scan a file, with the options of `Scan`; ArchiveError if it cannot be read."""
+    """Scan any file, with the options of `Scan`; ArchiveError if it cannot be read."""
     try:
         with open_file(path) as stream:
             return Scan(stream, **options)

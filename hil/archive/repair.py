@@ -1,7 +1,7 @@
 """Repair of truncated or damaged archives.
 
-What passes the checks of `hil.archive.scan` is copied, also behind a damage; message indexes and
-summary are regenerated, and the outcome states what is lost.
+What `hil.archive.scan` finds before the first damage is copied; message indexes and summary are
+regenerated, and the outcome states what is lost.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from os import PathLike
 from pathlib import Path
 from typing import BinaryIO
 
+from mcap.records import Metadata
+
 from hil.archive import container, header, schema
 from hil.archive.chunk import ChunkParser
 from hil.archive.header import METADATA, OUTCOME, ArchiveOutcome
 from hil.archive.mcap_writer import McapWriter, entries_of, span
-from hil.archive.reader import open_archive, scan_file
+from hil.archive.reader import open_archive, scan_archive
 from hil.archive.scan import Scan
-from hil.errors import ArchiveError, ArchiveWriteError, NotAnArchiveError
+from hil.errors import ArchiveError, ArchiveWriteError
 from hil.files import replace_file, sync_folder
 from hil.reading import open_file
 
@@ -67,22 +69,19 @@ def repair(
         ArchiveError: it cannot be read, or nothing of it can be saved.
     """
     path = Path(path)
-    found = scan_file(path, past_damage=True)
-    if found.header is None:
-        open_archive(path, fields=())  # raises with the reason
-        raise NotAnArchiveError(path, "is not an archive")
+    found = scan_archive(path, all_channels=True)[1]
     if found.mixed:
         problem = "its beginning and its end are of two recordings, its samples of either"
         raise ArchiveError(path, problem, remedy="restore it from a copy, or record again")
     target = path.resolve() if in_place else Path(output) if output else repaired_name(path)
     if not in_place and os.path.lexists(target):
         raise ArchiveWriteError(target, "exists already", remedy="choose another name with -o")
-    intact = not found.faults and has_valid_index(path, found)
+    intact = is_intact(path, found)
     written = None
     if not intact or (output is not None and not in_place):
         _rewrite(path, found, target)
         written = target
-    return Repair(path, written, intact, tuple(found.losses), found.samples, found.samples_lost)
+    return Repair(path, written, intact, _losses(found), found.samples, _samples_lost(found))
 
 
 def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
@@ -93,19 +92,16 @@ def amend_outcome(path: str | PathLike[str], outcome: str, reason: str) -> None:
         ArchiveWriteError: it cannot be written; the archive is unchanged.
     """
     path = Path(path)
-    found = scan_file(path, past_damage=True)
-    if (
-        found.faults
-        or found.header is None
-        or found.outcome is None
-        or not has_valid_index(path, found)
-    ):
+    found = scan_archive(path, all_channels=True)[1]
+    if not is_intact(path, found):
         raise ArchiveError(path, "is damaged", remedy="repair it with `hil archive repair`")
     _rewrite(path, found, path, {"outcome": outcome, "reason": reason})
 
 
-def has_valid_index(path: Path, found: Scan) -> bool:
-    """Return whether message indexes and summary fit the content, which has no fault."""
+def is_intact(path: Path, found: Scan) -> bool:
+    """Return whether the file has no damage, and its message indexes and summary fit."""
+    if found.damage is not None:
+        return False
     with open_file(path) as stream, open_file(path) as other:
         same = True
 
@@ -158,28 +154,47 @@ def _copy(
     """Write the valid content of an archive as a new one."""
     writer, parser = McapWriter(write, schema.PROFILE, schema.LIBRARY), ChunkParser()
     described = _description(found)
-    writer.add_metadata(METADATA, header.with_checksum(described))
-    for opcode, *place in found.pieces:
-        record = container.record_at(stream, *place)
-        if opcode != container.CHUNK:
-            parser.define(record)
-            writer.put(record.data)
+    writer.put(Metadata(METADATA, header.with_checksum(described)))
+    whole = found.size if found.damage is None else found.damage.offset
+    for head in found.heads:
+        if head.offset >= whole:
+            break
+        if head.opcode == container.HEADER:
             continue
-        head = container.parse_chunk(record)
-        messages = parser.messages(container.chunk_data(head, record.offset), record.offset)
-        if not messages.keys() <= parser.channels.keys():
-            for definition in found.definitions:
-                parser.define(definition)
-                writer.put(definition.data)
-        for known in parser.definitions:
-            writer.note(known)
-        entries = entries_of(messages)
-        first, last = span(entries)
-        head = replace(head, message_start_time=first, message_end_time=last)
-        writer.add_chunk(head, entries)
-    stated = _outcome(found, described, writer.checksums)
-    writer.add_metadata(OUTCOME, header.with_checksum({**stated, **(outcome or {})}))
+        record = container.read_record(stream, head)
+        if head.opcode == container.CHUNK:
+            chunk = container.parse_chunk(record)
+            messages = parser.messages(container.chunk_data(chunk, head.offset), head.offset)
+            for definition in parser.definitions:
+                writer.note(definition)
+            entries = entries_of(messages)
+            first, last = span(entries)
+            chunk = replace(chunk, message_start_time=first, message_end_time=last)
+            writer.add_chunk(chunk, entries)
+            continue
+        parser.define(record)
+        item = container.parse_item(record)
+        if not isinstance(item, Metadata) or item.name not in (METADATA, OUTCOME):
+            writer.put(item)
+    stated = {**_outcome(found, described, writer.checksums), **(outcome or {})}
+    writer.put(Metadata(OUTCOME, header.with_checksum(stated)))
     writer.finish()
+
+
+def _losses(found: Scan) -> tuple[str, ...]:
+    """Return what is lost, and where; empty if all that was written is there."""
+    shortfalls = tuple(found.shortfalls())
+    if not shortfalls or found.damage is None or found.damage.offset == found.size:
+        return shortfalls
+    return (f"the record at byte {found.damage.offset} {found.damage.reason}", *shortfalls)
+
+
+def _samples_lost(found: Scan) -> int | None:
+    """Return the number of lost samples, None where unknown."""
+    if not _losses(found):
+        return 0
+    stated = found.stated.samples
+    return None if stated is None else max(0, stated - found.samples)
 
 
 def _description(found: Scan) -> dict[str, str]:
@@ -194,12 +209,12 @@ def _description(found: Scan) -> dict[str, str]:
 def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -> dict[str, str]:
     """Return the ``hil.outcome`` record of a file with these chunks, unchanged without loss."""
     chunk_list = {header.CHUNKS: header.format_chunk_list(chunks)}
-    if not found.losses and found.outcome is not None:
-        record = found.outcome.record  # other chunks than before if another program cut them
-        return {**record, **(chunk_list if header.CHUNKS in record else {})}
-    unknown = {"outcome": "unknown", "reason": "the outcome is lost"}
-    before = found.outcome or ArchiveOutcome.of(unknown)
-    lost, earlier = found.samples_lost, before.samples_lost
+    before, losses, lost = found.stated, _losses(found), _samples_lost(found)
+    if not losses:  # other chunks than before if another program cut them
+        return {**before.record, **(chunk_list if header.CHUNKS in before.record else {})}
+    if not before.record:
+        before = ArchiveOutcome.of({"outcome": "unknown", "reason": "the outcome is lost"})
+    earlier = before.samples_lost
     return {
         **before.record,
         header.DESCRIPTION: header.checksum(described),
@@ -210,5 +225,5 @@ def _outcome(found: Scan, described: Mapping[str, str], chunks: Sequence[int]) -
         "repaired.samples_lost": (
             "unknown" if lost is None or earlier is None else str(lost + earlier)
         ),
-        "repaired.losses": json.dumps([*before.losses, *found.losses]),
+        "repaired.losses": json.dumps([*before.losses, *losses]),
     }

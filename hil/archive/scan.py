@@ -1,15 +1,14 @@
-"""Verification of an archive, record by record: the one judge of what is whole in a file.
+"""Verification of an archive, record by record, up to the first damage.
 
-A reader stops at the first damage, checks and repairs continue behind it. The checksum of a chunk
-does not show that it belongs to this recording: a file system may put a chunk of another archive in
-its place. The outcome therefore lists the checksums of all chunks in order; where this list is
-missing, cycle numbers must increase.
+The checksum of a chunk does not show that it belongs to this recording: a file system may put a
+chunk of another archive in its place. The outcome therefore lists the checksums of all chunks in
+order; where this list is missing, cycle numbers must increase.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from typing import Any, BinaryIO, Final
 
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from hil.archive import container, schema
 from hil.archive.cdr import LayoutError, MessageLayout, Rows
 from hil.archive.chunk import ChunkParser, Content, Messages
-from hil.archive.container import Damage, Record, Summary
+from hil.archive.container import Damage, Head, Record
 from hil.archive.events import ArchivedEvent
 from hil.archive.header import (
     METADATA,
@@ -40,6 +39,10 @@ _BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all i
 _SEQUENCES = 1 << 32  # message numbers are modulo this
 _LEAST = 8  # bytes of a file for one sample, of an arm at rest
 _COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
+_DEFINITIONS = (container.SCHEMA, container.CHANNEL)
+_CONTENT = frozenset(
+    {container.HEADER, container.CHUNK, container.ATTACHMENT, container.METADATA, *_DEFINITIONS}
+)
 
 
 class Scan:
@@ -48,19 +51,19 @@ class Scan:
     Args:
         fields: columns wanted, None for all.
         times: range of the stamps wanted [ns]; chunks outside, by the index, are not read.
-        past_damage: whether to continue behind damage, listed in `faults`, or to stop at the first,
-            `damage`.
+        all_channels: whether to verify also the channels that only viewers read.
 
     Attributes:
+        heads: of the records with content.
         metadata, header: the ``hil`` record as read, and parsed: None where invalid
             (`header_error`) or of another version.
-        outcome: the ``hil.outcome`` record, None until it was read.
+        outcome: the ``hil.outcome`` record, None if it was not reached.
+        stated: the outcome wherever it is in the file, empty if it cannot be found.
+        mixed: whether begin and end are of two recordings; the samples may be of either.
         events: those of the times wanted.
-        definitions: schema and channel records of the summary.
-        counts: messages by topic.
+        counts: verified messages by topic.
         chunks: number of valid chunks.
-        pieces: opcode, offset and length of the valid records except header and outcome.
-        faults: what is wrong, a sentence each, except message indexes and summary.
+        damage: the first one, None without.
     """
 
     def __init__(
@@ -69,9 +72,10 @@ class Scan:
         *,
         fields: Collection[str] | None = (),
         times: tuple[int, int] = ALWAYS,
-        past_damage: bool = False,
+        all_channels: bool = False,
     ) -> None:
         self.size = os.fstat(stream.fileno()).st_size
+        self.heads: list[Head] = []
         self.metadata: dict[str, str] | None = None
         self.header: ArchiveHeader | None = None
         self.header_error: HeaderError | None = None
@@ -81,15 +85,10 @@ class Scan:
         self.parser = ChunkParser()
         self.counts: dict[str, int] = {}
         self.chunks = 0
-        self.pieces: list[tuple[int, int, int]] = []
         self.damage: Damage | None = None
-        self.faults: list[str] = []
-        self._fields, self._times = fields, times
-        self._past_damage = past_damage
-        self._lost = False
-        self._gap = False  # whether something was lost behind the last valid chunk
+        self._fields, self._times, self._all_channels = fields, times, all_channels
         self._skipped = False  # whether chunks were left out: channels continue at any number
-        self._buffer = memoryview(bytearray(0 if past_damage else _BATCH))
+        self._buffer = memoryview(bytearray(_BATCH))
         self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
         self._place = 0  # of the next chunk in the list of checksums
         self._next: dict[str, int] = {}
@@ -99,27 +98,18 @@ class Scan:
         self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
         self._stamps = np.zeros(0, np.int64)
         self._count = 0
-        start = _data_end(stream, self.size) if past_damage else None
-        summary = Summary.read(stream, self.size, start=start)
-        self._written_by = _written_by(stream, self.size)
-        stated, self._mixed_ends = _stated_outcome(stream, self.size, summary)
-        self._repaired = stated.repaired
-        self._chunk_list: NDArray[np.uint32] | None = None
-        # Another program that copies a file may divide it into other chunks, and writes its name.
-        if self._written_by[1] == schema.LIBRARY and stated.chunks is not None:
-            self._chunk_list = np.array(stated.chunks, np.uint32)
-        expected = min(stated.samples or 0, self.size // _LEAST)
+        end = self._find_heads(stream)
+        self.stated, self.mixed, self._chunk_list = self._stated_outcome(stream)
+        expected = min(self.stated.samples or 0, self.size // _LEAST)
         self._room = expected if times == ALWAYS and fields != () else 0
-        self.definitions = summary.definitions if summary else []
-        stream.seek(0)
-        if past_damage:
-            self._read_all(stream, summary)
-        else:
-            self._read(stream, _chunks_outside(summary, times))
+        try:
+            self._read(stream, end)
+        except Damage as damage:
+            self.damage = damage
 
     @property
     def topics(self) -> Collection[str]:
-        """The channels of the samples and the events; others are verified with `past_damage`."""
+        """The channels of the samples and the events."""
         recorded = schema.CYCLE in self.parser.topics
         samples = (schema.CYCLE,) if recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
         return (*samples, schema.EVENTS)
@@ -137,101 +127,87 @@ class Scan:
         return columns
 
     @property
-    def mixed(self) -> bool:
-        """Whether begin and end are of two recordings; the samples may be of either."""
-        return self.outcome is not None and not self.outcome.belongs_to(self.header)
-
-    @property
     def samples(self) -> int:
         """Number of valid samples."""
         return max(self.counts.get(topic, 0) for topic in NUMBERS)
 
-    @property
-    def losses(self) -> list[str]:
-        """What is lost, and where; empty if all that was written is there."""
-        return self.faults if self._lost else []
+    def shortfalls(self) -> Iterator[str]:
+        """Yield a sentence for what the file states to contain and does not."""
+        for name in self.header.attachments if self.header else ():
+            if name not in self.attachments:
+                yield f"attachment {name!r} is missing"
+        outcome = self.outcome
+        if outcome is None:
+            yield "the outcome is missing"
+            return
+        found = {
+            "samples": (outcome.samples, self.samples),
+            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
+        }
+        if self._chunk_list is not None:
+            found["chunks"] = len(self._chunk_list), self.chunks
+        for key, (stated, count) in found.items():
+            if stated != count:
+                yield f"{stated} {key} were written, {count} are there"
 
-    @property
-    def samples_lost(self) -> int | None:
-        """Number of lost samples, None where unknown."""
-        if not self._lost:
-            return 0
-        stated = self.outcome.samples if self.outcome else None
-        return None if stated is None else max(0, stated - self.samples)
-
-    def _read(self, stream: BinaryIO, outside: Collection[int]) -> None:
-        """Read records up to their end or the first damage."""
+    def _find_heads(self, stream: BinaryIO) -> int | Damage:
+        """Find the records with content; return the end of the data section, or the damage."""
         try:
-            try:
-                for record in container.records(stream, self.size, skip=outside):
-                    if record.offset in outside:
-                        self._flush()
-                        self._place, self._skipped = self._place + 1, True
-                        self._next.clear()
-                        continue
-                    self._add(record)
-                    if record.opcode == container.METADATA:
-                        self._check_metadata(record.offset)
-            finally:
-                self._flush()  # pending chunks precede any damage found so far
-            chunks = self._chunk_list
-            if outside and chunks is not None and self._place < len(chunks):
-                raise Damage(self.size, "is not there: a chunk is missing")
-            if not outside and self.header is not None:
-                for text in self._shortfalls():
-                    raise Damage(self.size, f"is not there: {text}")
+            self.heads += container.heads(stream, self.size, _CONTENT)
         except Damage as damage:
-            self.damage = damage
+            return damage
+        return self.heads.pop().end
 
-    def _check_metadata(self, offset: int) -> None:
-        """Require a header of this version and an outcome of the same recording."""
-        if self.metadata is not None and not is_supported(self.metadata):
-            raise Damage(offset, "is of another version")
-        if self.header_error is not None:
-            raise Damage(offset, f"(metadata {METADATA!r}) cannot be used: {self.header_error}")
-        if self.mixed:
-            self.outcome = None
-            raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+    def _stated_outcome(
+        self, stream: BinaryIO
+    ) -> tuple[ArchiveOutcome, bool, NDArray[np.uint32] | None]:
+        """Return the outcome, whether it is of another recording, and its list of chunks.
 
-    def _read_all(self, stream: BinaryIO, summary: Summary | None) -> None:
-        """Read all valid records, also those that only the index leads to."""
-        seen: set[int] = set()
+        The outcome is empty where it is damaged or of another recording; there is no list in older
+        files, and in those that another program has copied, maybe into other chunks: it has written
+        its own name.
+        """
+        found: dict[str, dict[str, str]] = {}
+        library = ""
+        for head in self.heads:
+            with suppress(Damage):
+                if head.opcode == container.METADATA:
+                    name, entries = self._verified_metadata(container.read_record(stream, head))
+                    found.setdefault(name, entries)
+                elif head.opcode == container.HEADER:
+                    record = container.read_record(stream, head)
+                    library = library or container.parse(Header, record).library
         try:
-            for record in container.records(stream, self.size, check_end=False):
-                seen.add(record.offset)
-                self._try_add(record)
-        except Damage as damage:
-            self._gap = True  # counts and outcome show what is lost
-            self._add_fault(damage, loss=False)
-        for place in summary.places if summary else ():
-            if place[0] not in seen:
-                seen.add(place[0])
-                try:
-                    self._try_add(container.record_at(stream, *place))
-                except Damage as damage:
-                    self._add_fault(damage)
-        if self.metadata is not None:
-            if self._written_by != (schema.PROFILE, schema.LIBRARY):
-                self._add_fault("the header is not that of the profile", loss=False)
-            if self.mixed:
-                self._add_fault("the outcome is that of another recording")
-            for text in self._shortfalls():
-                self._add_fault(text)
+            header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
+        except (HeaderError, KeyError):
+            return ArchiveOutcome(), False, None
+        if not outcome.belongs_to(header):
+            return ArchiveOutcome(), True, None
+        listed = outcome.chunks if library == schema.LIBRARY else None
+        return outcome, False, None if listed is None else np.array(listed, np.uint32)
 
-    def _try_add(self, record: Record) -> None:
+    def _read(self, stream: BinaryIO, end: int | Damage) -> None:
+        """Read the wanted records in order, up to the first damage, which is raised."""
+        outside = _chunks_outside(stream, self.size, self._times)
         try:
-            self._add(record)
-        except Damage as damage:
-            self._add_fault(damage)
-
-    def _add_fault(self, problem: Damage | str, *, loss: bool = True) -> None:
-        """Add a fault, which does not lose content unless `loss`."""
-        self._gap |= loss
-        self._lost |= loss
-        if isinstance(problem, Damage):
-            problem = f"the record at byte {problem.offset} {problem.reason}"
-        if problem not in self.faults:
-            self.faults.append(problem)
+            for head in self.heads:
+                if head.opcode == container.CHUNK and head.offset in outside:
+                    self._flush()
+                    self._place, self._skipped = self._place + 1, True
+                    self._next.clear()
+                else:
+                    self._add(container.read_record(stream, head))
+        finally:
+            self._flush()  # pending chunks precede any damage found so far
+        if isinstance(end, Damage):
+            raise end
+        container.check_end(stream, self.size, end)
+        chunks = self._chunk_list
+        if outside and chunks is not None and self._place < len(chunks):
+            raise Damage(self.size, "is not there: a chunk is missing")
+        if not outside and self.header is not None:  # else some other MCAP file
+            for text in self.shortfalls():
+                raise Damage(self.size, f"is not there: {text}")
 
     def _add(self, record: Record) -> None:
         """Verify the next record, and add its content; `Damage` if it is not the next one."""
@@ -249,33 +225,57 @@ class Scan:
                 raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
             self.attachments[attachment.name] = attachment.data
         elif record.opcode == container.METADATA:
-            if self._add_metadata(record):
-                return
-        elif record.opcode in (container.SCHEMA, container.CHANNEL):
+            self._add_metadata(record)
+        elif record.opcode in _DEFINITIONS:
             self.parser.define(record)
-        else:
-            return
-        if self.metadata is not None:
-            self.pieces.append((record.opcode, offset, record.size))
 
-    def _add_metadata(self, record: Record) -> bool:
-        """Add header or outcome; return whether the record is one of them."""
+    @staticmethod
+    def _verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
+        """Return name and entries, without the checksum that they must have if they are ours."""
         name, entries = container.parse_metadata(record)
-        if name not in (METADATA, OUTCOME):
-            return False
-        if entries.pop("checksum", None) != checksum(entries):
+        ours = name in (METADATA, OUTCOME)
+        if ours and entries.pop("checksum", None) != checksum(entries):
             raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
+        return name, entries
+
+    def _add_metadata(self, record: Record) -> None:
+        """Add header or outcome: one each, of this version and of the same recording."""
+        offset = record.offset
+        name, entries = self._verified_metadata(record)
+        if name not in (METADATA, OUTCOME):
+            return
         if (self.metadata if name == METADATA else self.outcome) is not None:
-            raise Damage(record.offset, f"(metadata {name!r}) is there a second time")
+            raise Damage(offset, f"(metadata {name!r}) is there a second time")
         if name == OUTCOME:
-            self.outcome = ArchiveOutcome.of(entries)
-            return True
+            outcome = ArchiveOutcome.of(entries)
+            if not outcome.belongs_to(self.header):
+                raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+            self.outcome = outcome
+            return
         self.metadata = entries
+        if not is_supported(entries):
+            raise Damage(offset, "is of another version")
         try:
-            self.header = ArchiveHeader.of(entries) if is_supported(entries) else None
+            self.header = ArchiveHeader.of(entries)
         except HeaderError as error:
             self.header_error = error
-        return True
+            problem = f"(metadata {METADATA!r}) cannot be used: {error}"
+            raise Damage(offset, problem) from error
+
+    def _check_order(self, crc: int, offset: int) -> None:
+        """Check that the chunk with this checksum is the next of those that were written."""
+        if self.mixed:
+            reason = "(chunk) may be of either of two: the outcome is that of another recording"
+            raise Damage(offset, reason)
+        chunks = self._chunk_list
+        if chunks is None:
+            return
+        if self._place < len(chunks) and chunks[self._place] == crc:
+            self._place += 1
+        elif crc in chunks:
+            raise Damage(offset, "(chunk) does not continue the one before, by the outcome's list")
+        else:
+            raise Damage(offset, "(chunk) is of another recording, by the outcome's list")
 
     def _add_chunk(self, data: bytes, offset: int) -> None:
         """Decode the content of a chunk, or buffer it to decode several at once."""
@@ -306,44 +306,6 @@ class Scan:
             self._decode(self._buffer[place], offset)
             self.chunks += 1
 
-    def _shortfalls(self) -> Iterator[str]:
-        """Yield a sentence for what the file states to contain and does not."""
-        for name in self.header.attachments if self.header else ():
-            if name not in self.attachments:
-                yield f"attachment {name!r} is missing"
-        outcome = self.outcome
-        if outcome is None:
-            yield "the outcome is missing"
-            return
-        found = {
-            "samples": (outcome.samples, self.samples),
-            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
-        }
-        if self._chunk_list is not None:
-            found["chunks"] = len(self._chunk_list), self.chunks
-        for key, (stated, count) in found.items():
-            if stated != count:
-                yield f"{stated} {key} were written, {count} are there"
-
-    def _check_order(self, crc: int, offset: int) -> None:
-        """Check that the chunk with this checksum is the next of those that were written."""
-        if self._mixed_ends and not self._past_damage:
-            reason = "(chunk) may be of either of two: the outcome is that of another recording"
-            raise Damage(offset, reason)
-        chunks = self._chunk_list
-        if chunks is None:
-            return
-        if self._place < len(chunks) and chunks[self._place] == crc:
-            self._place += 1
-            return
-        places = np.flatnonzero(chunks == crc)
-        if not len(places) or places[-1] < self._place:
-            why = "is out of order" if len(places) else "is of another recording"
-            raise Damage(offset, f"(chunk) {why}, by the outcome's list of checksums")
-        if not self._past_damage:
-            raise Damage(offset, "(chunk) does not continue the one before")
-        self._place = int(places[-1]) + 1
-
     def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
         """Add messages that must be the next of their channels; else none of them.
 
@@ -355,9 +317,6 @@ class Scan:
             by_number = parser.messages(data, offset)
             if several and parser.channels.keys() != before[1].keys():
                 raise Damage(offset, "(chunk) defines a channel")
-            if not by_number.keys() <= parser.channels.keys():
-                for definition in self.definitions:
-                    parser.define(definition)
             if unknown := by_number.keys() - parser.channels.keys():
                 raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
             found = {parser.channels[number].topic: one for number, one in by_number.items()}
@@ -366,17 +325,14 @@ class Scan:
             new = self._numbers not in (set(), numbers) or numbers.isdisjoint(wanted)
             if numbers and new:
                 raise Damage(offset, "(chunk) has samples in other channels than those before")
-            verified = found if self._past_damage else {topic: found[topic] for topic in wanted}
-            missing = self._check_sequences(verified, offset)
+            verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
+            self._check_sequences(verified, offset)
             newest = self._check_times(verified, offset)
-            if missing:
-                self._check_gap(missing, offset)
             layouts = self._check_layouts(verified, offset)
             events = self._decode_events(verified, offset)
         except Damage:
             parser.schemas, parser.channels = before
             raise
-        self._gap = False
         self._newest = max(self._newest, newest)
         self._numbers = self._numbers or numbers
         for topic, messages in verified.items():
@@ -384,18 +340,17 @@ class Scan:
             self.counts[topic] = self.counts.get(topic, 0) + len(messages)
         self._layouts |= layouts
         self.events += [one for one in events if self._times[0] <= one.stamp < self._times[1]]
-        if self.header is not None:
-            self._append({topic: found[topic] for topic in wanted if topic != schema.EVENTS})
+        self._append({topic: found[topic] for topic in wanted if topic != schema.EVENTS})
 
     def _check_layouts(
         self, found: Mapping[str, Messages], offset: int
     ) -> dict[str, MessageLayout]:
         """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
+        assert self.header is not None
         layouts = {}
-        for topic in found.keys() & set(NUMBERS) if self.header else ():
+        for topic in found.keys() & set(NUMBERS):
             messages, layout = found[topic], self._layouts.get(topic)
             if layout is None:
-                assert self.header is not None
                 record, first = self.parser.schema(topic), bytes(messages.data[0][0])
                 try:
                     layout = schema.message_layout(topic, self.header.joint_names, record, first)
@@ -451,34 +406,20 @@ class Scan:
                 for raw, start in columns:
                     raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
 
-    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> list[str]:
-        """Check that no message is repeated; return the topics of which some are missing."""
-        gaps = {}
+    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> None:
+        """Check that no message is missing or repeated, but for those that a repair has lost."""
         for topic, messages in found.items():
             sequence = messages.of_heads("sequence")
             if (np.diff(sequence) != 1).any():
                 raise Damage(offset, "(chunk) has messages out of order")
             first = int(sequence[0])
-            gaps[topic] = first - self._next.get(topic, first if self._skipped else 0)
-            gaps[topic] %= _SEQUENCES
-            if gaps[topic] > _SEQUENCES // 2:
+            gap = first - self._next.get(topic, first if self._skipped else 0)
+            gap %= _SEQUENCES
+            if gap > _SEQUENCES // 2:
                 raise Damage(offset, "(chunk) repeats messages of those before")
-        if len({(len(found[topic]), gaps[topic]) for topic in found if topic in NUMBERS}) > 1:
-            raise Damage(offset, "(chunk) has channels of different length")
-        return [topic for topic, gap in gaps.items() if gap]
-
-    def _check_gap(self, topics: Collection[str], offset: int) -> None:
-        """Handle missing messages of these topics in front of the chunk at `offset`."""
-        if not self._past_damage:
-            if not self._repaired:
+            if gap and not self.stated.repaired:
                 reason = "(chunk) does not continue the one before it: a chunk is missing"
                 raise Damage(offset, reason)
-            return
-        if schema.CYCLE not in self.parser.topics and not set(NUMBERS).isdisjoint(topics):
-            raise Damage(offset, "(chunk) follows a gap that no cycle number would show")
-        if not self._gap and not self._repaired:
-            damage = Damage(offset, "(chunk) does not continue the one before")
-            self._add_fault(damage)
 
     def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
         """Check that cycles increase, and that all channels have the same times without cycles.
@@ -496,7 +437,7 @@ class Scan:
             raise Damage(offset, "(chunk) has messages without a stamp")
         if not all(np.array_equal(one, stamp) for one in stamps):
             raise Damage(offset, "(chunk) has channels of different times")
-        if timed[0] not in schema.PER_CYCLE or schema.CYCLE not in self.parser.topics:
+        if timed[0] != schema.CYCLE:
             return -1
         if (np.diff(stamp) <= 0).any():
             raise Damage(offset, "(chunk) has cycles that do not increase")
@@ -505,71 +446,18 @@ class Scan:
         return int(stamp[-1])
 
 
-def _written_by(stream: BinaryIO, size: int) -> tuple[str, str]:
-    """Return profile and library of a file, empty where its first record is damaged."""
-    stream.seek(0)
-    with suppress(Damage):
-        record = next(container.records(stream, size, check_end=False))
-        if record.opcode == container.HEADER:
-            head = container.parse(Header, record)
-            return head.profile, head.library
-    return "", ""
-
-
-def _stated_outcome(
-    stream: BinaryIO, size: int, summary: Summary | None
-) -> tuple[ArchiveOutcome, bool]:
-    """Return the outcome, found by the summary or from head to head; empty if it is damaged.
-
-    And whether it is of another recording than the header; then it is empty as well.
-    """
-    found: dict[str, dict[str, str]] = {}
-
-    def add(records: Iterable[Record]) -> None:
-        with suppress(Damage):
-            for record in records:
-                name, entries = container.parse_metadata(record)
-                claimed = entries.pop("checksum", None)
-                if name in (METADATA, OUTCOME) and claimed == checksum(entries):
-                    found.setdefault(name, entries)
-
-    if summary is not None:
-        places = summary.entries(container.METADATA_INDEX)
-        add(container.record_at(stream, one.offset, one.length) for one in places)
-    if found.keys() != {METADATA, OUTCOME}:
-        found.clear()
-        stream.seek(0)
-        add(container.records(stream, size, only=(container.METADATA,), check_end=False))
-    try:
-        header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
-    except (HeaderError, KeyError):
-        return ArchiveOutcome(), False
-    mixed = not outcome.belongs_to(header)
-    return (ArchiveOutcome() if mixed else outcome), mixed
-
-
-def _data_end(stream: BinaryIO, size: int) -> int | None:
-    """Return where the data section ends, from head to head: records may have moved."""
-    walk = container.records(stream, size, only=(container.DATA_END,), check_end=False)
-    try:
-        return next(walk).end
-    except Damage:
-        return None
-
-
-def _chunks_outside(summary: Summary | None, times: tuple[int, int]) -> Collection[int]:
+def _chunks_outside(stream: BinaryIO, size: int, times: tuple[int, int]) -> Collection[int]:
     """Return the places of chunks without messages of these times, by the index.
 
-    If all are outside, the first is read anyway: it defines the columns.
+    The first is read anyway: it defines the channels.
     """
-    if summary is None or times == ALWAYS:
+    if times == ALWAYS:
         return ()
-    chunks = summary.entries(container.CHUNK_INDEX)
-    start, stop = times
-    within = {
+    chunks = container.read_chunk_index(stream, size)
+    first = min((one.chunk_start_offset for one in chunks), default=0)
+    return {
         one.chunk_start_offset
         for one in chunks
-        if one.message_start_time < stop and one.message_end_time >= start
+        if one.chunk_start_offset != first
+        and not (one.message_start_time < times[1] and one.message_end_time >= times[0])
     }
-    known = {one.chunk_start_offset for one in chunks}
-    return known - (within or {min(known, default=0)})

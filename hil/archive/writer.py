@@ -14,6 +14,7 @@ from pathlib import Path, PurePath
 from typing import Any, Final, Self
 
 import numpy as np
+from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 
 from hil.archive.cdr import Rows
@@ -40,7 +41,6 @@ from hil.archive.schema import (
     MOTOR_CURRENT,
     PROFILE,
     Batch,
-    Channel,
     cycle_messages,
     description_message,
     profile,
@@ -116,14 +116,14 @@ class ArchiveFile:
         self._parts: list[bytes] = []  # to be written at once
         self._writer = McapWriter(self._parts.append, PROFILE, LIBRARY)
         with self._guarded():
-            self._writer.add_metadata(METADATA, with_checksum(described))
+            self._writer.put(Metadata(METADATA, with_checksum(described)))
             for name, data in sorted(attachments.items()):
                 media_type = _MEDIA_TYPES.get(PurePath(name).suffix, "application/octet-stream")
-                self._writer.add_attachment(name, media_type, data)
+                self._writer.put(Attachment(0, 0, name, media_type, data))
             self._write()
             if durable:  # at last, so that the file is empty for as short a time as possible
                 sync_folder(path.parent)
-        self._numbers = {channel.topic: register(self._writer, channel) for channel in channels}
+        self._numbers = {one.topic: self._writer.register(one) for one in channels}
 
     def add(self, batch: Batch) -> None:
         """Add messages of several channels to the chunk in progress."""
@@ -163,7 +163,7 @@ class ArchiveFile:
                 DESCRIPTION: self._description,
                 CHUNKS: format_chunk_list(self._writer.checksums),
             }
-            self._writer.add_metadata(OUTCOME, with_checksum({**outcome, **seals}))
+            self._writer.put(Metadata(OUTCOME, with_checksum({**outcome, **seals})))
             self._writer.finish()
             self._write()
             self._close()  # some file systems report only here that the disk is full
@@ -199,17 +199,6 @@ class ArchiveFile:
         if not self.closed:
             self.closed = True
             os.close(self._descriptor)
-
-
-def register(writer: McapWriter, channel: Channel) -> int:
-    """Define a channel of CDR messages; return its number."""
-    return writer.register(
-        channel.topic,
-        "cdr",
-        schema=channel.schema,
-        encoding="ros2msg",
-        definition=channel.definition.encode(),
-    )
 
 
 def _create(path: Path) -> int:

@@ -11,7 +11,7 @@ from typing import NamedTuple, Self
 
 import zstandard
 from mcap.reader import make_reader
-from mcap.records import Attachment, Chunk, Metadata
+from mcap.records import Attachment, Chunk, Header, Metadata
 from mcap.writer import CompressionType, IndexType, Writer
 
 from hil.archive import container
@@ -181,14 +181,16 @@ class Indexed:
     def put(self, data: bytes) -> None:
         """Append a record, given with its head."""
         item = Record(len(self.data), data[0], data[container.RECORD.size :])
-        if item.opcode != container.CHUNK:
-            self._writer.put(data)
-            return
-        head, parser = container.parse_chunk(item), ChunkParser()
-        found = parser.messages(container.chunk_data(head, item.offset), item.offset)
-        for definition in parser.definitions:
-            self._writer.note(definition)
-        self._writer.add_chunk(head, entries_of(found))
+        if item.opcode == container.CHUNK:
+            head, parser = container.parse_chunk(item), ChunkParser()
+            found = parser.messages(container.chunk_data(head, item.offset), item.offset)
+            for definition in parser.definitions:
+                self._writer.note(definition)
+            self._writer.add_chunk(head, entries_of(found))
+        elif item.opcode == container.HEADER:
+            self._writer.put(container.parse(Header, item))
+        else:
+            self._writer.put(container.parse_item(item))
 
     def ended(self) -> bytes:
         """Return the complete file."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import NonSeekingReader, make_reader
+from mcap.records import Attachment, Metadata
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
@@ -183,12 +184,13 @@ def test_the_same_calls_give_the_bytes_of_the_reference_writer(
     ours = McapWriter(files[0].write, "ros2", "test")
     theirs = Writer(files[1], chunk_size=1 << 62, compression=CompressionType.ZSTD)
     theirs.start("ros2", "test")
-    ours.add_attachment("a.txt", "text/plain", b"one")
+    ours.put(Attachment(0, 0, "a.txt", "text/plain", b"one"))
     theirs.add_attachment(0, 0, "a.txt", "text/plain", b"one")
-    kinds = [(f"/{i}", "cdr", f"s/{i}", "ros2msg", b"int8 x") for i in range(3)]
-    channels = [ours.register(*kind) for kind in kinds]
-    for topic, encoding, name, form, text in kinds:
-        theirs.register_channel(topic, encoding, theirs.register_schema(name, form, text))
+    kinds = [profile.Channel(f"/{i}", f"s/{i}", "int8 x") for i in range(3)]
+    channels = [ours.register(kind) for kind in kinds]
+    for kind in kinds:
+        number = theirs.register_schema(kind.schema, "ros2msg", kind.definition.encode())
+        theirs.register_channel(kind.topic, "cdr", number)
     for start, stop in ((0, 4), (4, 4), (4, 6)):
         part = slice(start, stop)
         times, numbers = np.array(stamps[part], np.int64), np.arange(start, stop)
@@ -199,9 +201,10 @@ def test_the_same_calls_give_the_bytes_of_the_reference_writer(
                 theirs.add_message(channel, stamp, row[number].tobytes(), stamp, number)
         ours.add_message(channels[2], 9 + start, 7, b"event")
         theirs.add_message(channels[2], 9 + start, b"event", 9 + start, 7)
-        for writer in (ours, theirs):
-            writer.add_metadata("note", {"key": "ä"})
-            writer.flush()
+        ours.put(Metadata("note", {"key": "ä"}))
+        theirs.add_metadata("note", {"key": "ä"})
+        ours.flush()
+        theirs.flush()
     for writer in (ours, theirs):
         writer.finish()
     assert files[0].getvalue() == files[1].getvalue()
