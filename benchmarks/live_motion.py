@@ -50,7 +50,7 @@ def play(worst: Worst, cell: Cell) -> tuple[float, Array]:
     guard, n = Guard(cell.guard_limits, STEP), len(worst.travel)
     player = TrajectoryPlayer(worst.motion, STEP, cell.joint_limits)
     player.begin(player.start)
-    guard.begin(player.start, np.zeros(n), np.zeros(n), np.zeros((2, n)), 0)
+    guard.begin(player.start, 0)
     for cycle in range(round(worst.instant / STEP)):
         position, velocity = player.advance()
         guard.check_set_point(position, velocity, player.bounds, cycle)

@@ -35,15 +35,7 @@ from drivers.events import (
 )
 from drivers.exchange.loop import exchange
 from drivers.guard import Guard, GuardLimits
-from drivers.motion_source import (
-    BoundsName,
-    CorrectionSource,
-    FeedForwardSource,
-    HoldableSource,
-    MotionSource,
-    OverridableSource,
-    ResumableSource,
-)
+from drivers.motion_source import BoundsName, CorrectionSource, MotionSource
 from drivers.packets import MODE_FIELDS, CyclicPacket, InitPacket, Mode
 from drivers.record import CycleRing, cycle_dtype
 from drivers.session import Session
@@ -56,7 +48,6 @@ from drivers.transports.udp import UdpSpec, UdpTransport
 __all__ = [
     "AnswersLost",
     "BoundsName",
-    "ResumableSource",
     "CorrectionSource",
     "Corrupt",
     "Counters",
@@ -70,13 +61,11 @@ __all__ = [
     "Event",
     "Fault",
     "FaultyLink",
-    "FeedForwardSource",
     "GapSeen",
     "HoldChanged",
     "Guard",
     "GuardError",
     "GuardLimits",
-    "HoldableSource",
     "InitPacket",
     "InitReceived",
     "LinkLost",
@@ -88,7 +77,6 @@ __all__ = [
     "MotionStarted",
     "OverrideChanged",
     "Outcome",
-    "OverridableSource",
     "PacketError",
     "PacketRejected",
     "Peer",

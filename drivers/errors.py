@@ -10,7 +10,9 @@ and attributes, without their cause.
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from enum import Enum
+from typing import Any, Final
 
 
 class DriverError(Exception):
@@ -92,25 +94,17 @@ class SourceFailed(RefusalError):
 
 
 class AxisNotInMode(RefusalError):
-    """Axis `joint` (from 0) is in `mode`, not in the open mode `wanted` that the motion needs."""
-
-    def __init__(self, joint: int, mode: int, wanted: int, cycle: int) -> None:
-        super().__init__(f"joint {joint + 1} is in mode {mode}; the motion needs {wanted}", cycle)
-        self.joint = joint
-        self.mode = mode
-        self.wanted = wanted
+    """A joint is not in the open mode that the motion needs."""
 
 
 class ModeRefused(RefusalError):
-    """Axis `joint` (from 0) reports an unknown mode, or is open without having been closed."""
+    """A joint reports an unknown mode, or is open without having been closed."""
 
     remedy = "have the controller's program go from mode 0 to the open mode of the cell file"
 
-    def __init__(self, joint: int, mode: int, known: bool, cycle: int) -> None:
-        reason = "it was not closed before" if known else "the reply to that mode is unknown"
-        super().__init__(f"joint {joint + 1} is in mode {mode}: {reason}", cycle)
-        self.joint = joint
-        self.mode = mode
+
+class ExitTimeout(RefusalError):
+    """The controller did not end open mode after the session asked for it."""
 
 
 class SessionFailed(RefusalError):
@@ -135,177 +129,96 @@ def error_text(error: BaseException) -> str:
         return f"{kind} without a message"
 
 
-class ExitTimeout(RefusalError):
-    """The controller did not end open mode in `cycles` since the session asked for it."""
+_BEYOND: Final = "the motion exceeds the limits and would be refused again: design another one"
+_REST_FIRST: Final = "let the arm come to rest before open mode is asked for"
+_LOOK_FOR_LOSSES: Final = "look for lost packets: the cable, other traffic, hil doctor"
+_CHECK_ARM: Final = "check that the arm is free, check its payload, then go slower"
+_CHECK_AXIS: Final = "check that the axis is free, then its following_error in [drive_train]"
+_REVOLUTIONS: Final = "motor revolutions"
+_PER_CYCLE: Final = "motor revolutions per cycle"
 
-    def __init__(self, cycles: int, cycle: int) -> None:
-        super().__init__(
-            f"open mode was asked to end {cycles} cycles ago and axes are still open", cycle
-        )
-        self.cycles = cycles
+
+class Check(Enum):
+    """A check of the guard: the quantity as messages name it, its unit, and a remedy if special."""
+
+    FINITE = "finiteness", ""
+    POSITION = "position", "rad", _BEYOND
+    VELOCITY = "velocity", "rad/s", _BEYOND
+    ACCELERATION = "acceleration", "rad/s²", _BEYOND
+    JERK = "jerk", "rad/s³", _BEYOND
+    STATED_VELOCITY = "difference between stated velocity and step", "rad/s"
+    FOLLOWING_ERROR = "following error", _REVOLUTIONS, _CHECK_AXIS
+    CURRENT = "target current", "A", _CHECK_ARM
+    COMMANDED_CURRENT = "commanded current", "A", _CHECK_ARM
+    CURRENT_STEP = "change of commanded current in one cycle", "A", _CHECK_ARM
+    CORRECTION_END = "correction at the end", ""
+    FIRST_SET_POINT = (
+        "distance between received target and actual position",
+        _REVOLUTIONS,
+        _REST_FIRST,
+    )
+    STANDSTILL = "velocity at the first set-point", _PER_CYCLE, _REST_FIRST
+    FIRST_AGE = (
+        "age, at the first set-point, of received target, position or velocity",
+        "cycles",
+        _REST_FIRST,
+    )
+    ACCEPTED = (
+        "distance between received target and the set-points sent last",
+        _REVOLUTIONS,
+        _LOOK_FOR_LOSSES,
+    )
+    GAP_VELOCITY = (
+        "difference, after a gap, between received velocity and the one sent last",
+        _PER_CYCLE,
+        _LOOK_FOR_LOSSES,
+    )
+    PAUSE_VELOCITY = (
+        "difference, after a pause, between the velocity received and the one sent last",
+        "rad/s",
+        _LOOK_FOR_LOSSES,
+    )
+    GAP_AGE = "age, after a gap, of received target or velocity", "cycles", _LOOK_FOR_LOSSES
+    GAP_CORRECTION = "correction sent last before a gap", "", _LOOK_FOR_LOSSES
+
+    def __init__(self, quantity: str, unit: str, remedy: str = RefusalError.remedy) -> None:
+        self.quantity = quantity
+        self.unit = unit
+        self.remedy = remedy
 
 
 class GuardError(RefusalError):
     """A quantity outside its bound.
 
     Attributes:
-        check: name of the check.
+        kind: the check that failed.
+        check: its quantity.
+        unit: of value and bound; that of the check if it is None.
         joint: index from 0.
-        value: what was found, in `unit`.
-        bound: largest magnitude allowed (or the nearer position limit), in `unit`.
+        value: what was found.
+        bound: largest magnitude allowed (or the nearer position limit).
     """
 
-    check = "guard"
-    unit = ""
-
-    def __init_subclass__(cls, *, check: str = "", unit: str = "", remedy: str = "") -> None:
-        cls.check = check or cls.check
-        cls.unit = unit or cls.unit
-        cls.remedy = remedy or cls.remedy
-
     def __init__(
-        self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
+        self,
+        kind: Check,
+        joint: int,
+        value: float,
+        bound: float,
+        cycle: int,
+        unit: str | None = None,
     ) -> None:
-        unit = self.unit if unit is None else unit
-        super().__init__(
-            f"{self.check} of joint {joint + 1} is {value:.9g} {unit}; "
-            f"allowed is {bound:.9g} {unit}",
-            cycle,
+        self.unit = unit = kind.unit if unit is None else unit
+        message = (
+            f"{kind.quantity} of joint {joint + 1} is {value:.9g} {unit}; "
+            f"allowed is {bound:.9g} {unit}"
         )
-        self.unit = unit
+        if not math.isfinite(value):
+            kind, message = Check.FINITE, f"joint {joint + 1} has {value} where a number must be"
+        super().__init__(message, cycle)
+        self.kind = kind
+        self.check = kind.quantity
+        self.remedy = kind.remedy
         self.joint = joint
         self.value = value
         self.bound = bound
-
-
-class NotFinite(GuardError, check="finiteness"):
-    """NaN or infinity where a finite number is required."""
-
-    def __init__(
-        self, joint: int, value: float, bound: float, cycle: int, unit: str | None = None
-    ) -> None:
-        super().__init__(joint, value, bound, cycle, unit)
-        self.args = (f"joint {joint + 1} has {value} where a number must be (cycle {cycle})",)
-
-
-class TargetNotFinite(NotFinite):
-    """The target of an open axis of `arm` (from 1) outside the cell is not finite."""
-
-    def __init__(self, arm: int, joint: int, value: float, cycle: int) -> None:
-        super().__init__(joint, value, float("inf"), cycle)
-        message = f"target received of axis {joint + 1} of arm {arm}, which is open, is {value}"
-        self.args = (f"{message} (cycle {cycle})",)
-        self.arm = arm
-
-
-_BEYOND = "the motion exceeds the limits and would be refused again: design another one"
-
-
-class PositionLimit(GuardError, check="position", unit="rad", remedy=_BEYOND):
-    """Set-point outside the joint's range."""
-
-
-class VelocityLimit(GuardError, check="velocity", unit="rad/s", remedy=_BEYOND):
-    """Step between two sent set-points, or the stated velocity, too fast."""
-
-
-class AccelerationLimit(GuardError, check="acceleration", unit="rad/s²", remedy=_BEYOND):
-    """Second difference of the sent set-points too large."""
-
-
-class JerkLimit(GuardError, check="jerk", unit="rad/s³", remedy=_BEYOND):
-    """Third difference of the sent set-points too large."""
-
-
-class VelocityMismatch(
-    GuardError, check="difference between stated velocity and step", unit="rad/s"
-):
-    """The source's velocity is not the derivative of its positions."""
-
-
-class FollowingError(
-    GuardError,
-    check="following error",
-    unit="motor revolutions",
-    remedy="check that the axis is free, then its following_error in [drive_train]",
-):
-    """The axis does not follow; the reply reports mode 508 in this axis."""
-
-
-class CurrentLimit(
-    GuardError,
-    check="target current",
-    unit="A",
-    remedy="check that the arm is free, check its payload, then go slower",
-):
-    """The servo's target current exceeds the narrower of the cell's and controller's limits."""
-
-
-class CommandedCurrentLimit(CurrentLimit, check="commanded current"):
-    """A current fed forward, or its sum with the servo's own, exceeds the limit."""
-
-
-class CommandedCurrentStep(CommandedCurrentLimit, check="change of commanded current in one cycle"):
-    """A current fed forward, or added to the servo's own, changes too much in one cycle."""
-
-
-class CorrectionNotEnded(GuardError, check="correction at the end"):
-    """The source is finished while its correction or feed-forward is not zero."""
-
-
-class FirstSetPoint(
-    GuardError,
-    check="distance between received target and actual position",
-    unit="motor revolutions",
-    remedy="let the arm come to rest before open mode is asked for",
-):
-    """The first set-point is not where the arm is, or the arm is not at rest."""
-
-
-class NotAtStandstill(
-    FirstSetPoint, check="velocity at the first set-point", unit="motor revolutions per cycle"
-):
-    """The axis moves in the cycle of its first set-point."""
-
-
-class FirstSetPointUnknown(
-    FirstSetPoint,
-    check="age, at the first set-point, of received target, position or velocity",
-    unit="cycles",
-):
-    """Target, position or velocity received with it were sent in an earlier cycle."""
-
-
-class SetPointNotAccepted(
-    GuardError,
-    check="distance between received target and the set-points sent last",
-    unit="motor revolutions",
-    remedy="look for lost packets: the cable, other traffic, hil doctor",
-):
-    """The controller's target is none of the set-points sent last."""
-
-
-class VelocityAfterGap(
-    SetPointNotAccepted,
-    check="difference, after a gap, between received velocity and the one sent last",
-    unit="motor revolutions per cycle",
-):
-    """After a long gap the axis rests, or its velocity is not that of the set-point sent last."""
-
-
-class VelocityAfterPause(
-    SetPointNotAccepted,
-    check="difference, after a pause, between the velocity received and the one sent last",
-    unit="rad/s",
-):
-    """After a pause by the clock the arm's velocity is not that of the set-points sent last."""
-
-
-class AgeAfterGap(
-    VelocityAfterGap, check="age, after a gap, of received target or velocity", unit="cycles"
-):
-    """After a long gap, target or velocity received were sent in an earlier cycle."""
-
-
-class CorrectionUnconfirmed(SetPointNotAccepted, check="correction sent last before a gap"):
-    """After a long gap it is unknown whether the controller applied the correction sent last."""

@@ -9,40 +9,37 @@ a hold that does not come to rest becomes a stop.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Final, cast
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.errors import SourceFailed, error_text
 from drivers.events import Outcome
-from drivers.guard import RANK
-from drivers.motion_source import (
-    BoundsName,
-    CorrectionSource,
-    FeedForwardSource,
-    MotionSource,
-    ResumableSource,
-    is_correction,
-    is_holdable,
-    is_motion,
-)
+from drivers.guard import RANK, Array
+from drivers.motion_source import BoundsName, CorrectionSource, MotionSource, has_members
 from drivers.states import CORRECTION_MODES, POSITION_MODES
-
-Array = NDArray[np.float64]
 
 _AT_REST: Final = 1e-9
 """Rounding of standstill, rad per cycle and rad/s."""
+_MEMBERS: Final = ("begin", "advance", "finished", "stop")
+_HOLD: Final = ("hold", "resume")
+_SET_POINT: Final = ("position", "velocity")
+_CORRECTION: Final = ("correction", "current")
 
 
-class Execution(ABC):
-    """Common part of motions and corrections.
+class Execution:
+    """Set-points of a `MotionSource`, or corrections of a `CorrectionSource`.
 
-    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`.
+    The end is held for `settle_cycles`; a stop or hold may take `stop_cycles`. A correction is zero
+    after its end.
 
     Attributes:
+        corrects: the source is a `CorrectionSource`.
+        feeds_forward: the source has `feed_forward`.
         started: the first set-point was sent.
+        position: (n,) rad, the last set-point.
         fraction: of the planned speed, last requested; None before.
         held: a hold is active.
         leaving: the motion came to rest and open mode is being left.
@@ -53,18 +50,23 @@ class Execution(ABC):
     def __init__(
         self,
         source: MotionSource | CorrectionSource,
+        mode: int,
         n_joints: int,
         settle_cycles: int,
         stop_cycles: int,
     ) -> None:
-        self._source = source
-        self._shape = (n_joints,)
-        self._still = np.zeros(n_joints)
+        self._source: Any = source
         self._settle_cycles = settle_cycles
         self._stop_cycles = stop_cycles
+        self._still = np.zeros(n_joints)
+        self._shape = (n_joints,)
         self._allowed: tuple[BoundsName, ...] = ("plan",)
         self._rest_by: int | None = None  # first cycle in which it takes too long
         self._resting = 0
+        self.corrects = mode in CORRECTION_MODES
+        self._names = _CORRECTION if self.corrects else _SET_POINT
+        self.feeds_forward = callable(getattr(source, "feed_forward", None))
+        self.position = self._still
         self.finished = False
         self.started = False
         self.fraction: float | None = None
@@ -83,24 +85,28 @@ class Execution(ABC):
         """The widest bounds allowed now."""
         return self._allowed[-1]
 
+    @property
+    def is_resumable(self) -> bool:
+        """Whether the source runs and can continue from the controller's target."""
+        running = self.started and not self.finished
+        return running and callable(getattr(self._source, "resume_from", None))
+
     def begin(self, position: Array, cycle: int) -> None:
         """Begin at the first set-point, (n,) rad; hold at once if that was requested before.
 
         Raises:
             SourceFailed: the source does not begin there, or does not hold.
         """
-        try:
-            self._begin_source(position)
+        with _failing("cannot begin", cycle):
+            if self.corrects:
+                self._source.begin()
+            else:
+                self.position = position
+                self._source.begin(position.copy())
             self.finished = bool(self._source.finished)
-        except BaseException as error:
-            raise _failed("cannot begin", error, cycle) from error
         self.started = True
         if self.held and (reason := self.hold(cycle)) is not None:
             raise SourceFailed(f"{reason}, before it began", cycle)
-
-    @abstractmethod
-    def _begin_source(self, position: Array) -> None:
-        """Begin the source at this position, (n,) rad."""
 
     def stop(self, reason: str, cycle: int) -> None:
         """Come to rest on the path; the first reason stays. Raises SourceFailed."""
@@ -111,10 +117,8 @@ class Execution(ABC):
         self.held = False
         self._rest_by = cycle + self._stop_cycles
         self._allow("stop")
-        try:
+        with _failing("failed to stop", cycle):
             self._source.stop()
-        except BaseException as error:
-            raise _failed("failed to stop", error, cycle) from error
 
     def override(self, fraction: float) -> str | None:
         """Change the override; return why that is not possible, or None."""
@@ -140,13 +144,12 @@ class Execution(ABC):
         """
         if self.outcome == "stopped" or self.finished:
             return None
-        source: object = self._source
         try:
-            if not is_holdable(source):
+            if not has_members(self._source, _HOLD):
                 return "held, which this motion cannot: it was stopped instead"
             if self.started:  # a source may reset itself when it begins
                 self._allow("stop")
-                source.hold()
+                self._source.hold()
         except BaseException as error:
             return f"the motion source failed to hold: {error_text(error)}"
         self.held = True
@@ -154,37 +157,91 @@ class Execution(ABC):
             self._rest_by = cycle + 1 + self._stop_cycles
         return None
 
-    def mark_at_rest(self) -> None:
-        """The motion is at rest, which completes a hold."""
-        if self.outcome != "stopped":
-            self._rest_by = None
-
     def resume(self) -> str | None:
         """Continue after a hold; return why that is not possible, or None."""
-        source: object = self._source
         try:
-            if not is_holdable(source):
+            if not has_members(self._source, _HOLD):
                 return "this motion cannot be held"
             if self.outcome == "stopped":
                 return "the motion is being stopped"
             if self.started:
-                source.resume()
+                self._source.resume()
         except BaseException as error:
             return f"the motion source refused it: {error_text(error)}"
         self._rest_by, self.held = None, False
         return None
 
+    def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
+        """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held.
+
+        Of a correction: motion (n,) as of `CorrectionSource`, motor current (n,) A, and the widest
+        bounds, because it names none. Raises SourceFailed.
+        """
+        try:
+            if self.finished:
+                self._resting += 1
+                return self.position, self._still, self._bounds()
+            first, second = self._source.advance()
+            first = self._checked(first, self._names[0])
+            second = self._checked(second, self._names[1])
+            bounds = self._bounds()
+            self.finished = bool(self._source.finished)
+        except BaseException as error:
+            raise _failed("failed", error, cycle) from error
+        if self._rest_by is not None:
+            moved = np.abs(first - self.position).max()
+            if not self.corrects and max(moved, np.abs(second).max()) <= _AT_REST:
+                self.mark_at_rest()
+            self._require_rest(cycle)
+        # The source may reuse its arrays.
+        if self.corrects:
+            return first.copy(), second.copy(), bounds
+        self.position = first.copy()
+        return self.position, second, bounds
+
+    def feed_forward(self, cycle: int) -> tuple[Array, Array]:
+        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
+
+        Zero at the end. Raises SourceFailed.
+        """
+        if self._resting:
+            return self._still, self._still
+        with _failing("failed to feed forward", cycle):
+            velocity, current = self._source.feed_forward()
+            return (
+                self._checked(velocity, "feed-forward velocity").copy(),
+                self._checked(current, "feed-forward current").copy(),
+            )
+
+    def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
+        """Continue from the controller's target, see `MotionSource`; raises SourceFailed."""
+        with _failing("cannot continue", cycle):
+            # Copies, because the guard compares with these arrays.
+            self._source.resume_from(position.copy(), velocity.copy(), cycles)
+
+    def mark_at_rest(self) -> None:
+        """The motion is at rest, which completes a hold, and its bounds where none are named."""
+        if self.outcome == "stopped":
+            return
+        self._rest_by = None
+        if self.corrects:
+            self._allowed = tuple(name for name in self._allowed if name != "stop")
+
     def _allow(self, bounds: BoundsName) -> None:
         if bounds not in self._allowed:
             self._allowed = tuple(sorted((*self._allowed, bounds), key=RANK.__getitem__))
 
-    def _checked(self, values: object, what: str, cycle: int) -> Array:
+    def _checked(self, values: object, what: str) -> Array:
         array = np.asarray(values, dtype=np.float64)
         if array.shape != self._shape:
-            raise SourceFailed(
-                f"the motion source gave a {what} of shape {array.shape}, not {self._shape}", cycle
-            )
+            raise ValueError(f"a {what} of shape {array.shape}, not {self._shape}")
         return array
+
+    def _bounds(self) -> BoundsName:
+        bounds: BoundsName = self._allowed[-1] if self.corrects else self._source.bounds
+        if not isinstance(bounds, str) or bounds not in self._allowed:
+            raise ValueError(f"bounds {bounds!r}, not {' or '.join(self._allowed)}")
+        return bounds
 
     def _require_rest(self, cycle: int) -> None:
         """Raise for a stop that takes too long; stop a hold that does."""
@@ -200,121 +257,17 @@ class Execution(ABC):
         )
 
 
-class MotionExecution(Execution):
-    """Set-points of a `MotionSource`.
-
-    Attributes:
-        position: (n,) rad, the last set-point.
-        feeds_forward: the source is a `FeedForwardSource`.
-    """
-
-    _source: MotionSource
-
-    def __init__(
-        self, source: MotionSource, n_joints: int, settle_cycles: int, stop_cycles: int
-    ) -> None:
-        super().__init__(source, n_joints, settle_cycles, stop_cycles)
-        self.position = self._still
-        self.feeds_forward = callable(getattr(source, "feed_forward", None))
-
-    def _begin_source(self, position: Array) -> None:
-        self.position = position
-        self._source.begin(position.copy())
-
-    def advance(self, cycle: int) -> tuple[Array, Array, BoundsName]:
-        """Return the next set-point (n,) rad, rad/s, and its bounds; the end is held."""
-        try:
-            if self.finished:
-                self._resting += 1
-                return self.position, self._still, self._bounds(cycle)
-            given, speed = self._source.advance()
-            position = self._checked(given, "position", cycle)
-            velocity = self._checked(speed, "velocity", cycle)
-            bounds = self._bounds(cycle)
-            self.finished = bool(self._source.finished)
-        except SourceFailed:
-            raise
-        except BaseException as error:
-            raise _failed("failed", error, cycle) from error
-        if self._rest_by is not None and self._is_at_rest(position, velocity):
-            self.mark_at_rest()
-        self._require_rest(cycle)
-        # The source may reuse its arrays.
-        self.position = position.copy()
-        return self.position, velocity, bounds
-
-    @property
-    def is_resumable(self) -> bool:
-        """Whether the source is a running `ResumableSource`."""
-        running = self.started and not self.finished
-        return running and callable(getattr(self._source, "resume_from", None))
-
-    def resume_from(self, position: Array, velocity: Array, cycles: int, cycle: int) -> None:
-        """Continue from the controller's target, see `ResumableSource`; raises SourceFailed."""
-        try:
-            # Copies, because the guard compares with these arrays.
-            source = cast(ResumableSource, self._source)
-            source.resume_from(position.copy(), velocity.copy(), cycles)
-        except BaseException as error:
-            raise _failed("cannot continue", error, cycle) from error
-
-    def feed_forward(self, cycle: int) -> tuple[Array, Array]:
-        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last."""
-        if self._resting:
-            return self._still, self._still
-        try:
-            velocity, current = cast(FeedForwardSource, self._source).feed_forward()
-            return (
-                self._checked(velocity, "feed-forward velocity", cycle).copy(),
-                self._checked(current, "feed-forward current", cycle).copy(),
-            )
-        except SourceFailed:
-            raise
-        except BaseException as error:
-            raise _failed("failed to feed forward", error, cycle) from error
-
-    def _is_at_rest(self, position: Array, velocity: Array) -> bool:
-        step = np.abs(position - self.position).max()
-        return bool(max(step, np.abs(velocity).max()) <= _AT_REST)
-
-    def _bounds(self, cycle: int) -> BoundsName:
-        bounds = self._source.bounds
-        if not isinstance(bounds, str) or bounds not in self._allowed:
-            allowed = " or ".join(self._allowed)
-            raise SourceFailed(f"the motion source named bounds {bounds!r}, not {allowed}", cycle)
-        return bounds
+@contextmanager
+def _failing(what: str, cycle: int) -> Iterator[None]:
+    """Make a `SourceFailed` of whatever a source raises."""
+    try:
+        yield
+    except BaseException as error:
+        raise _failed(what, error, cycle) from error
 
 
-class CorrectionExecution(Execution):
-    """Corrections of a `CorrectionSource`; after its end they are zero."""
-
-    _source: CorrectionSource
-
-    def mark_at_rest(self) -> None:
-        """End the bounds allowed for a hold, because a correction does not name its bounds."""
-        super().mark_at_rest()
-        if self.outcome != "stopped":
-            self._allowed = tuple(name for name in self._allowed if name != "stop")
-
-    def _begin_source(self, position: Array) -> None:  # noqa: ARG002  a correction has no position
-        self._source.begin()
-
-    def advance(self, cycle: int) -> tuple[Array, Array]:
-        """Return the next correction: motion (n,), see `CorrectionSource`, and current (n,) A."""
-        if self.finished:
-            self._resting += 1
-            return self._still, self._still
-        try:
-            given, amperes = self._source.advance()
-            motion = self._checked(given, "correction", cycle)
-            current = self._checked(amperes, "current", cycle)
-            self.finished = bool(self._source.finished)
-        except SourceFailed:
-            raise
-        except BaseException as error:
-            raise _failed("failed", error, cycle) from error
-        self._require_rest(cycle)
-        return motion.copy(), current.copy()
+def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
+    return SourceFailed(f"the motion source {what}: {error_text(error)}", cycle)
 
 
 def execution_of(
@@ -324,16 +277,12 @@ def execution_of(
     settle_cycles: int,
     stop_cycles: int,
 ) -> Execution | str:
-    """Return the execution of a source, or why the open mode cannot run it."""
+    """Return the execution of a source, or why it cannot run in this open mode."""
     try:
-        if mode in CORRECTION_MODES and is_correction(source):
-            return CorrectionExecution(source, n_joints, settle_cycles, stop_cycles)
-        if mode in POSITION_MODES and is_motion(source):
-            return MotionExecution(source, n_joints, settle_cycles, stop_cycles)
+        named = has_members(source, ("bounds",))
+        fits = (mode in POSITION_MODES) if named else (mode in CORRECTION_MODES)
+        if fits and has_members(source, _MEMBERS):
+            return Execution(source, mode, n_joints, settle_cycles, stop_cycles)
     except BaseException as error:
         return f"the motion source cannot be inspected: {error_text(error)}"
     return f"a {type(source).__name__} is not the kind of source mode {mode} needs"
-
-
-def _failed(what: str, error: BaseException, cycle: int) -> SourceFailed:
-    return SourceFailed(f"the motion source {what}: {error_text(error)}", cycle)

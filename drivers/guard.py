@@ -12,84 +12,53 @@ All comparisons are written so that NaN fails them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import (
-    AccelerationLimit,
-    CommandedCurrentLimit,
-    CommandedCurrentStep,
-    CorrectionNotEnded,
-    CorrectionUnconfirmed,
-    CurrentLimit,
-    FirstSetPoint,
-    FollowingError,
-    GuardError,
-    JerkLimit,
-    NotAtStandstill,
-    NotFinite,
-    PositionLimit,
-    SetPointNotAccepted,
-    VelocityAfterGap,
-    VelocityAfterPause,
-    VelocityLimit,
-    VelocityMismatch,
-)
+from drivers.errors import Check, GuardError
 from drivers.motion_source import BoundsName
 
 Array = NDArray[np.float64]
-
-
-def require_finite(values: Array, where: NDArray[np.bool_], cycle: int) -> None:
-    """Raise `NotFinite` for the first joint of `where` (n,) whose value (n,) is not finite."""
-    bad = where & ~np.isfinite(values)
-    if bad.any():
-        joint = int(np.argmax(bad))
-        raise NotFinite(joint, float(values[joint]), np.inf, cycle)
+Joints = NDArray[np.bool_]
 
 
 def require(
-    where: NDArray[np.bool_],
-    values: Array,
-    bounds: Array,
-    error: type[GuardError],
-    cycle: int,
-    unit: str | None = None,
+    where: Joints, values: Array, bounds: Array, check: Check, cycle: int, unit: str | None = None
 ) -> None:
-    """Raise `error` for the first joint of `where` (n,) whose value (n,) is above its bound."""
+    """Raise for the first joint of `where` (n,) whose value (n,) is above its bound (n,)."""
     bad = where & ~(values <= bounds)
     if bad.any():
         joint = int(np.argmax(bad))
-        kind = error if np.isfinite(values[joint]) else NotFinite
-        raise kind(joint, float(values[joint]), float(bounds[joint]), cycle, unit)
+        raise GuardError(check, joint, float(values[joint]), float(bounds[joint]), cycle, unit)
+
+
+def require_finite(values: Array, where: Joints, cycle: int) -> None:
+    """Raise for the first joint of `where` (n,) whose value (n,) is not finite."""
+    finite = np.where(np.isfinite(values), 0.0, values)
+    require(where, np.abs(finite), np.zeros_like(values), Check.FINITE, cycle)
 
 
 def report(
-    magnitude: Array,
-    found: Array,
-    allowed: Array,
-    checks: tuple[type[GuardError], ...],
-    cycle: int,
-    position_limits: Callable[[int, float], tuple[float, float]] | None = None,
+    found: Array, allowed: Array, checks: tuple[Check, ...], cycle: int, middle: Array | None = None
 ) -> NoReturn:
     """Raise for the first row and joint outside its bound; not finite values come first.
 
-    `magnitude` (k, n) is compared with `allowed` (k, n); the error states `found` (k, n), with its
-    sign. For a position, `position_limits` (joint, distance from the middle of the range) returns
-    the position and the limit to state. `checks` has the error of each row.
+    `found` (k, n) has a row for each of `checks`, with a magnitude of at most `allowed` (k, n).
+    A position is measured from the `middle` (n,) of its range.
     """
-    not_finite = ~np.isfinite(magnitude)
-    bad = not_finite if not_finite.any() else ~(magnitude <= allowed)
+    not_finite = ~np.isfinite(found)
+    bad = not_finite if not_finite.any() else ~(np.abs(found) <= allowed)
     row, joint = (int(index) for index in np.argwhere(bad)[0])
     value, bound = float(found[row, joint]), float(allowed[row, joint])
-    kind = NotFinite if not_finite.any() else checks[row]
-    if kind is PositionLimit and position_limits is not None:
-        value, bound = position_limits(joint, value)
-    raise kind(joint, value, bound, cycle)
+    if checks[row] is Check.POSITION and middle is not None:
+        bound = float(middle[joint]) + math.copysign(bound / (1.0 + RELATIVE_TOLERANCE), value)
+        value += float(middle[joint])
+    raise GuardError(checks[row], joint, value, bound, cycle)
 
 
 DEFAULT_STANDSTILL: Final = 5e-4
@@ -143,29 +112,26 @@ class GuardLimits:
 
     def __post_init__(self) -> None:
         n = np.size(self.lower)
-        for name in ("lower", "upper", "velocity", "acceleration", "jerk"):
-            self._check(name, n, positive=name not in ("lower", "upper"))
-        self._check("following_error", n, positive=True)
-        self._check("current", n, positive=True)
+        ranges = ("lower", "upper")
+        positive = ("velocity", "acceleration", "jerk", "following_error", "current")
+        for name in (*ranges, *positive):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != (n,) or not np.all(np.isfinite(array)):
+                raise ValueError(f"guard limits: {name} must be {n} finite numbers, got {array}")
+            if name in positive and not np.all(array > 0.0):
+                raise ValueError(f"guard limits: {name} must be positive, got {array}")
+            object.__setattr__(self, name, array)
         if not np.all(self.lower < self.upper):
             raise ValueError(f"guard limits: lower {self.lower} is not below upper {self.upper}")
-        for plan, override, stop in (
-            (1.0, self.override_acceleration, self.stop_acceleration),
-            (1.0, self.override_jerk, self.stop_jerk),
+        for override, stop in (
+            (self.override_acceleration, self.stop_acceleration),
+            (self.override_jerk, self.stop_jerk),
         ):
-            if not plan <= override <= stop:
+            if not 1.0 <= override <= stop:
                 raise ValueError(f"guard limits: factors 1 <= {override} <= {stop} do not hold")
         for name in ("standstill", "current_rise"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"guard limits: {name} {getattr(self, name)} is not positive")
-
-    def _check(self, name: str, n: int, *, positive: bool) -> None:
-        array = np.array(getattr(self, name), dtype=np.float64)
-        if array.shape != (n,) or not np.all(np.isfinite(array)):
-            raise ValueError(f"guard limits: {name} must be {n} finite numbers, got {array}")
-        if positive and not np.all(array > 0.0):
-            raise ValueError(f"guard limits: {name} must be positive, got {array}")
-        object.__setattr__(self, name, array)
 
     @property
     def n_joints(self) -> int:
@@ -219,23 +185,21 @@ LAG: Final = 0.05
 of 20 to 50 /s."""
 
 # Rows of the matrix of checked quantities, in the order in which a violation is reported.
-_SET_POINT_CHECKS: Final[tuple[type[GuardError], ...]] = (
-    PositionLimit,
-    VelocityLimit,
-    VelocityLimit,
-    VelocityMismatch,
-    AccelerationLimit,
-    JerkLimit,
+_SET_POINT_CHECKS: Final = (
+    Check.POSITION,
+    Check.VELOCITY,
+    Check.VELOCITY,
+    Check.STATED_VELOCITY,
+    Check.ACCELERATION,
+    Check.JERK,
 )
-_FEEDBACK_CHECKS: Final[tuple[type[GuardError], ...]] = (
-    FollowingError,
-    FollowingError,
-    CurrentLimit,
-)
+_FEEDBACK_CHECKS: Final = (Check.FOLLOWING_ERROR, Check.FOLLOWING_ERROR, Check.CURRENT)
 
 
 class Guard:
     """Checks feedback and set-points of one arm, cycle by cycle.
+
+    Every check raises `GuardError` where the set-point must not be sent or the motion not continue.
 
     Attributes:
         limits: of the arm.
@@ -304,27 +268,14 @@ class Guard:
         self._feedback_bounds[2] = self.current
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
-    def check_hold(self, target: Array, actual: Array, held: NDArray[np.bool_], cycle: int) -> None:
-        """Check that axes `held` (n,) can hold their target (n,) D1 while others are closed.
-
-        Raises:
-            NotFinite, FollowingError: they cannot.
-        """
+    def check_hold(self, target: Array, actual: Array, held: Joints, cycle: int) -> None:
+        """Check that axes `held` (n,) can hold their target (n,) D1 while others are closed."""
         require_finite(target, held, cycle)
-        error = np.abs(actual - target)
-        require(
-            held, error, self.following_error * (1.0 + RELATIVE_TOLERANCE), FollowingError, cycle
-        )
+        bound = self.following_error * (1.0 + RELATIVE_TOLERANCE)
+        require(held, np.abs(actual - target), bound, Check.FOLLOWING_ERROR, cycle)
 
-    def begin(self, q: Array, target: Array, actual: Array, step: Array, cycle: int) -> None:
-        """Check the first set-point q (n,) rad: the target (n,) D1 when the last axis opened.
-
-        The other arguments are those of `check_start`.
-
-        Raises:
-            NotFinite, PositionLimit, FirstSetPoint, NotAtStandstill: it must not be sent.
-        """
-        self.check_start(target, actual, step, cycle)
+    def begin(self, q: Array, cycle: int) -> None:
+        """Check the first set-point q (n,) rad, at rest, which then counts as sent."""
         self._active.reset()
         self._history[:4] = q
         self.check_set_point(q, np.zeros_like(q), "plan", cycle)
@@ -342,17 +293,14 @@ class Guard:
 
         Of the packet: `target` D1 and `actual` D3, (n,), and `step` D2 and D4, (2, n), motor
         revolutions and per cycle.
-
-        Raises:
-            NotFinite, FirstSetPoint, NotAtStandstill: it must not.
         """
         every = self._every
         require_finite(target, every, cycle)
         bound = FIRST_FRACTION * self.following_error
-        require(every, np.abs(target - actual), bound, FirstSetPoint, cycle)
+        require(every, np.abs(target - actual), bound, Check.FIRST_SET_POINT, cycle)
         standstill = np.full(len(target), self.limits.standstill)
         for velocity in step:
-            require(every, np.abs(velocity), standstill, NotAtStandstill, cycle)
+            require(every, np.abs(velocity), standstill, Check.STANDSTILL, cycle)
 
     def check_feedback(
         self,
@@ -361,7 +309,7 @@ class Guard:
         current: Array,
         commanded: Array,
         cycle: int,
-        where: NDArray[np.bool_] | None = None,
+        where: Joints | None = None,
     ) -> None:
         """Check following error and current, before the next set-point is computed.
 
@@ -375,9 +323,6 @@ class Guard:
             commanded: (n,) D1 of the last reply, motor revolutions.
             cycle: for the error.
             where: (n,) which joints; None for all.
-
-        Raises:
-            NotFinite, FollowingError, CurrentLimit: the motion must not continue.
         """
         found = self._feedback
         np.subtract(actual, commanded, out=found[0])
@@ -387,7 +332,7 @@ class Guard:
         if where is not None:
             found[:, ~where] = 0.0
         if not (found <= self._feedback_bounds).all():
-            report(found, found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
+            report(found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
         self,
@@ -396,7 +341,7 @@ class Guard:
         commanded: Array,
         step: Array,
         cycle: int,
-        where: NDArray[np.bool_],
+        where: Joints,
     ) -> None:
         """Check the first packet after a long gap, before the axes `where` (n,) continue.
 
@@ -410,40 +355,36 @@ class Guard:
             step: (n,) D2 of the last reply, motor revolutions per cycle.
             cycle: for the error.
             where: which joints.
-
-        Raises:
-            NotFinite, SetPointNotAccepted, VelocityAfterGap: to continue would be a jump.
         """
         bound = FIRST_FRACTION * self.following_error
-        require(where, np.abs(target - commanded), bound, SetPointNotAccepted, cycle)
+        require(where, np.abs(target - commanded), bound, Check.ACCEPTED, cycle)
         standstill = self.limits.standstill
         bound = np.maximum(0.5 * np.abs(step), standstill)
         moving = np.abs(velocity[1]) > standstill
         for joints, found in ((where, velocity[0]), (where & ~moving, velocity[1])):
-            require(joints, np.abs(found - step), bound, VelocityAfterGap, cycle)
+            require(joints, np.abs(found - step), bound, Check.GAP_VELOCITY, cycle)
 
-    def check_after_pause(self, velocity: Array, cycle: int, where: NDArray[np.bool_]) -> None:
+    def check_after_pause(self, velocity: Array, cycle: int, where: Joints) -> None:
         """Check after a late packet that the velocity (n,) rad/s is that of the set-points sent.
 
         The servo may lag behind by what it gains in `LAG` at the allowed acceleration.
-
-        Raises:
-            NotFinite, VelocityAfterPause: to continue would be a jump.
         """
         sent = (self._history[3] - self._history[2]) / self.period
         factor, _ = self.limits.factors(self._active.rank)
         bound = LAG * factor * self.limits.acceleration
-        require(where, np.abs(velocity - sent), bound, VelocityAfterPause, cycle)
+        require(where, np.abs(velocity - sent), bound, Check.PAUSE_VELOCITY, cycle)
+
+    def check_position(self, q: Array, cycle: int) -> None:
+        """Check the position (n,) rad that a correction leads to."""
+        found, allowed = (q - self._middle)[None], self._sets[0][:1]
+        if not (np.abs(found) <= allowed).all():
+            report(found, allowed, _SET_POINT_CHECKS[:1], cycle, self._middle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """Check the next set-point q (n,) rad, qd (n,) rad/s, which then counts as sent.
 
         `bounds` apply from this set-point on; wider ones stay active until no difference reaches
         back to them.
-
-        Raises:
-            NotFinite, PositionLimit, VelocityLimit, VelocityMismatch, AccelerationLimit,
-            JerkLimit: it must not be sent.
         """
         history = self._history
         history[:3] = history[1:4]
@@ -452,18 +393,12 @@ class Guard:
         found = self._quantities
         np.matmul(self._differences, history, out=found)
         found[0] -= self._middle
-        magnitude = np.abs(found)
         allowed = self._sets[self._active.update(bounds)]
-        if not (magnitude <= allowed).all():
-            report(magnitude, found, allowed, _SET_POINT_CHECKS, cycle, self.position_limits)
-
-    def position_limits(self, joint: int, value: float) -> tuple[float, float]:
-        """Return the position `value` off the middle of the range, and the nearest limit."""
-        limit = self.limits.upper if value > 0.0 else self.limits.lower
-        return float(self._middle[joint] + value), float(limit[joint])
+        if not (np.abs(found) <= allowed).all():
+            report(found, allowed, _SET_POINT_CHECKS, cycle, self._middle)
 
 
-_CHECKS: Final[tuple[type[GuardError], ...]] = (VelocityLimit, AccelerationLimit, JerkLimit)
+_RATE_CHECKS: Final = (Check.VELOCITY, Check.ACCELERATION, Check.JERK)
 _UNIT: Final = {"velocity": "rad/s", "offset": "rad"}
 
 
@@ -474,7 +409,8 @@ class CorrectionGuard:
     bounds as set-points, on their differences from one reply to the next: the differences of a
     velocity are mean accelerations and jerks, those of an offset one order higher. An offset also
     has the bounds of a velocity, as if the controller added it up cycle by cycle; so has its sum
-    with the target. A current has a limit and a largest step per cycle. Nothing is clamped.
+    with the target. A current has a limit and a largest step per cycle. Nothing is clamped; every
+    check raises `GuardError`.
 
     The motion is a "velocity", rad/s, or an "offset" of positions, rad.
     """
@@ -495,7 +431,7 @@ class CorrectionGuard:
         self._differences = (
             as_velocity if kind == "velocity" else np.vstack([as_position, as_velocity / T])
         )
-        self._checks = _CHECKS * (len(self._differences) // 3)
+        self._checks = _RATE_CHECKS * (len(self._differences) // 3)
         self._sets = {rank: self._bounds(rank) for rank in RANK.values()}
         self._active = ActiveBounds()
         self._history = np.zeros((4, n))
@@ -521,20 +457,15 @@ class CorrectionGuard:
         self._active.reset()
 
     def check_motion(self, motion: Array, bounds: BoundsName, cycle: int) -> None:
-        """Check the next velocity or offset (n,), which then counts as sent.
-
-        Raises:
-            NotFinite, VelocityLimit, AccelerationLimit, JerkLimit: it must not be sent.
-        """
+        """Check the next velocity or offset (n,), which then counts as sent."""
         history = self._history
         history[:3] = history[1:]
         history[3] = motion
         found = self._quantities
         np.matmul(self._differences, history, out=found)
         allowed = self._sets[self._active.update(bounds)]
-        magnitude = np.abs(found)
-        if not (magnitude <= allowed).all():
-            report(magnitude, found, allowed, self._checks, cycle)
+        if not (np.abs(found) <= allowed).all():
+            report(found, allowed, self._checks, cycle)
 
     @property
     def resting(self) -> bool:
@@ -553,53 +484,29 @@ class CorrectionGuard:
         """Check the speed of target and offset (n,) rad together, which then count as sent.
 
         `sent_in` (n,) is the cycle in which each target was sent, `rounding` (n,) rad of a step.
-
-        Raises:
-            NotFinite, VelocityLimit: too fast, with the offset as a position or as a step.
         """
         T = self._guard.period
         elapsed = T * np.maximum(sent_in - self._sent_in, 1.0)
         speed = (target - self._target) / elapsed
         bound = self._guard.limits.velocity * (1.0 + RELATIVE_TOLERANCE) + rounding / elapsed
         for step in (offset - self._offset, offset):
-            require(self._every, np.abs(speed + step / T), bound, VelocityLimit, cycle)
+            require(self._every, np.abs(speed + step / T), bound, Check.VELOCITY, cycle)
         self.set_target(target, offset, sent_in)
 
     def check_current(self, current: Array, servo: Array | None, cycle: int) -> None:
         """Check the next current (n,) A, which then counts as sent.
 
         It is fed forward, or added to the servo's own (n,) A.
-
-        Raises:
-            NotFinite, CommandedCurrentLimit, CommandedCurrentStep: it must not be sent.
         """
         total = current if servo is None else current + servo
         bound = self._guard.current * (1.0 + RELATIVE_TOLERANCE)
-        require(self._every, np.abs(total), bound, CommandedCurrentLimit, cycle)
+        require(self._every, np.abs(total), bound, Check.COMMANDED_CURRENT, cycle)
         step, largest = np.abs(current - self._current), bound * self._rise
-        require(self._every, step, largest, CommandedCurrentStep, cycle)
+        require(self._every, step, largest, Check.CURRENT_STEP, cycle)
         self._current[...] = current
 
-    def check_position(self, q: Array, cycle: int) -> None:
-        """Check the position (n,) rad that the correction leads to; raises PositionLimit."""
-        limits = self._guard.limits
-        require_finite(q, self._every, cycle)
-        reach = RELATIVE_TOLERANCE * 0.5 * (limits.upper - limits.lower)
-        outside = (q > limits.upper + reach) | (q < limits.lower - reach)
-        if outside.any():
-            joint = int(np.argmax(outside))
-            limit = limits.upper if q[joint] > limits.upper[joint] else limits.lower
-            raise PositionLimit(joint, float(q[joint]), float(limit[joint]), cycle)
-
-    def check_end(self, cycle: int) -> None:
-        """Check that a finished source gave zero last; raises CorrectionNotEnded."""
-        self._require_zero(CorrectionNotEnded, cycle)
-
-    def check_after_gap(self, cycle: int) -> None:
-        """Check after a long gap that the last correction, which may be unapplied, is zero."""
-        self._require_zero(CorrectionUnconfirmed, cycle)
-
-    def _require_zero(self, kind: type[GuardError], cycle: int) -> None:
+    def require_zero(self, check: Check, cycle: int) -> None:
+        """Require the last correction to be zero; raises GuardError with this check."""
         no_current = RELATIVE_TOLERANCE * self._guard.current
-        require(self._every, np.abs(self._history[3]), self._nothing, kind, cycle, self._unit)
-        require(self._every, np.abs(self._current), no_current, kind, cycle, "A")
+        require(self._every, np.abs(self._history[3]), self._nothing, check, cycle, self._unit)
+        require(self._every, np.abs(self._current), no_current, check, cycle, "A")

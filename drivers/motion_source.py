@@ -4,8 +4,7 @@
 open mode    who generates the targets                                   source
 ===========  ==========================================================  ====================
 4, 5         the PC                                                      `MotionSource`
-1            the PC, with feed-forward of velocity and current           `MotionSource`, or
-                                                                         `FeedForwardSource`
+1            the PC, with feed-forward of velocity and current           `MotionSource`
 2, 7, 8, 9   the controller; the PC corrects them                        `CorrectionSource`
 ===========  ==========================================================  ====================
 """
@@ -14,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal, Protocol, TypeGuard
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,23 @@ class MotionSource(Protocol):
     The session calls `begin` once, in the cycle of the first set-point (the position given, at zero
     velocity), then `advance` once for each later packet that it replies to. A source has no clock:
     after a gap the motion continues where it was.
+
+    Further methods are optional; without them the session refuses or does what they are for
+    differently:
+
+    - ``override(fraction)``: continue at this fraction (0..1) of the planned speed, within the
+      bounds "override".
+    - ``hold()`` and ``resume()``: come to rest on the path, within the bounds of a stop, and wait,
+      not `finished`; continue, within the same bounds until the former speed is reached. `stop` may
+      follow a hold. One that does not come to rest is stopped after `session.STOP_TIMEOUT`.
+    - ``resume_from(position, velocity, cycles)``: continue along the path from the target, (n,) rad
+      and rad/s, to which a controller has extrapolated the motion. A velocity across the path
+      decays within `cycles`. Raises if the target is off the path.
+    - ``feed_forward()``: in mode 1, return velocity (n,) rad/s and motor current (n,) A of the
+      set-point given last; called once after each `advance`. Both are zero at the first set-point
+      and at the end. Without it the velocity is that of the set-points, and the current zero.
+
+    Attributes ``motion_time`` (s) and ``rate`` (1 as planned), if both exist, are displayed.
     """
 
     @property
@@ -43,8 +59,8 @@ class MotionSource(Protocol):
     def bounds(self) -> BoundsName:
         """Set of bounds that the set-points satisfy from now on.
 
-        "override" is allowed from the first change of override on (`OverridableSource`), "stop"
-        from `stop`, or the first `hold` (`HoldableSource`), on.
+        "override" is allowed from the first change of override on, "stop" from `stop`, or the first
+        `hold`, on.
         """
 
     def begin(self, position: Array) -> None:
@@ -57,17 +73,6 @@ class MotionSource(Protocol):
         """Come to rest on the path; then `finished` is true. Calling it again changes nothing.
 
         Drive-off is requested if that takes longer than `session.STOP_TIMEOUT`.
-        """
-
-
-class FeedForwardSource(MotionSource, Protocol):
-    """A motion with velocity and current for feed-forward, in open mode 1."""
-
-    def feed_forward(self) -> tuple[Array, Array]:
-        """Return velocity (n,) rad/s and motor current (n,) A of the set-point given last.
-
-        Called once after each `advance`; both zero at the first set-point and at the end. Without
-        this method the velocity fed forward is that of the set-points, and the current zero.
         """
 
 
@@ -104,51 +109,12 @@ class CorrectionSource(Protocol):
         """Bring the correction back to zero; then `finished` is true."""
 
 
-class OverridableSource(Protocol):
-    """A source whose speed can be changed while it runs."""
-
-    def override(self, fraction: float) -> None:
-        """Continue at this fraction (0..1) of the planned speed, within the bounds "override"."""
-
-
-class HoldableSource(Protocol):
-    """A source that can rest on its path and continue from there."""
-
-    def hold(self) -> None:
-        """Come to rest on the path, within the bounds of a stop, and wait; not `finished`.
-
-        `stop` may follow. A source that does not come to rest is stopped after
-        `session.STOP_TIMEOUT`.
-        """
-
-    def resume(self) -> None:
-        """Continue, within the bounds of a stop until the former speed is reached."""
-
-
-class ResumableSource(Protocol):
-    """A source that can continue where a controller has extrapolated its motion."""
-
-    def resume_from(self, position: Array, velocity: Array, cycles: int) -> None:
-        """Continue along the path from the controller's target, (n,) rad and rad/s.
-
-        A velocity across the path decays within `cycles`. Raises if the target is off the path.
-        """
-
-
-def is_motion(source: object) -> TypeGuard[MotionSource]:
-    """Whether a source has the members of a `MotionSource`; none of them is called."""
-    return _has(source, ("begin", "advance", "finished", "bounds", "stop"))
-
-
-def is_correction(source: object) -> TypeGuard[CorrectionSource]:
-    """Whether a source has the members of a `CorrectionSource`, and no bounds."""
-    members = _has(source, ("begin", "advance", "finished", "stop"))
-    return members and not _has(source, ("bounds",))
-
-
-def is_holdable(source: object) -> TypeGuard[HoldableSource]:
-    """Whether a source has the members of a `HoldableSource`."""
-    return _has(source, ("hold", "resume"))
+def has_members(source: object, names: Sequence[str]) -> bool:
+    """Whether a source has these members; none of them is called."""
+    # A property is found on the class, without running the source's code.
+    return all(
+        hasattr(type(source), name) or name in getattr(source, "__dict__", ()) for name in names
+    )
 
 
 def progress_of(source: object) -> tuple[float, float]:
@@ -156,18 +122,7 @@ def progress_of(source: object) -> tuple[float, float]:
 
     A source that raises counts as not giving them: the cycle does not depend on either.
     """
-    return _number_of(source, "motion_time"), _number_of(source, "rate")
-
-
-def _number_of(source: object, name: str) -> float:
     try:
-        return float(getattr(source, name))
+        return float(source.motion_time), float(source.rate)  # type: ignore[attr-defined]
     except BaseException:
-        return math.nan
-
-
-def _has(source: object, names: Sequence[str]) -> bool:
-    # A property is found on the class, without running the source's code.
-    return all(
-        hasattr(type(source), name) or name in getattr(source, "__dict__", ()) for name in names
-    )
+        return math.nan, math.nan

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.drive_train import ArmWire
-from drivers.errors import (
-    AgeAfterGap,
-    AxisNotInMode,
-    FirstSetPointUnknown,
-    GuardError,
-    SetPointNotAccepted,
-    SourceFailed,
-)
-from drivers.execution import CorrectionExecution, Execution, MotionExecution
-from drivers.guard import FIRST_FRACTION, CorrectionGuard, Guard, require
+from drivers.errors import AxisNotInMode, Check, SourceFailed
+from drivers.execution import Execution
+from drivers.guard import FIRST_FRACTION, Array, CorrectionGuard, Guard, Joints, require
 from drivers.packets import MODE_FIELDS, Mode
 from drivers.replies import D1, D2, D4, D5, Reading, ReplyFrame
-
-Array = NDArray[np.float64]
 
 LEAP_FRACTION: Final = 0.25
 """Share of the following-error threshold allowed between target and set-point sent last."""
@@ -93,7 +84,7 @@ class SentSetPoints:
         target: Array,
         missed: int,
         cycle: int,
-        where: NDArray[np.bool_] | None = None,
+        where: Joints | None = None,
         *,
         stopping: bool = False,
     ) -> int:
@@ -112,7 +103,7 @@ class SentSetPoints:
             less than the standstill threshold per cycle does not show one.
 
         Raises:
-            NotFinite, SetPointNotAccepted: a target further than `FIRST_FRACTION` of the
+            GuardError: a target further than `FIRST_FRACTION` of the
                 following-error threshold from all of them, or than `LEAP_FRACTION` from the last,
                 or not the last one although this was sent `REPETITIONS` times.
         """
@@ -122,8 +113,8 @@ class SentSetPoints:
         # Usual case: the set-point sent last.
         if np.abs(target - newest).max() <= standstill:
             # At standstill a target reported late is equal to it as well.
-            step = np.abs(newest - sent[self._newest - 1]).max()
-            if self.lag and not self._repeated and step > standstill:
+            before = sent[self._newest - 1]
+            if self.lag and not self._repeated and np.abs(newest - before).max() > standstill:
                 self.lag = 0
             return 0
         rows = sent[(self._newest - self._back) % len(sent)]
@@ -132,8 +123,8 @@ class SentSetPoints:
         where = self._every if where is None else where
         nearest = np.minimum(late[: self._depth].min(axis=0), ahead.min(axis=0, initial=np.inf))
         threshold = self._guard.following_error
-        require(where, nearest, FIRST_FRACTION * threshold, SetPointNotAccepted, cycle)
-        require(where, late[0], LEAP_FRACTION * threshold, SetPointNotAccepted, cycle)
+        require(where, nearest, FIRST_FRACTION * threshold, Check.ACCEPTED, cycle)
+        require(where, late[0], LEAP_FRACTION * threshold, Check.ACCEPTED, cycle)
         behind = where & (late[0] > standstill)
         behind &= late.min(axis=0) <= ahead.min(axis=0, initial=np.inf)
         lag = int(late.argmin(axis=0)[behind].max(initial=0))
@@ -144,11 +135,9 @@ class SentSetPoints:
             return 0 if known_late else more
         self.again = True
         if self._repeated >= REPETITIONS:
-            require(where, late[0], np.full_like(newest, standstill), SetPointNotAccepted, cycle)
+            require(where, late[0], np.full_like(newest, standstill), Check.ACCEPTED, cycle)
         return 1 if self._repeated else more
 
-
-Joints = NDArray[np.bool_]
 
 # Rows of `ArmWire.raw`.
 TARGET, TARGET_VELOCITY, ACTUAL, ACTUAL_VELOCITY, CURRENT = range(5)
@@ -164,101 +153,127 @@ than half of it has so little curvature, less than 10 rad/s² within 1e-3 rad, t
 is needed; and the motion does not stay beside its path for as long as a gap may last."""
 
 
-class _OpenMode:
-    """Writes set-points into `frame`, which holds the safe reply, and into a record (2, n).
+class OpenMode(ABC):
+    """Writes set-points into `frame`, which holds the safe reply, and into the cycle's record.
+
+    Methods that check or send something raise `GuardError` or `SourceFailed`.
 
     Attributes:
         held: (n,) rad, the set-point sent last.
         lost: replies that were not accepted according to the last packet.
-        missed: packets before that one without a reply; to be set for each packet.
     """
 
-    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame) -> None:
+    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+        n = guard.limits.n_joints
         self._guard = guard
         self._wire = wire
+        self._raw = wire.raw
         self._frame = frame
-        self._still = np.zeros(guard.limits.n_joints)
-        self._every = np.ones(guard.limits.n_joints, dtype=np.bool_)
+        self._mode = mode
+        self._still = np.zeros(n)
+        self._every = np.ones(n, dtype=np.bool_)
         self.held = self._still
         self.lost = 0
-        self.missed = 0
 
-    def opening(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
-        """Hold the axes that are open already, by the safe reply; raises GuardError."""
-        self.lost = 0  # set-points of an earlier interval do not matter
-        self._hold(reading.held, reading.held | reading.ready, measured, commanded, cycle)
-
-    def _hold(
-        self, held: Joints, where: Joints, measured: Array, commanded: Array, cycle: int
+    def receive(
+        self, reading: Reading, measured: Array, commanded: Array, cycle: int, missed: int
     ) -> None:
-        self.require_holdable(held, where, cycle)
-        _command_targets(held, measured, commanded)
+        """Receive the packet of `cycle`; to be called before any other method.
 
-    def require_holdable(self, held: Joints, where: Joints, cycle: int) -> None:
-        """Require new targets for joints `held` (n,), and all of `where` near their targets.
-
-        Raises:
-            FirstSetPointUnknown, NotFinite, FollowingError: a target is old or not finite, or the
-                arm is elsewhere.
+        Args:
+            reading: status and modes.
+            measured: (8, n) its values in SI, joint side.
+            commanded: (2, n) record of the reply, NaN.
+            cycle: of the controller.
+            missed: packets before this one without a reply.
         """
-        self._require_fresh((TARGET,), FirstSetPointUnknown, cycle, held)
-        raw = self._wire.raw
-        self._guard.check_hold(raw[TARGET], raw[ACTUAL], where, cycle)
+        self._reading, self._measured, self._commanded = reading, measured, commanded
+        self._cycle, self._missed = cycle, missed
 
-    def require_start(self, cycle: int) -> None:
-        """Require the conditions of the first set-point; raises NotFinite, FirstSetPoint."""
-        self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
-        raw = self._wire.raw
-        self._guard.check_start(raw[TARGET], raw[ACTUAL], raw[1:4:2], cycle)
+    def opening(self) -> None:
+        """Hold the axes that are open already, by the safe reply."""
+        self.lost = 0  # set-points of an earlier interval do not matter
+        held = self._reading.held
+        self.require_holdable(held, held | self._reading.ready)
+        self._record_held(held)
 
-    def _require_fresh(
-        self,
-        rows: tuple[int, ...],
-        error: type[GuardError],
-        cycle: int,
-        where: Joints | None = None,
-    ) -> None:
+    def _record_held(self, held: Joints) -> None:
+        """Record the targets of `held` joints as commanded, at rest."""
+        self._commanded[0] = np.where(held, self._measured[0], np.nan)
+        self._commanded[1] = np.where(held, 0.0, np.nan)
+
+    def require_holdable(self, held: Joints, where: Joints) -> None:
+        """Require new targets for joints `held` (n,), and all of `where` near their targets."""
+        self._require_fresh((TARGET,), Check.FIRST_AGE, held)
+        self._guard.check_hold(self._raw[TARGET], self._raw[ACTUAL], where, self._cycle)
+
+    def require_start(self) -> None:
+        """Require the conditions of the first set-point."""
+        self._require_fresh(_NEEDED_FIRST, Check.FIRST_AGE, self._every)
+        self._check_start(self._raw[TARGET])
+
+    def _check_start(self, target: Array) -> None:
+        raw = self._raw
+        self._guard.check_start(target, raw[ACTUAL], raw[1:4:2], self._cycle)
+
+    def _require_fresh(self, rows: tuple[int, ...], check: Check, where: Joints) -> None:
         age = self._wire.age
         if age is None:
             return
-        where = self._every if where is None else where
         for row in rows:
-            require(where, age[row].astype(np.float64), self._still, error, cycle)
+            require(where, age[row].astype(np.float64), self._still, check, self._cycle)
+
+    def _check_feedback(self, sent: Array, where: Joints | None = None) -> None:
+        raw = self._raw
+        self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], sent, self._cycle, where)
+
+    @abstractmethod
+    def enter(self) -> None:
+        """Send the first set-point, at rest, or a correction of zero."""
+
+    @abstractmethod
+    def next(self, execution: Execution | None) -> None:
+        """Send the next set-point or correction of the motion; without one, rest."""
+
+    @abstractmethod
+    def check_after_gap(self, execution: Execution | None) -> None:
+        """Require after a long gap that to continue is no jump."""
+
+    @abstractmethod
+    def check_after_pause(self) -> None:
+        """Require after a late packet that the arm moves as commanded."""
+
+    @abstractmethod
+    def leaving(self) -> None:
+        """Rest, while the controller closes open mode."""
 
 
-def _command_targets(held: Joints, measured: Array, commanded: Array) -> None:
-    """Record the targets of `held` joints as commanded, at rest."""
-    commanded[0] = np.where(held, measured[0], np.nan)
-    commanded[1] = np.where(held, 0.0, np.nan)
-
-
-class PositionMode(_OpenMode):
+class PositionMode(OpenMode):
     """Modes 1, 4 and 5: the PC generates the targets."""
 
     def __init__(
         self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int, max_gap: int
     ) -> None:
-        super().__init__(guard, wire, frame)
-        self._mode = mode
+        super().__init__(guard, wire, frame, mode)
         self._history = SentSetPoints(guard, max_gap + 1)
         self._sent = self._still
         self._step = self._still
         self._velocity = self._still
         self._slots = wire.joint_slots[wire.opened]
-        self._last_reply = frame.floats[self._slots].copy()
+        self._last_reply = frame.floats[self._slots]
         self._continuing = wire.opened.copy()
         self._feed_forward = (
             CorrectionGuard(guard, "velocity") if mode == Mode.POSITION_FEED_FORWARD else None
         )
 
-    def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
-        """Send the target received as the first set-point, at rest; raises GuardError."""
-        self._require_fresh(_NEEDED_FIRST, FirstSetPointUnknown, cycle)
-        raw = self._wire.raw
-        target = raw[TARGET].copy()
-        position = measured[0].copy()
-        self._guard.begin(position, target, raw[ACTUAL], raw[1:4:2], cycle)
-        self._guard.check_feedback(target, raw[ACTUAL], raw[CURRENT], target, cycle)
+    def enter(self) -> None:
+        """Send the target received as the first set-point, at rest."""
+        self._require_fresh(_NEEDED_FIRST, Check.FIRST_AGE, self._every)
+        target = self._raw[TARGET].copy()
+        position = self._measured[0].copy()
+        self._check_start(target)
+        self._guard.begin(position, self._cycle)
+        self._check_feedback(target)
         if self._feed_forward is not None:
             self._feed_forward.begin()
         self.held = position
@@ -266,117 +281,95 @@ class PositionMode(_OpenMode):
         self._history.begin(target)
         self.lost = 0
         self._continuing[...] = self._wire.opened
-        self._rest(commanded)
+        self._rest()
 
-    def require_start(self, cycle: int) -> None:
+    def require_start(self) -> None:
         """Require the arm at rest at the set-point that was held, too."""
-        super().require_start(cycle)
-        raw = self._wire.raw
-        self._guard.check_start(self._sent, raw[ACTUAL], raw[1:4:2], cycle)
+        super().require_start()
+        self._check_start(self._sent)
 
-    def next(
-        self,
-        execution: Execution | None,
-        measured: Array,  # noqa: ARG002  needed for corrections only
-        commanded: Array,
-        cycle: int,
-    ) -> None:
-        """Send the motion's next set-point, or the last one without a motion.
-
-        Raises:
-            RefusalError: the arm does not follow, the source failed or the guard refused.
-        """
-        raw = self._wire.raw
-        self._guard.check_feedback(raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle)
-        stopping = execution is not None and execution.outcome == "stopped"
-        self._check_accepted(cycle, stopping=stopping)
+    def next(self, execution: Execution | None) -> None:
+        """Send the motion's next set-point, or the last one without a motion."""
+        cycle, commanded = self._cycle, self._commanded
+        self._check_feedback(self._sent)
+        self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
         if execution is None:
             self._guard.check_set_point(self.held, self._still, "plan", cycle)
-            self._rest(commanded)
+            self._rest()
             return
-        assert isinstance(execution, MotionExecution)
+        frame = self._frame.floats
         if self._history.again:
-            self._repeat(commanded)
+            # The controller holds the target before the last one: send that once more.
+            frame[self._slots] = self._last_reply
+            self._history.repeat()
+            commanded[0] = self.held
+            commanded[1] = self._velocity
             return
         position, velocity, bounds = execution.advance(cycle)
         self._guard.check_set_point(position, velocity, bounds, cycle)
         motor = self._wire.motor(position)
-        self._require_closed_still(motor, cycle)
+        self._require_closed_still(motor)
         self._step = step = motor - self._sent
-        np.subtract(position, self.held, out=commanded[1])
-        commanded[1] /= self._guard.period
-        commanded[0] = position
-        frame = self._frame.floats
+        self._velocity = (position - self.held) / self._guard.period
+        commanded[0], commanded[1] = position, self._velocity
         self._wire.write(frame, motor, step)
         if self._feed_forward is not None:
-            self._write_feed_forward(self._feed_forward, execution, step, cycle)
+            self._write_feed_forward(self._feed_forward, execution, step)
         self.held = position
         self._sent = motor
         self._history.add(motor)
-        self._last_reply = frame[self._slots].copy()
-        self._velocity = commanded[1].copy()
+        self._last_reply = frame[self._slots]
 
-    def _repeat(self, commanded: Array) -> None:
-        """Send the last reply once more, because the controller holds the target before it."""
-        self._frame.floats[self._slots] = self._last_reply
-        self._history.repeat()
-        commanded[0] = self.held
-        commanded[1] = self._velocity
-
-    def _require_closed_still(self, motor: Array, cycle: int) -> None:
+    def _require_closed_still(self, motor: Array) -> None:
         """Require closed axes to stay where the controller holds them, wrist couplings included."""
         opened = self._wire.opened
         if opened.all():
             return
-        off = np.abs(motor - self._wire.raw[TARGET]) > self._guard.limits.standstill
+        off = np.abs(motor - self._raw[TARGET]) > self._guard.limits.standstill
         if (off & ~opened).any():
-            raise AxisNotInMode(int(np.argmax(off & ~opened)), Mode.CLOSED, self._mode, cycle)
+            joint, wanted = int(np.argmax(off & ~opened)) + 1, int(self._mode)
+            message = f"joint {joint} is in mode {int(Mode.CLOSED)}; the motion needs {wanted}"
+            raise AxisNotInMode(message, self._cycle)
 
-    def _check_accepted(
-        self, cycle: int, where: Joints | None = None, *, stopping: bool = False
-    ) -> None:
+    def _check_accepted(self, where: Joints | None = None, *, stopping: bool = False) -> None:
         """Check the target received against the set-points sent, and count lost replies."""
-        target, age = self._wire.raw[TARGET], self._wire.age
-        lost = self._history.check(target, self.missed, cycle, where, stopping=stopping)
+        target, age = self._raw[TARGET], self._wire.age
+        self.lost = self._history.check(target, self._missed, self._cycle, where, stopping=stopping)
         if age is not None and age[TARGET].any():
             # An old target does not show whether the last reply was accepted.
-            lost, self._history.again = 0, False
-        self.lost = lost
+            self.lost, self._history.again = 0, False
 
     def _write_feed_forward(
-        self, guard: CorrectionGuard, execution: MotionExecution, step: Array, cycle: int
+        self, guard: CorrectionGuard, execution: Execution, step: Array
     ) -> None:
         frame, wire = self._frame.floats, self._wire
         if not execution.feeds_forward:
             wire.put(frame, D4, step)
             return
-        velocity, current = execution.feed_forward(cycle)
-        guard.check_motion(velocity, execution.widest, cycle)
-        guard.check_current(current, None, cycle)
+        velocity, current = execution.feed_forward(self._cycle)
+        guard.check_motion(velocity, execution.widest, self._cycle)
+        guard.check_current(current, None, self._cycle)
         if execution.finished:
-            guard.check_end(cycle)
+            guard.require_zero(Check.CORRECTION_END, self._cycle)
         wire.put(frame, D4, wire.motor_difference(velocity) * self._guard.period)
         wire.put(frame, D5, current)
 
-    def check_after_gap(self, execution: Execution | None, reading: Reading, cycle: int) -> None:
+    def check_after_gap(self, execution: Execution | None) -> None:
         """Compare target and velocity with the set-point sent last, after a long gap.
 
         A motion continues from the target, some steps further on its path, or at rest. Axes that
         have closed since the first set-point are left out.
-
-        Raises:
-            NotFinite, SetPointNotAccepted, VelocityAfterGap, SourceFailed: it cannot continue.
         """
-        where = self._continuing & reading.ready
-        self._require_fresh(_NEEDED_AFTER_GAP, AgeAfterGap, cycle, where)
-        raw, step = self._wire.raw, self._step
+        cycle, where = self._cycle, self._continuing & self._reading.ready
+        self._require_fresh(_NEEDED_AFTER_GAP, Check.GAP_AGE, where)
+        raw, step = self._raw, self._step
         target, velocity = np.where(where, raw[TARGET], self._sent), np.where(where, raw[1:4:2], 0)
-        if not (isinstance(execution, MotionExecution) and execution.is_resumable and step.any()):
+        if not (execution is not None and execution.is_resumable and step.any()):
             self._guard.check_after_gap(target, velocity, self._sent, step, cycle, where)
             return
         # A target that is reported late is further on by now.
         target = target + self._history.lag * velocity[0]
-        ahead = self._sent + np.arange(self.missed + 1)[:, None] * step
+        ahead = self._sent + np.arange(self._missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
         # For a motion slower than standstill, the target shows whether it was held.
@@ -391,45 +384,40 @@ class PositionMode(_OpenMode):
         self._history.resume_from(target, step)
         self.held, self._sent = position, target
 
-    def check_after_pause(self, reading: Reading, cycle: int) -> None:
+    def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
-        where = self._continuing & reading.ready
-        self._require_fresh((ACTUAL_VELOCITY,), AgeAfterGap, cycle, where)
-        velocity = self._wire.joint_difference(self._wire.raw[ACTUAL_VELOCITY])
-        self._guard.check_after_pause(velocity / self._guard.period, cycle, where)
+        where = self._continuing & self._reading.ready
+        self._require_fresh((ACTUAL_VELOCITY,), Check.GAP_AGE, where)
+        velocity = self._wire.joint_difference(self._raw[ACTUAL_VELOCITY])
+        self._guard.check_after_pause(velocity / self._guard.period, self._cycle, where)
 
-    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
+    def leaving(self) -> None:
         """Hold axes that were always open at the last set-point, reopened ones at their target."""
-        raw, continuing, held = self._wire.raw, self._continuing, reading.held
-        continuing &= reading.ready
-        self.require_holdable(held & ~continuing, held | reading.ready, cycle)
-        _command_targets(held, measured, commanded)
-        self._guard.check_feedback(
-            raw[TARGET], raw[ACTUAL], raw[CURRENT], self._sent, cycle, where=continuing
-        )
-        self._check_accepted(cycle, continuing)
+        ready, continuing, held = self._reading.ready, self._continuing, self._reading.held
+        continuing &= ready
+        self.require_holdable(held & ~continuing, held | ready)
+        self._record_held(held)
+        self._check_feedback(self._sent, continuing)
+        self._check_accepted(continuing)
         if np.array_equal(continuing, self._wire.opened):
             # A source that ends while moving would cause a jump to rest.
-            self._guard.check_set_point(self.held, self._still, "plan", cycle)
+            self._guard.check_set_point(self.held, self._still, "plan", self._cycle)
         self._history.add(self._sent)
         self._step = self._still
         slots = self._wire.joint_slots[continuing]
         self._frame.floats[slots, D1] = self._sent[continuing]
         self._frame.floats[slots, D2] = 0.0
-        commanded[0, continuing] = self.held[continuing]
+        self._commanded[0, continuing] = self.held[continuing]
 
-    def _rest(self, commanded: Array) -> None:
+    def _rest(self) -> None:
         self._step = self._still
         self._history.add(self._sent)
         self._wire.write(self._frame.floats, self._sent, self._still)
-        commanded[0] = self.held
-        commanded[1] = 0.0
+        self._commanded[0] = self.held
+        self._commanded[1] = 0.0
 
 
-_CURRENT_FIELD: Final = 5
-
-
-class CorrectionMode(_OpenMode):
+class CorrectionMode(OpenMode):
     """Modes 2, 7, 8 and 9: corrections of targets that the controller generates, or zeros.
 
     ====  ==============================  ===================================================
@@ -449,97 +437,80 @@ class CorrectionMode(_OpenMode):
     Following error is |D1 - D3| as received, because the PC sends no target.
     """
 
-    def __init__(
-        self,
-        guard: Guard,
-        wire: ArmWire,
-        frame: ReplyFrame,
-        mode: int,
-        max_gap: int,  # noqa: ARG002  needed for targets of the PC only
-    ) -> None:
-        super().__init__(guard, wire, frame)
-        self._mode = mode
+    def __init__(self, guard: Guard, wire: ArmWire, frame: ReplyFrame, mode: int) -> None:
+        super().__init__(guard, wire, frame, mode)
         self._offset = mode == Mode.DELTA_POSITION
-        self._velocity = mode in (Mode.FEED_FORWARD, Mode.VELOCITY)
-        self._current = _CURRENT_FIELD in MODE_FIELDS[mode]
+        self._velocity = D4 in MODE_FIELDS[mode]
+        self._current = D5 in MODE_FIELDS[mode]
         self._added_to_servo = mode == Mode.DELTA_CURRENT
         self._corrections = CorrectionGuard(guard, "offset" if self._offset else "velocity")
 
-    def enter(self, measured: Array, commanded: Array, cycle: int) -> None:
+    def enter(self) -> None:
         """Send zero; require the arm at rest at the controller's target."""
-        self.require_start(cycle)
-        self._check_arm(cycle)
-        self.held = measured[0].copy()
-        self._corrections.check_position(self.held, cycle)
+        self.require_start()
         self._corrections.begin()
-        self._send_zero(measured, commanded, cycle)
+        self._send_zero()
 
-    def _send_zero(self, measured: Array, commanded: Array, cycle: int) -> None:
-        self._corrections.set_target(self.held, self._still, self._sent_in(cycle))
-        self._record(self._still, measured, commanded)
+    def _send_zero(self) -> None:
+        self._check_feedback(self._raw[TARGET])
+        self.held = self._measured[0].copy()
+        self._guard.check_position(self.held, self._cycle)
+        self._corrections.set_target(self.held, self._still, self._sent_in())
+        self._record(self._still)
 
-    def next(
-        self, execution: Execution | None, measured: Array, commanded: Array, cycle: int
-    ) -> None:
+    def next(self, execution: Execution | None) -> None:
         """Send the next correction, or zero without a motion."""
-        self._check_arm(cycle)
-        self.held = measured[0].copy()
         if execution is None:
-            self._corrections.check_position(self.held, cycle)
-            self._send_zero(measured, commanded, cycle)
+            self._send_zero()
             return
-        assert isinstance(execution, CorrectionExecution)
-        motion, current = execution.advance(cycle)
-        self._require_fields(motion, current, cycle)
-        guard = self._corrections
-        guard.check_motion(motion, execution.widest, cycle)
-        if execution.widest == "stop" and guard.resting:
+        cycle, guard, target = self._cycle, self._corrections, self._raw[TARGET]
+        self._check_feedback(target)
+        self.held = self._measured[0].copy()
+        motion, current, bounds = execution.advance(cycle)
+        self._require_fields(motion, current)
+        guard.check_motion(motion, bounds, cycle)
+        if bounds == "stop" and guard.resting:
             execution.mark_at_rest()
-        guard.check_position(self.held + motion if self._offset else self.held, cycle)
+        self._guard.check_position(self.held + motion if self._offset else self.held, cycle)
         if self._offset:
-            rounding = self._wire.joint_rounding(self._wire.raw[TARGET])
-            guard.check_target(self.held, motion, self._sent_in(cycle), rounding, cycle)
-        servo = self._wire.raw[CURRENT] if self._added_to_servo else None
+            rounding = self._wire.joint_rounding(target)
+            guard.check_target(self.held, motion, self._sent_in(), rounding, cycle)
+        servo = self._raw[CURRENT] if self._added_to_servo else None
         guard.check_current(current, servo, cycle)
         if execution.finished:
-            guard.check_end(cycle)
+            guard.require_zero(Check.CORRECTION_END, cycle)
         self._write(motion, current)
-        self._record(motion, measured, commanded)
+        self._record(motion)
 
-    def check_after_gap(
-        self,
-        execution: Execution | None,  # noqa: ARG002  needed for targets of the PC only
-        reading: Reading,  # noqa: ARG002
-        cycle: int,
-    ) -> None:
+    def check_after_gap(self, execution: Execution | None) -> None:  # noqa: ARG002
         """Require the last correction to be zero: it is unknown whether it was applied."""
-        self._corrections.check_after_gap(cycle)
+        self._corrections.require_zero(Check.GAP_CORRECTION, self._cycle)
 
-    def check_after_pause(self, reading: Reading, cycle: int) -> None:
+    def check_after_pause(self) -> None:
         """Check nothing: the controller generates the motion."""
 
-    def leaving(self, reading: Reading, measured: Array, commanded: Array, cycle: int) -> None:
+    def leaving(self) -> None:
         """Send zeros, by the safe reply; the target to an axis in a position mode."""
-        if reading.held.any():
-            self._hold(reading.held, reading.held, measured, commanded, cycle)
-        self._check_arm(cycle, where=reading.ready)
+        held = self._reading.held
+        if held.any():
+            self.require_holdable(held, held)
+            self._record_held(held)
+        self._check_feedback(self._raw[TARGET], self._reading.ready)
 
-    def _sent_in(self, cycle: int) -> Array:
+    def _sent_in(self) -> Array:
         """Return the cycle in which each target received was sent."""
         age = self._wire.age
-        return self._still + cycle if age is None else cycle - age[TARGET].astype(np.float64)
+        return self._still + self._cycle if age is None else self._cycle - age[TARGET] * 1.0
 
-    def _check_arm(self, cycle: int, where: NDArray[np.bool_] | None = None) -> None:
-        raw = self._wire.raw
-        target = raw[TARGET]
-        self._guard.check_feedback(target, raw[ACTUAL], raw[CURRENT], target, cycle, where)
-
-    def _require_fields(self, motion: Array, current: Array, cycle: int) -> None:
+    def _require_fields(self, motion: Array, current: Array) -> None:
         """Refuse a correction that this mode has no field for."""
-        if not (self._offset or self._velocity) and np.any(motion):
-            raise SourceFailed(f"mode {self._mode} has no field for a motion: {motion}", cycle)
-        if not self._current and np.any(current):
-            raise SourceFailed(f"mode {self._mode} has no field for a current: {current}", cycle)
+        for name, values, has_field in (
+            ("motion", motion, self._offset or self._velocity),
+            ("current", current, self._current),
+        ):
+            if not has_field and np.any(values):
+                message = f"mode {self._mode} has no field for a {name}: {values}"
+                raise SourceFailed(message, self._cycle)
 
     def _write(self, motion: Array, current: Array) -> None:
         frame, wire = self._frame.floats, self._wire
@@ -550,11 +521,8 @@ class CorrectionMode(_OpenMode):
         if self._current:
             wire.put(frame, D5, current)
 
-    def _record(self, motion: Array, measured: Array, commanded: Array) -> None:
+    def _record(self, motion: Array) -> None:
         if self._offset:
-            np.add(measured[0], motion, out=commanded[0])
+            np.add(self._measured[0], motion, out=self._commanded[0])
         elif self._velocity:
-            commanded[1] = motion
-
-
-OpenMode = PositionMode | CorrectionMode
+            self._commanded[1] = motion

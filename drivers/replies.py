@@ -177,11 +177,12 @@ class Reading:
     other_slots: tuple[int, ...]
 
     @property
-    def faulty(self) -> tuple[int, int, bool]:
-        """Joint, mode and whether that is known: the first unknown mode, else the first open."""
+    def fault(self) -> str:
+        """Why these modes are refused, by the first unknown one, else the first open one."""
         known = np.isin(self.modes, list(KNOWN_MODES))
         joint = int(np.argmax(np.isin(self.modes, list(OPEN_MODES)) if known.all() else ~known))
-        return joint, int(self.modes[joint]), bool(known.all())
+        reason = "it was not closed before" if known.all() else "the reply to that mode is unknown"
+        return f"joint {joint + 1} is in mode {self.modes[joint]}: {reason}"
 
 
 class Reader:

@@ -35,18 +35,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.drive_train import Ages, ArmWire, DriveTrain
-from drivers.errors import (
-    ExitTimeout,
-    FollowingError,
-    GuardError,
-    PacketError,
-    RefusalError,
-    TargetNotFinite,
-)
-from drivers.guard import Guard
+from drivers.errors import Check, ExitTimeout, GuardError, PacketError, RefusalError
+from drivers.guard import Array, Guard
 from drivers.init_check import compare
 from drivers.open_mode import CorrectionMode, OpenMode, PositionMode
 from drivers.packets import EXIT_FROM_OPEN, InitPacket, OpenAxis
@@ -54,8 +46,6 @@ from drivers.record import CycleRing
 from drivers.replies import D1, Reader, Reading, ReplyFrame, Words
 from drivers.state_machine import StateMachine
 from drivers.states import CORRECTION_MODES, HAS_SET_POINTS, Input, State
-
-Array = NDArray[np.float64]
 
 EXIT_RETRY_CYCLES: Final = 100
 """Cycles after which the end of open mode is requested again."""
@@ -119,8 +109,10 @@ class ReplyPolicy:
             return
         self._wire = wire = ArmWire(self.init_check.drive_train, init, arm, only_axis)
         self.reader = Reader(wire.joint_slots, arms, arm, mode, wire.opened)
-        kind = CorrectionMode if mode in CORRECTION_MODES else PositionMode
-        self._open_mode = kind(guard, wire, self.frame, mode, max_gap)
+        if mode in CORRECTION_MODES:
+            self._open_mode = CorrectionMode(guard, wire, self.frame, mode)
+        else:
+            self._open_mode = PositionMode(guard, wire, self.frame, mode, max_gap)
         joints = slice(0, drive_train.n_joints)
         guard.narrow(
             init.following_error[arm - 1, joints].astype(np.float64),
@@ -134,6 +126,8 @@ class ReplyPolicy:
         words: Words,
         measured: Array,
         commanded: Array,
+        without_reply: int,
+        paused: bool,
     ) -> bytes:
         """Fill the frame for the machine's state, which is the one that the packet leads to.
 
@@ -143,6 +137,8 @@ class ReplyPolicy:
             words: (n_axes, 9) its axis blocks.
             measured: (8, n) the same in SI, joint side.
             commanded: (2, n) NaN, to be filled where set-points are sent.
+            without_reply: packets before this one without a reply.
+            paused: this packet arrived late by the clock.
 
         Returns:
             The 4 status bytes.
@@ -150,7 +146,9 @@ class ReplyPolicy:
         Raises:
             RefusalError: no set-point may be sent.
         """
-        state, cycle = machine.state, machine.cycle
+        state, cycle, open_mode = machine.state, machine.cycle, self._open_mode
+        if open_mode is not None:
+            open_mode.receive(reading, measured, commanded, cycle, without_reply)
         if state is State.FAULTED and reading.powered:
             return self._fill_refusal(machine.offending, reading, words)
         self.frame.safe(reading.reply, words)
@@ -158,23 +156,29 @@ class ReplyPolicy:
         if state not in HAS_SET_POINTS:
             self._hold_without_motion(machine, reading, words)
             return status
-        if self._open_mode is None:
+        if open_mode is None:
             raise RefusalError(f"this arm cannot be moved: {self.unusable}", cycle)
+        if machine.in_interval and state is not State.OPENING and not machine.entering:
+            # A gap or a pause must allow to continue.
+            if without_reply > self._max_gap:
+                open_mode.check_after_gap(machine.execution)
+            elif paused:
+                open_mode.check_after_pause()
         self._require_targets(reading.other_slots, cycle)
-        if state is State.EXITING:
-            # Left before the last axis opened, axes have been sent only their own targets.
-            in_interval = machine.in_interval
-            fill = self._open_mode.leaving if in_interval else self._open_mode.opening
-            fill(reading, measured, commanded, cycle)
-            self._require_targets(reading.reply.held, cycle)
-            machine.record_lost(self._open_mode.lost, self._max_gap)
-            return self._request_exit(status) if self._exit_due(machine) else status
-        if state is State.OPENING:
-            self._open_mode.opening(reading, measured, commanded, cycle)
-            self._require_targets(reading.reply.held, cycle)
-            done = self._opening_abandoned(machine, reading)
+        if state is State.OPEN:
+            done = self._next(open_mode, machine)
         else:
-            done = self._next(self._open_mode, machine, measured, commanded)
+            # Left before the last axis opened, axes have been sent only their own targets.
+            leaving = state is State.EXITING
+            if leaving and machine.in_interval:
+                open_mode.leaving()
+            else:
+                open_mode.opening()
+            self._require_targets(reading.reply.held, cycle)
+            if leaving:
+                machine.record_lost(open_mode.lost)
+                return self._request_exit(status) if self._exit_due(machine) else status
+            done = self._opening_abandoned(machine, reading)
         if not done:
             return status
         machine.apply(Input.EXIT)
@@ -184,13 +188,13 @@ class ReplyPolicy:
     def _hold_without_motion(self, machine: StateMachine, reading: Reading, words: Words) -> None:
         """Return open axes their target if that is possible, else request drive-off.
 
-        Raises GuardError in the first cycle of these.
+        Raises RefusalError in the first cycle of these.
         """
         try:
             self._require_targets(reading.reply.held, machine.cycle)
             if machine.state is State.FREEZING and self._open_mode is not None:
-                self._open_mode.require_holdable(reading.held, reading.held, machine.cycle)
-        except GuardError as error:
+                self._open_mode.require_holdable(reading.held, reading.held)
+        except RefusalError as error:
             if not self._reported:
                 self._reported = True
                 raise
@@ -206,7 +210,9 @@ class ReplyPolicy:
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             arm, axis = self._axis_of.get(slots[bad[0]], (self._arm, slots[bad[0]]))
-            raise TargetNotFinite(arm, axis, float(values[bad[0]]), cycle)
+            name = f"axis {axis + 1} of arm {arm}"
+            message = f"target received of {name}, which is open, is {values[bad[0]]}"
+            raise RefusalError(message, cycle)
 
     def _opening_abandoned(self, machine: StateMachine, reading: Reading) -> bool:
         """Whether to leave open mode although the last axis has not opened."""
@@ -224,29 +230,28 @@ class ReplyPolicy:
         """Whether to request the end of open mode once more; raises ExitTimeout."""
         leaving = machine.cycle - machine.entered_at
         if leaving >= self._exit_cycles:
-            raise ExitTimeout(leaving, machine.cycle)
+            message = f"open mode was asked to end {leaving} cycles ago and axes are still open"
+            raise ExitTimeout(message, machine.cycle)
         last = max(self._exit_requested_at, machine.entered_at)
         due = machine.cycle - last >= EXIT_RETRY_CYCLES
         if due:
             self._exit_requested_at = machine.cycle
         return due
 
-    def _next(
-        self, open_mode: OpenMode, machine: StateMachine, measured: Array, commanded: Array
-    ) -> bool:
+    def _next(self, open_mode: OpenMode, machine: StateMachine) -> bool:
         """Fill in the next set-point; return whether it was the last one."""
         execution, cycle = machine.execution, machine.cycle
         moving = execution is not None and execution.started
         if machine.entering:
             machine.entering = False
-            open_mode.enter(measured, commanded, cycle)
+            open_mode.enter()
         else:
             if execution is not None and moving and machine.stop_reason is not None:
                 execution.stop(machine.stop_reason, cycle)
             elif execution is not None and not moving:
-                open_mode.require_start(cycle)
-            open_mode.next(execution if moving else None, measured, commanded, cycle)
-            machine.record_lost(open_mode.lost, self._max_gap)
+                open_mode.require_start()
+            open_mode.next(execution if moving else None)
+            machine.record_lost(open_mode.lost)
         if execution is None:
             return machine.stop_reason is not None
         if not moving:
@@ -273,37 +278,10 @@ class ReplyPolicy:
         ring.age[row] = 0 if ages is None else ages[self._wire.joint_slots].max(axis=0)
         self._wire.read(words.view(np.float32), ring.measured[row], ages)
 
-    def check_gap(
-        self, without_reply: int, paused: bool, machine: StateMachine, reading: Reading
-    ) -> None:
-        """Check in open mode that a gap or a pause before this packet allows to continue.
-
-        Args:
-            without_reply: packets before this one without a reply.
-            paused: this packet arrived late by the clock.
-            machine: in the state that the packet leads to.
-            reading: status and modes of the packet.
-
-        Raises:
-            NotFinite, SetPointNotAccepted, VelocityAfterGap, VelocityAfterPause: it does not.
-        """
-        open_mode = self._open_mode
-        if open_mode is None:
-            return
-        open_mode.missed = without_reply
-        in_open = machine.state in (State.OPEN, State.EXITING) and machine.in_interval
-        if not in_open or machine.entering:
-            return
-        if without_reply > self._max_gap:
-            open_mode.check_after_gap(machine.execution, reading, machine.cycle)
-        elif paused:
-            open_mode.check_after_pause(reading, machine.cycle)
-
     def refuse(
         self, machine: StateMachine, error: RefusalError, reading: Reading, words: Words
     ) -> bytes:
-        """Enter the faulted state and fill the frame accordingly; return the status bytes."""
-        machine.apply(Input.REFUSAL)
+        """Fill the frame for the faulted state; return the status bytes."""
         machine.offending = _offending(error)
         return self._fill_refusal(machine.offending, reading, words)
 
@@ -328,4 +306,6 @@ class ReplyPolicy:
 
 
 def _offending(error: RefusalError) -> int | None:
-    return error.joint if isinstance(error, FollowingError) else None
+    if isinstance(error, GuardError) and error.kind is Check.FOLLOWING_ERROR:
+        return error.joint
+    return None

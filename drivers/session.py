@@ -49,8 +49,8 @@ from typing import Final
 import numpy as np
 
 from drivers.drive_train import Ages, DriveTrain
-from drivers.errors import ModeRefused, PacketError, RefusalError, RequestError, as_refusal
-from drivers.events import Counters, Event, InitReceived, LinkLost, PacketRejected, Refused
+from drivers.errors import ModeRefused, PacketError, RefusalError, as_refusal
+from drivers.events import Event, InitReceived, LinkLost, PacketRejected, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
 from drivers.motion_source import CorrectionSource, MotionSource
@@ -140,7 +140,7 @@ PAUSE_CYCLES: Final = 2.0
 _SYNC_AFTER_INIT: Final = (INIT_NUMBER + 1, INIT_NUMBER + 2)
 
 
-class Session:
+class Session(StateMachine):
     """One arm's session with one controller; not thread-safe.
 
     Args:
@@ -164,7 +164,8 @@ class Session:
         deadline: when silence becomes a fault, on the clock of `now`. Each new packet replied to
             moves it; duplicates and rejected packets do not. Infinite until the first `reply` or
             `tick`, after a silence was reported, and in state ended.
-        counters: packets by what became of them.
+
+    Commands and further attributes are those of `StateMachine`.
     """
 
     def __init__(
@@ -201,13 +202,12 @@ class Session:
                 f"only axis {only_axis} of {n} in mode {mode} is not served: one axis alone is "
                 "moved in modes 1, 4 and 5"
             )
+        super().__init__(max_gap)
         self.deadline = math.inf
-        self.counters = Counters()
         self._drive_train = drive_train
         self._guard = guard
         self._ring = ring
         self._mode = mode
-        self._max_gap = max_gap
         self._settle_cycles = settle_cycles
         self._init_timeout = init_timeout
         self._silence_timeout = silence_timeout
@@ -222,7 +222,6 @@ class Session:
             max_gap=max_gap,
             only_axis=only_axis,
         )
-        self._machine = StateMachine(self.counters)
         self._sequence = PacketSequence()
         self._policy: ReplyPolicy | None = None
         self._cold_start = False
@@ -233,21 +232,6 @@ class Session:
         self._without_reply = 0
         # Number and last reason of packets without a reply, by kind, since the last drain.
         self._unreported: dict[str, tuple[int, str]] = {}
-
-    @property
-    def state(self) -> State:
-        """Current state."""
-        return self._machine.state
-
-    @property
-    def interval(self) -> int:
-        """Index of the last interval in open mode, -1 before the first."""
-        return self._machine.interval
-
-    @property
-    def cycle(self) -> int:
-        """Cycles of the controller since its init packet, up to the packet replied to last."""
-        return self._machine.cycle
 
     @property
     def init(self) -> InitPacket | None:
@@ -264,14 +248,9 @@ class Session:
         """Drive train in use: the cell's, or the one with adopted values of the controller."""
         return self._drive_train if self._policy is None else self._policy.init_check.drive_train
 
-    @property
-    def requested(self) -> bool:
-        """Whether a motion was requested and has not ended."""
-        return self._machine.execution is not None
-
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; rejected packets last, by kind."""
-        events, self._machine.events = self._machine.events, []
+        events, self._events = self._events, []
         events.extend(PacketRejected(kind, *found) for kind, found in self._unreported.items())
         self._unreported.clear()
         return events
@@ -286,38 +265,8 @@ class Session:
         n, stop_cycles = self._drive_train.n_joints, round(STOP_TIMEOUT / self._guard.period)
         execution = execution_of(source, self._mode, n, self._settle_cycles, stop_cycles)
         if isinstance(execution, str):
-            raise RequestError(self.state.name.lower(), execution)
-        self._machine.request(execution, self._policy.unusable if self._policy else None)
-
-    def override(self, fraction: float) -> None:
-        """Run the requested motion at this fraction (0..1) of its speed from now on.
-
-        Raises:
-            RequestError: there is none, it is being stopped, or its source has no override.
-        """
-        self._machine.override(fraction)
-
-    def hold(self) -> None:
-        """Rest on the path until `resume`; a motion that cannot is stopped.
-
-        A motion that has not begun will begin at rest and wait there.
-
-        Raises:
-            RequestError: there is no motion.
-        """
-        self._machine.hold()
-
-    def resume(self) -> None:
-        """Continue after `hold`.
-
-        Raises:
-            RequestError: there is no motion, it is being stopped, or it cannot hold and resume.
-        """
-        self._machine.resume()
-
-    def stop(self, reason: str = "a stop was requested") -> None:
-        """Bring the motion to rest on its path and leave open mode; drop one not begun yet."""
-        self._machine.stop(reason)
+            raise self._request_error(execution)
+        self._accept(execution, self._policy.unusable if self._policy else None)
 
     def discarded(self, kind: str, count: int) -> None:
         """Count and report packets that the link dropped."""
@@ -341,11 +290,11 @@ class Session:
             return
         assert self._silent_since is not None
         silence = now - self._silent_since
-        self._machine.events.append(LinkLost(silence, self.state, self._without_reply))
+        self._events.append(LinkLost(silence, self.state, self._without_reply))
         self.deadline = math.inf
         self._sequence.broken = True
         stale = f"only packets that do not follow the last one came ({self._without_reply})"
-        self._machine.apply(Input.SILENCE, stale if self._without_reply else "")
+        self.apply(Input.SILENCE, stale if self._without_reply else "")
 
     def reply(self, packet: bytes, now: float, ages: Ages | None = None) -> bytes | None:
         """Return the reply to a packet, or None if it gets none.
@@ -382,16 +331,16 @@ class Session:
             self.counters.duplicates += 1
             return self._last_reply
         init = InitPacket.decode(packet)
-        machine, syncing = self._machine, self.state is State.SYNC
+        syncing = self.state is State.SYNC
         self._cold_start = syncing and self._sequence.last > 0
         if syncing and not self._sequence.leads_to(INIT_NUMBER, self._max_gap):
-            machine.end("lost", "the controller restarted: sync packets are missing")
-        machine.apply(Input.INIT)
+            self.end("lost", "the controller restarted: sync packets are missing")
+        self.apply(Input.INIT)
         self._policy = policy = self._make_policy(init)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
-        machine.cycle = 0
+        self.cycle = 0
         check = policy.init_check
-        machine.events.append(InitReceived(init, check.unusable, check.differences, check.adopted))
+        self._events.append(InitReceived(init, check.unusable, check.differences, check.adopted))
         return self._finish(packet, echo(packet), now)
 
     def _expects_sync(self, number: int, powered: bool) -> bool:
@@ -412,14 +361,14 @@ class Session:
             raise PacketError("status", packet[4 : 4 + N_ARMS].hex(), "no drive on before init")
         if len(packet) >= INIT_LENGTH:
             raise PacketError("length", len(packet), f"less than {INIT_LENGTH} bytes")
-        self._machine.apply(Input.SYNC)
+        self.apply(Input.SYNC)
         if self.state is State.SYNC:
             self._policy = None
         self._sequence.accept(number)
         return self._finish(packet, echo(packet), now)
 
     def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
-        policy, machine, ring = self._policy, self._machine, self._ring
+        policy, ring = self._policy, self._ring
         assert policy is not None
         decoded = CyclicPacket.decode(packet, policy.init.n_axes)
         if self._sequence.is_duplicate(number) and packet == self._last_packet:
@@ -431,7 +380,7 @@ class Session:
             self._report("stale", 1, f"number {number} does not follow {self._sequence.last}")
             return None
         missed = self._sequence.accept(number)
-        machine.cycle = self._sequence.cycle
+        self.cycle = self._sequence.cycle
         late = (now - self._arrived_at) / self._guard.period - max(missed, self._max_gap)
         words = words_of(decoded)
         # After a corrupted number the controller's own numbers are stale for a while.
@@ -441,32 +390,32 @@ class Session:
         ring.arrival[row] = now
         ring.number[row] = number
         ring.gap[row] = missed
-        ring.cycle[row] = machine.cycle
+        ring.cycle[row] = self.cycle
         refusal: RefusalError | None = None
         try:
             policy.record(ring, row, reading, words, ages)
-            machine.record_gap(missed, without_reply, self._max_gap)
-            machine.require_axes(reading, self._mode)
-            before = machine.state
-            machine.apply(reading.input)
-            if machine.state is State.FAULTED and before is not State.FAULTED:
-                refusal = ModeRefused(*reading.faulty, machine.cycle)
-            measured, commanded = ring.measured[row], ring.commanded[row]
-            policy.check_gap(without_reply, late > PAUSE_CYCLES, machine, reading)
-            status = policy.fill(machine, reading, words, measured, commanded)
+            self.record_gap(missed, without_reply)
+            self.require_axes(reading, self._mode)
+            before = self.state
+            self.apply(reading.input)
+            if self.state is State.FAULTED and before is not State.FAULTED:
+                refusal = ModeRefused(reading.fault, self.cycle)
+            record = ring.measured[row], ring.commanded[row]
+            status = policy.fill(self, reading, words, *record, without_reply, late > PAUSE_CYCLES)
         except BaseException as error:
             # Any error becomes a reply in this cycle that asks the controller to stop.
-            refusal = as_refusal(error, machine.cycle)
+            refusal = as_refusal(error, self.cycle)
             ring.commanded[row] = math.nan
-            status = policy.refuse(machine, refusal, reading, words)
-        machine.in_interval = machine.in_interval and reading.any_open
-        ring.interval[row] = machine.interval if machine.in_interval else -1
-        ring.state[row] = machine.state
+            self.apply(Input.REFUSAL)
+            status = policy.refuse(self, refusal, reading, words)
+        self.in_interval = self.in_interval and reading.any_open
+        ring.interval[row] = self.interval if self.in_interval else -1
+        ring.state[row] = self.state
         ring.commit()
         if refusal is not None:
             self.counters.refused += 1
-            machine.events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
-            machine.end("refused", str(refusal))
+            self._events.append(Refused(refusal, ring.last(FLIGHT_RECORDER)))
+            self.end("refused", str(refusal))
         return self._finish(packet, policy.frame.finish(number, status), now)
 
     def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:

@@ -1,4 +1,4 @@
-"""State, interval and requested motion of a session, and the events of their changes."""
+"""State, interval and requested motion of a session, with the commands of its user."""
 
 from __future__ import annotations
 
@@ -50,7 +50,8 @@ class StateMachine:
 
     Attributes:
         state: current state.
-        cycle: the controller's cycle, for events.
+        counters: packets by what became of them.
+        cycle: of the controller since its init packet, up to the packet replied to last.
         entered_at: the cycle in which the state was entered.
         interval: index of the last interval in open mode, -1 before the first.
         in_interval: whether that interval continues.
@@ -58,11 +59,11 @@ class StateMachine:
         execution: the requested motion, or None.
         stop_reason: why open mode is to be left, or None.
         offending: joint whose following error was reported, None where drive-off is requested.
-        events: since they were last drained.
     """
 
-    def __init__(self, counters: Counters) -> None:
+    def __init__(self, max_gap: int) -> None:
         self.state = State.SYNC
+        self.counters = Counters()
         self.cycle = 0
         self.entered_at = 0
         self.interval = -1
@@ -71,12 +72,17 @@ class StateMachine:
         self.execution: Execution | None = None
         self.stop_reason: str | None = None
         self.offending: int | None = None
-        self.events: list[Event] = []
-        self._counters = counters
+        self._max_gap = max_gap
+        self._events: list[Event] = []
         self._losses: deque[tuple[int, int]] = deque()
         self._first_interval = 0
 
-    def request(self, execution: Execution, unusable: str | None) -> None:
+    @property
+    def requested(self) -> bool:
+        """Whether a motion was requested and has not ended."""
+        return self.execution is not None
+
+    def _accept(self, execution: Execution, unusable: str | None) -> None:
         """Store a motion for the next time in open mode; raises RequestError."""
         reason = None
         if self.execution is not None:
@@ -98,25 +104,35 @@ class StateMachine:
     def _request_error(self, reason: str, what: str = "motion") -> RequestError:
         return RequestError(self.state.name.lower(), reason, what)
 
-    def stop(self, reason: str) -> None:
-        """Leave open mode after coming to rest; drop a motion that has not begun."""
+    def stop(self, reason: str = "a stop was requested") -> None:
+        """Bring the motion to rest on its path and leave open mode; drop one not begun yet."""
         if self.execution is not None and not self.execution.started:
             self.end("stopped", reason)
         if self.state in (State.OPENING, State.OPEN):
             self.stop_reason = self.stop_reason or reason
 
     def override(self, fraction: float) -> None:
-        """Run the requested motion at this fraction of its speed; raises RequestError."""
+        """Run the requested motion at this fraction (0..1) of its speed from now on.
+
+        Raises:
+            RequestError: there is none, it is being stopped, or its source has no override.
+        """
         execution = self.execution
         before = None if execution is None else execution.fraction
         reason = _NO_MOTION if execution is None else execution.override(fraction)
         if reason is not None:
             raise self._request_error(reason, "change of override")
         if fraction != before:
-            self.events.append(OverrideChanged(float(fraction), self.cycle))
+            self._events.append(OverrideChanged(float(fraction), self.cycle))
 
     def hold(self) -> None:
-        """Come to rest on the path and wait there; stop if the source cannot hold."""
+        """Rest on the path until `resume`; a motion that cannot is stopped.
+
+        A motion that has not begun will begin at rest and wait there.
+
+        Raises:
+            RequestError: there is no motion.
+        """
         execution = self.execution
         if execution is None:
             raise self._request_error(_NO_MOTION, "hold")
@@ -126,41 +142,45 @@ class StateMachine:
         if reason is not None:
             self.stop(reason)
         elif execution.held is not before:
-            self.events.append(HoldChanged(True, self.cycle))
+            self._events.append(HoldChanged(True, self.cycle))
 
     def resume(self) -> None:
-        """Continue after a hold; raises RequestError."""
+        """Continue after `hold`.
+
+        Raises:
+            RequestError: there is no motion, it is being stopped, or it cannot hold and resume.
+        """
         execution = self.execution
         before = execution is not None and execution.held
         reason = _NO_MOTION if execution is None else execution.resume()
         if reason is not None:
             raise self._request_error(reason, "resumption")
         if before:
-            self.events.append(HoldChanged(False, self.cycle))
+            self._events.append(HoldChanged(False, self.cycle))
 
-    def record_lost(self, lost: int, max_gap: int) -> None:
+    def record_lost(self, lost: int) -> None:
         """Count `lost` replies that the controller did not accept.
 
-        More than `max_gap` of them in `LOSS_WINDOW` cycles stop a motion on its path, because the
-        controller's target then moves in jumps.
+        Too many of them in `LOSS_WINDOW` cycles stop a motion on its path, because the controller's
+        target then moves in jumps.
         """
         if not lost:
             return
-        self._counters.not_accepted += lost
-        self.events.append(AnswersLost(lost, self.cycle))
+        self.counters.not_accepted += lost
+        self._events.append(AnswersLost(lost, self.cycle))
         self._losses.append((self.cycle, lost))
         while self._losses[0][0] <= self.cycle - LOSS_WINDOW:
             self._losses.popleft()
         count = sum(number for _, number in self._losses)
-        if count > max_gap and self.state is State.OPEN and self.execution:
+        if count > self._max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
 
-    def record_gap(self, missed: int, without_reply: int, max_gap: int) -> None:
-        """Count `missed` packets; more than `max_gap` `without_reply` ones stop a motion."""
+    def record_gap(self, missed: int, without_reply: int) -> None:
+        """Count `missed` packets; too many `without_reply` ones in a row stop a motion."""
         if missed:
-            self._counters.missed += missed
-            self.events.append(GapSeen(missed, self.cycle))
-        if without_reply > max_gap and self.state is State.OPEN and self.execution:
+            self.counters.missed += missed
+            self._events.append(GapSeen(missed, self.cycle))
+        if without_reply > self._max_gap and self.state is State.OPEN and self.execution:
             self.stop(f"{without_reply} packets were missed in a row")
 
     def require_axes(self, reading: Reading, mode: int) -> None:
@@ -173,14 +193,15 @@ class StateMachine:
             joint = int(np.argmin(reading.ready))
         if joint is not None:
             found = int(reading.modes[joint])
-            wanted = Mode.CLOSED if found == mode else mode
-            raise AxisNotInMode(joint, found, wanted, self.cycle)
+            wanted = int(Mode.CLOSED if found == mode else mode)
+            message = f"joint {joint + 1} is in mode {found}; the motion needs {wanted}"
+            raise AxisNotInMode(message, self.cycle)
 
     def begin_motion(self, position: Array) -> None:
         """Begin the motion at its first set-point, (n,) rad; raises SourceFailed."""
         assert self.execution is not None
         self.execution.begin(position, self.cycle)
-        self.events.append(MotionStarted(self.interval, self.cycle))
+        self._events.append(MotionStarted(self.interval, self.cycle))
 
     def apply(self, cause: Input, reason: str = "") -> None:
         """Change to the next state, and end a motion that the transition does not allow.
@@ -208,7 +229,7 @@ class StateMachine:
     def _enter(self, before: State, after: State) -> None:
         self.state = after
         self.entered_at = self.cycle
-        self.events.append(StateChanged(before, after, self.cycle))
+        self._events.append(StateChanged(before, after, self.cycle))
         if after is State.OPEN:
             self._losses.clear()
             self.entering = True
@@ -226,4 +247,4 @@ class StateMachine:
         reached = self.in_interval and self.interval >= self._first_interval
         interval = self.interval if self.execution.started or reached else -1
         self.execution = None
-        self.events.append(MotionEnded(outcome, reason, interval, self.cycle))
+        self._events.append(MotionEnded(outcome, reason, interval, self.cycle))

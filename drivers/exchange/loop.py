@@ -40,7 +40,7 @@ _LONG_QUEUED: Final = 0.5
 _BUNCHED: Final = 0.5
 """Cycles between two arrivals below which these and others were delayed on their way."""
 _IMMEDIATE: Final = 0.1
-"""Cycles that the reception of a packet takes at most if it was queued."""
+"""Cycles that the reception of a queued packet takes at most."""
 _OLD_BACKLOG: Final = 3.0
 _OLD_BACKLOG_SECONDS: Final = 0.005
 """Age of the newest packet of a backlog, in cycles and at least in s, above which the queue must
@@ -109,15 +109,14 @@ class ReceiveQueue:
     A full queue contains the oldest packets. If the newest packet found is so old that later ones
     were dropped, it gets no reply either while axes are open: the next one comes within a cycle.
 
-    Where the link has no time stamps, arrivals are estimated, only to detect a backlog.
+    Where the link has no time stamps, a packet received at once may have others behind it.
     """
 
     def __init__(self, transport: Transport, session: Session) -> None:
         self._transport = transport
         self._session = session
-        self._read_at = self._estimated = math.inf
+        self._read_at = math.inf
         self._earliest_next = -math.inf
-        self._number = 0
 
     def receive(self) -> tuple[Arrival, ...]:
         """Return the packets to be answered, in order; none if none came before the deadline.
@@ -133,10 +132,13 @@ class ReceiveQueue:
         now = transport.now
         period = session.period
         stamp = self._stamp()
-        arrived = self._estimate(packet, before, now, period) if stamp is None else stamp
+        arrived = now if stamp is None else stamp
         read_at, self._read_at = self._read_at, now
         earliest, self._earliest_next = self._earliest_next, arrived + _BUNCHED * period
-        queued = now - arrived > _LONG_QUEUED * period
+        if stamp is None:
+            queued = now - before <= _IMMEDIATE * period
+        else:
+            queued = now - arrived > _LONG_QUEUED * period
         delayed = queued or now - read_at > _LATE_READ * period or arrived < earliest
         # While any peer is accepted, the queue may hold packets of several.
         if delayed and not _accepts_any_peer(session):
@@ -155,17 +157,6 @@ class ReceiveQueue:
             ages = ages.copy()
         return Arrival(packet, now if stamp is None else stamp, ages, stamp is not None)
 
-    def _estimate(self, packet: bytes, before: float, now: float, period: float) -> float:
-        """Estimate the arrival of a packet received between `before` and `now`."""
-        number = _number(packet)
-        cycles, self._number = _ahead(number, self._number), number
-        if now - before > _IMMEDIATE * period:
-            self._estimated = now
-        else:  # it was queued: it arrived when it was due
-            steps = cycles if cycles <= _NUMBER_WINDOW else 1
-            self._estimated = min(now, self._estimated + steps * period)
-        return self._estimated
-
     def _newest(self, first: Arrival, period: float) -> tuple[Arrival, ...]:
         """Return the newest of each kind among a packet and those queued behind it."""
         transport = self._transport
@@ -173,14 +164,10 @@ class ReceiveQueue:
         backlog = _Backlog(MAX_AXES if init is None else init.n_axes)
         backlog.add(first)
         for _ in range(_MAX_BACKLOG):
-            before = transport.now
             packet = transport.receive(0.0)
             if packet is None:
                 break
-            stamp, now = self._stamp(), transport.now
-            if stamp is None:
-                self._estimate(packet, before, now, period)
-            backlog.add(self._arrival(packet, stamp, now, copy=True))
+            backlog.add(self._arrival(packet, self._stamp(), transport.now, copy=True))
         arrivals, dropped = tuple(arrival for _, arrival in backlog.newest), backlog.dropped
         if dropped and self._too_old(arrivals, period):
             arrivals, dropped = (), dropped + 1

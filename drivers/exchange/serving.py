@@ -44,7 +44,7 @@ from drivers.states import State
 from drivers.transports.base import Transport
 
 EVENT_PERIOD: Final = 0.1
-"""Shortest time between two events of one sort, s."""
+"""Shortest time between two reports of events that are counted, s."""
 DETACHED_LINGER: Final = 2.0
 """Time that packets are answered after the axes closed, without a supervisor, s."""
 FINISH_LINGER: Final = 1.0
@@ -66,37 +66,35 @@ _MAY_BE_OPEN: Final = frozenset(
 _COUNTERS: Final = ("answered", "missed", "duplicates", "stale", "not_accepted", "refused")
 """Counters of a session with their own field in the control block."""
 STOPPED: Final = "a stop was requested"
-_Mergeable = PacketRejected | GapSeen | AnswersLost
+_Countable = PacketRejected | GapSeen | AnswersLost
 
 
 class EventLimiter:
-    """Limits rejections of each kind, gaps and lost replies to one event per `EVENT_PERIOD`.
+    """Sums up rejections of each kind, gaps and lost replies, reported once per `EVENT_PERIOD`.
 
-    Those in between are summed up; the sum, with the cycle of the last, follows at the end of the
-    period, and before the end of a motion or of the link. Other events pass at once.
+    A sum has the cycle of the last; it is also reported before the end of a motion or of the link.
+    Other events pass at once.
     """
 
     def __init__(self) -> None:
-        self._pending: dict[str, _Mergeable] = {}
-        self._next_at: dict[str, float] = {}
+        self._pending: dict[tuple[type, str], _Countable] = {}
+        self._next_at = -math.inf
 
     def filter(self, events: Iterable[Event], now: float) -> list[Event]:
         """Return the events to be reported at this moment, in order."""
         released: list[Event] = []
         for event in events:
             if isinstance(event, PacketRejected | GapSeen | AnswersLost):
-                sort = type(event).__name__
-                if isinstance(event, PacketRejected):
-                    sort += event.kind
+                sort = type(event), getattr(event, "kind", "")
                 pending = self._pending.get(sort)
                 self._pending[sort] = event if pending is None else _sum(pending, event)
-                self._release(sort, now, released)
-            else:
-                if isinstance(event, MotionEnded | LinkLost):
-                    released += self.flush()
-                released.append(event)
-        for sort in tuple(self._pending):
-            self._release(sort, now, released)
+                continue
+            if isinstance(event, MotionEnded | LinkLost):
+                released += self.flush()
+            released.append(event)
+        if self._pending and now >= self._next_at:
+            self._next_at = now + EVENT_PERIOD
+            released += self.flush()
         return released
 
     def flush(self) -> list[Event]:
@@ -105,19 +103,11 @@ class EventLimiter:
         self._pending.clear()
         return pending
 
-    def _release(self, sort: str, now: float, released: list[Event]) -> None:
-        if now >= self._next_at.get(sort, -math.inf):
-            released.append(self._pending.pop(sort))
-            self._next_at[sort] = now + EVENT_PERIOD
 
-
-def _sum(earlier: _Mergeable, later: _Mergeable) -> _Mergeable:
+def _sum(earlier: _Countable, later: _Countable) -> _Countable:
     """Return the sum of two events of one sort."""
-    if isinstance(earlier, GapSeen):
-        assert isinstance(later, GapSeen)
-        return GapSeen(earlier.missed + later.missed, later.cycle)
-    assert not isinstance(later, GapSeen)
-    return replace(later, count=earlier.count + later.count)
+    name = "missed" if isinstance(later, GapSeen) else "count"
+    return replace(later, **{name: getattr(earlier, name) + getattr(later, name)})
 
 
 class ControlServer:

@@ -23,7 +23,7 @@ from drivers import (
     State,
     StateChanged,
 )
-from drivers.errors import GuardError
+from drivers.errors import Check, GuardError
 from drivers.packets import DRIVE_ON, cyclic_length, next_number
 from drivers.states import POSITION_MODES
 
@@ -431,14 +431,19 @@ def all_drive_off(answer: CyclicPacket) -> bool:
     return bool((answer.axes["mode"] == Mode.DRIVE_OFF_REQUEST).all())
 
 
-def assert_refused(rig: Rig, answer: CyclicPacket, kind: type) -> Exception:
+def kind_of(error: Exception) -> object:
+    """Return the check of a guard's error, the class of any other."""
+    return error.kind if isinstance(error, GuardError) else type(error)
+
+
+def assert_refused(rig: Rig, answer: CyclicPacket, kind: object) -> Exception:
     assert all_drive_off(answer)
     assert answer.status == bytes(4)
     assert rig.state is State.FAULTED
     assert rig.ended.outcome == "refused"
     assert np.isnan(rig.records[-1]["commanded_position"]).all()
     error = rig.refusal
-    assert type(error) is kind
+    assert kind_of(error) is kind
     assert error.cycle == rig.records[-1]["cycle"]
     return error
 
@@ -465,9 +470,9 @@ def only(**bounds: float) -> GuardLimits:
     return limits(**{name: np.full(N, bound) for name, bound in (wide | bounds).items()})
 
 
-def refused(kind: type, check: Callable[..., object], *args: Any, **named: Any) -> GuardError:
-    """Return the error that a check raises, which must be of this class."""
+def refused(kind: Check, check: Callable[..., object], *args: Any, **named: Any) -> GuardError:
+    """Return the error that a check raises, which must be of this kind."""
     with pytest.raises(GuardError) as caught:
         check(*args, **named)
-    assert type(caught.value) is kind
+    assert caught.value.kind is kind
     return caught.value

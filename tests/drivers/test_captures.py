@@ -26,7 +26,7 @@ from drivers import (
     Session,
     State,
 )
-from drivers.errors import VelocityLimit
+from drivers.errors import Check
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
 from tests.drivers.rig import Table
@@ -309,8 +309,8 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     (ended,) = replay.seen(MotionEnded)
     # In the others the drive went off, or open mode was closed, with the last set-point.
     assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
-    refused = [(type(event.error), event.error.joint) for event in replay.seen(Refused)]
-    assert refused == ([(VelocityLimit, 0)] if name == "a_508" else [])
+    refused = [(event.error.kind, event.error.joint) for event in replay.seen(Refused)]
+    assert refused == ([(Check.VELOCITY, 0)] if name == "a_508" else [])
 
 
 def assert_documented(

@@ -485,12 +485,12 @@ class TestFullQueue:
     def test_newest_of_an_old_backlog_gets_no_reply(self, is_open, count, since, replies):
         """While axes are open: a single packet or a recent one gets its reply."""
         rig, source = moving() if is_open else (closed(), None)
-        advances, cycle = getattr(source, "advances", 0), rig.session._machine.cycle
+        advances, cycle = getattr(source, "advances", 0), rig.session.cycle
         link = self.serve(rig, [rig.packet() for _ in range(count)], since)
         assert len(link.sent) == replies
         assert rig.session.counters.discarded.get("late", 0) == count - replies
         if not replies:
-            assert (source.advances, rig.session._machine.cycle) == (advances, cycle)
+            assert (source.advances, rig.session.cycle) == (advances, cycle)
 
     def test_init_packet_of_an_old_backlog_is_answered(self):
         rig, _ = moving()

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from drivers import errors, events
 from drivers.errors import (
     AxisNotInMode,
-    CorrectionNotEnded,
+    Check,
     DriverError,
     DriveTrainError,
     ExitTimeout,
@@ -155,12 +155,11 @@ EXAMPLES = {
     TransportClosed: TransportClosed("gone"),
     RefusalError: RefusalError("why", 17),
     SourceFailed: SourceFailed("row 3", 4),
-    AxisNotInMode: AxisNotInMode(2, 0, 4, 99),
-    ModeRefused: ModeRefused(2, 3, False, 99),
-    ExitTimeout: ExitTimeout(5000, 6000),
-    CorrectionNotEnded: CorrectionNotEnded(1, 2.0, 0.0, 3, "rad/s"),
+    AxisNotInMode: AxisNotInMode("joint 3 is in mode 0", 99),
+    ModeRefused: ModeRefused("joint 3 is in mode 3", 99),
+    ExitTimeout: ExitTimeout("open", 6000),
+    GuardError: GuardError(Check.CORRECTION_END, 1, 2.0, 0.0, 3, "rad/s"),
     errors.SessionFailed: errors.SessionFailed("why", 7),
-    errors.TargetNotFinite: errors.TargetNotFinite(2, 6, float("inf"), 8),
 }
 
 
@@ -204,16 +203,18 @@ def assert_same(mine, theirs):
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_errors_pickle(kind):
-    error = EXAMPLES.get(kind)
-    if error is None:
-        assert issubclass(kind, GuardError), f"no example of {kind.__name__}"
-        error = kind(3, -1.25, 0.5, 1234)
-        assert (error.joint, error.value, error.bound, error.cycle) == (3, -1.25, 0.5, 1234)
-    again = through_pickle(error)
-    assert_same(error, again)
-    if isinstance(error, GuardError):
-        assert again.unit == error.unit
-        assert again.check == error.check
+    error = EXAMPLES[kind]
+    assert_same(error, through_pickle(error))
+
+
+@pytest.mark.parametrize("check", Check)
+def test_guard_error_states_check_joint_value_bound_and_cycle(check):
+    error = GuardError(check, 3, -1.25, 0.5, 1234)
+    assert (error.joint, error.value, error.bound, error.cycle) == (3, -1.25, 0.5, 1234)
+    assert (error.check, error.unit, error.remedy) == (check.quantity, check.unit, check.remedy)
+    for part in (check.quantity, "joint 4", "-1.25", "0.5", "cycle 1234"):
+        assert part in str(error)
+    assert through_pickle(error).kind is check
 
 
 def _nothing(self, *_):

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from drivers import Mode, MotionEnded, MotionStarted, State
-from drivers.errors import AgeAfterGap, AxisNotInMode, FirstSetPointUnknown, VelocityAfterGap
+from drivers.errors import (
+    AxisNotInMode,
+    Check,
+)
 from drivers.reply_policy import EXIT_RETRY_CYCLES
 from tests.drivers.rig import (
     MOVE,
@@ -19,6 +22,7 @@ from tests.drivers.rig import (
     assert_refused,
     closed,
     init_packet,
+    kind_of,
     moving,
     opened,
     running,
@@ -221,14 +225,14 @@ class TestOnlyAxis:
     def test_motion_of_another_joint_is_refused(self, joint):
         rig, _ = self.moving(0, joint, cycles=300)
         assert type(rig.refusal) is AxisNotInMode
-        assert (rig.refusal.joint, rig.refusal.mode) == (joint, Mode.CLOSED)
+        assert f"joint {joint + 1} is in mode 0;" in str(rig.refusal)
 
     def test_another_open_axis_ends_the_motion(self):
         rig, _ = self.moving(0, cycles=1)
         rig.modes[2] = Mode.POSITION
         rig.cycle()
         assert type(rig.refusal) is AxisNotInMode
-        assert rig.refusal.joint == 2
+        assert "joint 3 is in mode 4;" in str(rig.refusal)
 
 
 class TestRecords:
@@ -322,7 +326,7 @@ class TestAgesAtTheStart:
         rig.ages[3, column] = 1
         assert (rig.cycle(mode=mode).axes["mode"] == 505).all()
         error = rig.refusal
-        assert type(error) is FirstSetPointUnknown
+        assert kind_of(error) is Check.FIRST_AGE
         assert (error.joint, error.value, error.bound, error.unit) == (3, 1.0, 0.0, "cycles")
         assert rig.state is State.FAULTED
 
@@ -343,7 +347,7 @@ class TestAgesAtTheStart:
         rig.cycle(5)
         assert rig.state is State.OPEN
         rig.session.request(still(5))
-        assert_refused(rig, rig.cycle(), FirstSetPointUnknown)
+        assert_refused(rig, rig.cycle(), Check.FIRST_AGE)
 
 
 class TestAgesAfterGaps:
@@ -359,8 +363,8 @@ class TestAgesAfterGaps:
     @pytest.mark.parametrize("column", [D1, D2, D4])
     def test_old_values_after_a_gap_are_refused(self, column):
         rig, source, answer = self.after(3, column, 1)
-        error = assert_refused(rig, answer, AgeAfterGap)
-        assert isinstance(error, VelocityAfterGap)
+        error = assert_refused(rig, answer, Check.GAP_AGE)
+        assert kind_of(error) in (Check.GAP_VELOCITY, Check.GAP_AGE)
         assert (error.joint, error.value, error.unit) == (2, 1.0, "cycles")
         assert source.advances == 305
         rig, source, _ = self.after(3, column, 0)
@@ -381,7 +385,7 @@ class TestAgesAfterGaps:
         rig.cycle()
         rig.miss(10)
         assert all_drive_off(rig.cycle())
-        assert type(rig.refusal) is AgeAfterGap
+        assert kind_of(rig.refusal) is Check.GAP_AGE
 
 
 class TestReturnedTargets:
@@ -398,7 +402,7 @@ class TestReturnedTargets:
         rig.ages[2, D1] = 1
         assert all_drive_off(rig.cycle())
         error = rig.refusal
-        assert type(error) is FirstSetPointUnknown
+        assert kind_of(error) is Check.FIRST_AGE
         assert (error.joint, error.value) == (2, 1.0)
 
     def test_old_target_is_not_returned_to_a_reopened_axis(self):
@@ -414,7 +418,7 @@ class TestReturnedTargets:
         assert rig.state is State.EXITING, "axes still open are given the last set-point"
         rig.axes["mode"][2] = Mode.POSITION
         assert all_drive_off(rig.cycle())
-        assert type(rig.refusal) is FirstSetPointUnknown
+        assert kind_of(rig.refusal) is Check.FIRST_AGE
 
 
 def test_ages_do_not_change_a_motion():

@@ -28,6 +28,7 @@ from drivers import (
     StateChanged,
     exchange,
 )
+from drivers.errors import GuardError
 from drivers.packets import Mode, cyclic_length
 from planner import JointLimits, TrajectoryPlayer, plan
 from sim_fixtures import Phase, SimulatedController
@@ -298,7 +299,9 @@ class Run:
         """The first relevant event."""
         for event in self.events:
             if isinstance(event, Refused):
-                return f"{self._asked_for()} {type(event.error).__name__}"
+                error = event.error
+                kind = error.kind.name if isinstance(error, GuardError) else type(error).__name__
+                return f"{self._asked_for()} {kind}"
             if isinstance(event, MotionEnded):
                 lost = event.outcome == "lost"
                 return f"lost: {_SHORT[event.reason]}" if lost else event.outcome

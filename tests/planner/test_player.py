@@ -347,7 +347,7 @@ class Arm:
     def begin(self):
         first = self.player.start + self.offset
         self.player.begin(first)
-        self.guard.begin(first, np.zeros(6), np.zeros(6), np.zeros((2, 6)), 0)
+        self.guard.begin(first, 0)
         return self
 
     def run(self, cycles):

@@ -42,9 +42,9 @@ def catches_up_unguarded(patch: pytest.MonkeyPatch) -> None:
     advance, gap = TrajectoryPlayer.advance, [0]
     record_gap = StateMachine.record_gap
 
-    def recorded(self: StateMachine, missed: int, unanswered: int, max_gap: int) -> None:
+    def recorded(self: StateMachine, missed: int, unanswered: int) -> None:
         gap[0] = missed
-        record_gap(self, missed, unanswered, max_gap)
+        record_gap(self, missed, unanswered)
 
     def advanced(self: TrajectoryPlayer) -> Any:
         for _ in range(gap[0]):

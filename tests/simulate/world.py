@@ -19,7 +19,7 @@ from unittest.mock import patch
 import numpy as np
 
 from drivers import State
-from drivers.errors import NotAtStandstill
+from drivers.errors import Check
 from drivers.events import MotionEnded
 from hil.archive import writer
 from hil.campaign import Campaign, Link, link
@@ -321,7 +321,7 @@ class World:
 
     def _trembled(self, life: Life) -> bool:
         """Whether a motion was refused because the arm moved at standstill."""
-        if NotAtStandstill.check not in str(life.error):
+        if Check.STANDSTILL.quantity not in str(life.error):
             return False
         index = next(k for k, event in reversed(life.events) if isinstance(event, MotionEnded))
         at = life.exchanged[index].cycle
@@ -509,7 +509,7 @@ def _check_usable(scene: Scene, life: Life) -> None:
     error, result = life.error, life.result
     if isinstance(error, RepetitionsRejectedError):
         raise SceneError(f"{scene.words}: {error}")
-    if isinstance(error, MotionFailedError) and NotAtStandstill.check in error.reason:
+    if isinstance(error, MotionFailedError) and Check.STANDSTILL.quantity in error.reason:
         raise SceneError(f"{scene.words}: {error}")
     if result is None or not result.complete:
         how = f"{type(error).__name__}: {error}" if error is not None else "incomplete"
