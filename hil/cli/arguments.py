@@ -31,21 +31,6 @@ AcceptInitOption = Annotated[
         "cell; the archive records this.",
     ),
 ]
-DhOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="TABLE",
-        help="CSV table of DH parameters in place of --urdf: joint, type, a, alpha, d, "
-        "theta_offset (m, rad; or a_mm, alpha_deg, …), one row per joint. Needs --convention.",
-    ),
-]
-ConventionOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Convention of --dh: standard (Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
-        "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
-    ),
-]
 
 
 Command = Callable[..., None]
