@@ -424,62 +424,24 @@ def _spring():
     raise OSError("sprung")
 
 
-class TestStall:
-    def test_backlog_after_a_stall_is_dropped(self):
-        with running(session={"max_gap": 100}) as (exchange, controller):
-            start_cruise(exchange, controller)
-            os.kill(exchange.pid, signal.SIGSTOP)
-            while (
-                Path(f"/proc/{exchange.pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T"
-            ):
-                time.sleep(0.001)
-            for _ in range(90):
-                controller.post()
-            time.sleep(10 * PERIOD)
-            os.kill(exchange.pid, signal.SIGCONT)
-            assert controller.silent(0.1)
-            before = controller.moved
-            controller.cycle(1)
-            assert controller.moved - before == pytest.approx(PERIOD * Cruise.SPEED, rel=0.01)
-            controller.cycle(200)
-            status = exchange.status()
-            assert status.late - status.answered_late == 90
-            assert status.missed == 90
-
-    def test_consecutive_late_replies_stop_the_motion(self):
-        allowances = {"session": {"max_gap": 100}, "max_late": 2, "preload": (__name__,)}
-        with running(realtime=RealTimeSettings(), **allowances) as (exchange, controller):
-            exchange.submit(Slow())
-            controller.open = True
-            controller.cycle(20)
-            ended = []
-            begin = due = time.monotonic()
-            while not ended:
-                assert time.monotonic() < begin + 30.0
-                due += PERIOD
-                if time.monotonic() - due > 0.1:  # no burst after a stall
-                    due = time.monotonic()
-                controller.post()
-                time.sleep(max(0.0, due - time.monotonic()))
-                controller.follow_received()
-                events = exchange.events()
-                ended = [event for event in events if isinstance(event, MotionEnded)]
-            assert ended[0].outcome == "stopped", ended[0].reason
-            assert "consecutive replies left too late" in ended[0].reason
-            assert exchange.status().worst_turnaround_us > 1e6 * Slow.COST
-
-
-class Slow(Cruise):
-    """Takes five cycles for each step: the next packet overtakes every reply, even where a busy
-    computer makes the controller of the test late."""
-
-    COST = 5 * PERIOD
-
-    def advance(self):
-        end = time.monotonic() + self.COST
-        while time.monotonic() < end:
-            pass
-        return super().advance()
+def test_backlog_after_a_stall_is_dropped():
+    with running(session={"max_gap": 100}) as (exchange, controller):
+        start_cruise(exchange, controller)
+        os.kill(exchange.pid, signal.SIGSTOP)
+        while Path(f"/proc/{exchange.pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "T":
+            time.sleep(0.001)
+        for _ in range(90):
+            controller.post()
+        time.sleep(10 * PERIOD)
+        os.kill(exchange.pid, signal.SIGCONT)
+        assert controller.silent(0.1)
+        before = controller.moved
+        controller.cycle(1)
+        assert controller.moved - before == pytest.approx(PERIOD * Cruise.SPEED, rel=0.01)
+        controller.cycle(200)
+        status = exchange.status()
+        assert status.late - status.answered_late == 90
+        assert status.missed == 90
 
 
 class TestStops:

@@ -29,15 +29,13 @@ class Script:
 
 
 class FarEnd(Script):
-    """For the contract: idle cycles while the test has nothing to send."""
+    """For the contract: silent cycles while the test has nothing to send."""
 
-    IDLE = b"idle"
+    def next_packet(self):
+        return super().next_packet() or b""
 
     def send(self, packet):
         self.packets.append(packet)
-
-    def next_packet(self):
-        return self.packets.popleft() if self.packets else self.IDLE
 
     def wait(self):
         pass
@@ -47,77 +45,43 @@ class FarEnd(Script):
         return [reply for reply in self.accepted if reply is not None]
 
 
-class WithoutIdlePackets(SimulatedTransport):
-    """A controller has something to send in every cycle; the contract also wants silence."""
-
-    def _next_cycle(self):
-        packet = super()._next_cycle()
-        return None if packet == FarEnd.IDLE else packet
-
-
 class TestContract(TransportContract):
     @pytest.fixture
     def link(self):
         far = FarEnd()
-        return WithoutIdlePackets(far), far
-
-
-cycles = st.integers(0, 30)
-directions = st.sampled_from(["to_pc", "to_controller"])
-counts = st.integers(1, 3)
-faults_of_any_kind = st.one_of(
-    st.builds(Lose, cycles, directions, counts),
-    st.builds(Delay, cycles, directions, counts, seconds=st.floats(1e-5, 0.01)),
-    st.builds(Duplicate, cycles, directions, counts),
-    st.builds(Reorder, cycles, directions),
-    st.builds(Corrupt, cycles, directions, offset=st.just(1), mask=st.just(1)),
-)
+        return SimulatedTransport(far), far
 
 
 def packets(count: int) -> list[bytes]:
     return [bytes([index]) * 4 for index in range(count)]
 
 
-def answer_all(transport, limit: int = 100) -> list[bytes]:
-    received = []
-    try:
-        for _ in range(limit):
-            packet = transport.receive(1.0)
-            received.append(packet)
-            transport.send(b"re:" + packet)
-    except TransportClosed:
-        pass
-    return received
+class TestTime:
+    def test_each_packet_is_one_cycle_without_drift(self):
+        transport = SimulatedTransport(Script([b"x"] * 100_000))
+        for cycle in range(1, 100_001):
+            transport.receive(1.0)
+            assert transport.now == cycle * 0.002
+        assert (transport.ages, transport.rejected()) == (None, {})
+        with pytest.raises(TransportClosed, match="no more packets"):
+            transport.receive(1.0)
 
-
-def test_each_packet_is_one_cycle_without_drift():
-    transport = SimulatedTransport(Script([b"x"] * 100_000))
-    for cycle in range(1, 100_001):
-        transport.receive(1.0)
-        assert transport.now == cycle * 0.002
-    assert (transport.ages, transport.rejected()) == (None, {})
-    with pytest.raises(TransportClosed, match="no more packets"):
-        transport.receive(1.0)
-
-
-def test_wait_shorter_than_a_cycle():
-    transport = SimulatedTransport(Script(packets(1)))
-    assert transport.receive(0.0015) is None
-    assert transport.now == pytest.approx(0.0015)
-    assert transport.receive(0.001) is not None
-    assert transport.now == pytest.approx(0.002)
-
-
-def test_one_reply_or_none_per_cycle():
-    peer = Script(packets(4))
-    transport = SimulatedTransport(peer)
-    for index in range(4):
-        transport.receive(1.0)
-        if index != 1:
-            transport.send(bytes([index]))
-    with pytest.raises(TransportClosed):
-        transport.receive(1.0)
-    assert peer.accepted == [b"\0", None, b"\2", b"\3"]
+    @pytest.mark.parametrize(
+        ("script", "faults", "waits"),
+        [
+            (packets(1), [], [(0.0015, 0.0015, None), (0.001, 0.002, 0)]),
+            (packets(100), [Lose(0, count=60)], [(0.1, 0.1, None), (0.1, 0.122, 60)]),
+            ([b"\0" * 4, *[b""] * 50], [Delay(0, seconds=0.05)],
+             [(0.04, 0.04, None), (0.04, 0.052, 0)]),
+        ],
+        ids=["within a cycle", "loss", "delay"],
+    )  # fmt: skip
+    def test_timeout_before_the_packet(self, script, faults, waits):
+        transport = SimulatedTransport(Script(script), faults)
+        for timeout, now, index in waits:
+            packet = transport.receive(timeout)
+            assert (packet and packet[0]) == index
+            assert transport.now == pytest.approx(now)
 
 
 def on_time(*which: int) -> list[tuple[float, int]]:
@@ -133,6 +97,9 @@ CASES = {
     "packet doubled": ([Duplicate(1)], on_time(0, 1, 1, 2, 3), [0, 1, 2, 3], [1], []),
     "answer doubled": (
         [Duplicate(1, TO_CONTROLLER)], on_time(0, 1, 2, 3), [0, 1, 2, 3], [1], []),
+    "changed": (
+        [Corrupt(1, offset=0, mask=0x40), Corrupt(2, TO_CONTROLLER, offset=3, mask=0x20)],
+        [(1.0, 0), (2.0, 65), (3.0, 2), (4.0, 3)], [0, 65, 34, 3], [], []),
     "late within its cycle": (
         [Delay(1, seconds=0.0005)], [(1.0, 0), (2.25, 1), *on_time(2, 3)], [0, 1, 2, 3], [], []),
     # The answer comes in the next cycle, which has had its own.
@@ -155,30 +122,57 @@ CASES = {
 """Faults; when each packet arrives, in cycles, and which; answers by cycle, surplus and late."""
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_effect_of_faults(name):
-    faults, expected, accepted, surplus, late = CASES[name]
-    peer = Script(packets(len(accepted)))
-    transport, seen = SimulatedTransport(peer, faults), []
-    with pytest.raises(TransportClosed):
-        while True:
-            packet = transport.receive(1.0)
-            seen.append((transport.now / peer.period, packet[0]))
-            transport.send(b"re:" + packet)
-    assert seen == [pytest.approx(one) for one in expected]
-    for found, replies in zip(
-        (peer.accepted, transport.surplus_replies, transport.late_replies),
-        (accepted, surplus, late), strict=True,
-    ):  # fmt: skip
-        assert [reply and reply[3] for reply in found] == replies
-
-
 class TestFaults:
-    def test_loss_longer_than_the_timeout(self):
-        transport = SimulatedTransport(Script(packets(100)), [Lose(0, count=60)])
-        assert transport.receive(0.1) is None
-        assert transport.now == pytest.approx(0.1)
-        assert transport.receive(0.1)[0] == 60
+    @pytest.mark.parametrize("name", CASES)
+    def test_effect(self, name):
+        faults, expected, accepted, surplus, late = CASES[name]
+        peer = Script(packets(len(accepted)))
+        transport, seen = SimulatedTransport(peer, faults), []
+        with pytest.raises(TransportClosed):
+            while True:
+                packet = transport.receive(1.0)
+                seen.append((transport.now / peer.period, packet[0]))
+                transport.send(b"re:" + packet)
+        assert seen == [pytest.approx(one) for one in expected]
+        for found, replies in zip(
+            (peer.accepted, transport.surplus_replies, transport.late_replies),
+            (accepted, surplus, late), strict=True,
+        ):  # fmt: skip
+            assert [reply and reply[3] for reply in found] == replies
+
+    cycles = st.integers(0, 30)
+    directions = st.sampled_from(["to_pc", "to_controller"])
+    counts = st.integers(1, 3)
+    any_fault = st.one_of(
+        st.builds(Lose, cycles, directions, counts),
+        st.builds(Delay, cycles, directions, counts, seconds=st.floats(1e-5, 0.01)),
+        st.builds(Duplicate, cycles, directions, counts),
+        st.builds(Reorder, cycles, directions),
+        st.builds(Corrupt, cycles, directions, offset=st.just(1), mask=st.just(1)),
+    )
+
+    @given(st.lists(any_fault, max_size=12), st.floats(1e-4, 0.02))
+    def test_time_increases_and_each_cycle_has_one_reply(self, faults, timeout):
+        peer = Script(packets(30))
+        transport = SimulatedTransport(peer, faults)
+        before = 0.0
+        with pytest.raises(TransportClosed):
+            while True:
+                packet = transport.receive(timeout)
+                assert transport.now >= before
+                before = transport.now
+                if packet is not None:
+                    transport.send(b"re:" + packet)
+        assert len(peer.accepted) == 30
+        answered = [reply for reply in peer.accepted if reply is not None]
+        assert len(answered) + len(transport.surplus_replies) + len(transport.late_replies) <= 60
+
+    def test_faults_of_one_packet_add_up(self):
+        link = FaultyLink([Delay(3, cycles=2.0), Delay(3, seconds=0.5), Duplicate(3)], 0.25)
+        assert link.carry(3, "to_pc", b"x") == [(1.0, b"x")] * 2
+        assert link.carry(3, "to_controller", b"x") == [(0.0, b"x")]
+        assert FaultyLink([Duplicate(3), Lose(3)], 0.001).carry(3, "to_pc", b"x") == []
+        assert FaultyLink([Duplicate(3)], 0.001).carry(3, "to_pc", b"") == []
 
     def test_fault_of_a_thousand_million_cycles_is_fast(self):
         began = perf_counter()
@@ -189,53 +183,3 @@ class TestFaults:
             assert link.carry(cycle, "to_controller", b"x") == [(0.0, b"x")]
         assert link.carry(1_000_000_001, "to_pc", b"x") == [(0.0, b"x")]
         assert perf_counter() - began < 1.0
-
-    def test_corruption_in_both_directions(self):
-        peer = Script(packets(3))
-        faults = [Corrupt(1, offset=2, mask=0x80), Corrupt(2, "to_controller", offset=0, mask=0x01)]
-        received = answer_all(SimulatedTransport(peer, faults))
-        assert received[1] == bytes([1, 1, 0x81, 1])
-        assert peer.accepted[2] == bytes([ord("r") ^ 1]) + b"e:" + bytes([2]) * 4
-        assert received[0] == bytes(4)
-
-    def test_silent_controller(self):
-        peer = Script([b"a", b"", b"", b"d"])
-        transport = SimulatedTransport(peer)
-        assert answer_all(transport) == [b"a", b"d"]
-        assert peer.accepted == [b"re:a", None, None, b"re:d"]
-
-
-class TestDelay:
-    def test_timeout_shorter_than_the_delay(self):
-        transport = SimulatedTransport(Script([b"x", *[b""] * 50]), [Delay(0, seconds=0.05)])
-        assert transport.receive(0.04) is None
-        assert transport.now == pytest.approx(0.04)
-        assert transport.receive(0.04) == b"x"
-        assert transport.now == pytest.approx(0.052)
-
-    @given(st.lists(faults_of_any_kind, max_size=12), st.floats(1e-4, 0.02))
-    def test_time_increases_and_each_cycle_has_one_reply(self, faults, timeout):
-        peer = Script(packets(30))
-        transport = SimulatedTransport(peer, faults)
-        before = 0.0
-        try:
-            while True:
-                packet = transport.receive(timeout)
-                assert transport.now >= before
-                before = transport.now
-                if packet is not None:
-                    transport.send(b"re:" + packet)
-        except TransportClosed:
-            pass
-        assert len(peer.accepted) == 30
-        answered = [reply for reply in peer.accepted if reply is not None]
-        assert len(answered) + len(transport.surplus_replies) + len(transport.late_replies) <= 60
-
-
-class TestFaultyLink:
-    def test_faults_of_one_packet_add_up(self):
-        link = FaultyLink([Delay(3, cycles=2.0), Delay(3, seconds=0.5), Duplicate(3)], 0.25)
-        assert link.carry(3, "to_pc", b"x") == [(1.0, b"x")] * 2
-        assert link.carry(3, "to_controller", b"x") == [(0.0, b"x")]
-        assert FaultyLink([Duplicate(3), Lose(3)], 0.001).carry(3, "to_pc", b"x") == []
-        assert FaultyLink([Duplicate(3)], 0.001).carry(3, "to_pc", b"") == []

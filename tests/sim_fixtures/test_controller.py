@@ -17,7 +17,6 @@ from drivers.packets import (
     CyclicPacket,
     InitPacket,
     Mode,
-    cyclic_length,
     echo,
     is_init,
     next_number,
@@ -326,21 +325,6 @@ class TestCurrentsAreTorques:
         assert a > 0.0
         assert -b / (2.0 * a) == pytest.approx(documented, abs=0.01)
 
-    @pytest.mark.parametrize(
-        "flip",
-        [
-            {"gear_ratio": [116.0, 116.0, -106.0, -50.0, 51.5, -33.0]},
-            {"k54": -0.03},
-            {"k64": 0.02},
-            {"k65": -0.035},
-            {"torque_constant": [1.1, 1.1, 0.75, 0.36, 0.46, 0.42]},
-        ],
-    )
-    def test_one_wrong_figure_in_the_conversion_shows(
-        self, residuals: Callable[..., Array], flip: dict[str, Any]
-    ) -> None:
-        assert (residuals(make_drive(**flip)) / residuals()).max() > 50.0
-
 
 class TestArms:
     """Axes of other arms in the packets."""
@@ -405,18 +389,6 @@ class TestArms:
         controller.accept(reply.encode())
         moved = self.axes_at(controller, Phase.OPEN, 4)["d"][2:, 0] - before
         np.testing.assert_allclose(moved, 0.5 if opens else 0.0)
-
-    def test_long_packets_have_732_bytes_and_a_tail_that_one_seed_repeats(self) -> None:
-        def packets(**changes: Any) -> list[bytes]:
-            return echoed(small_cell.controller(cold_start=False, **changes), 40)[1:]
-
-        long, short = packets(long_packets=True), packets()
-        assert {len(packet) for packet in long} == {732}
-        assert {len(packet) for packet in short} == {cyclic_length(2)}
-        assert [packet[: cyclic_length(2)] for packet in long] == short
-        assert long[0][-100:] != long[1][-100:]
-        assert long == packets(long_packets=True)
-        assert long != packets(long_packets=True, seed=2)
 
 
 class TestOwnMotion:
