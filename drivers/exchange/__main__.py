@@ -19,7 +19,7 @@ from drivers.drive_train import DriveTrain
 from drivers.exchange import realtime
 from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventWriter, ExchangeEnded, ExchangeFailed, ExchangeStarted
-from drivers.exchange.loop import exchange
+from drivers.exchange.loop import MAX_LATE, exchange
 from drivers.exchange.process import ExchangeSettings
 from drivers.exchange.serving import ControlServer, portable
 from drivers.guard import Guard, GuardLimits
@@ -135,7 +135,10 @@ def main(arguments: Sequence[str]) -> int:
     notes = tuple(getattr(transport, "notes", ()))
     server.log(ExchangeStarted(os.getpid(), report, notes))
     channel.send(pickle.dumps((report, notes)))
-    status = _serve(transport, session, server, settings.late_allowed)
+    max_late = settings.max_late
+    if max_late is None:
+        max_late = settings.session.get("max_gap", MAX_LATE)
+    status = _serve(transport, session, server, max_late)
     control.finished = int(status == 0)
     return status
 

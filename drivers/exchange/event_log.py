@@ -30,24 +30,10 @@ class ExchangeStarted:
 
 
 @dataclass(frozen=True)
-class OverrideRefused:
-    """The present motion cannot change its speed."""
+class CommandRefused:
+    """An override, hold or resumption that is not possible; a motion goes on as before."""
 
-    fraction: float
-    reason: str
-
-
-@dataclass(frozen=True)
-class HoldRefused:
-    """There is no motion to hold; one requested later begins as usual."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class ResumeRefused:
-    """The motion cannot be resumed."""
-
+    command: str
     reason: str
 
 
@@ -80,15 +66,7 @@ class ExchangeFailed:
 
 
 ExchangeEvent = (
-    Event
-    | ExchangeStarted
-    | OverrideRefused
-    | HoldRefused
-    | ResumeRefused
-    | EventsLost
-    | Leaving
-    | ExchangeEnded
-    | ExchangeFailed
+    Event | ExchangeStarted | CommandRefused | EventsLost | Leaving | ExchangeEnded | ExchangeFailed
 )
 
 

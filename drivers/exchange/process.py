@@ -19,7 +19,6 @@ from drivers.errors import DriverError, RequestError
 from drivers.exchange import control, event_log
 from drivers.exchange.control import ControlBlock
 from drivers.exchange.event_log import EventReader, ExchangeEvent
-from drivers.exchange.loop import MAX_LATE
 from drivers.exchange.motion_transfer import LONGEST_MESSAGE, READ, WITHDRAWN, hand_over
 from drivers.exchange.realtime import RealTimeReport, RealTimeSettings
 from drivers.guard import GuardLimits
@@ -54,14 +53,6 @@ class ExchangeSettings:
     preload: tuple[str, ...] = ()
     needs_archive: bool = True
     max_late: int | None = None
-
-    @property
-    def late_allowed(self) -> int:
-        """`max_late`, or its default."""
-        if self.max_late is not None:
-            return self.max_late
-        allowed: int = self.session.get("max_gap", MAX_LATE)
-        return allowed
 
 
 class ExchangeError(DriverError):
@@ -193,19 +184,19 @@ class ExchangeProcess:
         self._control.stop_count += 1
 
     def override(self, fraction: float) -> None:
-        """Change the speed of the present motion; `OverrideRefused` if it cannot be changed."""
+        """Change the speed of the present motion; `CommandRefused` if it cannot be changed."""
         self._control.override = fraction
         self._control.override_count += 1
 
     def hold(self) -> None:
         """Hold the present motion on its path until `resume`; one that cannot be held is stopped.
 
-        A motion that has not begun begins at rest. Without a motion there is a `HoldRefused` event.
+        A motion that has not begun begins at rest; without one there is a `CommandRefused` event.
         """
         self._hold(1)
 
     def resume(self) -> None:
-        """Resume the motion held; `ResumeRefused` if that is impossible."""
+        """Resume the motion held; `CommandRefused` if that is impossible."""
         self._hold(0)
 
     def _hold(self, held: int) -> None:

@@ -27,12 +27,10 @@ from drivers.exchange.control import (
 from drivers.exchange.event_log import (
     NO_ARCHIVE,
     NO_SUPERVISOR,
+    CommandRefused,
     EventWriter,
     ExchangeEvent,
-    HoldRefused,
     Leaving,
-    OverrideRefused,
-    ResumeRefused,
 )
 from drivers.exchange.loop import POLL
 from drivers.exchange.motion_transfer import READ, WITHDRAWN, Inbox, unpack
@@ -205,10 +203,14 @@ class ControlServer:
                 self._answer(RequestError(self._state, STOPPED))
         if control.override_count != self._overrides:
             self._overrides = control.override_count
-            self._change_override(control.override)
+            fraction = control.override
+            self._command(f"override of {fraction:g}", lambda: session.override(fraction))
         if control.hold_count != self._holds:
             self._holds = control.hold_count
-            self._change_hold(bool(control.held))
+            if control.held:
+                self._command("hold", session.hold)
+            else:
+                self._command("resumption", session.resume)
         # Not in the call that read it, so that a stop in between comes first.
         if self._offered is not None:
             self._request(self._offered)
@@ -248,20 +250,11 @@ class ControlServer:
             return NO_ARCHIVE
         return ""
 
-    def _change_override(self, fraction: float) -> None:
+    def _command(self, name: str, command: Callable[[], object]) -> None:
         try:
-            self._session.override(fraction)
+            command()
         except DriverError as error:
-            self.log(OverrideRefused(fraction, str(error)))
-
-    def _change_hold(self, held: bool) -> None:
-        try:
-            if held:
-                self._session.hold()
-            else:
-                self._session.resume()
-        except DriverError as error:
-            self.log((HoldRefused if held else ResumeRefused)(str(error)))
+            self.log(CommandRefused(name, str(error)))
 
     def _read_motion(self, now: float) -> None:
         """Read the motion that was handed over; it may be withdrawn meanwhile."""

@@ -27,15 +27,13 @@ from drivers.events import (
     StateChanged,
 )
 from drivers.exchange.event_log import (
+    CommandRefused,
     EventsLost,
     ExchangeEnded,
     ExchangeEvent,
     ExchangeFailed,
     ExchangeStarted,
-    HoldRefused,
     Leaving,
-    OverrideRefused,
-    ResumeRefused,
 )
 from hil.archive.events import Level
 from hil.archive.writer import ArchiveWriter
@@ -66,9 +64,7 @@ _TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
         Level.ERROR,
         "events that were overwritten before they could be archived: {0.count}",
     ),
-    OverrideRefused: (Level.WARN, "no override of {0.fraction:g}: {0.reason}"),
-    HoldRefused: (Level.WARN, "no motion to hold: {0.reason}"),
-    ResumeRefused: (Level.WARN, "the motion cannot be resumed: {0.reason}"),
+    CommandRefused: (Level.WARN, "no {0.command}: {0.reason}"),
 }
 
 
