@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,7 @@ from hil.campaign.trajectory_files import write_trajectories
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption, at_most_one, print_json
 from hil.design import Method, load_settings, preset
-from hil.design.advice import WEAK, criteria_text, margins, weakest
+from hil.design.advice import criteria_text
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.design.settings import preset_text
 from hil.errors import HilError, InputError, OperatorStopError
@@ -48,50 +47,6 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
         "file": str(folder.result),
         "picture": str(folder.picture),
     }
-
-
-def _lines(done: Designed) -> Iterator[str]:
-    """Yield the criteria and what limits them."""
-    excitation, design = done.result.excitation, done.design
-    sines, criteria = done.result.settings.sines, excitation.criteria
-    broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
-    yield (
-        f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
-        f"{len(design.front)} on the front"
-    )
-    raw, scaled = criteria.condition, criteria.scaled_condition
-    assert raw is not None and scaled is not None
-    yield f"condition number of the regressor {raw:.0f}, {scaled:.1f} with columns of unit length"
-    if scaled > WEAK:
-        names = ", ".join(weakest(done.problem.objective, excitation.trajectory))
-        yield (
-            f"this motion hardly separates {names}: use more via points or harmonics, allow a "
-            "longer motion, or choose other parameters ([objective] parameters)"
-        )
-    if design.chosen is None:
-        yield f"polished from {criteria_text(design.origin_criteria.measures)}"
-    if sines is not None and sines.ramp == 0.0:
-        yield "this motion starts and ends at full speed, which no controller can run; set a ramp"
-
-
-def _draw(
-    folder: DesignFolder,
-    done: Designed,
-    cell: Cell,
-) -> None:
-    """Draw the picture; a failure is only reported."""
-    from hil.plots.design_picture import draw_design  # matplotlib is slow to import
-
-    figure = draw_design(
-        done.design,
-        cell,
-        unchecked=done.result.settings.unchecked,
-        margins=margins(cell, done.problem, done.design.excitation.trajectory),
-    )
-    try:
-        save(figure, folder.picture)
-    except InputError as error:
-        say(f"warning: {error}; repeat with --resume to draw it", err=True)
 
 
 def design(
@@ -174,10 +129,14 @@ def design(
 
     def finish(done: Designed) -> None:
         """Report and draw the result, while the folder is locked."""
-        for line in _lines(done):
-            reporter.say(line)
-        if unchecked := ", ".join(done.result.settings.unchecked):
-            text = f"not checked: {unchecked}; {loaded.name} may refuse this motion"
+        excitation, unchecked = done.result.excitation, done.result.settings.unchecked
+        broken = ", ".join(f"{kind} {count}" for kind, count in excitation.rejected.items())
+        reporter.say(
+            f"{excitation.tried} motions tried; broken constraints: {broken or 'none'}; "
+            f"{len(done.design.front)} on the front"
+        )
+        if unchecked:
+            text = f"not checked: {', '.join(unchecked)}; {loaded.name} may refuse this motion"
             say(f"warning: {text}", err=True)  # also with --quiet
         lacking, files = _campaign(folder, loaded, done)
         if files:
@@ -195,14 +154,19 @@ def design(
         if json:
             print_json(found)
         else:
-            excitation, p = done.result.excitation, done.problem.objective.n_parameters
+            p = done.problem.objective.n_parameters
             typer.echo(
                 printable(
                     f"{criteria_text(excitation.criteria.measures)} of {coupling_index_max(p):.0f},"
                     f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
-        _draw(folder, done, loaded)
+        from hil.plots.design_picture import draw_design  # matplotlib is slow to import
+
+        try:
+            save(draw_design(done.design, loaded, unchecked), folder.picture)
+        except InputError as error:
+            say(f"warning: {error}; repeat with --resume to draw it", err=True)
 
     with stop_on_interrupt() as stop:
         done = run_design(

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from json import dumps as json_text
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -16,67 +14,14 @@ from numpy.typing import NDArray
 from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import JsonOption, exactly_one, print_json
 from hil.errors import InputError
-from hil.files import convert_write_errors, write_atomically
 from hil.move import random_via_points
 from hil.plots import check_format, draw_plan, save
-from hil.reading import parse_json, read_input
+from hil.reading import read_input
 from hil.terminal_text import printable
-from planner.errors import (
-    InvalidPlanFile,
-    InvalidViaPoints,
-    PlannerCrashed,
-    PlanningError,
-    PlanningTimedOut,
-)
 from planner.moves import MotionPlan, Move, plan_moves
-from planner.plan_file import PlanFile
 from planner.worker import in_child
 
 Array = NDArray[np.float64]
-P = ParamSpec("P")
-T = TypeVar("T")
-
-PLAN_SUFFIX = ".json"
-
-
-def read_plan_file(path: Path) -> PlanFile:
-    """Read a plan file (JSON); InputError if it is not one."""
-    text = read_input(path).removeprefix("\ufeff")
-    try:
-        return PlanFile.from_dict(parse_json(text))
-    except (ValueError, AttributeError) as error:
-        raise InputError(path, str(error), remedy="name a plan file") from error
-    except RecursionError as error:
-        raise InputError(path, "is nested too deeply", remedy="name a plan file") from error
-
-
-def planned_again(path: Path, cell: Cell) -> MotionPlan:
-    """Plan the moves of a file for the limits of a cell.
-
-    InputError: the file cannot be read, is for another arm, or its motion breaks its limits or
-    differs from its moves. PlannerError: the moves cannot be planned for this cell.
-    """
-    file = read_plan_file(path)
-    if file.joint_names != cell.joint_names:
-        problem = f"is for the joints {', '.join(file.joint_names)}"
-        remedy = f"those of the cell are {', '.join(cell.joint_names)}"
-        raise InputError(path, problem, field="joints", remedy=remedy)
-    if file.trajectory is not None:
-        own = file if file.limits is not None else replace(file, limits=cell.joint_limits)
-        try:
-            isolated(own.plan)
-        except (InvalidPlanFile, InvalidViaPoints, PlanningError) as error:
-            raise InputError(path, str(error)) from error
-    return isolated(file.plan, cell.joint_limits)
-
-
-def isolated(function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a planning function in a child process; InputError if that crashed or timed out."""
-    try:
-        return in_child(function, *args, **kwargs)
-    except (PlannerCrashed, PlanningTimedOut) as error:
-        remedy = "move a via point a little, plan fewer, or ask for another fly or speed"
-        raise InputError(None, f"this motion cannot be planned: {error}", remedy=remedy) from error
 
 
 def read_via_points(path: Path, frame: AngleFrame) -> Array:
@@ -122,56 +67,44 @@ def plan(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     speed: Annotated[float, typer.Option(min=0.01, max=100.0)] = 100.0,
     fly: Annotated[float, typer.Option(min=0.0, max=100.0)] = 50.0,
-    output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     picture: Path | None = None,
     json: JsonOption = False,
 ) -> None:
     """Plan a motion through via points and report how each of them is passed. Nothing moves.
 
     Angles are in the frame of the cell's limits: those of the teach pendant if it is "controller".
-    A plan file has its own speeds and flies, and is planned for the limits of CELL. Only joint
-    limits are checked here: not floor, walls, currents or self-collision.
+    Only joint limits are checked here: not floor, walls, currents or self-collision.
 
     **Example:** `hil plan cell.toml --random 6 --fly 50 --picture plan.png`
 
     Options:
         cell: The cell file.
-        via: Via points: a table in degrees, one row per point, first the start; or a plan file
-            (*.json).
+        via: Via points: a table in degrees, one row per point, first the start.
         random: Number of random via points, in place of --via.
         seed: Seed of the random via points.
         speed: Percent of the joint speed limits.
         fly: Fly in percent (FLY_NORM); 0 stops at each point.
-        output: Write a plan file (*.json).
         picture: Plot the plan (*.png, *.svg, *.pdf).
     """
-    if output is not None and output.suffix.lower() != PLAN_SUFFIX:
-        problem, remedy = f"{output.suffix!r} is not a plan file", f"use {PLAN_SUFFIX}"
-        raise InputError(output, problem, field="--output", remedy=remedy)
     if picture is not None:
         check_format(picture)
     exactly_one(via=via, random=random)
     loaded = Cell.load(cell)
     frame = AngleFrame.of(loaded)
-    if via is not None and via.suffix.lower() == PLAN_SUFFIX:
-        planned = planned_again(via, loaded)
-    else:
-        points = (
-            random_via_points(loaded, frame, random or 1, seed)
-            if via is None
-            else read_via_points(via, frame)
-        )
-        moves = [Move(target=one, speed=speed / 100, fly_percent=fly) for one in points[1:]]
-        planned = isolated(plan_moves, points[0], moves, loaded.joint_limits)
+    points = (
+        random_via_points(loaded, frame, random or 1, seed)
+        if via is None
+        else read_via_points(via, frame)
+    )
+    moves = [Move(target=one, speed=speed / 100, fly_percent=fly) for one in points[1:]]
+    # The solver can crash its process.
+    planned = in_child(plan_moves, points[0], moves, loaded.joint_limits)
     names = loaded.joint_names
     summary = _summary(planned, loaded, frame)
     if json:
         print_json(summary)
     else:
         typer.echo(printable(_table(summary, frame.shown(planned.start), names)))
-    if output is not None:
-        with convert_write_errors(output):
-            write_atomically(output, json_text(PlanFile.of(planned, names).to_dict()) + "\n")
     if picture is not None:
         save(draw_plan(planned, names, frame, title=loaded.name), picture)
 

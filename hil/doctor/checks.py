@@ -5,12 +5,10 @@ from __future__ import annotations
 import errno
 import ipaddress
 import json
-import re
 import resource
 import shutil
 import socket
 import subprocess
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -45,27 +43,7 @@ class Check:
 
 COMMAND_TIMEOUT = 3.0
 """Time limit of a command, s."""
-_LARGEST = 4_000_000
-
-
-def run_command(command: Sequence[str]) -> str | None:
-    """Return the output of a command; None if it is not installed or exceeds the time limit."""
-    path = shutil.which(command[0], path="/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/bin")
-    if path is None:
-        return None
-    try:
-        done = subprocess.run(
-            [path, *command[1:]],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=COMMAND_TIMEOUT,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout
+_PROGRAMS = "/usr/sbin:/usr/bin:/sbin:/bin:/usr/local/bin"
 
 
 class System:
@@ -75,8 +53,22 @@ class System:
         self.root = root
 
     def run(self, *command: str) -> str | None:
-        """Return the output of a command; None if it is not installed."""
-        return run_command(command)
+        """Return the output of a command; None if it is not installed or exceeds its time."""
+        path = shutil.which(command[0], path=_PROGRAMS)
+        if path is None:
+            return None
+        try:
+            return subprocess.run(
+                [path, *command[1:]],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=COMMAND_TIMEOUT,
+                check=False,
+            ).stdout
+        except (OSError, subprocess.TimeoutExpired):
+            return None
 
     def path(self, name: str) -> Path:
         """Return the path of the file `name` (absolute)."""
@@ -85,8 +77,7 @@ class System:
     def text(self, name: str) -> str:
         """Return the stripped text of a file; empty if it cannot be read."""
         try:
-            with self.path(name).open("rb") as file:
-                return file.read(_LARGEST).decode("utf-8", errors="replace").strip()
+            return self.path(name).read_text("utf-8", errors="replace").strip()
         except OSError:
             return ""
 
@@ -139,22 +130,8 @@ def memory_lock(given: RealTimeReport, limit: int) -> Check:
 
 
 _CPU = "/sys/devices/system/cpu"
-_GOOD_CLOCKS = {"tsc", "kvm-clock", "arch_sys_counter", "hyperv_clocksource_tsc_page"}
 _IDLE_LATENCY = 50
 """Largest wake-up time of an idle state, µs."""
-
-
-def clock_source(system: System) -> Check:
-    """Check the clock, which is read several times a cycle."""
-    name, folder = "clock source", "/sys/devices/system/clocksource/clocksource0"
-    source = system.text(f"{folder}/current_clocksource")
-    if not source:
-        return Check(name, Status.UNKNOWN, "not reported by the kernel")
-    if source in _GOOD_CLOCKS:
-        return Check(name, Status.OK, source)
-    offered = "tsc" in system.text(f"{folder}/available_clocksource").split()
-    remedy = (f"echo tsc | sudo tee {folder}/current_clocksource",) if offered else ()
-    return Check(name, Status.WARN, source, remedy)
 
 
 def governor(system: System) -> Check:
@@ -197,21 +174,8 @@ def idle_states(system: System, *, cpu_awake: bool) -> Check:
     return Check(name, Status.WARN, f"{found}; /dev/cpu_dma_latency may not be written", remedy)
 
 
-def load(system: System) -> Check:
-    """Check the load: real-time priority has no precedence over interrupts and disk."""
-    count = max(len(system.texts(f"{_CPU}/cpu[0-9]*/uevent")), 1)
-    try:
-        minute = float(system.text("/proc/loadavg").split()[0])
-    except (IndexError, ValueError):
-        return Check("other load", Status.UNKNOWN, "not reported by the kernel", ("uptime",))
-    found = f"{minute:g} programs running or waiting over the last minute, {count} processors"
-    if minute <= 0.5 * count:
-        return Check("other load", Status.OK, found)
-    return Check("other load", Status.WARN, found, ("top   # end programs that are not needed",))
-
-
 def computer_checks(given: RealTimeReport | None, system: System) -> list[Check]:
-    """Check permissions, processor and load; `given` is None if the probe failed."""
+    """Check permissions and processor; `given` is None if the probe failed."""
     if given is None:
         command = ("python -m hil.doctor.probe permissions   # prints the error",)
         rights = [Check("permissions", Status.BAD, "the probe failed", command)]
@@ -221,8 +185,7 @@ def computer_checks(given: RealTimeReport | None, system: System) -> list[Check]
         ]
         rights = [scheduling(given, limits[0]), memory_lock(given, limits[1])]
     awake = given is not None and given.cpu_awake
-    states = idle_states(system, cpu_awake=awake)
-    return [*rights, clock_source(system), governor(system), states, load(system)]
+    return [*rights, governor(system), idle_states(system, cpu_awake=awake)]
 
 
 BYTES_PER_CYCLE = 400
@@ -327,7 +290,7 @@ def try_port(bind: str, port: int) -> int:
     return 0
 
 
-def port_check(bind: str, port: int, error: int, system: System) -> Check:
+def port_check(bind: str, port: int, error: int) -> Check:
     """Judge the error number of `try_port`."""
     name = f"UDP port {port}"
     if error == 0:
@@ -335,10 +298,8 @@ def port_check(bind: str, port: int, error: int, system: System) -> Check:
     found = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
     remedy: tuple[str, ...] = ()
     if error == errno.EADDRINUSE:
-        output = system.run("ss", "-lunpH", f"sport = :{port}") or ""
-        user = re.search(r'"(.*?)",pid=(\d+)', output)
-        who = f"{user[1]} (process {user[2]})" if user else "a program of another user"
-        found, remedy = f"in use by {who}", (f"sudo ss -lunp sport = :{port}",)
+        found = "in use by another program"
+        remedy = (f"sudo ss -lunp sport = :{port}   # names it",)
     elif error == errno.EADDRNOTAVAIL:
         found = f"{bind} is not an address of this PC"
         remedy = ("ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0",)
@@ -399,4 +360,4 @@ def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
     if table.can is not None and table.transport == "can":
         return [can_check(table.can, system)]
     error = try_port(table.bind, table.port)
-    return [route_check(table.host, system), port_check(table.bind, table.port, error, system)]
+    return [route_check(table.host, system), port_check(table.bind, table.port, error)]

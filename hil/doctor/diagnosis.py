@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import subprocess
 import sys
 import tempfile
@@ -11,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
 RESERVE: Final = 100e-6
 """Part of a cycle for session and guard (20 µs, at most 40), transmission both ways (25 µs each at
 100 Mbit/s) and the interrupt of the network card, s."""
-EDGES: Final = np.array([0, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, np.inf]) * 1e-6
-"""Bounds of the bars of the histogram, s."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +49,6 @@ class Latency:
     def late_cycles(self, period: float) -> int:
         """Return the number of cycles of `period` s without a reply in time."""
         return int(np.floor((self.samples + RESERVE) / period).sum())
-
-    def histogram(self) -> dict[str, int]:
-        """Return the number of samples by bounds in µs, lower bound included."""
-        counts, _ = np.histogram(self.samples, EDGES)
-        finite = (1e6 * EDGES[:-1]).tolist()
-        bounds = [f"{low:.0f}-{high:.0f}" for low, high in pairwise(finite)]
-        return dict(zip([*bounds, f"over {finite[-1]:.0f}"], counts.tolist(), strict=True))
 
     def summary(self) -> dict[str, float | int]:
         """Return percentiles, µs, and late cycles."""
@@ -258,7 +247,6 @@ def examine(
 
 
 _COLOUR = {Status.OK: "green", Status.WARN: "yellow", Status.BAD: "red", Status.UNKNOWN: "blue"}
-_BAR = 40
 _OTHERWISE = (
     "If it is still not fit after that: switch off C-states, frequency stepping and "
     "hyper-threading in the firmware set-up (BIOS); isolate a processor; {}use another PC."
@@ -266,7 +254,7 @@ _OTHERWISE = (
 
 
 def show(diagnosis: Diagnosis, console: Console) -> None:
-    """Print checks, histograms, verdict and remedies."""
+    """Print checks, latencies, verdict and remedies."""
     table = Table(box=None, pad_edge=False)
     for title in ("check", "", "found"):
         table.add_column(title, overflow="fold")
@@ -274,7 +262,13 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         status = Text(check.status, style=_COLOUR[check.status])
         table.add_row(Text(check.name), status, Text(printable(check.found)))
     console.print(table)
-    lines = [line for latency in diagnosis.latencies for line in (*histogram(latency), "")]
+    lines = [
+        f"{latency.name} [µs]: "
+        + ", ".join(
+            f"{name.removesuffix('_us')} {value:g}" for name, value in latency.summary().items()
+        )
+        for latency in diagnosis.latencies
+    ]
     lines += [
         f"{verdict.cycle_ms} ms: {'fit' if verdict.fit else 'not fit'}; {verdict.reason}"
         for verdict in diagnosis.cycles
@@ -286,18 +280,6 @@ def show(diagnosis: Diagnosis, console: Console) -> None:
         console.print(printable(line), markup=False, highlight=False, soft_wrap=True)
     style = "bold green" if diagnosis.fit else "bold red"
     console.print(Text(printable(diagnosis.line), style=style), soft_wrap=True)
-
-
-def histogram(latency: Latency) -> Iterator[str]:
-    """Yield percentiles and bars; logarithmic, so that rare stalls are visible."""
-    p50, p99, p999, worst = (1e6 * latency.percentile(p) for p in (50, 99, 99.9, 100))
-    yield (
-        f"{latency.name}: p50 {p50:.0f}  p99 {p99:.0f}  p99.9 {p999:.0f}  max {worst:.0f} µs, "
-        f"{len(latency.samples)} samples in {latency.seconds:g} s"
-    )
-    for bounds, count in latency.histogram().items():
-        share = math.log1p(count) / math.log1p(len(latency.samples))
-        yield f"  {bounds:>10} µs {count:>8} {'█' * math.ceil(_BAR * share)}"
 
 
 def remedies(checks: Sequence[Check]) -> Iterator[str]:

@@ -100,7 +100,7 @@ def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> N
 
 
 def _heading(
-    design: Design, cell: Cell, unchecked: Sequence[str], margins: str
+    design: Design, cell: Cell, unchecked: Sequence[str]
 ) -> Iterator[tuple[str, float, str]]:
     """Yield the lines of the heading with size in points and colour."""
     excitation = design.excitation
@@ -120,30 +120,16 @@ def _heading(
             style.TEXT + 1.0,
             style.LIMIT,
         ),
-        (margins, style.SMALL, style.INK),
         ("red dashes: limits", style.SMALL, style.MUTED),
     ):
         for line in textwrap.wrap(text, int(_LINE_LENGTH / size)):
             yield line, size, colour
 
 
-def draw_design(
-    design: Design,
-    cell: Cell,
-    *,
-    unchecked: Sequence[str] = (),
-    margins: str = "",
-) -> Figure:
-    """Draw a designed motion.
-
-    Args:
-        design: the search with its motion.
-        cell: the cell to run it on.
-        unchecked: what the search did not check ("floor", "the arm itself", ...).
-        margins: text on the distance to the limits.
-    """
+def draw_design(design: Design, cell: Cell, unchecked: Sequence[str] = ()) -> Figure:
+    """Draw a designed motion for a cell, and what was not checked ("floor", "walls", ...)."""
     model, trajectory = cell.model, design.excitation.trajectory
-    lines = list(_heading(design, cell, unchecked, margins))
+    lines = list(_heading(design, cell, unchecked))
     side = float(np.clip(_CELL * model.base.rank, _SMALLEST, _LARGEST))
     beside = _FRONT + 3 * _LEGEND_LINE
     head = _TITLE_AT + _HEAD_LINE * (len(lines) - 1) + _HEAD_FOOT

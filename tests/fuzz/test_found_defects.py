@@ -144,9 +144,8 @@ def bag_whose_names_are_no_text(path: Path) -> None:
     import_rosbag2(path, path.with_name("o.mcap"), robot=importers.robot())
 
 
-def design_without_a_digest(path: Path) -> None:
-    lines = documents.design().splitlines()
-    text = "".join(f"{line}\n" for line in lines if not line.startswith("motion_sha256"))
+def design_without_positions(path: Path) -> None:
+    text = documents.design().replace("positions_deg", "places_deg")
     path.write_text(documents.sealed(text))
     DesignResult.load(path)
 
@@ -176,8 +175,8 @@ REFUSED: list[tuple[str, Callable[[Path], object], type[Exception], str]] = [
       for value in (2.2e203, -1e13, np.inf, np.nan)),
     ("log", log_with_signalling_nan, SourceError, "is nan in sample 1"),
     ("bag.db3", bag_whose_names_are_no_text, SourceError, r"bag\.db3: is not a rosbag2"),
-    ("excitation.toml", design_without_a_digest, InputError,
-     r"is not a designed excitation \('motion_sha256'\)"),
+    ("excitation.toml", design_without_positions, InputError,
+     r"is not a designed excitation \('positions'\)"),
     ("excitation.toml", of_text(DesignResult.load, NESTED), InputError, "nested too deep"),
     ("plan.toml", lambda _: from_text("a=1e9999999999999999999"), ValueError, "out of range"),
     ("rehearsal.json",

@@ -1,3 +1,5 @@
+"""`hil plan`: targets as planned, and the picture of a plan."""
+
 from __future__ import annotations
 
 import json
@@ -8,11 +10,10 @@ import sys
 import matplotlib.image
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from hil.cell import AngleFrame, Cell
-from hil.cli.plan import plan, read_plan_file
+from hil.cli import app
 from hil.errors import InputError
 from hil.plots import draw_plan
 from hil.plots.plan_picture import corner_times
@@ -34,23 +35,11 @@ def cell() -> Cell:
     return Cell.load(CELL_PATH)
 
 
-@pytest.fixture(scope="module")
-def app() -> typer.Typer:
-    app = typer.Typer()
-    app.command()(plan)
-    return app
-
-
-@pytest.fixture
-def run(app):
-    def run(*arguments: object) -> str:
-        result = CliRunner().invoke(
-            app, [str(CELL_PATH), *map(str, arguments)], catch_exceptions=False
-        )
-        assert result.exit_code == 0, result.output
-        return result.output
-
-    return run
+def run(*arguments: object) -> str:
+    words = ["plan", str(CELL_PATH), *map(str, arguments)]
+    result = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
 
 
 @pytest.fixture
@@ -60,8 +49,9 @@ def via(tmp_path):
     return path
 
 
-def test_each_via_point_is_reported(run, via):
-    lines = run("--via", via, "--fly", 50).splitlines()
+def test_each_via_point_is_reported_in_the_angles_of_the_controller(via, tmp_path):
+    out = run("--via", via, "--fly", 50)
+    lines = out.splitlines()
     assert lines[0].split()[:3] == ["target", "joint_1", "joint_2"]
     rows = [line.split() for line in lines[2:6]]
     assert [row[0] for row in rows] == ["0", "1", "2", "3"]
@@ -69,21 +59,17 @@ def test_each_via_point_is_reported(run, via):
     assert [row[9].rstrip(",") for row in rows] == ["start", "flown", "flown", "stopped"]
     times = [float(row[7]) for row in rows]
     assert times == sorted(times) and times[0] == 0.0
+    found, slow = (json.loads(run("--via", via, "--json", "--speed", one)) for one in (100, 20))
+    assert found["angles"] == "controller"
+    np.testing.assert_allclose(found["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
+    assert slow["duration"] > 2.0 * found["duration"]
+    # A byte order mark and the lines of a header are ignored.
+    marked = tmp_path / "marked.csv"
+    marked.write_bytes(b"\xef\xbb\xbf" + VIA.split("\n", 2)[2].encode())
+    assert run("--via", marked, "--fly", 50) == out
 
 
-def test_targets_are_in_the_angles_of_the_controller(run, via):
-    out = json.loads(run("--via", via, "--json"))
-    assert out["angles"] == "controller"
-    np.testing.assert_allclose(out["targets"][0]["target_deg"], [40, 30, -60, 50, 40, 10])
-
-
-def test_slower_moves(run, via):
-    out = json.loads(run("--via", via, "--json"))
-    slow = json.loads(run("--via", via, "--json", "--speed", 20))
-    assert slow["duration"] > 2.0 * out["duration"]
-
-
-def test_random_via_points_are_within_limits_and_repeatable(run):
+def test_random_via_points_are_within_limits_and_repeatable():
     first, second, other = (
         json.loads(run("--random", 5, "--seed", seed, "--json")) for seed in (1, 1, 2)
     )
@@ -91,18 +77,7 @@ def test_random_via_points_are_within_limits_and_repeatable(run):
     assert len(first["targets"]) == 5
 
 
-def test_a_plan_file_is_planned_again_and_agrees(run, via, tmp_path, cell):
-    path = tmp_path / "plan.json"
-    out = run("--via", via, "--fly", 75, "--output", path)
-    assert run("--via", path) == out
-    file = read_plan_file(path)
-    assert file.moves[0].fly_percent == 75.0
-    assert file.plan().trajectory.duration == pytest.approx(
-        float(out.splitlines()[-2].split()[0]), abs=1e-3
-    )
-
-
-def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
+def test_draws_a_picture_that_is_not_blank(via, tmp_path):
     path = tmp_path / "plan.png"
     run("--via", via, "--picture", path)
     pixels = matplotlib.image.imread(path)
@@ -113,61 +88,28 @@ def test_draws_a_picture_that_is_not_blank(run, via, tmp_path):
         assert path.with_suffix(suffix).stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
-    ("arguments", "problem"),
-    [
-        ([], "--via or --random: one of them is required"),
-        (["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
-        (["--via", "missing.csv"], "cannot be read"),
-        (["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
-        (["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
-        (["--via", "VIA", "--output", "nowhere/plan.json"], "cannot be written"),
-        (["--via", "VIA", "--output", "plan.yaml"], "not a plan file"),
-    ],
-)
-def test_names_what_is_wrong(app, via, arguments, problem):
-    arguments = [str(via) if argument == "VIA" else argument for argument in arguments]
-    with pytest.raises(InputError, match=problem):
-        CliRunner().invoke(app, [str(CELL_PATH), *arguments], catch_exceptions=False)
+HOME = "0 0 -90 0 90 0\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "problem"),
+    ("text", "arguments", "problem"),
     [
-        ("0 0 0\n1 1 1\n", "line 1: '0 0 0' is not a posture"),
-        ("0 0 -90 0 90 0\n", "1 via points"),
-        ("", "0 via points"),
-        ("a,b,c,d,e,f\nA,B,C,D,E,F\n0,0,-90,0,90,0\n", "line 2: 'A B C D E F' is no"),
-        ("nan nan nan nan nan nan\n0 0 -90 0 90 0\n9 9 -90 0 90 0\n", "line 1: 'nan nan"),
+        (VIA, [], "--via or --random: one of them is required"),
+        (VIA, ["--random", "3", "--via", "VIA"], "--via and --random: exclude each other"),
+        (VIA, ["--via", "missing.csv"], "cannot be read"),
+        (VIA, ["--via", "VIA", "--picture", "plan.bmp"], "not a picture format"),
+        (VIA, ["--via", "VIA", "--picture", "nowhere/plan.png"], "cannot be written"),
+        ("0 0 0\n1 1 1\n", ["--via", "VIA"], "line 1: '0 0 0' is not a posture"),
+        (HOME, ["--via", "VIA"], "1 via points"),
+        ("", ["--via", "VIA"], "0 via points"),
+        ("a,b,c,d,e,f\nA,B,C,D,E,F\n" + HOME, ["--via", "VIA"], "line 2: 'A B C D E F' is no"),
+        ("nan nan nan nan nan nan\n" + HOME, ["--via", "VIA"], "line 1: 'nan nan"),
     ],
 )
-def test_invalid_via_points_are_reported(app, tmp_path, text, problem):
-    path = tmp_path / "via.txt"
-    path.write_text(text)
+def test_names_what_is_wrong(via, text, arguments, problem):
+    via.write_text(text)
     with pytest.raises(InputError, match=problem):
-        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
-
-
-def test_a_byte_order_mark_is_ignored(run, via, tmp_path):
-    points_only, marked = tmp_path / "points.csv", tmp_path / "marked.csv"
-    points_only.write_text(VIA.split("\n", 2)[2])
-    marked.write_bytes(b"\xef\xbb\xbf" + points_only.read_bytes())
-    assert run("--via", marked) == run("--via", points_only) == run("--via", via)
-
-
-def test_a_motion_that_is_not_that_of_its_moves_is_refused(app, run, via, tmp_path):
-    """Limits of the cell and the planned motion may be left out."""
-    path, edited = tmp_path / "plan.json", tmp_path / "edited.json"
-    out = run("--via", via, "--output", path)
-    data = json.loads(path.read_text())
-    data["moves"][1]["target"][0] += 0.1
-    edited.write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"edited\.json: .*motion"):
-        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(edited)], catch_exceptions=False)
-    data["moves"][1]["target"][0] -= 0.1
-    del data["motion"], data["limits"]
-    path.write_text(json.dumps(data))
-    assert run("--via", path) == out
+        run(*(via if argument == "VIA" else argument for argument in arguments))
 
 
 CRASH = """\
@@ -180,15 +122,10 @@ ruckig.Ruckig = Crashing
 """
 
 
-@pytest.mark.parametrize("how", ["via", "file"])
-def test_a_crash_of_the_solver_is_reported(run, via, tmp_path, how):
+def test_a_crash_of_the_solver_is_reported(via, tmp_path):
     (tmp_path / "sitecustomize.py").write_text(CRASH)
-    arguments = ["--via", str(via)]
-    if how == "file":
-        run("--via", via, "--output", tmp_path / "plan.json")
-        arguments = ["--via", str(tmp_path / "plan.json")]
     ended = subprocess.run(
-        [sys.executable, "-m", "hil", "plan", str(CELL_PATH), *arguments],
+        [sys.executable, "-m", "hil", "plan", str(CELL_PATH), "--via", str(via)],
         env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))},
         capture_output=True,
         text=True,
@@ -197,17 +134,6 @@ def test_a_crash_of_the_solver_is_reported(run, via, tmp_path, how):
     assert ended.returncode == 2, ended
     (sentence,) = ended.stderr.splitlines()
     assert sentence.startswith("error:") and "killed by signal 11" in sentence
-
-
-def test_a_plan_file_of_another_arm_is_refused(app, run, via, tmp_path):
-    path = tmp_path / "plan.json"
-    run("--via", via, "--output", path)
-    path.write_text(path.read_text().replace('"joint_6"', '"tail"'))
-    with pytest.raises(InputError, match="tail"):
-        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
-    path.write_text("not = [a plan")
-    with pytest.raises(InputError, match="name a plan file"):
-        CliRunner().invoke(app, [str(CELL_PATH), "--via", str(path)], catch_exceptions=False)
 
 
 def planned(cell: Cell, count: int, fly: float = 50.0):

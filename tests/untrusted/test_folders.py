@@ -38,7 +38,7 @@ from hil.campaign.status import conduct_of
 from hil.campaign.warmup import FrictionMeter, WarmUp
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
-from hil.cli.plan import read_plan_file, read_via_points
+from hil.cli.plan import read_via_points
 from hil.errors import ArchiveError, HilError, InputError
 from hil.files import write_atomically, write_files
 from hil.importers.arrays import READERS, ArrayFile
@@ -223,7 +223,6 @@ RECORDINGS: dict[str, Callable[[Path], object]] = {
     "bag.db3": bag_files,
     "bag.mcap": lambda path: topics(*bag_files(path)),
     "via.csv": lambda path: read_via_points(path, AngleFrame("urdf", np.ones(3), np.zeros(3))),
-    "plan.json": read_plan_file,
     "results.json": StudyResults.load,
     "excitation_000_a1.mcap": open_archive,
     "excitation_001_a1.mcap": check_archive,

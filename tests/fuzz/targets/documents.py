@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,7 +14,6 @@ from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.warmup import WarmUp
-from hil.cli.plan import read_plan_file
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
 from hil.errors import InputError
@@ -90,21 +88,14 @@ def results(path: Path) -> None:
     assert Results.load(again).to_json() == found.to_json()
 
 
-def moves(path: Path) -> None:
-    """A file of moves is written as it was read."""
-    found = read_plan_file(path)
-    again = path.with_name("again.json")
-    again.write_text(json.dumps(found.to_dict()))
-    assert read_plan_file(again).to_dict() == found.to_dict()
-
-
 READERS: dict[str, Callable[[Path], object]] = {
     "plan.json": plan, "settings.toml": load_settings, "results.json": results,
     "manifest.json": manifest,
     "rehearsal.json": lambda path: Rehearsal.load(CampaignFolder(path.parent)),
     "dry_run.json": lambda path: DryRun.load(CampaignFolder(path.parent), "0"),
     "warmup.json": lambda path: WarmUp.load(path, "0"),
-    "moves.toml": moves, "moves.json": moves, "excitation.toml": DesignResult.load,
+    "moves.toml": load_settings, "moves.json": plan,  # inputs of a former reader
+    "excitation.toml": DesignResult.load,
 }  # fmt: skip
 
 
@@ -136,7 +127,6 @@ def seeds() -> list[bytes]:
     place.mkdir(exist_ok=True)
     campaign = fast_campaign(place / "campaign", fast_cell(place, n_via=2))
     root = campaign.folder.root
-    found = campaign.plan.moves
     texts = {
         "plan.json": (root / "plan.json").read_text(),
         "manifest.json": '{"inputs": {"cell.toml": "00"}, "archives": [{"name": '
@@ -145,8 +135,6 @@ def seeds() -> list[bytes]:
         "dry_run.json": DRY_RUN, "warmup.json": WARMUP,
         "settings.toml": preset_text("front"),
     }  # fmt: skip
-    if found is not None:
-        texts["moves.json"] = json.dumps(found.to_dict())
     return [bytes((NAMES.index(name),)) + text.encode() for name, text in texts.items()]
 
 
