@@ -186,10 +186,7 @@ class Session(StateMachine):
     ) -> None:
         n = drive_train.n_joints
         if not n == guard.limits.n_joints == ring.n_joints:
-            raise ValueError(
-                f"drive train, guard and ring are for {n}, {guard.limits.n_joints} and "
-                f"{ring.n_joints} joints"
-            )
+            raise ValueError("drive train, guard and ring differ in their number of joints")
         if mode not in SERVED_MODES:
             served = ", ".join(str(int(m)) for m in SERVED_MODES)
             raise ValueError(f"motion in mode {mode} is not served; modes {served} are")
@@ -198,10 +195,7 @@ class Session(StateMachine):
         if not 1 <= arm <= N_ARMS:
             raise ValueError(f"arm {arm} is not one of 1..{N_ARMS}")
         if only_axis is not None and not (mode in POSITION_MODES and 1 <= only_axis <= n):
-            raise ValueError(
-                f"only axis {only_axis} of {n} in mode {mode} is not served: one axis alone is "
-                "moved in modes 1, 4 and 5"
-            )
+            raise ValueError(f"only axis {only_axis} of {n} is not served in mode {mode}")
         super().__init__(max_gap)
         self.deadline = math.inf
         self._drive_train = drive_train

@@ -183,8 +183,8 @@ class Scan:
             return ArchiveOutcome(), False, None
         if not outcome.belongs_to(header):
             return ArchiveOutcome(), True, None
-        listed = outcome.chunks if library == schema.LIBRARY else None
-        return outcome, False, None if listed is None else np.array(listed, np.uint32)
+        checksums = outcome.chunks if library == schema.LIBRARY else None
+        return outcome, False, None if checksums is None else np.array(checksums, np.uint32)
 
     def _read(self, stream: BinaryIO, end: int | Damage) -> None:
         """Read the wanted records in order, up to the first damage, which is raised."""
