@@ -18,48 +18,20 @@ from planner.plan_file import PlanFile
 from planner.toml_text import degrees_text, radians_of, toml_key, toml_value
 from tests.motion_table import MotionTable
 from tests.planner.six_axes import SIX_AXES, random_points
+from tests.planner.test_moves import problems
 
 NAMES = tuple(f"joint_{i}" for i in range(1, 7))
-
-shares = st.floats(0.01, 1.0)
-positions = st.floats(-1.0, 1.0)
-
-
-@st.composite
-def moves(draw, n: int):
-    some = st.none() | st.lists(shares, min_size=n, max_size=n)
-    return Move(
-        target=draw(st.lists(positions, min_size=n, max_size=n)),
-        speed=draw(shares),
-        acceleration=draw(shares),
-        joint_speed=draw(some),
-        joint_acceleration=draw(some),
-        joint_jerk=draw(some),
-        fly_percent=draw(st.floats(0.0, 100.0)),
-    )
 
 
 @st.composite
 def files(draw):
     """Any valid file."""
-    n = draw(st.integers(1, 3))
-    rates = st.lists(st.floats(0.1, 100.0), min_size=n, max_size=n)
-    limits = draw(
-        st.none()
-        | st.builds(JointLimits, st.just([-1.0] * n), st.just([1.0] * n), rates, rates, rates)
-    )
-    overrides = draw(
-        st.builds(Overrides, speed=shares, acceleration=shares, deceleration=shares)
-        | st.lists(shares, min_size=n, max_size=n).map(lambda each: Overrides(joint=each))
-        | st.just(Overrides())
-    )
-    start = np.array(draw(st.lists(positions, min_size=n, max_size=n)))
-    names = tuple(
-        draw(
-            st.lists(st.text('aé🤖\x7f"\\ .=\n#', min_size=1), min_size=n, max_size=n, unique=True)
-        )
-    )
-    return PlanFile(names, start, tuple(draw(st.lists(moves(n), max_size=4))), overrides, limits)
+    points, moves, limits, overrides = draw(problems())
+    n = limits.n_joints
+    letters = st.text('aé🤖\x7f"\\ .=\n#', min_size=1)
+    names = tuple(draw(st.lists(letters, min_size=n, max_size=n, unique=True)))
+    overrides, limits = draw(st.sampled_from([(overrides, limits), (Overrides(), None)]))
+    return PlanFile(names, points[0], tuple(moves), overrides, limits)
 
 
 @given(files())
@@ -108,22 +80,33 @@ def test_the_stored_motion_is_used_not_one_planned_again(planned):
     assert restored.trajectory.coefficients[2][0, 3] == jerk[3]
 
 
-def test_edited_moves_do_not_match_the_stored_motion(planned):
-    data = PlanFile.of(planned, NAMES).to_dict()
+def slower(data):
     data["moves"][0]["speed"] = 0.79
-    edited = PlanFile.from_dict(data)
-    with pytest.raises(InvalidPlanFile, match="delete the motion"):
-        edited.plan()
-    without = replace(edited, trajectory=None)
-    assert without.plan().trajectory.duration > planned.trajectory.duration
 
 
-def test_a_damaged_stored_motion_is_refused(planned):
-    for row, quantity, by in ((0, 3, 1.1), (5, 0, 1.0 + 1e-6)):
-        data = PlanFile.of(planned, NAMES).to_dict()
+def damaged(row, quantity, by):
+    def damage(data):
         data["motion"]["coefficients"][0][row][quantity] *= by
-        with pytest.raises(InvalidPlanFile, match="stored motion"):
-            PlanFile.from_dict(data).plan()
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (slower, "delete the motion"),
+        (damaged(0, 3, 1.1), "stored motion"),
+        (damaged(5, 0, 1.0 + 1e-6), "stored motion"),
+    ],
+)
+def test_a_stored_motion_must_be_that_of_the_moves(planned, edit, words):
+    data = PlanFile.of(planned, NAMES).to_dict()
+    edit(data)
+    edited = PlanFile.from_dict(data)
+    with pytest.raises(InvalidPlanFile, match=words):
+        edited.plan()
+    without = replace(edited, trajectory=None).plan().trajectory.duration
+    assert (without > planned.trajectory.duration) == (edit is slower)
 
 
 HAND_WRITTEN = {
@@ -217,19 +200,18 @@ def test_a_short_detour_differs_from_the_planned_motion():
         PlanFile.from_dict(data).plan()
 
 
-JOINTS = ("axis 1", "wrist, long", "j3", "j4", "j5", "j6")
-
-
 class TestMotionAsCsv:
+    JOINTS = ("axis 1", "wrist, long", "j3", "j4", "j5", "j6")
+
     @pytest.mark.parametrize("rate", [7.0, 100.0, 1000.0 / 3.0])
     def test_it_has_every_bit_of_the_samples(self, rate):
         motion = plan(random_points(1), SIX_AXES)
-        text = to_csv(motion, rate, JOINTS)
+        text = to_csv(motion, rate, self.JOINTS)
         assert text.startswith(
             "time [s],axis 1.position [rad],axis 1.velocity [rad/s],axis 1.acceleration [rad/s^2],"
         )
         table = MotionTable.of(text)
-        assert table.joint_names == JOINTS
+        assert table.joint_names == self.JOINTS
         assert table.duration == motion.duration
         np.testing.assert_array_equal(table.time[:-1], np.arange(len(table.time) - 1) / rate)
         assert 0.0 < table.time[-1] - table.time[-2] <= 1.0 / rate + 1e-9
@@ -237,14 +219,16 @@ class TestMotionAsCsv:
         for ours, theirs in zip(rows, motion.sample(table.time), strict=True):
             assert ours.tobytes() == np.ascontiguousarray(theirs).tobytes()
 
-    @pytest.mark.parametrize("rate", [0.0, np.nan, 1.01e5])
-    def test_an_impossible_rate_is_refused(self, rate):
-        with pytest.raises(InvalidSetting, match="rate"):
-            to_csv(plan(random_points(1), SIX_AXES), rate, JOINTS)
-
-    def test_a_motion_without_duration_is_refused(self):
-        with pytest.raises(InvalidSetting, match="duration"):
-            to_csv(plan(np.zeros((2, 6)), SIX_AXES), 10.0, JOINTS)
+    @pytest.mark.parametrize(
+        ("points", "rate", "name"),
+        [
+            *((random_points(1), rate, "rate") for rate in (0.0, np.nan, 1.01e5)),
+            (np.zeros((2, 6)), 10.0, "duration"),
+        ],
+    )
+    def test_an_impossible_rate_or_duration_is_refused(self, points, rate, name):
+        with pytest.raises(InvalidSetting, match=name):
+            to_csv(plan(points, SIX_AXES), rate, self.JOINTS)
 
 
 texts = st.text(st.characters(codec="utf-8"))
