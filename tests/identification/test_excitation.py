@@ -3,7 +3,6 @@
 import hashlib
 import json
 import math
-import pickle
 from dataclasses import asdict
 from functools import cache, partial
 from itertools import pairwise
@@ -40,7 +39,7 @@ from identification.excitation.genomes import SineGenome, ViaPointGenome
 from identification.excitation.objective import Objective
 from identification.excitation.searches.scores import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
-from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
+from identification.excitation.violation import KINDS, NoFeasibleMotionError
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from planner import (
@@ -56,7 +55,6 @@ from sim_fixtures.ns16 import load_truth, urdf_text
 from tests.identification.robots import joint, link, robot
 from tests.identification.searching import NS16_HOME as HOME
 from tests.identification.searching import NS16_LIMITS as LIMITS
-from tests.identification.searching import NS16_VELOCITY
 from tests.identification.two_link import URDF, values_of
 
 OPEN = ViaPointGenome(LIMITS, n_via=6, slowest=0.3)
@@ -461,22 +459,6 @@ class TestViolations:
         assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
         assert f"at {side} {bound:g} s" in str(violation)
 
-    def test_excess_by_kind_is_the_largest(self, swing):
-        constraints = Constraints(
-            ROD_LIMITS.scaled(velocity=0.5),
-            max_duration=1.0,
-            checker=CollisionChecker(ROD_URDF, Workspace(floor=0.01, margin=0.06)),
-            currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
-        )
-        motion = sampled(swing)
-        violations = constraints.violations(swing, motion)
-        assert pickle.loads(pickle.dumps(constraints)).violations(swing, motion) == violations
-        excess = excess_by_kind(violations)
-        assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
-        for kind, worst in zip(KINDS, excess, strict=True):
-            assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
-        assert not excess_by_kind(()).any()
-
 
 ARM_LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 MODEL = RobotModel.from_urdf(URDF)
@@ -620,20 +602,6 @@ class TestMeasures:
         unit = columns / np.linalg.norm(columns, axis=0)
         assert criteria.condition == pytest.approx(np.linalg.cond(columns), rel=1e-6)
         assert criteria.scaled_condition == pytest.approx(np.linalg.cond(unit), rel=1e-6)
-
-    def test_criteria_agree_at_8_ms_and_1_ms(self):
-        """Section 3.2 on a planned motion of six joints through eight points."""
-        velocity, model = NS16_VELOCITY, RobotModel.from_urdf(urdf_text())
-        limits = JointLimits([-2.8] * 6, [2.8] * 6, velocity, velocity / 0.3, velocity / 0.3 / 0.1)
-        via = np.random.default_rng(0).uniform(-2.7, 2.7, (8, 6))
-        motion = plan(via, limits, speed=0.5, fly=0.5)
-        coarse, fine = (Objective(model).criteria(motion, period) for period in (0.008, 0.001))
-        assert fine.n_samples == pytest.approx(8 * coarse.n_samples, rel=0.01)
-        # From one random motion to the next they spread by 12 and by 9: a thousandth, a fiftieth.
-        assert coarse.log10_det == pytest.approx(fine.log10_det, abs=0.012)
-        assert coarse.coupling_index == pytest.approx(fine.coupling_index, abs=0.18)
-        raw = [c.log10_det + 58 * math.log10(c.n_samples) for c in (coarse, fine)]
-        assert raw[1] - raw[0] == pytest.approx(58 * math.log10(8), abs=0.1)  # without the scaling
 
 
 RANDOM_MOTIONS = Scale((20.0, 150.0), (10.0, 30.0))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -40,9 +39,6 @@ from identification.model.pseudo_inertia import (
     reference_bodies,
 )
 from identification.model.robot import RobotModel, StandardLayout
-from identification.signals.recording import Recording
-from identification.signals.samples import Preprocessing, prepare
-from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 from tests.identification import two_link
 from tests.identification.robots import NS16_TURNS, one_joint, random_urdf, robot_text, some_bodies
@@ -114,20 +110,6 @@ class TestRobotModel:
         expected = inverse_dynamics(urdf, gravity, q, qd, qdd)
         expected += rotors * qdd + f0 * np.sign(qd) + f1 * qd + f2 * qd**3 + fo
         assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
-
-    def test_the_ns16_has_40_base_and_18_friction_parameters(self):
-        model = RobotModel.from_urdf(urdf_text())
-        assert model.joint_names == tuple(f"joint_{i}" for i in range(1, 7))
-        assert model.n_parameters == len(model.units) == 58
-        assert model.parameter_names[:40] == model.base.names
-        assert model.parameter_names[40:42] == ("f0_1", "f0_2")
-        assert model.parameter_names[46] == "f1_1"
-        assert model.parameter_names[57] == "f2_6"
-        unit = dict(zip(model.parameter_names, model.units, strict=True))
-        assert unit["I1yy"] == unit["I3m"] == "kg m²"
-        assert unit["mc2x"] == "kg m"
-        assert unit["f0_1"] == "N·m"
-        assert unit["f1_6"] == "N·m·s/rad"
 
     def test_a_prismatic_joint_has_linear_units(self):
         model = RobotModel.from_urdf(slider("1 0 0"))
@@ -471,62 +453,6 @@ class TestBaseParameters:
         assert base.largest_dropped < 1e-4 * base.smallest_pivot
 
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "tx40"
-GEARS = np.array([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
-# Joint 5 turns motor 6 along (Gautier; the same in the published identification of this arm).
-TURNS = np.diag(GEARS)
-TURNS[5, 4] = GEARS[5]
-HOME = np.array([0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0])
-
-
-@pytest.fixture(scope="module")
-def recording():
-    if not DATA.is_dir():
-        pytest.skip(f"there are no recordings at {DATA}")
-    motor, torque = (
-        np.loadtxt(DATA / name, delimiter=",", skiprows=1)
-        for name in ("pos_read_data.csv", "curr_data.csv")
-    )
-    return Recording(
-        time=np.arange(len(motor)) * 2e-4,
-        position=motor @ np.linalg.inv(TURNS).T + HOME,
-        joint_names=tuple(f"joint_{j}" for j in range(1, 7)),
-        torque=torque @ TURNS,
-    )
-
-
-def fitted(recording, coupling):
-    model = RobotModel.from_urdf(
-        (DATA / "tx40_mdh_modified.urdf").read_text(encoding="utf-8"),
-        friction=FrictionLaw(offset=True),
-        coupling=coupling,
-    )
-    options = Preprocessing(smooth_torque=True, torque_bandwidth=40.0)
-    samples = prepare(recording, model, options=options)
-    found = estimate(model, Factor.of(model, samples), np.ones(6))
-    (error,) = prediction_error(model, found.values, [samples], all_rows=True)
-    return found, error
-
-
-class TestPublishedRecording:
-    def test_the_coupling_explains_it(self, recording):
-        """Comparators, with linear friction: 10.9 % with, 14.3 % without; joint 5: 19 %, 53 %."""
-        _, without = fitted(recording, None)
-        _, coupled = fitted(recording, Coupling(TURNS))
-        assert coupled.overall <= 0.109
-        assert coupled.relative[4] <= 0.19
-        assert without.overall > 0.12
-        assert without.relative[4] > 0.45
-
-    def test_the_coupled_motors_parameters_are_the_published_ones(self, recording):
-        """Iam6, fsm6 and fvm6 of the YAML beside the data: 0.00964, 1.95, 0.616."""
-        found, _ = fitted(recording, Coupling(TURNS))
-        values = dict(zip(found.names, found.values, strict=True))
-        assert values["I56"] == pytest.approx(0.00964, rel=0.05)
-        assert values["f0_m6"] == pytest.approx(1.95, rel=0.05)
-        assert values["f1_m6"] == pytest.approx(0.616, rel=0.05)
-
-
 LAWS = st.builds(
     FrictionLaw,
     coulomb=st.booleans(),
@@ -631,18 +557,6 @@ class TestDissipation:
             for v in (-3.0, -0.01, 0.01, 3.0):
                 assert torque_of(law, own, v) * v >= -1e-12
 
-    def test_all_dissipative_friction_is_allowed(self):
-        law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
-        friction = JointFriction((law,), (True,))
-        combine, not_negative = dissipation(friction)
-        possible = {"f0": 2.0, "f1": 1.0, "fd": -0.9, "fs": -1.8, "fo": -5.0}
-        g = np.linalg.solve(combine, [possible[term.symbol] for term in friction.terms])
-        assert np.all(g[not_negative] >= 0.0)
-        for beyond in ({"fd": -1.1}, {"fs": -2.1}, {"f0": -0.1}, {"fd": 1.1}):
-            values = possible | beyond
-            g = np.linalg.solve(combine, [values[term.symbol] for term in friction.terms])
-            assert np.any(g[not_negative] < 0.0), beyond
-
 
 steps = st.lists(st.sampled_from([-3e-4, -1e-5, 0.0, 1e-5, 2e-3]), min_size=2, max_size=60)
 distances = st.sampled_from([1e-5, 1e-4, 1e-3])
@@ -663,11 +577,6 @@ class TestPreslidingState:
 
 
 class TestDirectionOfFriction:
-    def test_without_presliding_it_is_the_sign(self):
-        motion = a_motion()
-        direction = MODEL.friction.direction(*motion[:3])
-        np.testing.assert_array_equal(direction, np.sign(motion.velocity))
-
     def test_the_torque_uses_the_direction_of_a_motion(self):
         motion = a_motion()
         half = motion._replace(direction=0.5 * np.sign(motion.velocity))
@@ -754,7 +663,6 @@ class TestCoupling:
             Coupling(matrix)
 
 
-KR300 = Path(__file__).resolve().parents[3] / "shared" / "data" / "kr300"
 ANCHORS = Anchors(base=0.8, link=0.2, angle=math.radians(5.0))
 # A balancer of a heavy arm: 163 bar in 0.96 litres at a length of 0.6 m.
 BALANCER = GasCylinder(
@@ -828,15 +736,6 @@ class TestElementTorque:
         whole = EXTENSION.known(POSITIONS)
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
-
-    def test_a_published_balancer_is_reproduced(self):
-        """A recording with and one without its balancer differ by the computed torque."""
-        if not KR300.is_dir():
-            pytest.skip(f"there is no recording {KR300}")
-        raw, off = (
-            np.genfromtxt(KR300 / name, delimiter=",", names=True) for name in ("A.csv", "Abal.csv")
-        )
-        np.testing.assert_allclose(BALANCER.known(raw["q2"]), raw["tau2"] - off["tau2"], atol=1e-6)
 
 
 class TestElementFigures:

@@ -1,30 +1,16 @@
-"""The regressor, and estimators of one recording or its parts, equal to nine digits."""
+"""The regressor, and blocks of time of a factor."""
 
 import gc
 import weakref
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from identification.estimators.consistent import consistent_estimate
-from identification.estimators.instrumental import estimate_instrumental
-from identification.estimators.least_squares import fit_least_squares
-from identification.estimators.losses import Huber, Tukey
-from identification.estimators.prior import fit_with_prior, nominal_prior
-from identification.estimators.robust import robust_estimate
-from identification.factor.columns import instrument_factor
-from identification.factor.factor import Factor, joined, total_factor
-from identification.model.motion import Motion
+from identification.factor.factor import Factor, joined
 from identification.model.regressor import CHUNK
 from identification.model.robot import RobotModel
 from identification.selection.essential import eliminate
-from identification.signals.samples import Samples
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import joint, robot
 from tests.identification.two_link import MODEL, a_motion, coloured, recording
@@ -107,95 +93,15 @@ class TestRegressor:
             gc.enable()
 
 
-Pieces = Sequence[tuple[Samples, Motion]]
-"""Parts of a recording with the parts of the plan."""
+@pytest.fixture(scope="module")
+def samples():
+    motion = a_motion(5.0)
+    return recording(coloured(np.random.default_rng(7), 1000, 5e-3, 0.02), motion)
 
 
-@cache
-def whole():
-    plan = a_motion(5.0)
-    rng = np.random.default_rng(7)
-    motion = plan._replace(acceleration=plan.acceleration + rng.normal(0.0, 0.3, (1000, 2)))
-    samples = recording(coloured(rng, len(plan.time), 5e-3, 0.02), motion)
-    samples.torque[100:110] += 40.0  # outliers
-    return samples, plan
-
-
-def cut(places):
-    """Return the parts of a recording with a common time origin."""
-    samples, plan = whole()
-    edges = [0, *sorted(places), len(plan.time)]
-    parts = [slice(a, b) for a, b in pairwise(edges) if b > a]
-    return [
-        (
-            replace(
-                samples,
-                motion=samples.motion.rows(part),
-                torque=samples.torque[part],
-                usable=samples.usable[part],
-                segments=(slice(0, part.stop - part.start),),
-            ),
-            plan.rows(part),
-        )
-        for part in parts
-    ]
-
-
-def recordings(pieces):
-    return [samples for samples, _ in pieces]
-
-
-def instruments(pieces):
-    factors = [instrument_factor(MODEL, *piece) for piece in pieces]
-    total = factors[0]
-    for factor in factors[1:]:
-        total = total + factor
-    return total
-
-
-def consistent(pieces):
-    factor = total_factor(MODEL, recordings(pieces))
-    free = fit_least_squares(MODEL, recordings(pieces))
-    return consistent_estimate(MODEL, factor, free).estimate
-
-
-ESTIMATORS = {
-    "ordinary": lambda pieces: fit_least_squares(MODEL, recordings(pieces), "ordinary"),
-    "weighted": lambda pieces: fit_least_squares(MODEL, recordings(pieces)),
-    "prior": lambda pieces: (
-        fit_with_prior(MODEL, recordings(pieces), nominal_prior(MODEL)).estimate
-    ),
-    "huber": lambda pieces: robust_estimate(MODEL, recordings(pieces), Huber()).estimate,
-    "tukey": lambda pieces: robust_estimate(MODEL, recordings(pieces), Tukey()).estimate,
-    "instrumental": lambda pieces: estimate_instrumental(MODEL, instruments(pieces)).estimate,
-    "consistent": consistent,
-}
-
-
-def deviations(one, other):
-    """Return the difference of the values in standard deviations."""
-    return np.asarray(np.abs(one.values - other.values) / one.std)
-
-
-@cache
-def from_one(name):
-    return ESTIMATORS[name](cut([]))
-
-
-class TestParts:
-    """Of a recording."""
-
-    @pytest.mark.parametrize("name", ESTIMATORS)
-    @given(places=st.lists(st.integers(1, 999), max_size=12))
-    @settings(max_examples=6, deadline=None)
-    def test_any_split_gives_the_same_values_and_covariance(self, name, places):
-        one, many = from_one(name), ESTIMATORS[name](cut(places))
-        assert deviations(one, many).max() < 1e-9
-        np.testing.assert_allclose(many.std, one.std, rtol=1e-9)
-        assert many.method.rpartition(", ")[2] == one.method.rpartition(", ")[2]  # the blocks
-
-    def test_blocks_can_be_selected_joined_and_merged(self):
-        phase = total_factor(MODEL, recordings(cut([])))
+class TestBlocksOfTime:
+    def test_blocks_can_be_selected_joined_and_merged(self, samples):
+        phase = Factor.by_time(MODEL, samples)
         half = len(phase) // 2
         again = joined([phase.blocks(slice(0, half)), phase.blocks(slice(half, None))])
         weights = np.array([0.5, 2.0])
@@ -213,8 +119,7 @@ class TestParts:
             some.by_block(weights), phase.by_block(weights)[:, place[:, None], place], rtol=1e-12
         )
 
-    def test_blocks_without_rows_change_nothing(self):
-        samples, _ = whole()
+    def test_blocks_without_rows_change_nothing(self, samples):
         late = replace(samples, origin=samples.origin - 3.0)
         phase, same = (Factor.by_time(MODEL, one) for one in (late, samples))
         assert len(phase) == len(same) + 24
