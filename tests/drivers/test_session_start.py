@@ -40,12 +40,6 @@ from tests.drivers.rig import (
     still,
 )
 
-WORDS = 9
-
-
-def words(packet: CyclicPacket) -> np.ndarray:
-    return packet.axes.view(np.int32).reshape(-1, WORDS)
-
 
 class TestHandShake:
     def test_cold_start_echoes_nine_sync_init_and_two_sync(self):
@@ -61,7 +55,10 @@ class TestHandShake:
 
     @pytest.mark.parametrize("length", [12, 228, 732, 1199])
     def test_sync_of_any_length_below_init_gets_its_own_length_back(self, length):
-        assert len(Rig().sync(1, length)) == length
+        rig = Rig()
+        assert rig.sync(1, INIT_LENGTH) is None
+        assert (rig.session.counters.malformed, rig.state) == (1, State.SYNC)
+        assert len(rig.sync(1, length)) == length
 
     def test_warm_start_begins_with_the_init_packet(self):
         rig = started()
@@ -87,41 +84,62 @@ class TestHandShake:
         assert rig.send(packet) == reply, "after a silence it is a new packet"
         assert (rig.session.counters.duplicates, len(rig.records)) == (4, 2)
 
+    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.POSITION, Mode.DELTA_POSITION])
+    @pytest.mark.parametrize("arm", range(4))
+    def test_a_packet_with_a_drive_on_is_no_sync_packet(self, mode, arm):
+        rig = Rig()
+        rig.number = 5000
+        rig.modes = mode
+        for count in range(1, 4):
+            packet = bytearray(rig.packet())
+            packet[4:8] = bytes(4)
+            packet[4 + arm] = DRIVE_ON
+            assert rig.send(bytes(packet)) is None
+            assert rig.session.counters.malformed == count
+        assert rig.state is State.SYNC
+        rig.start()
+        assert rig.cycle() is not None
 
-class TestSafeReplies:
-    """What is answered where nothing moves: field by field."""
+    @pytest.mark.parametrize(
+        ("numbers", "retained"),
+        [
+            ((), True),
+            (range(1, 10), True),
+            (range(1, 8), True),
+            (range(1, 7), False),
+            ((1,), False),
+        ],
+    )
+    def test_request_before_the_init_packet(self, numbers, retained):
+        """It is dropped if sync packets before the init packet are missing."""
+        rig = Rig()
+        rig.session.tick(0.0)
+        rig.session.request(still(3))
+        for number in numbers:
+            rig.sync(number)
+        rig.send(rig.init.encode())
+        assert rig.session.requested is retained
+        if not retained:
+            reason = "the controller restarted: sync packets are missing"
+            assert (rig.ended.outcome, rig.ended.reason) == ("lost", reason)
 
-    def filled(self, mode, status=DRIVE_ON) -> tuple[Rig, CyclicPacket, CyclicPacket]:
+
+class TestReplies:
+    @pytest.mark.parametrize("status", [0, DRIVE_ON])
+    def test_mode_504_is_the_last_to_get_a_reply(self, status):
+        """Zeros; everything is echoed if the drive is off."""
         rig = started()
-        rng = np.random.default_rng(3)
-        rig.axes["d"] = rng.uniform(-1, 1, (N, 5))
-        rig.axes["d"][:, 2] = rig.axes["d"][:, 0]
-        rig.axes["extra"] = rng.uniform(-1, 1, (N, 3))
-        answer = rig.cycle(mode=mode, status=status)
-        assert answer.functionality == bytes(4)
-        return rig, CyclicPacket.decode(rig.transcript[-1][0], N), answer
-
-    @pytest.mark.parametrize("mode", [500, 502])
-    def test_pause_has_a_long_deadline(self, mode):
-        rig, _, _ = self.filled(mode)
-        assert rig.state is State.FREEZING
-        assert rig.session.deadline == pytest.approx(rig.now + 300.0)
-
-    def test_mode_504_gets_one_reply_of_zeros(self):
-        rig, _, answer = self.filled(Mode.END_OF_SESSION)
-        assert not words(answer).any()
-        assert rig.state is State.ENDED
+        rig.axes["d"] = np.random.default_rng(3).uniform(-1, 1, (N, 5))
+        answer = rig.cycle(mode=Mode.END_OF_SESSION, status=status)
         last_packet = rig.transcript[-1][0]
+        received = CyclicPacket.decode(last_packet, N).axes.tobytes()
+        assert answer.axes.tobytes() == (bytes(36 * N) if status else received)
+        assert rig.state is State.ENDED
         assert rig.cycle() is None
         assert rig.send(last_packet) is None
         assert rig.send(rig.init.encode()) is None
         assert rig.session.counters.ended == 3
         assert rig.session.deadline == np.inf
-
-    def test_mode_504_with_the_drive_off_is_echoed(self):
-        rig, packet, answer = self.filled(Mode.END_OF_SESSION, status=0)
-        np.testing.assert_array_equal(words(answer), words(packet))
-        assert rig.state is State.ENDED
 
     def test_reply_to_a_longer_packet(self):
         rig = started()
@@ -130,52 +148,54 @@ class TestSafeReplies:
         assert len(reply) == 228
         assert b"\xa5\xa5\xa5\xa5" not in reply
 
-
-class TestRejectedPackets:
-    def test_stale_packet(self):
-        rig = closed()
-        old = rig.transcript[-1][0]
-        rig.cycle(3)
-        assert rig.send(old) is None
-        assert rig.session.counters.stale == 1
-        assert rig.seen(PacketRejected) == [PacketRejected("stale", 1)]
-
     def test_number_too_far_ahead_is_stale(self):
         rig = closed()
-        answered = rig.number
+        answered, old = rig.number, rig.transcript[-1][0]
         rig.number = answered + 500
         assert rig.cycle() is None, "1 s is 500 cycles; this one is 501 ahead"
         rig.number = answered + 499
         assert rig.cycle() is not None
         assert rig.session.counters.missed == 499
+        assert rig.send(old) is None
+        assert rig.session.counters.stale == 2
+        assert rig.seen(PacketRejected) == [PacketRejected("stale", 1)] * 2
+        assert rig.seen(PacketRejected)[-1].reason.endswith("does not follow 511")
 
     @pytest.mark.parametrize(
-        "packet",
-        [b"", b"\x0b", struct.pack("<i", 11), struct.pack("<i", 11) + bytes(223), bytes(228)],
+        ("packet", "words"),
+        [
+            *((packet, "expected at least the 12") for packet in (b"", b"\x0b", bytes(11))),
+            (struct.pack("<i", 11) + bytes(223), "227 bytes: packet length"),
+            (bytes(228), "228 bytes: packet number is 0; expected 1..32767"),
+        ],
     )
-    def test_malformed_packets(self, packet):
+    def test_malformed_packets(self, packet, words):
         rig = started()
         assert rig.send(packet) is None
         assert rig.state is State.INIT
         assert rig.session.counters.malformed == 1
+        (event,) = rig.seen(PacketRejected)
+        assert words in event.reason
 
 
 class TestSilence:
-    def test_deadline_before_and_after_init(self):
+    def test_deadline(self):
+        """Of 300 s before the init packet and in a pause, 1 s otherwise."""
         rig = Rig()
         assert rig.session.deadline == np.inf
         rig.session.tick(5.0)
         assert rig.session.deadline == 305.0
         rig.now = 6.0
         rig.close()
-        assert rig.session.deadline == pytest.approx(rig.now + 1.0)
-
-    def test_rejected_packets_do_not_move_the_deadline(self):
-        rig = closed()
         deadline = rig.session.deadline
+        assert deadline == pytest.approx(rig.now + 1.0)
         rig.send(rig.transcript[-1][0])
         rig.send(b"nonsense")
-        assert rig.session.deadline == deadline
+        assert rig.session.deadline == deadline, "rejected packets do not move it"
+        for pause in (Mode.PAUSE_BY_PC, Mode.PAUSE_BY_CONTROLLER):
+            rig.cycle(mode=pause)
+            assert rig.state is State.FREEZING
+            assert rig.session.deadline == pytest.approx(rig.now + 300.0)
 
     def test_silence_before_init_drops_requests(self):
         rig = Rig()
@@ -202,64 +222,32 @@ class TestSilence:
         assert rig.state is State.FAULTED
         assert rig.seen(LinkLost) == [LinkLost(pytest.approx(1.0), State.CLOSED)]
 
-    def test_silence_is_detected_without_tick(self):
-        rig = closed()
-        rig.now += 5.0
-        rig.cycle()
-        assert rig.path[-2:] == [State.FAULTED, State.CLOSED]
-
-    def test_after_silence_any_number_gets_a_reply(self):
+    def test_after_silence_any_number_or_a_cold_start_gets_a_reply(self):
+        """And silence is detected without a tick."""
         rig = closed()
         rig.now += 5.0
         rig.number += 9000
         assert rig.cycle() is not None
-        assert rig.state is State.CLOSED
-        # How long it was, numbers that wrap around cannot fields.
+        assert rig.path[-2:] == [State.FAULTED, State.CLOSED]
+        # How long it was, numbers that wrap around cannot show.
         assert rig.records["gap"][-1] == 0
         assert np.diff(rig.records["cycle"][-2:]) == 1
-
-    def test_after_silence_a_cold_start_is_followed(self):
-        rig = closed()
         rig.now += 60.0
         rig.start(cold=True)
         rig.cycle()
         assert rig.path[-4:] == [State.FAULTED, State.SYNC, State.INIT, State.CLOSED]
 
-
-class TestStartInMidSession:
-    @pytest.mark.parametrize("mode", [Mode.CLOSED, Mode.POSITION, Mode.DELTA_POSITION])
-    @pytest.mark.parametrize("arm", range(4))
-    def test_a_packet_with_a_drive_on_is_no_sync_packet(self, mode, arm):
+    def test_stale_packets_are_not_silence(self):
         rig = Rig()
-        rig.number = 5000
-        rig.modes = mode
-        for count in range(1, 4):
-            packet = bytearray(rig.packet())
-            packet[4:8] = bytes(4)
-            packet[4 + arm] = DRIVE_ON
-            assert rig.send(bytes(packet)) is None
-            assert rig.session.counters.malformed == count
-        assert rig.state is State.SYNC
-        rig.start()
-        assert rig.cycle() is not None
-
-
-@pytest.mark.parametrize(
-    ("numbers", "retained"),
-    [((), True), (range(1, 10), True), (range(1, 8), True), (range(1, 7), False), ((1,), False)],
-)
-def test_request_before_the_init_packet(numbers, retained):
-    """It is dropped if sync packets before the init packet are missing."""
-    rig = Rig()
-    rig.session.tick(0.0)
-    rig.session.request(still(3))
-    for number in numbers:
-        rig.sync(number)
-    rig.send(rig.init.encode())
-    assert rig.session.requested is retained
-    if not retained:
-        reason = "the controller restarted: sync packets are missing"
-        assert (rig.ended.outcome, rig.ended.reason) == ("lost", reason)
+        rig.session.request(still(3))
+        rig.close()
+        for _ in range(30):
+            rig.number = 3
+            assert rig.cycle() is None
+        rig.session.tick(rig.now + 2.0)
+        rig.events += rig.session.events()
+        assert [event.stale for event in rig.seen(LinkLost)] == [30]
+        assert rig.ended.reason == "only packets that do not follow the last one came (30)"
 
 
 class TestConstruction:
@@ -301,30 +289,6 @@ def test_discarded_packets_are_reported_once():
     assert session.events() == [PacketRejected("foreign", 1)]
     assert session.counters.discarded["foreign"] == 6
     assert Rig().session.counters.discarded == {}
-
-
-class TestReasons:
-    """Reasons of rejected packets."""
-
-    def test_malformed_packet(self):
-        rig = Rig()
-        for _ in range(40):
-            rig.send(bytes(12))
-        reasons = {event.reason for event in rig.seen(PacketRejected)}
-        assert reasons == {"12 bytes: packet number is 0; expected 1..32767"}
-
-    def test_stale_packets_are_not_silence(self):
-        rig = Rig()
-        rig.session.request(still(3))
-        rig.close()
-        for _ in range(30):
-            rig.number = 3
-            assert rig.cycle() is None
-        rig.session.tick(rig.now + 2.0)
-        rig.events += rig.session.events()
-        assert [event.stale for event in rig.seen(LinkLost)] == [30]
-        assert rig.ended.reason == "only packets that do not follow the last one came (30)"
-        assert rig.seen(PacketRejected)[-1].reason.endswith("does not follow 11")
 
 
 def test_drive_off_has_zeros_for_values_not_finite():
@@ -561,11 +525,7 @@ class TestAcceptedInit:
 @pytest.mark.parametrize(
     ("theirs", "ours", "below"),
     [
-        (
-            np.float32(1.23456514),
-            1.23457,
-            False,
-        ),  # rounded to six digits
+        (np.float32(1.23456514), 1.23457, False),  # rounded to six digits
         (np.float32(1.2345), 1.2346, True),
         (np.float32(0.1), 0.1, False),
         (np.float32(np.nan), 1.0, False),
