@@ -50,13 +50,6 @@ program, `b_*` one laboratory's controller and another's PC program, `s_*` the t
 ETHERNET = 1
 
 
-@dataclass(frozen=True)
-class Datagram:
-    time: float
-    from_controller: bool
-    payload: bytes
-
-
 def capture_path(shared_data: Path, name: str) -> Path:
     """Where a capture lies; skips the test if that one is not there."""
     path = shared_data / "c4g_captures" / f"{name}.pcap"
@@ -65,17 +58,17 @@ def capture_path(shared_data: Path, name: str) -> Path:
     return path
 
 
-def read_datagrams(path: Path) -> list[Datagram]:
-    """All datagrams in order; the end that sends first is the controller."""
+def read_datagrams(path: Path) -> list[tuple[bool, bytes]]:
+    """All datagrams in order, and whether the controller sent them: the end that sends first."""
     data = path.read_bytes()
     magic, _, _, _, _, _, link_type = struct.unpack_from("<IHHiIII", data)
     assert magic == 0xA1B2C3D4
     assert link_type == ETHERNET
-    datagrams: list[Datagram] = []
+    datagrams = []
     controller = None
     offset = 24
     while offset < len(data):
-        seconds, fraction, captured, length = struct.unpack_from("<IIII", data, offset)
+        _, _, captured, length = struct.unpack_from("<IIII", data, offset)
         assert captured == length
         frame = data[offset + 16 : offset + 16 + captured]
         offset += 16 + captured
@@ -85,21 +78,20 @@ def read_datagrams(path: Path) -> list[Datagram]:
         port, _, udp_length = struct.unpack_from(">HHH", udp)
         sender = (ip[12:16], port)
         controller = controller or sender
-        payload = udp[8:udp_length]
-        datagrams.append(Datagram(seconds + 1e-6 * fraction, sender == controller, payload))
+        datagrams.append((sender == controller, udp[8:udp_length]))
     return datagrams
 
 
 def conversation(shared_data: Path, name: str) -> list[tuple[bytes, bytes | None]]:
     """Each packet of the controller with the answer it got, if any."""
     pairs: list[tuple[bytes, bytes | None]] = []
-    for datagram in read_datagrams(capture_path(shared_data, name)):
-        if datagram.from_controller:
-            pairs.append((datagram.payload, None))
+    for from_controller, payload in read_datagrams(capture_path(shared_data, name)):
+        if from_controller:
+            pairs.append((payload, None))
         else:
             packet, earlier = pairs[-1]
             assert earlier is None, f"{name}: two answers to one packet"
-            pairs[-1] = (packet, datagram.payload)
+            pairs[-1] = (packet, payload)
     return pairs
 
 
@@ -126,17 +118,10 @@ DIFFERENT_ON_PURPOSE = {
 }
 
 
-def limits(n: int, following_error: float) -> GuardLimits:
+def limits(n: int) -> GuardLimits:
     # Wide: a foreign motion of float32 positions has noise for second and third differences.
-    return GuardLimits(
-        lower=np.full(n, -100.0),
-        upper=np.full(n, 100.0),
-        velocity=np.full(n, 5.0),
-        acceleration=np.full(n, 1e7),
-        jerk=np.full(n, 1e10),
-        following_error=np.full(n, following_error),
-        current=np.full(n, 10.0),
-    )
+    far, each = np.full(n, 100.0), np.ones(n)
+    return GuardLimits(-far, far, 5.0 * each, 1e7 * each, 1e10 * each, 2.0 * each, 10.0 * each)
 
 
 def train_of(init: InitPacket, n: int) -> DriveTrain:
@@ -179,7 +164,6 @@ class Replay:
     n: int
     mode: int = 4
     settle_cycles: int = 5
-    following_error: float = 2.0
     session: Session = field(init=False)
     now: float = 0.0
     events: list[object] = field(default_factory=list)
@@ -192,7 +176,7 @@ class Replay:
         self.ring = CycleRing(self.n)
         self.session = Session(
             self.train,
-            Guard(limits(self.n, self.following_error), 0.002),
+            Guard(limits(self.n), 0.002),
             self.ring,
             mode=self.mode,
             settle_cycles=self.settle_cycles,
@@ -213,13 +197,6 @@ class Replay:
 
     def seen(self, kind: type) -> list:
         return [event for event in self.events if isinstance(event, kind)]
-
-
-def replay_of(shared_data: Path, name: str, following_error: float = 2.0) -> Replay:
-    # Their program asks for the end of open mode with its last set-point.
-    settle_cycles = 0 if name == "a_exit" else 5
-    mode = 5 if name == "a_mode5" else 4
-    return Replay(conversation(shared_data, name), 6, mode, settle_cycles, following_error)
 
 
 def situation(received: oracle.Packet, theirs: oracle.Packet | None) -> str:
@@ -268,7 +245,9 @@ def assert_equal(ours: oracle.Packet, expected: oracle.Packet, positions: np.nda
 @pytest.mark.parametrize("name", MOVED)
 def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     n = 6
-    replay = replay_of(shared_data, name)
+    # Their program asks for the end of open mode with its last set-point.
+    settle_cycles, mode = 0 if name == "a_exit" else 5, 5 if name == "a_mode5" else 4
+    replay = Replay(conversation(shared_data, name), n, mode, settle_cycles)
     arms = (1,) * n
     seen: dict[str, set[str]] = {}
     row, before = 0, replay.targets[0]
@@ -298,7 +277,6 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
             assert what == "end"
         else:
             seen.setdefault(what, set()).update(fields(oracle.differences(ours, theirs)))
-            assert_documented(what, name, received, ours, theirs)
     assert replay.session.state is State.ENDED
     assert replay.session.counters.malformed == replay.session.counters.stale == 0
     for what, found in seen.items():
@@ -311,33 +289,6 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
     refused = [(event.error.kind, event.error.joint) for event in replay.seen(Refused)]
     assert refused == ([(Check.VELOCITY, 0)] if name == "a_508" else [])
-
-
-def assert_documented(
-    what: str, name: str, received: oracle.Packet, ours: oracle.Packet, theirs: oracle.Packet
-) -> None:
-    """Check that the captured reply is as the facts describe it."""
-    if what in ("off", "driving on", "closed"):
-        assert all(axis.d == (oracle.ZERO,) * 8 for axis in theirs.axes)
-        assert [a.mode for a in theirs.axes] == [a.mode for a in received.axes]
-        assert theirs.status == bytes(4)
-    elif what == "opening":
-        assert name == "a_stagger"
-        assert {axis.mode for axis in theirs.axes} == {oracle.DRIVE_OFF_REQUEST}
-        assert [a.mode for a in ours.axes] == [a.mode for a in received.axes]
-    elif what == "open":
-        for mine, their in zip(ours.axes, theirs.axes, strict=True):
-            # Its positions are float32, and it subtracts them in float32.
-            resolution = 2.0 * np.spacing(np.float32(max(1.0, abs(their.floats[0]))))
-            assert mine.d[0] == their.d[0]
-            assert abs(mine.floats[1] - their.floats[1]) <= resolution
-    elif what == "their 505":
-        assert name == "a_505"
-        assert {axis.mode for axis in theirs.axes} == {oracle.DRIVE_OFF_REQUEST}
-    else:
-        assert (what, name) == ("their 508", "a_508")
-        assert [axis.mode for axis in theirs.axes] == [oracle.FOLLOWING_ERROR, 4, 4, 4, 4, 4]
-        assert not any(axis.floats[0] for axis in theirs.axes[1:])
 
 
 def test_controller_with_an_invalid_axis_map_is_not_moved(shared_data: Path):
@@ -415,7 +366,6 @@ class TestSevenAxesInMidSession:
                 break
             ours, theirs = oracle.parse(ours_raw, self.N), oracle.parse(reply, self.N)
             assert fields(oracle.differences(ours, theirs)) <= {"D2"}
-            assert_documented("open", SEVEN_AXES, received, ours, theirs)
             compared += 1
         assert compared == len(replay.targets) - 1 > 50
 
@@ -431,11 +381,10 @@ def test_packets_decode_and_encode_unchanged(shared_data: Path, name: str):
     datagrams = read_datagrams(capture_path(shared_data, name))
     n = open_axes(conversation(shared_data, name), name)
     kinds = dict.fromkeys(("init", "whole", "long"), 0)
-    for datagram in datagrams:
-        data = datagram.payload
+    for from_controller, data in datagrams:
         if len(data) == INIT_LENGTH:
             kinds["init"] += 1
-            if datagram.from_controller:
+            if from_controller:
                 assert is_init(data)
                 assert InitPacket.decode(data).encode() == data
             continue
