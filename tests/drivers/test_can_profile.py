@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zlib
 from collections import Counter
 from pathlib import Path
 
@@ -129,12 +128,6 @@ class TestUp:
         assert_slow_values(received[-1], ages, sent)
         assert [each[8:12] for each in received[-2:]] == [bytes(4), sent[35][8:12]]
 
-    def test_slow_values_of_two_axes_repeat_faster(self, profile):
-        wire = Wire(profile, n_axes=2)
-        for number in range(11, 20):
-            wire.up(packet(number, n_axes=2))
-        assert wire.near.ages.max() == 8
-
     @pytest.mark.parametrize("again", [False, True], ids=["silence", "init packet"])
     def test_slow_values_are_unknown_after_a_restart(self, wire, again):
         for number in range(11, 40):
@@ -171,22 +164,16 @@ class TestClassicNumbers:
         return Wire("classic")
 
     def test_positions_are_rounded_to_16_bit_increments(self, wire):
-        rng = np.random.default_rng(5)
-        actual = rng.uniform(-255, 255, N)
-        target, current = actual + rng.uniform(-0.9, 0.9, N), rng.uniform(-31, 31, N)
-        d = numbers_in((0, target), (2, actual), (4, current))
-        got = decoded(wire.up(packet(11, d=d))).axes["d"]
-        np.testing.assert_allclose(got[:, [0, 2]], d[:, [0, 2]], rtol=0, atol=0.51 * STEP)
-        np.testing.assert_allclose(got[:, 4], d[:, 4], rtol=0, atol=0.51 / 64)
-
-    def test_target_does_not_depend_on_the_position(self, wire):
         """D1 is sent as a difference to D3, yet comes out the same whatever D3 is."""
-        rng = np.random.default_rng(6)
-        targets = set()
+        rng = np.random.default_rng(5)
         for number in range(11, 61):
-            d = numbers_in((0, 12.3456789), (2, 12.3456789 + rng.normal(0.0, 3 * STEP, N)))
-            targets |= set(decoded(wire.up(packet(number, d=d))).axes["d"][:, 0].tolist())
-        assert len(targets) == 1
+            actual = rng.uniform(-255, 255, N)
+            target, current = actual + rng.uniform(-0.9, 0.9, N), rng.uniform(-31, 31, N)
+            d = numbers_in((0, target), (2, actual), (4, current)).astype(np.float32)
+            got = decoded(wire.up(packet(number, d=d))).axes["d"]
+            rounded = np.rint(d.astype(float) / STEP) * STEP
+            np.testing.assert_array_equal(got[:, [0, 2]], rounded[:, [0, 2]])
+            np.testing.assert_allclose(got[:, 4], d[:, 4], rtol=0, atol=0.51 / 64)
 
     @pytest.mark.parametrize(
         ("column", "values", "lost"),
@@ -679,15 +666,6 @@ class TestDbc:
         assert {code: str(choice) for code, choice in choices.items()} == {
             code: known.get(mode, f"mode_{mode}") for mode, code in CODES[profile].items()
         }
-
-    def test_cantools_reads_the_head_of_a_segmented_packet(self, profile, database):
-        packet = init_packet()
-        head = ControllerEnd(BusRates(profile)).packet(packet)[0]
-        message = database.get_message_by_frame_id(head.id)
-        signals = message.decode(head.data.ljust(message.length, b"\0"), decode_choices=False)
-        assert signals["segment"] == 0
-        assert signals["packet_length"] == 1200
-        assert signals["crc32"] == zlib.crc32(packet)
 
     def test_cantools_reads_replies(self, profile, database, wire):
         modes = np.array([4, 0, 4, 4, 0, 4])

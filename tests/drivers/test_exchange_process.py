@@ -23,7 +23,6 @@ from drivers import CyclicPacket, Mode, MotionEnded, MotionStarted, RequestError
 from drivers.exchange import process, realtime
 from drivers.exchange.control import ArchiveState, ControlBlock
 from drivers.exchange.event_log import (
-    CommandRefused,
     ExchangeEnded,
     ExchangeFailed,
     ExchangeStarted,
@@ -125,11 +124,6 @@ class UdpController:
             reply = self.socket.recv(2048)  # late reply to an earlier packet
         assert CyclicPacket.decode(reply, N).number == expected
         self._follow(reply)
-
-    def follow_received(self) -> None:
-        """Follow the answers that are there, to whichever cycle they are."""
-        while not self.silent(0.0):
-            self._follow(self.socket.recv(2048))
 
     def silent(self, seconds: float) -> bool:
         """Whether no answer comes within that time."""
@@ -277,19 +271,6 @@ def test_packets_are_answered_while_the_controller_moves_the_arm():
             assert exchange.alive
         run_to_the_end(exchange, controller)
         assert exchange.wait(30.0) == 0
-
-
-def test_motion_of_many_megabytes_is_handed_over():
-    with running() as (exchange, controller):
-        controller.cycle(5)
-        exchange.submit(still(100_000))
-        status = exchange.status()
-        assert status.program_accepted == 1
-        assert status.pickup_us > 0.0
-        controller.open = True
-        controller.cycle(20)
-        assert the(MotionStarted, exchange.events()).interval == 0
-        assert controller.unanswered == 0
 
 
 class TestRefusedMotions:
@@ -581,16 +562,6 @@ class TestStart:
         with pytest.raises(ExchangeError, match="no more processes"):
             ExchangeProcess.start(settings(free_port()))
         assert set(Path("/proc/self/fd").iterdir()) == before
-
-
-def test_override_that_a_motion_cannot_make_is_refused():
-    with running() as (exchange, controller):
-        start_cruise(exchange, controller)
-        for fraction in (0.5, float("nan")):
-            exchange.override(fraction)
-            controller.cycle(5)
-            assert the(CommandRefused, exchange.events()).command == f"override of {fraction}"
-        assert controller.open
 
 
 ENTER = """

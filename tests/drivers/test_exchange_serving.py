@@ -44,7 +44,7 @@ from drivers.exchange.event_log import (
 from drivers.exchange.loop import POLL
 from drivers.exchange.serving import DETACHED_LINGER, MAX_LINGER, ControlServer, EventLimiter
 from drivers.record import CycleRing
-from tests.drivers.rig import PERIOD, Cruise, N, drive_train, limits, still
+from tests.drivers.rig import Cruise, N, drive_train, limits, still
 
 
 def gaps(numbers):
@@ -279,6 +279,9 @@ class FakeSession:
     def resume(self):
         self.calls.append("resume")
 
+    def override(self, fraction):
+        self.hold()
+
 
 class Bench:
     """A control server without a link."""
@@ -448,12 +451,15 @@ class TestHold:
         self.change(bench, 1, 0)  # of two changes between two packets the last is applied
         assert bench.session.calls[3:] == ["resume"]
 
-    def test_hold_without_motion_is_refused(self, bench):
+    def test_impossible_commands_are_refused(self, bench):
         self.change(bench, 1)
+        bench.control.override = float("nan")
+        bench.control.override_count += 1
+        bench.step()
         assert bench.session.calls == []
-        (notice,) = bench.reader.drain()
-        assert notice.command == "hold"
-        assert "no motion was requested" in notice.reason
+        notices = bench.reader.drain()
+        assert [notice.command for notice in notices] == ["hold", "override of nan"]
+        assert all("no motion was requested" in notice.reason for notice in notices)
 
 
 class TestPublished:
@@ -480,15 +486,12 @@ class TestPublished:
         assert (bench.control.late, bench.control.answered_late) == (7, 3)
 
 
-class TestWarmUp:
-    @pytest.mark.parametrize("period", [0.001, 0.002])
-    def test_warm_up_reaches_open_mode(self, period):
-        assert warm_up(drive_train(), limits(), period)[0] is State.OPEN
-
-    def test_warm_up_commands_the_middle_of_the_range(self):
-        lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
-        _, reply = warm_up(drive_train(), limits(lower=lower, upper=upper), PERIOD, cycles=5)
-        answer = CyclicPacket.decode(reply, N)
-        assert (answer.axes["mode"] == Mode.POSITION).all()
-        reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
-        np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)
+@pytest.mark.parametrize("period", [0.001, 0.002])
+def test_warm_up_reaches_open_mode_in_the_middle_of_the_range(period):
+    lower, upper = np.linspace(-3.0, -1.0, N), np.linspace(1.0, 2.5, N)
+    state, reply = warm_up(drive_train(), limits(lower=lower, upper=upper), period)
+    assert state is State.OPEN
+    answer = CyclicPacket.decode(reply, N)
+    assert (answer.axes["mode"] == Mode.POSITION).all()
+    reported = drive_train().joint_position(answer.axes["d"][:, 0].astype(float))
+    np.testing.assert_allclose(reported, 0.5 * (lower + upper), atol=1e-6)

@@ -621,13 +621,6 @@ class TestProgram:
         self.phases_to(loop, Phase.ENDED)
         assert loop.reason == f"open mode was lost 3 times in a row: {reason}"
 
-    def test_a_trip_in_open_mode_drops_the_drive_before_the_modes(self) -> None:
-        loop = self.program(Phase.OPEN)
-        loop.trip("test")
-        assert (loop.powered, loop.braked, all(loop.open_axes)) == (False, True, True)
-        assert self.phases_to(loop, Phase.DRIVE_OFF) == [Phase.TRIPPED] * 2
-        assert not any(loop.open_axes)
-
     def test_finish_waits_until_the_arm_is_at_rest(self) -> None:
         loop = self.program(Phase.OPEN)
         loop.finish()

@@ -25,13 +25,6 @@ def dh(controller_deg: list[float]) -> Array:
     return np.radians(angles * train["joint_sign"])
 
 
-def wrist_and_flange(model: pin.Model, controller_deg: list[float]) -> tuple[Array, Array]:
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, dh(controller_deg))
-    flange = data.oMf[model.getFrameId("flange")].translation
-    return np.array(data.oMi[6].translation), np.array(flange)
-
-
 def test_pinocchio_reads_the_planted_standard_parameters(model: pin.Model) -> None:
     planted = ns16.standard_parameters()
     for i in range(1, 7):
@@ -63,13 +56,6 @@ def test_link_frames_are_the_dh_frames_at_the_previous_origin(model: pin.Model) 
         origin = before[:3, 3] + ([0.0, 0.0, 0.6] if i == 0 else 0.0)  # O_0 at joint 2's height
         np.testing.assert_allclose(placement.translation, origin, atol=1e-14)
         before = after
-
-
-def test_home_has_the_wrist_in_front_of_and_above_the_base(model: pin.Model) -> None:
-    wrist, flange = wrist_and_flange(model, CELL["campaign"]["home_deg"])
-    np.testing.assert_allclose(wrist, [0.300 + 0.624, 0.0, 0.600 + 0.700 - 0.185], atol=1e-12)
-    # a wrist bent by 90 deg turns the flange out of the forearm's line, straight up or down
-    np.testing.assert_allclose(np.abs(flange - wrist), [0.0, 0.0, 0.135], atol=1e-12)
 
 
 def test_limits_are_the_controllers_mapped_to_dh_angles(model: pin.Model) -> None:

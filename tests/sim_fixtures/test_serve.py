@@ -39,8 +39,7 @@ class VirtualClock:
 class Cabinet:
     """A controller without a robot: numbered packets, and a list of the replies.
 
-    Of its packets, by index, those in `silent_in` are empty, `ends_in` has mode 504, and the reply
-    to those in `picky_in` is found wrong.
+    Of its packets, by index, those in `silent_in` are empty, and `ends_in` has mode 504.
     """
 
     period = T
@@ -48,13 +47,11 @@ class Cabinet:
     finished = stopped = False
 
     def __init__(
-        self, clock: VirtualClock, cycles: int = 50, *, at_rest=True, silent_in=(), ends_in=-1,
-        picky_in=(),
+        self, clock: VirtualClock, cycles: int = 50, *, at_rest=True, silent_in=(), ends_in=-1
     ) -> None:  # fmt: skip
         self.sent_at: list[float] = []
         self.accepted: list[bytes | None] = []
         self.at_rest, self.silent_in, self.ends_in = at_rest, silent_in, ends_in
-        self.picky_in = picky_in
         self._clock, self._cycles = clock, cycles
         self._number = 1
 
@@ -71,7 +68,6 @@ class Cabinet:
         return packet.encode()
 
     def accept(self, reply: bytes | None) -> None:
-        self.rejected_replies += len(self.accepted) in self.picky_in
         self.accepted.append(reply)
         self._number = next_number(self._number)
 
@@ -179,11 +175,6 @@ def test_a_flood_of_junk_ends_with_the_cycle():
     summary, cabinet, _ = served(answer, receive_cost=0.001 * T)
     assert summary.cycles == 50
     assert max(gaps(cabinet)) < 1.3 * T
-
-
-def test_an_answer_the_controller_finds_wrong_counts_as_missing():
-    summary, _, _ = served(options={"picky_in": range(9, 50, 10)})
-    assert (summary.replies, summary.missed, summary.rejected) == (45, 5, 5)
 
 
 @pytest.mark.parametrize("stall", [0.6, 3.0, 30.0, 200.0])
