@@ -41,8 +41,17 @@ from drivers.record import CycleRing, cycle_dtype
 from drivers.session import Session
 from drivers.states import State
 from drivers.transports.base import Transport, TransportError, TransportSpec
-from drivers.transports.faults import Corrupt, Delay, Duplicate, Fault, FaultyLink, Lose, Reorder
-from drivers.transports.simulated import Peer, SimulatedTransport
+from drivers.transports.simulated import (
+    Corrupt,
+    Delay,
+    Duplicate,
+    Fault,
+    FaultyLink,
+    Lose,
+    Peer,
+    Reorder,
+    SimulatedTransport,
+)
 from drivers.transports.udp import UdpSpec, UdpTransport
 
 __all__ = [

@@ -1,6 +1,6 @@
 """Faults of the simulated controller and its robot, and the text format of all faults.
 
-Cycles are packets of the controller from 0, as in `drivers.transports.faults`; axes count from 1.
+Cycles are packets of the controller from 0, as in the simulated link; axes count from 1.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from drivers.transports import faults as link
+from drivers.transports import simulated as link
 from sim_fixtures.settings import SimulationError
 
 if TYPE_CHECKING:

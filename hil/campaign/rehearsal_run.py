@@ -17,8 +17,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
-from drivers.transports.faults import Delay, Duplicate, Fault, Lose
-from drivers.transports.simulated import SimulatedTransport
+from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ControllerFault, HilError, InputError, OperatorStopError

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers import Corrupt, Duplicate, Lose, SimulatedTransport, TransportClosed
-from drivers.transports.faults import Delay, FaultyLink, Reorder
+from drivers.transports.simulated import Delay, FaultyLink, Reorder
 from tests.drivers.transport_contract import TransportContract
 
 

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.states import State
-from drivers.transports.faults import Lose
-from drivers.transports.simulated import SimulatedTransport
+from drivers.transports.simulated import Lose, SimulatedTransport
 from hil.archive import ArchiveName, ArchiveWriter, open_archive
 from hil.campaign import (
     Campaign,

@@ -20,8 +20,7 @@ import pytest
 from drivers.errors import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
-from drivers.transports.faults import Corrupt, Lose
-from drivers.transports.simulated import SimulatedTransport
+from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.recorder import Recorded
 from hil.campaign import Link, Progress, Stop

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.packets import CyclicPacket, echo, is_init, next_number, packet_number
-from drivers.transports.faults import Corrupt, Delay, Duplicate, Lose, Reorder
+from drivers.transports.simulated import Corrupt, Delay, Duplicate, Lose, Reorder
 from sim_fixtures import Phase, SettingError, SimulatedController
 from sim_fixtures.faults import (
     GRAMMAR,

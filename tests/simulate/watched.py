@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import CycleRing, Session
-from drivers.transports.faults import Fault as LinkFault
+from drivers.transports.simulated import Fault as LinkFault
 from drivers.transports.simulated import SimulatedTransport
 from hil.campaign import Link
 from sim_fixtures import Phase, SimulatedController
