@@ -23,7 +23,7 @@ from sim_fixtures.settings import ControllerSettings, SettingError
 
 
 class Phase(IntEnum):
-    """State of the program."""
+    """State of the program; from DRIVING_ON to CLOSING the drive is on."""
 
     START = auto()
     DRIVE_OFF = auto()
@@ -40,17 +40,7 @@ class Phase(IntEnum):
     ENDED = auto()
 
 
-POWERED = frozenset(
-    {
-        Phase.DRIVING_ON,
-        Phase.CLOSED,
-        Phase.MOVING,
-        Phase.PAUSED,
-        Phase.OPENING,
-        Phase.OPEN,
-        Phase.CLOSING,
-    }
-)
+POWERED = frozenset(phase for phase in Phase if Phase.DRIVING_ON <= phase <= Phase.CLOSING)
 UNBRAKED = POWERED - {Phase.DRIVING_ON}
 STILL_OPEN = frozenset({Phase.CLOSING, Phase.TRIPPED})
 """Phases whose first cycles report the previous modes."""

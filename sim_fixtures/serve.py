@@ -173,11 +173,6 @@ class ServeCounts:
         self.missed += 1
         self._unanswered.append(number)
 
-    def count_stretched(self, seconds: float) -> None:
-        """Count an extended cycle."""
-        self.stretched += 1
-        self.stretch_max = max(self.stretch_max, seconds)
-
     def count_discarded(self, number: int | None) -> None:
         """Count an answer that is not that of the present cycle; None if it has no number."""
         if number is not None and number in self._unanswered:
@@ -328,7 +323,9 @@ class _Server:
         if reply is None and self.stretch and not (self.unanswered and ending):
             until = sent + self.peer.period
             reply = self._reply(packet, until + self.stretch)
-            self.counts.count_stretched(self.clock.monotonic() - until)
+            self.counts.stretched += 1
+            extended = self.clock.monotonic() - until
+            self.counts.stretch_max = max(self.counts.stretch_max, extended)
         self.unanswered = reply is None
         if reply is not None:
             self.counts.answer.add(self.clock.monotonic() - sent)

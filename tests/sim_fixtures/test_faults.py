@@ -21,20 +21,16 @@ from sim_fixtures.faults import (
 from tests.fault_matrix import small_cell
 
 LINES = {
-    "lose@1200": Lose(1200),
     "lose@1200x3:to_controller": Lose(1200, "to_controller", 3),
     "delay@1200:5ms": Delay(1200, seconds=0.005),
     "delay@1200:250us": Delay(1200, seconds=250e-6),
     "delay@0x4:1.5cycles:to_controller": Delay(0, cycles=1.5, direction="to_controller", count=4),
     "duplicate@1200": Duplicate(1200),
-    "duplicate@1200x2:to_controller": Duplicate(1200, "to_controller", 2),
     "reorder@1200": Reorder(1200),
     "reorder@1200:to_controller": Reorder(1200, "to_controller"),
-    "corrupt@1200:offset=8": Corrupt(1200, offset=8),
     "corrupt@1200:offset=8:mask=0x80:to_controller": Corrupt(
         1200, "to_controller", offset=8, mask=0x80
     ),
-    "restart@5000:cold": ControllerFault("restart", 5000, word="cold"),
     "restart@5000": ControllerFault("restart", 5000, word="cold"),
     "restart@5000:warm": ControllerFault("restart", 5000, word="warm"),
     "drive-drop@7": ControllerFault("drive-drop", 7),
@@ -44,7 +40,6 @@ LINES = {
     "following-error@7x20:axis=2:slip": ControllerFault("following-error", 7, 2, 20, "slip"),
     "saturate@7x30:axis=1": ControllerFault("saturate", 7, 1, 30),
     "push@7:axis=2": ControllerFault("push", 7, 2, 50),
-    "push@7x30:axis=1": ControllerFault("push", 7, 1, 30),
     "pause@7x50:502": ControllerFault("pause", 7, count=50, word="502"),
     "pause@7:500": ControllerFault("pause", 7, count=50, word="500"),
 }

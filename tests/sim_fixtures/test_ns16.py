@@ -111,15 +111,6 @@ def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> Non
     assert truth.coulomb[0] > truth.coulomb[2] > truth.coulomb[3] > truth.coulomb[5]
 
 
-def test_forty_columns_are_independent_and_no_more(model: pin.Model) -> None:
-    rng = np.random.default_rng(1)
-    states = [rng.uniform(-2.0, 2.0, (3, 6)) for _ in range(40)]
-    full = np.vstack([full_regressor(model, *s) for s in states])
-    base = np.vstack([base_regressor(model, *s) for s in states])
-    assert np.linalg.matrix_rank(base) == 40
-    assert np.linalg.matrix_rank(full, tol=1e-9 * np.linalg.norm(full)) == 40
-
-
 def test_base_torques_are_the_torques_of_the_rigid_bodies_and_rotors(model: pin.Model) -> None:
     rng = np.random.default_rng(2)
     base = ns16.base_from_standard(ns16.standard_parameters())
