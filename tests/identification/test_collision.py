@@ -13,14 +13,12 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from identification.errors import ShapeError
-from identification.excitation.collision.bodies import Box, Workspace, joint_poses, link_bodies
+from identification.excitation.collision.bodies import Box, Workspace, link_bodies
 from identification.excitation.collision.checker import CollisionChecker
-from identification.excitation.errors import CollisionModelError, WorkspaceError
-from identification.model.kinematics import chain_from_urdf
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.simulated_logs import urdf_path
-from tests.identification.robots import joint, link, random_urdf, robot
+from tests.identification.robots import joint, link, robot
 
 TILTED = "0.1 -0.3 0.7"
 NOWHERE = Workspace(floor=None, margin=0.0)
@@ -218,20 +216,6 @@ class TestMotions:
 
 
 class TestDistances:
-    def test_joint_frames_are_those_of_pinocchio(self):
-        urdf = random_urdf(1)
-        model, chain = pin.buildModelFromXML(urdf), chain_from_urdf(urdf)
-        data, q = (
-            model.createData(),
-            np.random.default_rng(1).uniform(-2.0, 2.0, (20, chain.n_joints)),
-        )
-        rotations, translations = joint_poses(chain, q)
-        for k, row in enumerate(q):
-            pin.forwardKinematics(model, data, pin.integrate(model, pin.neutral(model), row))
-            for i, pose in enumerate(data.oMi):
-                np.testing.assert_allclose(rotations[i, k], pose.rotation, atol=1e-12)
-                np.testing.assert_allclose(translations[i, k], pose.translation, atol=1e-12)
-
     def test_shapes_are_freed(self, arm):
         def living():
             gc.collect()
@@ -330,18 +314,6 @@ class TestInvalidInput:
         for check in (checkers(0.05).clear, checkers(0.05).deepest_contact):
             with pytest.raises(ValueError, match="finite"):
                 check(q)
-
-    def test_unusable_shapes_and_boxes_are_refused(self):
-        for shape in ('<mesh filename="package://nowhere/part.stl"/>', ""):
-            urdf = robot(
-                link("base"),
-                link("tip", shape),
-                joint("joint_1", "base", "tip", "0 0 1", rpy=TILTED),
-            )
-            with pytest.raises(CollisionModelError):
-                CollisionChecker(urdf, Workspace())
-        with pytest.raises(WorkspaceError):
-            Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0))
 
 
 class TestPairs:

@@ -25,7 +25,6 @@ from identification.factor.factor import joint_weights, rows_of, total_factor
 from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
 from tests.identification import two_link
-from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
     URDF,
@@ -141,13 +140,6 @@ class TestConsistentEstimate:
             assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
         assert_consistent(MODEL, found)
 
-    def test_the_third_friction_term_may_have_either_sign(self):
-        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
-        friction = np.array([4, 4, 2, 2, -0.1, 0.1, -1, 1])
-        values = values_of(model, friction)
-        found = simulated(values, 0.001, 5, model=model)
-        np.testing.assert_allclose(found.friction, friction, rtol=0.05)
-
     def test_no_other_consistent_parameters_fit_better(self):
         values = with_friction(-1.0, 2.0, 1.5, 0.8)
         values[MODEL.parameter_names.index("I2yy")] = -0.1  # active constraints
@@ -206,17 +198,6 @@ class TestConsistentEstimate:
         assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
         assert np.all(np.isfinite(found.standard))
         np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
-
-    @pytest.mark.parametrize(
-        "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
-    )
-    def test_other_robots(self, path):
-        """With partly inconsistent nominal parameters."""
-        model = RobotModel.from_urdf(robot_text(path))
-        values = values_of(model, np.repeat([2.0, 1.0, 0.0], model.n_joints), 0.5)
-        found = simulated(values, 0.1, 1, model=model)
-        assert_consistent(model, found)
-        assert error_rise(found) < 1e-3
 
 
 class TestDrives:

@@ -115,20 +115,6 @@ class TestDelay:
         )
         assert estimate_delay(recording, model).delay == pytest.approx(0.005, abs=5e-5)
 
-    def test_a_resting_axis_does_not_matter(self):
-        time = np.arange(6000) * STEP
-        keep = np.array([1.0, 0.0])
-        rng = np.random.default_rng(1)
-        q = motion(time)[0] * keep
-        late = [part * keep for part in motion(time - 0.0007)]
-        recording = Recording(
-            time=time,
-            position=q + 1e-6 * rng.standard_normal(q.shape),
-            joint_names=MODEL.joint_names,
-            torque=MODEL.torque(TRUTH, *late) + 0.1 * rng.standard_normal(q.shape),
-        )
-        assert estimate_delay(recording, MODEL).applied == pytest.approx(7e-4, abs=1e-4)
-
 
 class TestUndeterminedDelay:
     def test_a_slow_motion_does_not_determine_it(self):
@@ -176,14 +162,3 @@ class TestDelayUncertainty:
         added = wider.covariance - fitted.covariance
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)
-
-    def test_undetermined_parameters_stay_undetermined(self):
-        samples = prepare(a_recording(0.0), MODEL)
-        fitted, products = self.fit(MODEL, samples), rate_products(MODEL, samples)
-        covariance = fitted.covariance.copy()
-        covariance[0, :] = covariance[:, 0] = 0.0
-        covariance[0, 0] = np.inf
-        unknown = replace(fitted, covariance=covariance)
-        wider = with_uncertain_delay(unknown, Factor.of(MODEL, samples), products, 1.0)
-        assert np.isinf(wider.covariance[0, 0])
-        np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

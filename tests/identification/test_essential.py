@@ -174,13 +174,6 @@ def factors_of(model, runs):
 
 
 class TestChoice:
-    def test_many_recordings_are_merged(self):
-        """The error over merged blocks is the same sum."""
-        training, *held_out = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 9))
-        found = choose_essential(MODEL, training, held_out)
-        total = sum(held_out, Factor.zero(MODEL))
-        assert found.chosen.held_out == pytest.approx(total.relative_error(found.values), rel=1e-9)
-
     def test_empty_factors_raise(self):
         (training,) = factors_of(MODEL, runs_of(MODEL, TRUTH, 1, 1))
         with pytest.raises(IdentificationError, match="no usable held-out sample"):

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import kstest
 
 from identification.excitation import CRITERIA, validation_motions
-from identification.excitation.collision.bodies import Box, Workspace, joint_poses
+from identification.excitation.collision.bodies import Workspace
 from identification.excitation.collision.checker import CollisionChecker
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
@@ -87,19 +86,6 @@ class TestGenomes:
         with WorkerProcess(timeout=60.0) as child:
             assert [bits(motion) for motion in child.call(genome.motions, genes)] == together
 
-    @GENOMES
-    def test_a_first_population_is_uniform_and_its_seed_decides_it(self, genome):
-        assert (OPEN.n_genes, CLOSED.n_genes) == (
-            6 * 6 + 6,
-            4 * 6 + 6,
-        )  # points and speeds; no home
-        assert BARE.n_genes == 6 * 3 * 2  # W = 3 amplitudes and frequencies
-        genes = genome.sample(np.random.default_rng(7), 50)
-        assert genes.shape == (50, genome.n_genes)
-        assert kstest(genes.ravel(), "uniform").pvalue > 0.001
-        np.testing.assert_array_equal(genome.sample(np.random.default_rng(7), 50), genes)
-        assert not np.array_equal(genome.sample(np.random.default_rng(8), 50), genes)
-
 
 class TestViaPoints:
     @pytest.mark.parametrize("genome", [OPEN, CLOSED])
@@ -140,14 +126,6 @@ class TestObstacles:
             for start, end in pairwise(path):
                 steps = int(np.ceil(np.max(np.abs(end - start)) / 0.1)) + 1
                 assert checker.clear(np.linspace(start, end, steps + 1)).all()
-
-    def test_a_population_without_free_space(self, checker):
-        everywhere = Workspace(boxes=(Box((-0.5, -0.5, 0.3), (0.5, 0.5, 3.0)),), margin=0.0)
-        blocked = CollisionChecker(urdf_text(), everywhere)
-        genome = ViaPointGenome(LIMITS, n_via=1, home=HOME, checker=blocked)
-        genes = genome.sample(np.random.default_rng(1), 2)
-        assert genes.shape == (2, 12)
-        assert all(check_motion(m, LIMITS, checker=blocked) for m in genome.motions(genes))
 
 
 class TestSines:
@@ -558,16 +536,6 @@ class TestCriteria:
         assert Criteria.of_gram(gram, 10) == expected
         assert np.isnan(correlation(gram)).all()
 
-    @pytest.mark.parametrize("p", [2, 5, 12])
-    def test_fully_correlated_errors_reach_the_largest_coupling(self, p):
-        assert coupling_index_max(58) == 1653.0
-        together = np.linspace(1.0, 2.0, p) * (-1.0) ** np.arange(p)
-        apart = 1e-7
-        # the inverse of (t t' + e 1) by Sherman and Morrison
-        gram = np.eye(p) - np.outer(together, together) / (apart + together @ together)
-        assert coupling_index(gram) == pytest.approx(coupling_index_max(p), rel=1e-5)
-        assert coupling_index(gram) <= coupling_index_max(p)
-
     @given(seed=st.integers(0, 99))
     def test_the_coupling_index_sums_the_correlations(self, seed):
         gram = gram_of(random_columns(seed))
@@ -771,12 +739,6 @@ class TestValidationMotions:
             again = plan_moves(one.via_points[0], one.moves, LIMITS)
             assert again.trajectory.to_dict() == one.trajectory.to_dict()
 
-    def test_they_depend_on_the_seed_but_not_on_their_number(self):
-        again = motions_of(seed=3, count=2, checker=CHECKER, currents=currents(1))
-        for one, same in zip(again, found(), strict=False):
-            assert one.trajectory.to_dict() == same.trajectory.to_dict()
-        assert not np.array_equal(motions_of(seed=4, count=1)[0].via_points, found()[0].via_points)
-
     def test_those_of_a_seed_never_change(self):
         """Recorded with the first campaigns; plans of old archives name these seeds."""
         text = json.dumps(
@@ -831,17 +793,3 @@ class TestRefusal:
         error = self.refusal(seed=1, checker=low)
         assert "floor at home" in str(error)
         assert error.nearest["collision"].value < 0.0
-
-    def test_a_blocked_cell_is_named_with_its_obstacle(self, monkeypatch):
-        monkeypatch.setattr(validation_motions, "_TRIES_PER_MOTION", 3)  # of fifty points each
-        monkeypatch.setattr(validation_motions, "_RANGE_SHARE", 0.02)
-        middle = (LIMITS.lower + LIMITS.upper) / 2
-        wrist = joint_poses(NS16.chain, middle[None])[1][5, 0]
-        crate = Box(tuple(wrist - 0.15), tuple(wrist + 0.15))
-        checker = CollisionChecker(urdf_text(), Workspace(boxes=(crate,)))
-        assert checker.clear(HOME[None]).all()
-        error = self.refusal(seed=1, checker=checker)
-        nearest = error.nearest["collision"]
-        assert error.rejected == {"collision": 3}
-        assert nearest.subject.endswith("and box 0")
-        assert len(nearest.posture) == 6 and nearest.value < 0.05

@@ -683,16 +683,6 @@ def samples_of(model, bandwidth=None):
 class TestFrictionCurve:
     """Friction of a joint over speed."""
 
-    def test_jumps_at_zero_and_has_the_offset(self):
-        model = model_with()
-        curve = friction_curve(model, planted(model), 1, -2.0, 3.0)
-        assert (curve.speed[0], curve.speed[-1]) == (-2.0, 3.0)
-        ends = [-F0[1] - 2.0 * F1[1] + FO[1], F0[1] + 3.0 * F1[1] + FO[1]]
-        np.testing.assert_allclose(curve.torque[[0, -1]], ends)
-        middle = len(curve.speed) // 2
-        jump = curve.torque[middle] - curve.torque[middle - 1]
-        assert jump == pytest.approx(2.0 * F0[1], rel=1e-4)
-
     def test_agrees_with_the_data(self):
         """Torque minus the other parts is on the curve for a perfect model."""
         model = model_with()

@@ -1,12 +1,8 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification.errors import IdentificationError
-from identification.estimators import instrumental
 from identification.estimators.instrumental import (
     estimate_instrumental,
     partial_r2,
@@ -14,7 +10,7 @@ from identification.estimators.instrumental import (
     same_plan,
 )
 from identification.factor.columns import instrument_factor, measured_part
-from identification.factor.factor import Factor, estimate
+from identification.factor.factor import estimate
 from identification.model.friction import FrictionLaw
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel
@@ -135,14 +131,6 @@ class TestInstrumentalEstimate:
             covered.append(np.abs(one.values - TRUTH) < one.interval_factor * one.std)
         assert 0.90 <= np.mean(covered) <= 0.99
 
-    def test_the_measured_part_is_the_least_squares_factor(self):
-        samples = executed(1)
-        factor = instrument_factor(MODEL, samples, PLAN)
-        same_rows = replace(samples, usable=samples.usable & MODEL.moving(PLAN.velocity))
-        expected = Factor.of(MODEL, same_rows)
-        np.testing.assert_allclose(measured_part(factor).gram, expected.gram, rtol=1e-9, atol=1e-7)
-        np.testing.assert_array_equal(measured_part(factor).samples, expected.samples)
-
     def test_a_resting_instrument_determines_nothing(self):
         still = PLAN._replace(
             velocity=PLAN.velocity * [1.0, 0.0], acceleration=PLAN.acceleration * [1.0, 0.0]
@@ -175,14 +163,6 @@ class TestPlannedMotion:
         assert not instruments.usable[TIME - min(shoulder, elbow) < -STEP].any()
         assert instruments.usable[inside].all()
 
-    def test_a_known_lag_is_used(self, monkeypatch):
-        samples = executed(0)
-        found = planned_motion(samples, PLAN.position)
-        monkeypatch.setattr(instrumental, "tracking_lag", lambda *_: pytest.fail("sought"))
-        again = planned_motion(samples, PLAN.position, lag=found.lag)
-        np.testing.assert_array_equal(again.motion.position, found.motion.position)
-        np.testing.assert_array_equal(again.usable, found.usable)
-
     def test_repetitions_share_a_plan_for_any_clock(self):
         plan = TIME, PLAN.position
         spline = fit_smoothing_spline(TIME, PLAN.position, np.full(2, 1e-16), widest=40.0)
@@ -198,13 +178,3 @@ class TestPlannedMotion:
             np.nan * PLAN.position,
         )
         assert not any(same_plan(plan, (TIME, other)) for other in others)
-
-    def test_missing_commands_are_not_used(self):
-        samples, command = executed(0), PLAN.position.copy()
-        command[300:340, 1] = np.nan
-        instruments = planned_motion(samples, command)
-        assert not instruments.usable[300:340].any()
-        assert instruments.usable[400:-400].all()
-        for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
-            with pytest.raises(IdentificationError, match=words):
-                planned_motion(samples, np.full_like(command, value))

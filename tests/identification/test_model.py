@@ -111,12 +111,6 @@ class TestRobotModel:
         expected += rotors * qdd + f0 * np.sign(qd) + f1 * qd + f2 * qd**3 + fo
         assert np.abs(model.torque(values, q, qd, qdd) - expected).max() < 1e-10
 
-    def test_a_prismatic_joint_has_linear_units(self):
-        model = RobotModel.from_urdf(slider("1 0 0"))
-        assert model.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
-        assert model.units == ("kg", "N", "N·s/m", "N·s²/m²")
-        assert model.base.expressions() == ("m1 + I1m",)
-
     @pytest.mark.parametrize(
         ("text", "locked", "words"),
         [
@@ -424,27 +418,6 @@ class TestBaseParameters:
         # Their traces are not printed as groups either.
         assert np.array_equal(rounded.grouping != 0.0, ns16.base.grouping != 0.0)
 
-    def test_groups_are_named_by_their_first_parameter(self, ns16):
-        base, again = ns16.base, RobotModel.from_urdf(urdf_text()).base
-        assert again.names == base.names
-        assert np.array_equal(again.grouping, base.grouping)
-        assert np.array_equal(base.grouping[:, base.pivots], np.eye(base.rank))
-        assert tuple(base.standard_names[k] for k in base.pivots) == base.names
-        assert np.all(np.diff(base.pivots) > 0)
-        # A parameter is dropped since those before it explain it.
-        for column in set(range(len(base.standard_names))) - set(base.pivots.tolist()):
-            groups = base.pivots[np.flatnonzero(base.grouping[:, column])]
-            assert np.all(groups < column), base.standard_names[column]
-
-    def test_an_unclear_rank_is_reported(self, ns16):
-        """The first axis a ten-thousandth of a radian off gravity: more is felt, but hardly."""
-        skewed = urdf_text().replace("1.5707963267948966", "1.5709")
-        base = RobotModel.from_urdf(skewed).base
-        assert base.rank > ns16.base.rank
-        assert base.smallest_pivot < 1e-4
-        weakest = base.names[int(np.argmin(base.shares[base.pivots]))]
-        assert f"{base.smallest_pivot:.1e} ({weakest})" in base.explanation()
-
     @pytest.mark.parametrize("arm", ARMS)
     def test_the_rank_is_that_of_pinocchios_regressor(self, arm):
         urdf = robot_text(ARMS[arm])
@@ -504,19 +477,6 @@ class TestLawsOfJoints:
         expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
         np.testing.assert_allclose(torque, expected, atol=1e-11)
 
-    def test_parameters_are_ordered_by_term(self):
-        model = RobotModel.from_urdf(
-            TWO_LINK,
-            friction=FrictionLaw(third=None),
-            joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", stribeck=0.1)},
-        )
-        assert model.friction.names == ("f0_1", "f0_2", "f1_1", "f2_2", "fs_2")
-        assert model.friction.units == ("N·m", "N·m", "N·m·s/rad", "N·m·s³/rad³", "N·m")
-        table = model.friction.table(np.arange(5.0))
-        assert table == ({"f0": 0.0, "f1": 2.0}, {"f0": 1.0, "f2": 3.0, "fs": 4.0})
-        with pytest.raises(ShapeError):
-            model.friction.table(np.arange(4.0))
-
     def test_rows_at_rest_are_excluded_only_with_that_zone(self):
         model = RobotModel.from_urdf(
             TWO_LINK,
@@ -526,13 +486,6 @@ class TestLawsOfJoints:
         speeds = np.array([[0.0, 0.0], [0.1, 0.1], [-0.11, 0.0]])
         assert model.moving(speeds).tolist() == [[False, True], [False, True], [True, True]]
         np.testing.assert_array_equal(model.friction.standstill, [0.1, 0.1])
-
-    def test_offsets_do_not_count_as_friction(self):
-        model = RobotModel.from_urdf(TWO_LINK, friction=FrictionLaw(third=None, offset=True))
-        friction = [
-            n for n, f in zip(model.parameter_names, model.friction_columns, strict=True) if f
-        ]
-        assert friction == ["f0_1", "f0_2", "f1_1", "f1_2"]
 
     def test_invalid_ones_are_refused(self):
         with pytest.raises(ModelError, match="standstill"):
@@ -600,13 +553,6 @@ def states(m=40):
 class TestCoupling:
     """Motors that turn with several joints."""
 
-    def test_names_and_units_of_coupling_parameters(self, coupled):
-        assert coupled.parameter_names[40:43] == ("I45", "I46", "I56")
-        assert coupled.parameter_names[-4:] == ("f0_m5", "f0_m6", "f1_m5", "f1_m6")
-        assert coupled.units[40:43] == ("kg m²",) * 3
-        assert coupled.units[-4:] == ("N·m", "N·m", "N·m·s/rad", "N·m·s/rad")
-        assert coupled.friction_columns.tolist() == [False] * 43 + [True] * 22
-
     def test_rotors_and_motor_friction_act_through_it(self, coupled):
         """tau = K' J K qdd + sum of c_m' f_m(c_m qd), computed from K here."""
         q, qd, qdd = states()
@@ -632,14 +578,6 @@ class TestCoupling:
         # Joint speeds at which motor 5 is at rest: c_5 qd = 0.
         qd[0, 4] = 0.2
         assert coupled.moving(qd).tolist() == [[True, True, True, False, False, True]]
-
-    def test_either_part_can_be_left_out(self):
-        for part, count in (("friction", 43 + 18), ("inertia", 40 + 22)):
-            coupling = Coupling(NS16_TURNS, **{part: False})
-            assert RobotModel.from_urdf(urdf_text(), coupling=coupling).n_parameters == count
-        law = FrictionLaw(coulomb=False)
-        viscous = RobotModel.from_urdf(urdf_text(), friction=law, coupling=Coupling(NS16_TURNS))
-        assert viscous.parameter_names[-2:] == ("f1_m5", "f1_m6")
 
     def test_uncoupled_motors_add_nothing(self):
         uncoupled = RobotModel.from_urdf(urdf_text())
@@ -756,13 +694,6 @@ class TestElementFigures:
             JointElements.of([TORSION], ["a"], [True])
         with pytest.raises(ModelError, match="prismatic"):
             JointElements.of([TORSION], ["joint2"], [False])
-
-    def test_names_of_two_on_one_joint_differ(self):
-        free = [replace(TORSION, identified=True), replace(EXTENSION, identified=True)]
-        assert JointElements.of(free, ["joint1", "joint2"], [True] * 2).names == (
-            "spring_2",
-            "spring_2b",
-        )
 
 
 def with_elements(*elements):

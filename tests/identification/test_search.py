@@ -22,7 +22,7 @@ from identification.excitation.genomes import SineGenome
 from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import Population, SearchSettings
-from identification.excitation.searches.run import dominating, most_evaluations, polish, search
+from identification.excitation.searches.run import dominating, polish, search
 from identification.excitation.searches.scores import ROW, Front, Scale, Scores, unplanned
 from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
@@ -203,20 +203,6 @@ class TestRun:
         assert bits(resumed) == whole and resumed.complete
         assert journal.recalled == sum(sizes[:done])
         assert [len(genes) for genes in population.genes] == sizes[done:]
-
-    def test_progress_reports_counts_and_the_best_motion(self):
-        seen, counts = [], []
-        with Population(problem()) as population:
-            design = search(
-                population, asked("front", polish=40), progress=seen.append, scored=counts.append
-            )
-        assert [each.phase for each in seen] == ["sample"] + 4 * ["search"] + 2 * ["polish"]
-        assert [each.generation for each in seen] == [0, 1, 2, 3, 4, 4, 4]
-        assert [each.evaluated for each in seen][:5] == [200, 212, 224, 236, 248]
-        assert seen[-1].evaluated == design.excitation.tried == sum(counts)
-        assert design.excitation.tried <= most_evaluations(asked("front", polish=40)) == 288
-        assert all(each.feasible == each.evaluated for each in seen)
-        assert list(seen[4].best) == design.front.measures[design.origin].tolist()
 
     def test_a_motion_that_crashes_its_process_does_not_win(self, population):
         small = asked("b", population=6, generations=1)
@@ -516,18 +502,6 @@ class TestPolish:
         if excess[1] == excess[0]:
             assert rugged(after)[0] >= rugged(before)[0]
 
-    def test_it_ends_on_request_and_when_steps_are_tiny(self):
-        population = Bowl()
-
-        def enough():
-            return len(population.scored) > 5
-
-        _, scores = polished(population, START, evaluations=10_000, stop=enough)
-        assert len(population.scored) == 6
-        assert size_of(scores)[0] == max(100.0 - bowl(genes).min() for genes in population.scored)
-        polished(population, START, evaluations=100_000)
-        assert sum(map(len, population.scored)) < 50_000
-
     def test_a_compromise_improves_in_all_measures_or_stays(self):
         genes = np.clip(0.5 * (TARGET + TARGET[::-1]) + 0.1, 0.0, 1.0)
         before = TwoGoals().score(genes[None])
@@ -613,20 +587,6 @@ class TestRecall:
             assert opened_journal.damaged == lengths[4] - lengths[1]
             opened_journal.record(*generation(1))
             assert known(again) == 2
-
-    def test_other_genes_are_not_recalled(self):
-        file, _ = written(3)
-        opened_journal = opened(file)
-        others, scores = generation(7)
-        moved, _ = generation(1)
-        moved[2, 3] = np.nextafter(moved[2, 3], 2.0)
-        for genes in (others, moved, moved[:3]):
-            assert opened_journal.recall(genes) is None
-        opened_journal.record(others, scores)
-        again = opened(file)
-        for genes in (others, generation(2)[0], generation(0)[0]):
-            assert again.recall(genes) is not None
-        assert (again.recalled, again.damaged) == (12, 0)
 
 
 class FullDisk(io.BytesIO):

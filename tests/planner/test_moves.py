@@ -174,18 +174,6 @@ class TestMotion:
         slow = plan_moves(points[0], stopping, limits, slower)
         assert stops.duration <= slow.duration * (1 + 1e-13)
 
-    @given(problems(), st.floats(0.0, 50.0), st.floats(0.02, 1.0))
-    @settings(max_examples=60)
-    def test_to_half_of_the_ramps_more_speed_takes_no_longer(self, problem, percent, share):
-        # Seen backwards from its stop, a ramp from a higher speed begins with at least half of one
-        # from a lower speed: so the faster motion may follow the slower one's join, and a join that
-        # replaces more saves more. Above half this is not so; see the slow test.
-        points, moves, limits, overrides = problem
-        moves = [replace(move, fly_percent=percent) for move in moves]
-        slower = replace(overrides, speed=share * overrides.speed)
-        fast = plan_moves(points[0], moves, limits, overrides).duration
-        assert fast <= plan_moves(points[0], moves, limits, slower).duration * (1 + 1e-9)
-
 
 def ramps(motion):
     """Largest acceleration while speeding up and while slowing down, along a line."""
@@ -303,15 +291,6 @@ def test_a_setting_out_of_range_is_refused_by_name(make, name):
     with pytest.raises(InvalidSetting) as refusal:
         make()
     assert refusal.value.name == name
-
-
-def test_moves_of_another_arm_are_refused():
-    a, b = random_points(8, 2)
-    for start, moves in ((a, [Move(b[:5])]), (a[:5], [Move(b[:5])]), (a, [])):
-        with pytest.raises(InvalidViaPoints):
-            plan_moves(start, moves, SIX_AXES)
-    with pytest.raises(InvalidSetting, match="joint override"):
-        plan_moves(a, [Move(b)], SIX_AXES, Overrides(joint=[1.0] * 5))
 
 
 @example(np.nextafter(1.0, 2.0))

@@ -15,7 +15,6 @@ from scipy.interpolate import PPoly
 
 from planner import (
     InvalidLimits,
-    InvalidSetting,
     InvalidTrajectory,
     JointLimits,
     LimitExceeded,
@@ -341,14 +340,6 @@ def test_the_papers_bounds_limit_position_and_acceleration(seed, harmonics):
     assert np.all(extrema.acceleration <= limits.acceleration)
 
 
-def test_the_papers_bounds_need_an_offset_inside_the_limits():
-    for offset in (SIX_AXES.upper, SIX_AXES.lower - 1.0, [0.0], [np.nan] * 6):
-        with pytest.raises(InvalidSetting):
-            harmonic_bounds(SIX_AXES, offset, 3)
-    with pytest.raises(InvalidSetting):
-        harmonic_bounds(SIX_AXES, np.zeros(6), 0)
-
-
 def executable(limits, seed: int) -> FourierSeries:
     """A ramped series that reaches the tightest of the limits' rates exactly, but for 1e-9."""
     random = np.random.default_rng(seed)
@@ -472,18 +463,6 @@ class TestRestToRest:
         gap = np.abs(law.coefficients[0][1:, :3] - ends[:-1])
         assert np.all(gap <= 1e-12 * np.array(scale) + [0.0, law.duration * tick, tick])
         assert ends[-1, 0] == pytest.approx(distance, rel=1e-12)
-
-    @given(problems())
-    def test_it_is_as_fast_as_an_independent_planner(self, problem):
-        distance, velocity, acceleration, deceleration, jerk = problem
-        asked = ruckig.InputParameter(1)
-        asked.target_position = [distance]
-        asked.max_velocity, asked.max_acceleration = [velocity], [acceleration]
-        asked.min_acceleration = [-deceleration]
-        asked.max_jerk = [jerk]
-        solution = ruckig.Trajectory(1)
-        ruckig.Ruckig(1).calculate(asked, solution)
-        assert scalar(*problem)[0].duration == pytest.approx(solution.duration, rel=1e-6)
 
 
 def flown(points, limits, share=0.5):
@@ -661,23 +640,6 @@ def test_a_ramp_is_smooth_within_its_bounds_to_the_target(state, target):
         )
     assert way.sample(way.duration) == (way.motion_time, target, 0.0)
     assert way.sample(way.duration + 2.0)[0] == pytest.approx(way.motion_time + 2.0 * target)
-
-
-@given(states(), fractions)
-def test_no_ramp_is_faster(state, target):
-    bounds, rate, slope = state
-    # The reference is known to crash at states on their limit, and is exact to 1e-8.
-    slope = float(np.clip(slope, -0.9 * bounds.slope, 0.9 * bounds.slope))
-    problem = ruckig.InputParameter(1)
-    problem.control_interface = ruckig.ControlInterface.Velocity
-    problem.current_position, problem.current_velocity = [0.0], [rate]
-    problem.current_acceleration = [slope]
-    problem.target_velocity, problem.target_acceleration = [target], [0.0]
-    problem.max_acceleration, problem.max_jerk = [bounds.slope], [bounds.change]
-    reference = ruckig.Trajectory(1)
-    ruckig.Ruckig(1).calculate(problem, reference)
-    duration = ramp(rate, slope, target, bounds).duration
-    assert duration == pytest.approx(reference.duration, rel=1e-6, abs=1e-7)
 
 
 moments = st.one_of(st.just(0.0), st.floats(0.0, 3.0))

@@ -21,7 +21,6 @@ from planner.worker import (
     in_child,
     map_in_children,
     plan_in_child,
-    stream_in_children,
 )
 from tests.planner.six_axes import SIX_AXES, join, random_points
 
@@ -271,19 +270,3 @@ def test_a_child_killed_while_it_starts_is_started_again():
         with pytest.raises(ZeroDivisionError):
             map_in_children(children, operator.truediv, chunks_of(3, 2), lambda _: (1, 0))
         assert map_in_children(children, list, chunks_of(2, 1), lambda chunk: (chunk,)) == [0, 1]
-
-
-class TestStreamInChildren:
-    def test_a_chunk_is_requested_when_a_child_is_free(self):
-        requested = []
-
-        def chunks():
-            for index in range(50):
-                requested.append(index)
-                yield [index]
-
-        with WorkerProcess() as child:
-            results = stream_in_children([child], list, chunks(), lambda chunk: (chunk,))
-            assert next(results) == (0, 0)
-            assert requested == [0, 1]
-            assert sorted(results) == [(index, index) for index in range(1, 50)]
