@@ -94,56 +94,26 @@ def convert_write_errors(folder: Path) -> Iterator[None]:
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes | None]) -> None:
-    """Replace files of an existing folder (None removes one), or none of them: OutputError.
+    """Replace files of an existing folder (None removes one); OutputError if that is not possible.
 
-    New files are written first; old ones are moved back if one cannot be replaced.
+    All new files are complete before the first is replaced: a full disk changes nothing.
     """
     try:
         in_the_way = next((name for name in contents if (folder / name).is_dir()), None)
         if in_the_way is not None:
             raise IsADirectoryError(errno.EISDIR, f"{in_the_way} is a folder")
         with TemporaryDirectory(prefix=".hil-", dir=folder, ignore_cleanup_errors=True) as stage:
-            _replace_all(folder, contents, Path(stage))
+            for name, content in contents.items():
+                if content is not None:
+                    _write_through(Path(stage, name), content)
+            for name, content in contents.items():
+                if content is None:
+                    (folder / name).unlink(missing_ok=True)
+                else:
+                    Path(stage, name).replace(folder / name)
     except OSError as error:
         raise OutputError(folder, f"cannot be written to ({error.strerror})") from error
     _sync(folder)
-
-
-def _replace_all(folder: Path, contents: Mapping[str, str | bytes | None], stage: Path) -> None:
-    """Replace files by way of a folder beside them; if one fails, restore the others."""
-    new, old = stage / "new", stage / "old"
-    new.mkdir()
-    old.mkdir()
-    for name, content in contents.items():
-        if content is not None:
-            _write_through(new / name, content)
-    touched: list[str] = []
-    try:
-        for name, content in contents.items():
-            touched.append(name)
-            _keep(folder / name, old / name)
-            if content is not None:
-                (new / name).replace(folder / name)
-            else:
-                (folder / name).unlink(missing_ok=True)
-    except BaseException:
-        for name in touched:
-            with suppress(OSError):
-                if os.path.lexists(old / name):
-                    (old / name).replace(folder / name)
-                elif not (new / name).exists():
-                    (folder / name).unlink(missing_ok=True)
-        raise
-
-
-def _keep(path: Path, copy: Path) -> None:
-    """Give an existing file a second name; its own may be lost."""
-    if not os.path.lexists(path):
-        return
-    try:
-        os.link(path, copy, follow_symlinks=False)
-    except OSError:  # a file system without links, or another user's file
-        path.replace(copy)
 
 
 def _write_through(path: Path, content: str | bytes) -> None:

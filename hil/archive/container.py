@@ -186,10 +186,12 @@ def read_record(stream: BinaryIO, head: Head) -> Record:
 
 
 def records(stream: BinaryIO, size: int, *, only: Collection[int] = range(256)) -> Iterator[Record]:
-    """Yield the records of the data section whose opcodes are in `only`, see `heads`."""
+    """Yield the records of the data section with these opcodes, see `heads`; then check the end."""
     for head in heads(stream, size, only):
         if head.opcode in only:
             yield read_record(stream, head)
+        if head.opcode == DATA_END:
+            check_end(stream, size, head.end)
 
 
 def check_end(stream: BinaryIO, size: int, offset: int) -> None:

@@ -4,7 +4,9 @@ the same bytes of the same calls."""
 from __future__ import annotations
 
 import io
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,16 +110,33 @@ def assert_same_messages(found: dict[str, list[Any]], ours: Archive) -> None:
     assert event.stamp.sec == 4000
 
 
-@pytest.mark.parametrize("reader", [make_reader, NonSeekingReader])
-def test_mcap_with_its_ros2_decoder_reads_the_same_values(
-    path: Path, ours: Archive, reader: Any
-) -> None:
-    found: dict[str, list[Any]] = {}
+def decoded_by_mcap(path: Path, reader: Any) -> Iterator[tuple[str, Any]]:
     with path.open("rb") as stream:
         opened = reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
         for _, channel, message, decoded in opened.iter_decoded_messages():
             assert message.log_time == message.publish_time
-            found.setdefault(channel.topic, []).append(decoded)
+            yield channel.topic, decoded
+
+
+def decoded_by_rosbags(path: Path) -> Iterator[tuple[str, Any]]:
+    """With nothing but the definitions in the file."""
+    with AnyReader([path]) as reader:
+        for connection, _, raw in reader.messages():
+            yield connection.topic, reader.deserialize(raw, connection.msgtype)
+
+
+@pytest.mark.parametrize(
+    "decoded",
+    [
+        partial(decoded_by_mcap, reader=make_reader),
+        partial(decoded_by_mcap, reader=NonSeekingReader),
+        decoded_by_rosbags,
+    ],
+)
+def test_others_read_the_same_values(path: Path, ours: Archive, decoded: Any) -> None:
+    found: dict[str, list[Any]] = {}
+    for topic, message in decoded(path):
+        found.setdefault(topic, []).append(message)
     assert_same_messages(found, ours)
 
 
@@ -135,26 +154,10 @@ def test_mcap_finds_index_statistics_metadata_and_attachments(path: Path, ours: 
     assert metadata["hil.outcome"]["outcome"] == "completed"
 
 
-def test_rosbags_reads_the_same_values(path: Path, ours: Archive) -> None:
-    """With nothing but the definitions in the file."""
-    found: dict[str, list[Any]] = {}
-    with AnyReader([path]) as reader:
-        for connection, _, raw in reader.messages():
-            message = reader.deserialize(raw, connection.msgtype)
-            found.setdefault(connection.topic, []).append(message)
-    assert_same_messages(found, ours)
-
-
-@pytest.mark.parametrize(
-    "urdf",
-    [
-        b"\xff",
-        URDF.replace("plate", "p" * (1 << 20)).encode(),
-    ],
-)
-def test_what_is_no_description_is_not_shown(urdf: bytes) -> None:
+def test_what_is_no_description_is_not_shown() -> None:
     """The recording is written without it."""
-    assert description_message(urdf) is None
+    for urdf in (b"\xff", URDF.replace("plate", "p" * (1 << 20)).encode()):
+        assert description_message(urdf) is None
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))

@@ -69,29 +69,6 @@ def test_folder_in_place_of_a_file_is_named_and_left(folder: Path, third: str | 
     assert unchanged(folder)
 
 
-@pytest.mark.parametrize(("failing", "links"), [("a", True), ("b", False), ("c", True)])
-def test_files_are_restored_if_one_cannot_be_replaced(
-    folder: Path, failing: str, links: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Also on file systems where a file has one name only."""
-    replace = Path.replace
-
-    def sometimes(path: Path, target: Path) -> Path:
-        if path.name == failing and path.parent.name == "new":
-            raise PermissionError(1, "Operation not permitted")
-        return replace(path, target)
-
-    def refused(*_: object, **__: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
-
-    monkeypatch.setattr(Path, "replace", sometimes)
-    if not links:
-        monkeypatch.setattr("os.link", refused)
-    with pytest.raises(OutputError, match="not permitted"):
-        write_files(folder, {"d": None, "c": "new", "a": "new", "b": "new"})
-    assert unchanged(folder)
-
-
 def test_missing_folder_is_an_output_error(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="No such file") as caught:
         write_files(tmp_path / "gone", {"a": "new"})

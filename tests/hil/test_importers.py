@@ -90,34 +90,31 @@ class TestColumns:
         assert found["velocity"] == pytest.approx(np.radians(VALUES[:, [5, 6, 4]]), rel=1e-15)
 
 
+TIMES = [
+    ("s", ["1700000000.123456789", "1700000000.123556790"], [0, 100001]),
+    ("ms", ["0", "0.5"], [0, 500_000]),
+    ("us", ["1e6", "1000001"], [0, 1000]),
+    ("ns", ["1700000000123456789", "1700000000123456791"], [0, 2]),
+    ("s", ["-0.025", "0.05"], [0, 75_000_000]),
+    ("s", ["0", "0.01", "0.013", "0.5", "0.5001"],
+     [0, 10_000_000, 13_000_000, 500_000_000, 500_100_000]),
+]  # fmt: skip
+
+
 class TestTime:
     def test_a_sample_rate_counts_samples(self, file, robot):
-        columns = column_map(sample_rate=3000.0)
-        path = import_log(file, file.with_suffix(".mcap"), robot=robot, columns=columns)
-        assert np.array_equal(open_recording(path).time, np.arange(20) * (1 / 3000.0))
+        read(file, robot, sample_rate=3000.0)
+        time = open_recording(file.with_suffix(".mcap")).time
+        assert np.array_equal(time, np.arange(20) * (1 / 3000.0))
 
-    @pytest.mark.parametrize(
-        ("unit", "times", "expected"),
-        [
-            ("s", ["1700000000.123456789", "1700000000.123556790"], [0, 100001]),
-            ("ms", ["0", "0.5"], [0, 500_000]),
-            ("us", ["1e6", "1000001"], [0, 1000]),
-            ("ns", ["1700000000123456789", "1700000000123456791"], [0, 2]),
-            ("s", ["-0.025", "0.05"], [0, 75_000_000]),
-            ("s", ["0", "0.01", "0.013", "0.5", "0.5001"],
-             [0, 10_000_000, 13_000_000, 500_000_000, 500_100_000]),
-        ],
-    )  # fmt: skip
+    @pytest.mark.parametrize(("unit", "times", "expected"), TIMES)
     def test_a_time_column_is_exact_to_the_nanosecond(self, tmp_path, robot, unit, times, expected):
         lines = [f"{time},1,2,{row}" for row, time in enumerate(times)]
         (tmp_path / "a.csv").write_text("t,q1,q2,q3\n" + "\n".join(lines))
-        columns = column_map(time={"column": "t", "unit": unit})
-        path = import_log(tmp_path / "a.csv", tmp_path / "a.mcap", robot=robot, columns=columns)
-        stamp = open_archive(path).columns["stamp"]
+        stamp = read(tmp_path / "a.csv", robot, time={"column": "t", "unit": unit})["stamp"]
         assert (stamp - stamp[0]).tolist() == expected
-        assert open_recording(path).time.tolist() == pytest.approx(
-            [1e-9 * value for value in expected], abs=1e-16
-        )
+        time = open_recording(tmp_path / "a.mcap").time
+        assert time == pytest.approx([1e-9 * value for value in expected], abs=1e-16)
 
 
 class TestUnitsAndGears:
@@ -195,36 +192,30 @@ class TestBadInput:
     @pytest.mark.parametrize(
         ("line", "found"),
         [
-            ("0.1,1,x,3,4,5,6", "'x'"),
-            ("0.1,1", "nothing"),
-            ("0.1,1,inf,3,4,5,6", "'inf'"),
+            ("0.1,1,x,3,4,5,6", "'x' in column q2, not a number"),
+            ("0.1,1", "nothing in column q2"),
+            ("0.1,1,inf,3,4,5,6", "'inf' in column q2"),
+            ("nan,1,2,3,4,5,6", "'nan' for the time"),
+            (",1,2,3,4,5,6", "nothing for the time"),
         ],
     )
-    def test_an_invalid_cell_is_named_by_line_and_column(self, file, robot, line, found):
+    def test_an_invalid_cell_is_named_by_line(self, file, robot, line, found):
         lines = file.read_text().splitlines()
         file.write_text("\n".join([*lines[:11], line, *lines[12:]]))
-        with pytest.raises(SourceError, match=f"line 12 has {found} in column q2, not a number"):
-            read(file, robot)
+        with pytest.raises(SourceError, match=f"line 12 has {found}"):
+            read(file, robot, time={"column": "t"})
 
-    @pytest.mark.parametrize("time", ["", "nan"])
-    def test_an_invalid_time_is_named_by_line(self, tmp_path, robot, time):
-        (tmp_path / "a.csv").write_text(f"t,q1,q2,q3\n0,1,2,3\n{time},1,2,3\n")
-        with pytest.raises(SourceError, match=r"time: line 3 has ('.*'|nothing) for the time"):
-            read(tmp_path / "a.csv", robot, time={"column": "t"})
-
-    def test_rows_longer_than_the_header_are_refused(self, tmp_path, robot):
-        """The column without a name may be the first or the last."""
-        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3")
-        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name the other"):
-            read(file, robot)
-
-    def test_empty_files_and_other_lengths_are_refused(self, tmp_path, file, robot):
+    def test_unusable_files_are_refused(self, tmp_path, file, robot):
         log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
         with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
             read(file, robot, torque={"columns": "tau{}", "file": "tau.csv"})
         (tmp_path / "b.csv").write_text("t,q1\n")
         with pytest.raises(SourceError, match="has no row of numbers"):
             read(tmp_path / "b.csv", robot)
+        # The column without a name may be the first or the last.
+        longer = log(tmp_path / "c.csv", VALUES, "t,q1,q2,q3")
+        with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name the other"):
+            read(longer, robot)
 
 
 QUANTITIES = {
@@ -477,36 +468,34 @@ LOG = {
 }
 
 
+RECORDS, CELLS = np.zeros((1, 3), [("q", object)]), np.empty(3, object)
+for _joint in range(3):
+    RECORDS[0, _joint]["q"] = CELLS[_joint] = Q[:, _joint]
+LOG |= {"cells": CELLS, "records": RECORDS, "signals": {"values": Q.T[None]}}
+STRUCTS = {
+    "log.joint.q": Q,
+    "log.joint.more.q": -Q,
+    "log.joint.tau": TAU,
+    "log.each({}).q": Q,  # numbered from 1
+    "log.cells({})": Q,
+    "log.records({}).q": Q,
+    "log.signals.values": Q,  # (1, joints, samples), as Simulink logs
+}
+
+
 class TestStructs:
-    @pytest.mark.parametrize(
-        ("columns", "expected"),
-        [("log.joint.q", Q), ("log.joint.more.q", -Q), ("log.joint.tau", TAU)],
-    )
-    def test_field_by_path(self, tmp_path, robot, columns, expected):
+    @pytest.mark.parametrize("columns", STRUCTS)
+    def test_field_by_path(self, tmp_path, robot, columns):
         savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0}, do_compression=True)
         entries = {"time": {"column": "log.t"}}
         found = read_arrays(tmp_path / "a.mat", robot, position={"columns": columns}, **entries)
-        assert np.array_equal(found["position"], expected)
+        assert np.array_equal(found["position"], STRUCTS[columns])
         assert (found["stamp"] / 1e9) == pytest.approx(TIME)
 
-    @pytest.mark.parametrize("name", ["log.each({}).q", "cells({})", "one({}).q"])
-    def test_elements_are_numbered_from_1(self, tmp_path, robot, name):
-        records = np.zeros((1, 3), [("q", object)])
-        cells = np.empty(3, object)
-        for joint in range(3):
-            records[0, joint]["q"] = cells[joint] = Q[:, joint]
-        savemat(tmp_path / "a.mat", {"log": LOG, "cells": cells, "one": records})
-        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": name})
-        assert np.array_equal(found["position"], Q)
-
-    def test_columns_of_a_field_and_dimensions_of_one_element(self, tmp_path, robot):
-        """Simulink logs (1, joints, samples)."""
+    def test_columns_of_a_field(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"log": {"all": np.column_stack([TIME, Q])}})
         position = {"array": "log.all", "columns": (1, 2, 3)}
         assert np.array_equal(read(tmp_path / "a.mat", robot, position=position)["position"], Q)
-        savemat(tmp_path / "a.mat", {"log": {"signals": {"values": Q.T[None]}}})
-        found = read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.signals.values"})
-        assert np.array_equal(found["position"], Q)
 
     def test_missing_field_is_named_with_the_others(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0})
@@ -559,12 +548,11 @@ class TestUntrustedFiles:
         assert np.array_equal(read_arrays(tmp_path / "b.mat", robot)["position"], Q)
 
     def test_only_arrays_of_the_map_are_read_with_limited_size(self, tmp_path, robot):
-        path = tmp_path / "a.npz"
+        path, forged = tmp_path / "a.npz", {"descr": "<f8", "fortran_order": False}
         np.savez(path, q=Q, o=np.array([print], object), few=np.array([1, 2j]))
-        with zipfile.ZipFile(path, "a") as archive, archive.open("bomb.npy", "w") as bomb:
-            head = {"descr": "<f8", "fortran_order": False, "shape": (10**12, 3)}
-            np.lib.format.write_array_header_1_0(bomb, head)
         with zipfile.ZipFile(path, "a") as archive:
+            with archive.open("bomb.npy", "w") as bomb:
+                np.lib.format.write_array_header_1_0(bomb, forged | {"shape": (10**12, 3)})
             archive.writestr("truncated.npy", stored("npy")[:-1])
         assert np.array_equal(read_arrays(path, robot, position={"columns": "q"})["position"], Q)
         for name, sentence in {
@@ -575,19 +563,13 @@ class TestUntrustedFiles:
         }.items():
             with pytest.raises(SourceError, match=sentence):
                 read_arrays(path, robot, position={"columns": name})
-
-    def test_forged_shapes_objects_and_other_files_are_refused(self, tmp_path, robot):
         with (tmp_path / "a.npy").open("wb") as file:
-            head = {"descr": "<f8", "fortran_order": False, "shape": (10**7, 3)}
-            np.lib.format.write_array_header_1_0(file, head)
-        with pytest.raises(SourceError, match="cannot be read"):
-            read_arrays(tmp_path / "a.npy", robot)
-        np.save(tmp_path / "a.npy", np.array([print] * 3, object), allow_pickle=True)
-        with pytest.raises(SourceError, match=r"a\.npy"):
-            read_arrays(tmp_path / "a.npy", robot)
-        (tmp_path / "a.npz").write_bytes(b"PK\x03\x04 truncated")
-        with pytest.raises(SourceError, match=r"a\.npz: cannot be read .* save the arrays again"):
-            read_arrays(tmp_path / "a.npz", robot)
+            np.lib.format.write_array_header_1_0(file, forged | {"shape": (10**7, 3)})
+        np.save(tmp_path / "b.npy", np.array([print] * 3, object), allow_pickle=True)
+        (tmp_path / "b.npz").write_bytes(b"PK\x03\x04 truncated")
+        for name in ("a.npy", "b.npy", "b.npz"):
+            with pytest.raises(SourceError, match=f"{name}: cannot be read .* save the arrays"):
+                read_arrays(tmp_path / name, robot)
 
     def test_unclosed_brackets_take_linear_time(self, tmp_path, robot):
         (tmp_path / "a.m").write_text("a=[" * 100_000 + "a" * 100_000)
@@ -644,15 +626,12 @@ class TestTextMatrices:
         assert np.array_equal(table.numbers([0, 1, 2], "position"), values)
         assert table.names == (("q1", "q2", "q3") if header else ())
 
-    def test_an_empty_line_between_numbers_is_named(self, tmp_path, robot):
+    def test_empty_lines_are_named_or_skipped_on_request(self, tmp_path, robot):
         lines = [" ".join(map(repr, row)) for row in Q.tolist()]
         (tmp_path / "q.txt").write_text("\n".join([*lines[:9], "", *lines[9:]]))
         with pytest.raises(SourceError, match=r"line 10 is empty; .*skip_empty = true.*skip_rows"):
             read_arrays(tmp_path / "q.txt", robot)
-
-    def test_empty_lines_are_skipped_on_request(self, tmp_path, robot):
-        lines = [" ".join(map(repr, row)) + "\n" for row in Q.tolist()]
-        (tmp_path / "q.txt").write_text("\n".join(["", "q1 q2 q3", "", *lines, " "]))
+        (tmp_path / "q.txt").write_text("\n\n".join(["", "q1 q2 q3", *lines, " "]))
         found = read_arrays(tmp_path / "q.txt", robot, format={"skip_empty": True})
         assert np.array_equal(found["position"], Q)
 
@@ -731,63 +710,57 @@ def warnings(
     return list(examine(samples, arm.joint_names, arm.urdf.read_text()).warnings)
 
 
-def factors(warning: str) -> list[str]:
-    """Return the factors of the velocities that a warning lists."""
-    return warning.partition(":")[0].partition(" times ")[2].split(", ")
+def factors(warning: str) -> dict[str, float]:
+    """Return the factors of the velocities that a warning lists, by joint."""
+    parts = warning.partition(":")[0].partition(" times ")[2].split(", ")
+    return {name: float(factor) for factor, name in (part.split(" for ") for part in parts)}
 
 
-class TestUnits:
-    def test_correct_logs_have_no_warning(self, arm: Simulated, panda: Simulated) -> None:
+ORDER = [0, 1, 2, 5, 4, 3, 6]
+ERRORS = {
+    "degrees": ({"position": DEGREES}, "degrees read as radians"),
+    "degrees of rad": ({"position": 1 / DEGREES}, "no joint moves further than"),
+    "no velocity": ({"velocity": 0.0}, "does not follow its position"),
+    "torque": ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
+    "slow clock": ({"clock": 1e3}, "0.1 samples per second are unusual"),
+    "fast clock": ({"clock": 1e-3}, "1e+05 samples per second are unusual"),
+    "order": (
+        {"order": (1, 2, 0, 3, 4, 5)},
+        "as those of shoulder_lift_joint, elbow_joint, shoulder_pan_joint, wrist_1_joint, "
+        "wrist_2_joint, wrist_3_joint by 0 %",
+    ),
+}
+
+
+class TestWarnings:
+    def test_correct_logs_have_none(self, arm: Simulated, panda: Simulated) -> None:
         assert warnings(arm) == []
         assert warnings(panda) == []
 
-    @pytest.mark.parametrize(
-        ("error", "sentence"),
-        [
-            ({"position": DEGREES}, "degrees read as radians"),
-            ({"position": 1 / DEGREES}, "no joint moves further than"),
-            ({"velocity": 0.0}, "does not follow its position"),
-            ({"torque": 1000.0}, "its limit in the URDF is 150 N·m (or N): check its unit"),
-            ({"clock": 1e3}, "0.1 samples per second are unusual"),
-            ({"clock": 1e-3}, "1e+05 samples per second are unusual"),
-        ],
-    )
-    def test_error_is_named(self, arm: Simulated, error: dict[str, float], sentence: str) -> None:
+    @pytest.mark.parametrize("what", ERRORS)
+    def test_error_is_named(self, arm: Simulated, what: str) -> None:
+        error, sentence = ERRORS[what]
         found = warnings(arm, **error)
         assert any(sentence in warning for warning in found), found
 
-    @pytest.mark.parametrize("factor", [DEGREES, -1.0])
-    def test_velocities_have_factors_by_joint(self, panda: Simulated, factor: float) -> None:
-        (sentence,) = warnings(panda, velocity=factor)
-        found = [float(one.split()[0]) for one in factors(sentence)]
-        assert found == pytest.approx([factor] * len(panda.joint_names), rel=1e-2)
-
-    def test_of_some_joints_and_degrees(self, arm: Simulated, panda: Simulated) -> None:
+    def test_velocities_have_factors_by_joint(self, arm: Simulated, panda: Simulated) -> None:
+        for factor in (DEGREES, -1.0):
+            (sentence,) = warnings(panda, velocity=factor)
+            expected = dict.fromkeys(panda.joint_names, factor)
+            assert factors(sentence) == pytest.approx(expected, rel=1e-2)
         (sentence,) = warnings(arm, velocity=np.array([1.0, 3.0, 1.0, 1.0, 1.0, 0.2]))
-        found = factors(sentence)
-        assert [float(one.split()[0]) for one in found] == pytest.approx([3.0, 0.2], rel=1e-2)
-        assert found[0].endswith("for shoulder_lift_joint")
+        expected = {arm.joint_names[1]: 3.0, arm.joint_names[5]: 0.2}
+        assert factors(sentence) == pytest.approx(expected, rel=1e-2)
+
+    def test_positions_in_degrees_order_or_zero(self, panda: Simulated) -> None:
+        """The ranges of joints 4 and 6 of this arm exclude each other."""
         (sentence, *others) = warnings(panda, position=DEGREES, velocity=DEGREES)
         assert sentence.startswith("as mapped, 100 % of the rows leave the limits of the URDF")
         assert 'as degrees read as radians, none would: write unit = "deg"' in sentence
         assert all("degrees" in other for other in others)
-
-
-class TestOrder:
-    def test_of_velocities_is_found(self, arm: Simulated) -> None:
-        names = list(arm.joint_names)
-        (sentence,) = warnings(arm, order=(1, 2, 0, 3, 4, 5))
-        right = [names[1], names[2], names[0], *names[3:]]
-        assert f"as those of {', '.join(right)} by 0 %" in sentence
-        assert "as mapped they deviate from the slopes by" in sentence
-
-    def test_of_positions_is_found_and_a_wrong_zero_is_none(self, panda: Simulated) -> None:
-        """The ranges of joints 4 and 6 of this arm exclude each other."""
-        names = list(panda.joint_names)
-        order = [0, 1, 2, 5, 4, 3, 6]
-        found = warnings(replace(panda, position=panda.position[:, order]))
-        assert "% of the rows leave the limits of the URDF" in found[0]
-        assert f"those of {', '.join(names[j] for j in order)}, none would" in found[0]
+        found = warnings(replace(panda, position=panda.position[:, ORDER]))
+        names = ", ".join(panda.joint_names[j] for j in ORDER)
+        assert f"those of {names}, none would" in found[0]
         found = warnings(replace(panda, position=panda.position + 20.0 * (np.arange(7) == 3)))
         assert "check unit, sign and zero in the column map" in found[0]
         assert "order" not in found[0]

@@ -309,69 +309,17 @@ def test_a_session_that_ends_early_is_reported(on_udp: tuple[Path, int]) -> None
     assert archive.outcome.entries["outcome"] == "completed"
 
 
-def children(pid: int, module: str) -> int:
-    """The child of a process that runs a module."""
-    for task in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-        if module in Path(f"/proc/{task}/cmdline").read_text():
-            return int(task)
-    raise AssertionError(f"no {module}")
-
-
-@pytest.mark.slow
-def test_a_killed_exchange_ends_a_recording_as_lost(on_udp: tuple[Path, int]) -> None:
-    path, port = on_udp
-    archive = path.parent / "a.mcap"
-    with running(*own_motion(path, port)), recorder_of(path) as recorder:
-        wait_until_recorded(archive, recorder)
-        os.kill(children(recorder.pid, "drivers.exchange"), signal.SIGKILL)
-        _, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 4
-    assert "the exchange process ended" in errors
-    assert "a.mcap" in errors
-    outcome = open_archive(archive).outcome
-    assert (outcome.outcome, outcome.reason) == ("lost", "the exchange process ended")
-
-
-@pytest.mark.slow
-def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
-    path, port = on_udp
-    archive = path.parent / "a.mcap"
-    with (
-        running(*own_motion(path, port)) as controller,
-        recorder_of(path) as recorder,
-    ):
-        wait_until_recorded(archive, recorder)
-        os.kill(children(recorder.pid, "hil.archive.process"), signal.SIGSTOP)
-        result = next(line for line in recorder.stdout if "replying until" in line)
-        assert "sent no heartbeat for 5 s and was ended" in result
-        controller.send_signal(signal.SIGTERM)
-        counts, _ = controller.communicate(timeout=60)
-        _, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 4
-    assert "a.mcap is readable up to its last part" in " ".join(errors.split())
-    assert json.loads(counts)["missed"] <= 1  # the last packet, 504, needs no answer
-    assert open_archive(archive).n_samples > 500
-
-
-def test_a_missing_controller_is_waited_for_as_stated(
-    on_udp: tuple[Path, int],
-) -> None:
-    path, _ = on_udp
-    with recorder_of(path, "--wait", "0.5") as recorder:
-        _, errors = recorder.communicate(timeout=60)
-    assert recorder.returncode == 4
-    assert "no init packet within 0.5 s; no packet from 127.0.0.1" in " ".join(errors.split())
-
-
 def test_a_recording_without_a_controller_ends_with_a_sentence(on_udp: tuple[Path, int]) -> None:
     path, _ = on_udp
     with pytest.raises(HilError, match=r"controller\.transport"):
         record_command(CELL_PATH, output=path.parent / "a.mcap")
+    with recorder_of(path, "--wait", "0.5") as recorder:
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "no init packet within 0.5 s; no packet from 127.0.0.1" in " ".join(errors.split())
     with recorder_of(path) as recorder:
         assert "waiting for the controller" in recorder.stdout.readline()
-        assert "no packet from 127.0.0.1 (0 packets from other addresses)" in line_on_packets(
-            recorder
-        )
+        assert "no packet from 127.0.0.1 (0 packets" in line_on_packets(recorder)
         recorder.send_signal(signal.SIGINT)
         _, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 130

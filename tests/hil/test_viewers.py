@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import numpy as np
@@ -100,23 +99,6 @@ class TestLayouts:
             assert len(sizes) == int(splitter.attrib["count"]) == len(splitter.findall("DockArea"))
             assert sum(sizes) == pytest.approx(1.0)
 
-    def test_rerun(self, six: Messages, monkeypatch: pytest.MonkeyPatch) -> None:
-        """The library is replaced by a mock, whose calls are checked."""
-        blueprint = MagicMock()
-        monkeypatch.setitem(sys.modules, "rerun", MagicMock(blueprint=blueprint))
-        monkeypatch.setitem(sys.modules, "rerun.blueprint", blueprint)
-        source = (VIEWERS / "rerun_blueprint.py").read_text()
-        exec(compile(source, "rerun_blueprint.py", "exec"), {})
-        assert blueprint.Blueprint.return_value.save.call_args.args == ("hil", "arm.rbl")
-        views = (blueprint.TimeSeriesView, blueprint.Spatial3DView, blueprint.TextLogView)
-        named = [
-            topic
-            for view in views
-            for call in view.call_args_list
-            for topic in re.findall(r"(/\w[\w/]*)/\*\*", str(call.kwargs["contents"]))
-        ]
-        assert set(named) == set(six) - {"/hil/cycle"}
-
 
 @pytest.fixture
 def excitation(campaign: Campaign) -> Path:
@@ -147,23 +129,18 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
         assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
 
 
-class TestFrame:
-    """Positions, speeds and torques of a page are in one frame, which the page names."""
-
-    def test_torque_has_the_sign_of_its_angle(self, excitation: Path, campaign: Campaign) -> None:
-        """Torque times speed is the power of the joint in any frame."""
-        columns = open_archive(excitation).columns
-        sign = np.array(campaign.cell.drive_table.joint_sign)
-        assert -1 in sign
-        traces = {q.title.partition(" [")[0]: q.traces for q in view_of(excitation).quantities}
-        for joint, trace in enumerate(traces["torque at the joint"]):
-            shown = columns["torque"][:, joint] * sign[joint]
-            assert np.nanmax(trace.value) == shown.max()
-            assert np.nanmin(trace.value) == shown.min()
-        view = view_of(excitation)
-        frame = "angles, speeds and torques as on the teach pendant"
-        assert view.frame == frame
-        assert any(frame in text.get_text() for text in draw_archive(view).texts)
+def test_torque_has_the_sign_of_its_angle(excitation: Path, campaign: Campaign) -> None:
+    """Torque times speed is the power of the joint in any frame; the page names its frame."""
+    torque = open_archive(excitation).columns["torque"]
+    sign = np.array(campaign.cell.drive_table.joint_sign)
+    assert -1 in sign
+    view = view_of(excitation)
+    traces = {q.title.partition(" [")[0]: q.traces for q in view.quantities}
+    for joint, trace in enumerate(traces["torque at the joint"]):
+        shown = torque[:, joint] * sign[joint]
+        assert (np.nanmin(trace.value), np.nanmax(trace.value)) == (shown.min(), shown.max())
+    assert view.frame == "angles, speeds and torques as on the teach pendant"
+    assert any(view.frame in text.get_text() for text in draw_archive(view).texts)
 
 
 def test_one_sample_of_a_long_recording_is_not_lost(tmp_path: Path) -> None:

@@ -48,16 +48,19 @@ class TestTimes:
         assert archive.complete != truncated
 
     def test_damage_outside_the_range_is_not_read(self, written, path):
-        """It stops a full reading."""
-        path.write_bytes(written.changed(written.chunks[1], -5))
-        assert open_archive(path).n_samples == 10
-        archive = open_archive(path, start=50.2)
-        assert archive.complete
-        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:])
-        path.write_bytes(written.changed(written.chunks[3], -5))
-        archive = open_archive(path, start=50.2)
-        assert not archive.complete
-        assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:30])
+        """It stops a full reading; so does one within, and a damaged summary is ignored."""
+        at = written.records[-1].end + 40
+        summary = written.data[:at] + bytes([written.data[at] ^ 1]) + written.data[at + 1 :]
+        for data, count, complete in (
+            (written.changed(written.chunks[1], -5), 23, True),
+            (written.changed(written.chunks[3], -5), 10, False),
+            (summary, 23, False),
+        ):
+            path.write_bytes(data)
+            assert not open_archive(path).complete
+            archive = open_archive(path, start=50.2)
+            assert archive.complete == complete
+            assert np.array_equal(archive.columns["cycle"], FIRST + 20 + np.arange(count))
 
     def test_stamps_that_run_backwards_are_selected_one_by_one(self, tmp_path):
         stamp = np.array([5, 9, 1, 7, 3], np.int64) * 10**9
@@ -67,14 +70,6 @@ class TestTimes:
         )
         archive = open_archive(path, start=3.0, stop=8.0)
         assert archive.columns["position"][:, 0].tolist() == [0.0, 3.0, 4.0]
-
-
-def test_damaged_summary_is_ignored(written, path: Path) -> None:
-    at = written.records[-1].end + 40
-    path.write_bytes(written.data[:at] + bytes([written.data[at] ^ 1]) + written.data[at + 1 :])
-    archive = open_archive(path, start=50.2, stop=50.3)
-    assert np.array_equal(archive.columns["cycle"], written.rows["cycle"][20:30])
-    assert not archive.complete
 
 
 CYCLES = 8_000
@@ -96,14 +91,12 @@ def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
-def test_reading_a_part_takes_little_more_than_the_part(long):
+def test_work_holds_little_more_than_the_part(long):
+    """Checks and repairs hold a chunk at a time."""
     column = CYCLES * 8
     assert CONTENT > 2.5 * WORK
     assert peak(lambda: open_archive(long, fields=["cycle"])) < 3 * column + WORK
     assert peak(lambda: open_archive(long, start=1.0, stop=1.1)) < WORK
-
-
-def test_checking_and_repairing_hold_a_chunk_at_a_time(long):
     assert peak(lambda: check_archive(long)) < WORK
     truncated = long.with_name("truncated.mcap")
     truncated.write_bytes(long.read_bytes()[:-5000])
