@@ -49,6 +49,16 @@ def design_summary(done: Designed, folder: DesignFolder) -> dict[str, Any]:
     }
 
 
+def _draw(folder: DesignFolder, done: Designed, cell: Cell) -> None:
+    """Draw the picture; a failure is only reported."""
+    from hil.plots.design_picture import draw_design  # matplotlib is slow to import
+
+    try:
+        save(draw_design(done.design, cell, done.result.settings.unchecked), folder.picture)
+    except InputError as error:
+        say(f"warning: {error}; repeat with --resume to draw it", err=True)
+
+
 def design(
     cell: Annotated[Path | None, typer.Argument()] = None,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("runs/design"),
@@ -161,12 +171,7 @@ def design(
                     f" {excitation.trajectory.duration:.2f} s: {folder.result}"
                 )
             )
-        from hil.plots.design_picture import draw_design  # matplotlib is slow to import
-
-        try:
-            save(draw_design(done.design, loaded, unchecked), folder.picture)
-        except InputError as error:
-            say(f"warning: {error}; repeat with --resume to draw it", err=True)
+        _draw(folder, done, loaded)
 
     with stop_on_interrupt() as stop:
         done = run_design(

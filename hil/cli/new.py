@@ -23,7 +23,6 @@ from hil.new import (
     from_archive,
     from_init,
     read_init,
-    with_clear_home,
 )
 from hil.progress import say
 from hil.reading import parse_port
@@ -90,8 +89,6 @@ def new(
         known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
     made = replace(made, known=known)
     text, unknown = (made.for_design() if design_only else made).text(output)
-    if design_only and not unknown:
-        text = with_clear_home(text, made, output)
     with convert_write_errors(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:

@@ -1,6 +1,6 @@
 """Generation of a commented cell file from a URDF, a controller or an archive."""
 
-from .cell_text import NewCell, cell_of_urdf, with_clear_home
+from .cell_text import NewCell, cell_of_urdf
 from .known import Known, from_archive, from_init, read_init
 
 __all__ = [
@@ -10,5 +10,4 @@ __all__ = [
     "from_archive",
     "from_init",
     "read_init",
-    "with_clear_home",
 ]

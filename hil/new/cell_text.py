@@ -10,7 +10,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Final, get_origin
 
@@ -20,15 +19,12 @@ from pydantic.fields import FieldInfo
 from scipy.spatial.transform import Rotation
 
 from drivers.drive_train import WRIST_AXES
-from hil.cell import Cell, CellError
 from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.schema import CellFile
-from hil.cell.text import urdf_limits, with_values
+from hil.cell.text import urdf_limits
 from hil.errors import InputError
-from hil.motion_checks import collision_checker
-from hil.reading import read_input, read_text
+from hil.reading import read_input
 from identification.errors import ModelError
-from identification.excitation.constraints import clearance
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
@@ -309,32 +305,3 @@ def _chain(path: Path, urdf: str) -> Chain:
             return chain_from_urdf(urdf)
     except ModelError as error:
         raise InputError(path, str(error), remedy="correct the URDF") from error
-
-
-_TURNED: Final = 3
-"""Largest number of joints turned away from the home posture."""
-
-
-def with_clear_home(text: str, new: NewCell, path: Path) -> str:
-    """Return the text of a cell file with a home posture free of collision.
-
-    It is the first with at most three joints turned by 90° from the present one, else the present
-    one.
-    """
-    urdf = new.urdf if new.urdf is not None else read_text(new.urdf_path)
-    cell = Cell.from_texts(text, urdf, path)
-    try:
-        checker = collision_checker(cell)
-    except CellError:
-        return text
-    limits, home = cell.joint_limits, cell.home
-    chosen = (one for n in range(_TURNED + 1) for one in combinations(range(len(home)), n))
-    for joints in chosen:
-        for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=len(joints)):
-            posture = home.copy()
-            posture[list(joints)] += turns
-            inside = (posture > limits.lower) & (posture < limits.upper)
-            if inside.all() and clearance(checker, posture[None]) is None:
-                shown = [round(float(angle), 3) + 0.0 for angle in np.degrees(posture)]
-                return with_values(text, {"campaign.home_deg": shown})
-    return text

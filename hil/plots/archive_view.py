@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -178,12 +177,8 @@ class _Scales:
                 limits["torque"] = both * cell.torque_limit
         if cell is not None and cell.file.drive_train is not None:
             motors = cell.drive_train.motor_from_joint
-        # Invalid limits are not drawn.
-        with suppress(ArchiveError):
-            table = archive.table("drive_train.json")
-            for name, key in (("current", "current_limit"), ("following", "following_error")):
-                if (limit := _limit_in(table, key, n)) is not None:
-                    limits[name] = both * limit
+            limits["current"] = both * cell.drive_train.current_limit
+            limits["following"] = both * np.array(cell.drive_table.following_error)
         return cls(frame, _slides(archive, n), motors, limits)
 
     @property
@@ -226,15 +221,6 @@ class _Scales:
 
     def _rate(self, rate: Array) -> Array:
         return np.where(self.slides, 1e3 * rate, self.frame.shown_rate(rate))
-
-
-def _limit_in(table: Any, key: str, n: int) -> Array | None:
-    """Return limits (n,) of a table of an untrusted file; None if invalid."""
-    try:
-        limit = np.array(table[key], dtype=np.float64)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
-    return limit if limit.shape == (n,) and np.all((limit > 0.0) & np.isfinite(limit)) else None
 
 
 def _cell(archive: Archive) -> Cell | None:

@@ -43,16 +43,6 @@ def archive(path: Path, samples: Samples | None = None, /, **attachments: bytes)
     )
 
 
-@pytest.mark.parametrize(
-    "table", [b"{", b"[1]", b"\xff", b'{"current_limit": "ab"}', b'{"current_limit": [null, 1]}',
-              b'{"current_limit": [NaN, 1]}', b"[" * 9999]
-)  # fmt: skip
-def test_invalid_limits_in_an_archive_are_not_shown(tmp_path: Path, table: bytes) -> None:
-    view = view_of(archive(tmp_path / "imported.mcap", drive_train_json=table))
-    assert view.quantities
-    assert all(not trace.limits for one in view.quantities for trace in one.traces)
-
-
 def test_jump_of_the_clock_by_years_is_fast(tmp_path: Path) -> None:
     far = Samples(np.array([0, 2**60]), position=np.ones((2, 2)), torque=np.ones((2, 2)))
     view = view_of(archive(tmp_path / "imported.mcap", far))

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from hil.archive import open_archive
 from hil.campaign import Campaign
 from hil.cli import COMMANDS, app, main
 from hil.results import Results
-from hil.version import install_command
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 
 
@@ -87,26 +85,6 @@ def test_a_flag_has_no_type_in_the_help(arguments: list[str]) -> None:
     result = CliRunner().invoke(app, [*arguments, "--help"], env={"COLUMNS": "200"})
     assert "--" in result.stdout
     assert "<bool>" not in result.stdout
-
-
-@pytest.mark.parametrize(
-    ("direct", "command"),
-    [
-        (None, "pip install 'hil[live]'"),
-        (
-            '{"url": "file:///home/a%20b/hil", "dir_info": {"editable": true}}',
-            "pip install -e '/home/a b/hil[live]'",
-        ),
-        ('{"url": "file:///home/hil", "dir_info": {}}', "pip install '/home/hil[live]'"),
-        ('{"url": "https://x.org/hil.whl", "archive_info": {}}', "pip install 'hil[live]'"),
-    ],
-)
-def test_an_extra_is_installed_from_where_hil_itself_came(
-    direct: str | None, command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read = {"direct_url.json": direct}.__getitem__
-    monkeypatch.setattr("hil.version.distribution", lambda _: SimpleNamespace(read_text=read))
-    assert install_command("live") == command
 
 
 def test_the_version_names_package_and_numerical_libraries() -> None:

@@ -19,8 +19,7 @@ from hil.campaign.trajectory_files import PLAYER, RATE, SCRIPT_RATE, trajectory_
 from hil.cell import Cell
 from hil.cell.text import with_values
 from hil.cli import app
-from hil.motion_checks import collision_checker, current_model
-from identification.excitation.constraints import clearance
+from hil.motion_checks import current_model
 from identification.model.motion import Motion
 from planner import JointLimits, Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
@@ -61,13 +60,6 @@ class TestDesignOnlyCell:
         _, summary = new_cell(tmp_path, TWO_JOINTS)
         names = ("velocity_deg", "acceleration_deg", "jerk_deg")
         assert summary["unknown"] == [f"limits.{name}" for name in names]
-
-    def test_home_is_clear_of_the_floor(self, tmp_path: Path) -> None:
-        """At zero this arm hangs below its base."""
-        urdf = WITH_SPEED.replace('xyz="0 0 1"', 'xyz="0 0 0.15" rpy="3.14159 0 0"')
-        cell = Cell.load(new_cell(tmp_path, urdf)[0])
-        assert cell.home.any()
-        assert clearance(collision_checker(cell), cell.home[None]) is None
 
     def test_joint_torques_are_limited_without_a_drive_train(self, tmp_path: Path) -> None:
         cell = Cell.load(new_cell(tmp_path, WITH_SPEED)[0])
