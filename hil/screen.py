@@ -49,7 +49,6 @@ _ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
 }
 _SEQUENCES: Final = re.compile(r"\x1b\[[0-?]*[ -/]*[@-~]?|\x1bO.?", re.DOTALL)
 """Sequences of arrow and function keys; the last one may be incomplete."""
-_AFTER_ESCAPE: Final = re.compile(r"\x1b([^\x1b])", re.DOTALL)
 _UNFINISHED: Final = re.compile(rb"\x1b(?:\[[0-?]*[ -/]*|O)?\Z")
 _SEQUENCE_WAIT: Final = 0.05
 """s to wait for the rest of a sequence; without it, it is the key Esc."""
@@ -58,19 +57,11 @@ _LOCAL, _CONTROL, _INPUT = 3, 6, 0
 
 
 def typed(chunk: str) -> str:
-    """Return the keys in what a terminal sent, without sequences of arrow and function keys.
-
-    Esc holds. With another key (as a terminal sends Alt) it is that key for stop and hold, and a
-    hold for any other.
-    """
-
-    def urgent(key: str) -> bool:
-        return _ACTIONS.get(key) in ("stop", "hold")
-
-    keys = _AFTER_ESCAPE.sub(
-        lambda found: found[1] if urgent(found[1]) else "\x1b", _SEQUENCES.sub("", chunk)
-    )
-    return keys if len(keys) <= _LONGEST_TYPED else "".join(filter(urgent, keys))
+    """Return the keys in what a terminal sent, without sequences of arrow and function keys."""
+    keys = _SEQUENCES.sub("", chunk)
+    if len(keys) > _LONGEST_TYPED:
+        keys = "".join(key for key in keys if _ACTIONS.get(key) in ("stop", "hold"))
+    return keys
 
 
 def after(request: OperatorRequest, key: str, override: float) -> OperatorRequest:
@@ -297,16 +288,6 @@ NEWEST, REMEMBERED = 5, 200
 """Messages that are shown, and that are printed at the end."""
 
 
-def controller_of(cell: Cell) -> str:
-    """Return what the first line shows of the cell's own link."""
-    table = cell.controller
-    if cell.only_simulated:
-        return SIMULATED
-    if table.transport == "can" and table.can is not None:
-        return f"{table.can.interface}:{table.can.channel}"
-    return table.host
-
-
 class ScreenError(RuntimeError):
     """The screen is no longer drawn, or its keys are no longer read."""
 
@@ -355,13 +336,12 @@ class Screen:
     @classmethod
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
         """Return the screen of a run on a cell's own link; `title` is by default its name."""
-        return cls(
-            cell.joint_names,
-            stop,
-            title=title or cell.name,
-            controller=controller_of(cell),
-            quiet=quiet,
-        )
+        table = cell.controller
+        on_bus = table.can if table.transport == "can" else None
+        address = table.host if on_bus is None else f"{on_bus.interface}:{on_bus.channel}"
+        link = SIMULATED if cell.only_simulated else address
+        name = title or cell.name
+        return cls(cell.joint_names, stop, title=name, controller=link, quiet=quiet)
 
     def __enter__(self) -> Screen:
         self._open()

@@ -21,13 +21,12 @@ from hil.campaign import (
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
-from hil.design import DesignResult
+from hil.design import load_design
 from hil.errors import ControllerFault, InputError, OperatorStopError
 from hil.outcome import FILES, REPORT, RESULTS, SERIES
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
 from hil.simulation import simulated_link, simulated_provenance
-from identification.excitation import Excitation
 from sim_fixtures.ns16 import CELL_PATH
 
 
@@ -76,7 +75,7 @@ def demo(
         plan = (
             design(cell, reporter)
             if excitation is None
-            else plan_around(cell, _designed(excitation, cell))
+            else plan_around(cell, load_design(excitation, cell))
         )
         require_runnable(cell, plan)  # before an earlier campaign is removed
         _make_room(output)
@@ -108,13 +107,6 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
         f"recorded {seconds:.0f} s of simulated motion in {took:.1f} s "
         f"({seconds / took:.1f} x real time)"
     )
-
-
-def _designed(path: Path, cell: Cell) -> Excitation:
-    """Load the motion of a design for the cell; it is checked before it runs."""
-    result = DesignResult.load(path)
-    result.require_cell(cell, path)
-    return result.excitation
 
 
 _OURS = {"archives", "cell.toml", "robot.urdf", "plan.json", "manifest.json", "paper"}

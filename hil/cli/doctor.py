@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from hil.cell import Cell
 from hil.cli.arguments import JsonOption, print_json
 from hil.cli.verdict import NOT_GOOD
-from hil.doctor.checks import controller_in
 from hil.doctor.diagnosis import as_json, examine, show
 from hil.progress import reporter
 
@@ -29,7 +29,7 @@ def doctor(
     Checks permissions, processor, load, route, port or CAN bus, and disk; then measures wake-up and
     turnaround latency in processes with the real-time settings of an exchange. Sends nothing to the
     controller, changes nothing and needs no root; run it as the user who will run hil. Each remedy
-    is a command. Without CELL the cycle is 1 ms; of CELL only [controller] has to be complete.
+    is a command. Without CELL the cycle is 1 ms.
 
     Exit status: 0 fit for the cycle; 5 not fit, or the link cannot work, or measured for less than
     60 s (provisional); 2 bad input.
@@ -40,7 +40,7 @@ def doctor(
         output: Folder for archives, on the disk to test.
         quick: Measure for 5 s each; the result is provisional (exit status 5).
     """
-    controller = None if cell is None else controller_in(cell)
+    controller = None if cell is None else Cell.load(cell).controller
     diagnosis = examine(
         controller,
         cycle_ms=1 if controller is None else controller.cycle_ms,

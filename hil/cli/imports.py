@@ -202,9 +202,6 @@ def log(
 
 
 app.command("log")(log)
-# Hidden aliases.
-app.command("mcap", hidden=True)(rosbag2)
-app.command("csv", hidden=True)(log)
 
 
 def _print(path: Path, *, json: bool) -> None:

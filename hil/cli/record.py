@@ -15,7 +15,7 @@ from hil.archive.live import LiveView
 from hil.archive.recorder import Recorded
 from hil.campaign import Progress, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError
 from hil.progress import say
@@ -153,14 +153,11 @@ class View:
     def _line(self, progress: Progress) -> str:
         if progress.waiting:
             return progress.waiting
-        parts = [
-            progress.state.name.lower().replace("_", " "),
-            f"{progress.cycles * self._cell.period:.1f} s",
-            f"{progress.missed} missed, {progress.late} late",
-        ]
-        if progress.not_accepted:
-            parts.append(f"{progress.not_accepted} replies not accepted")
-        if progress.position is not None and np.isfinite(progress.position).all():
-            angles = np.degrees(self._cell.controller_angles(progress.position))
-            parts.append(" ".join(f"{angle:.2f}°" for angle in angles))
-        return "  ".join(parts)
+        text = (
+            f"{progress.state.name.lower().replace('_', ' ')}  "
+            f"{progress.cycles * self._cell.period:.1f} s  {progress.missed} missed, "
+            f"{progress.late} late, {progress.not_accepted} not accepted"
+        )
+        if progress.position is None or not np.isfinite(progress.position).all():
+            return text
+        return f"{text}  {AngleFrame.pendant(self._cell).text_of_angles(progress.position)}"

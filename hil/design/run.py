@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, cast
 
 from hil.cell import AngleFrame, Cell
 from hil.errors import InputError, OperatorStopError, UnsafeError
-from hil.files import lock_folder, write_atomically
+from hil.files import convert_write_errors, lock_folder, write_atomically
 from hil.motion_checks import violation_text
 from hil.progress import Reporter
 from hil.reading import open_file
@@ -56,7 +56,7 @@ class DesignFolder:
             problem = f"has a design already ({present[0].name})"
             remedy = "resume it (--resume), name another folder (-o), or add --force"
             raise InputError(self.root, problem, remedy=remedy)
-        with self._write_errors():
+        with convert_write_errors(self.root):
             for path in (self.result, self.picture, self.journal, self.settings):
                 path.unlink(missing_ok=True)
             write_atomically(self.settings, _HEAD + "\n" + to_text(settings.to_dict(), {}))
@@ -87,22 +87,13 @@ class DesignFolder:
         Raises:
             InputError: it cannot be opened.
         """
-        with self._write_errors():
+        with convert_write_errors(self.root):
             if self.journal.exists():
                 open_file(self.journal).close()  # regular files only
             # unbuffered, so that closing the file cannot fail
             file = self.journal.open("r+b" if self.journal.exists() else "x+b", buffering=0)
         with file:
             yield cast(BinaryIO, file)
-
-    @contextmanager
-    def _write_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            problem = f"cannot be written to ({error.strerror})"
-            remedy = "free disk space, or name another folder (-o)"
-            raise InputError(self.root, problem, remedy=remedy) from error
 
 
 def _flat(settings: DesignSettings) -> dict[str, Any]:

@@ -11,31 +11,20 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, get_args
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    ValidationError,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from hil.cell.errors import first_error
+from hil.cell.schema import Choice, NonNegative, Number, Positive, Table, Whole, field
 from hil.errors import InputError
 from hil.reading import parse_toml, read_text
 from identification.excitation import Method
 
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 
-# Strict: pydantic would read "24" as 24 and true as 1.
-Number = Annotated[FiniteFloat, Field(strict=True)]
-Whole = Annotated[int, Field(strict=True)]
-Choice = Annotated[bool, Field(strict=True)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 Eta = Annotated[Number, Field(ge=1, le=1000)]
-AboveZero = Annotated[Number, Field(gt=0)]
-Frequencies = Annotated[list[AboveZero], Field(min_length=1)]
+Frequencies = Annotated[list[Positive], Field(min_length=1)]
+Fraction = Annotated[Number, Field(gt=0, le=1)]
 _MOTIONS: Final[Mapping[str, Method]] = {"via_points": "b", "sines": "a"}
 RESULT_FORMAT: Final = "designed excitation"
 """Key `format` of a result file, which has a table of the settings."""
@@ -51,35 +40,27 @@ def _one_or_many(value: Any) -> Any:
     return [value] if isinstance(value, int | float) else value
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class SearchTable(_Table):
+class SearchTable(Table):
     """`[search]`: effort and weights of the search."""
 
-    population: Whole = Field(ge=4, le=10_000, description="a number of individuals, 4 to 10000")
-    generations: Whole = Field(
-        ge=1, le=100_000, description="a number of generations, the first one included, 1 to 100000"
+    population: Whole = field("a number of individuals, 4 to 10000", ge=4, le=10_000)
+    generations: Whole = field(
+        "a number of generations, the first one included, 1 to 100000", ge=1, le=100_000
     )
-    crossover: Share = Field(description="the probability that two parents are crossed, 0 to 1")
-    mutation: Share = Field(description="the probability that a gene is mutated, 0 to 1")
-    crossover_eta: Eta = Field(
-        default=15.0, description="the distribution index of the crossover (SBX), 1 to 1000"
-    )
-    mutation_eta: Eta = Field(
-        default=20.0, description="the distribution index of the mutation, 1 to 1000"
-    )
-    weights: tuple[Share, Share] = Field(
-        default=(0.7, 0.3),
-        description="the weights of log det and of I_c,max / I_c, two shares from 0 to 1 that add "
+    crossover: Share = field("the probability that two parents are crossed, 0 to 1")
+    mutation: Share = field("the probability that a gene is mutated, 0 to 1")
+    crossover_eta: Eta = field("the distribution index of the crossover (SBX), 1 to 1000", 15.0)
+    mutation_eta: Eta = field("the distribution index of the mutation, 1 to 1000", 20.0)
+    weights: tuple[Share, Share] = field(
+        "the weights of log det and of I_c,max / I_c, two shares from 0 to 1 that add "
         "up to 1; methods b and balanced",
+        (0.7, 0.3),
     )
-    polish: Whole = Field(
-        default=0,
+    polish: Whole = field(
+        "a number of motions for the local search from the best one, 0 for none",
+        0,
         ge=0,
         le=10_000_000,
-        description="a number of motions for the local search from the best one, 0 for none",
     )
 
     @model_validator(mode="after")
@@ -92,40 +73,36 @@ class SearchTable(_Table):
         return self
 
 
-class ViaPointTable(_Table):
+class ViaPointTable(Table):
     """`[via_points]`: a motion through via points, as the controller's interpolator runs it."""
 
-    n_via: Whole = Field(ge=2, le=60, description="a number of via points to search, 2 to 60")
-    fly: Share = Field(description="a fly-by fraction, 0 (stop at every via point) to 1")
-    slowest: Annotated[Number, Field(gt=0, le=1)] = Field(
-        description="the smallest fraction of a joint's speed limit, above 0, at most 1"
-    )
-    range_share: Annotated[Number, Field(gt=0, le=1)] = Field(
-        default=1.0,
-        description="the central fraction of each joint's range for via points, above 0, at most 1",
+    n_via: Whole = field("a number of via points to search, 2 to 60", ge=2, le=60)
+    fly: Share = field("a fly-by fraction, 0 (stop at every via point) to 1")
+    slowest: Fraction = field("the smallest fraction of a joint's speed limit, above 0, at most 1")
+    range_share: Fraction = field(
+        "the central fraction of each joint's range for via points, above 0, at most 1", 1.0
     )
 
 
-class SineTable(_Table):
+class SineTable(Table):
     """`[sines]`: a sum of sines for each joint (eq. 8 of the paper)."""
 
-    harmonics: Whole = Field(ge=1, le=20, description="a number of sines for each joint, 1 to 20")
-    length: AboveZero = Field(description="the duration of the motion in s, above 0")
-    ramp: Annotated[Number, Field(ge=0)] = Field(
-        description="the duration of fade-in and fade-out in s, 0 for none (such a motion cannot "
-        "be run)"
+    harmonics: Whole = field("a number of sines for each joint, 1 to 20", ge=1, le=20)
+    length: Positive = field("the duration of the motion in s, above 0")
+    ramp: NonNegative = field(
+        "the duration of fade-in and fade-out in s, 0 for none (such a motion cannot be run)"
     )
-    slowest: Annotated[Frequencies, BeforeValidator(_one_or_many)] = Field(
-        description="the lowest angular frequency in rad/s, above 0: one, or one for each joint"
+    slowest: Annotated[Frequencies, BeforeValidator(_one_or_many)] = field(
+        "the lowest angular frequency in rad/s, above 0: one, or one for each joint"
     )
-    fastest: Frequencies | Literal["from limits"] = Field(
-        description='the highest angular frequency in rad/s, one for each joint, or "from limits": '
+    fastest: Frequencies | Literal["from limits"] = field(
+        'the highest angular frequency in rad/s, one for each joint, or "from limits": '
         "sqrt(acceleration limit / distance of offset and limit), as in the paper's appendix"
     )
-    offset: Literal["middle", "home"] | list[Number] = Field(
-        default="middle",
-        description='the mean posture: "middle" of the joints\' ranges, "home" of the cell, or '
+    offset: Literal["middle", "home"] | list[Number] = field(
+        'the mean posture: "middle" of the joints\' ranges, "home" of the cell, or '
         "angles in degrees, one for each joint, in the frame of the cell's [limits]",
+        "middle",
     )
 
     @model_validator(mode="after")
@@ -143,24 +120,19 @@ class SineTable(_Table):
         return self
 
 
-class ConstraintTable(_Table):
+class ConstraintTable(Table):
     """`[constraints]`: constraints beside the joint limits."""
 
-    min_duration: Annotated[Number, Field(ge=0)] = Field(
-        default=0.0, description="the shortest duration in s, 0 for any"
+    min_duration: NonNegative = field("the shortest duration in s, 0 for any", 0.0)
+    max_duration: Positive = field("the longest duration in s, above 0", 20.0)
+    closed: Choice = field(
+        "true or false: motions through via points begin and end in the cell's home", True
     )
-    max_duration: AboveZero = Field(default=20.0, description="the longest duration in s, above 0")
-    closed: Choice = Field(
-        default=True,
-        description="true or false: motions through via points begin and end in the cell's home",
+    collision: Choice = field(
+        "true or false: check clearance from floor, walls and the arm ([workspace])", True
     )
-    collision: Choice = Field(
-        default=True,
-        description="true or false: check clearance from floor, walls and the arm ([workspace])",
-    )
-    current: Choice = Field(
-        default=True,
-        description="true or false: check the motors' current limits with the nominal model",
+    current: Choice = field(
+        "true or false: check the motors' current limits with the nominal model", True
     )
 
     @model_validator(mode="after")
@@ -173,13 +145,11 @@ class ConstraintTable(_Table):
         return self
 
 
-class ObjectiveTable(_Table):
+class ObjectiveTable(Table):
     """`[objective]`: parameters in the criteria."""
 
-    parameters: Literal["all"] | Annotated[list[str], Field(min_length=2)] = Field(
-        default="all",
-        description='"all", or a list of at least two names of parameters as `hil identify` '
-        "reports them",
+    parameters: Literal["all"] | Annotated[list[str], Field(min_length=2)] = field(
+        '"all", or a list of at least two names of parameters as `hil identify` reports them', "all"
     )
 
     @property
@@ -188,16 +158,14 @@ class ObjectiveTable(_Table):
         return None if isinstance(self.parameters, str) else self.parameters
 
 
-class DesignSettings(_Table):
+class DesignSettings(Table):
     """The whole file."""
 
-    method: Method = Field(description='"a", "b", "balanced" or "front"')
-    seed: Whole = Field(
-        default=1, ge=0, lt=2**63, description="a whole number, 0 or more; one seed is one result"
-    )
-    search: SearchTable = Field(description="a table [search]")
-    via_points: ViaPointTable | None = Field(default=None, description="a table [via_points]")
-    sines: SineTable | None = Field(default=None, description="a table [sines]")
+    method: Method = field('"a", "b", "balanced" or "front"')
+    seed: Whole = field("a whole number, 0 or more; one seed is one result", 1, ge=0, lt=2**63)
+    search: SearchTable = field("a table [search]")
+    via_points: ViaPointTable | None = field("a table [via_points]", None)
+    sines: SineTable | None = field("a table [sines]", None)
     constraints: ConstraintTable = ConstraintTable()
     objective: ObjectiveTable = ObjectiveTable()
 

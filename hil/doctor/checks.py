@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
 from hil.archive.process import STALL_LIMIT
-from hil.reading import parse_toml, read_text
 
 if TYPE_CHECKING:
     from hil.cell.schema import CanTable, ControllerTable
@@ -223,24 +222,6 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
     status = Status.OK if worst < _SLOW else Status.WARN if worst < _TOO_SLOW else Status.BAD
     found = f"64 KiB written in {1e3 * middle:.1f} ms, at most {1e3 * worst:.1f} ms"
     return [space, Check("disk write", status, found, () if worst < _SLOW else (_MOVE,))]
-
-
-def controller_in(path: Path) -> ControllerTable:
-    """Return `[controller]` of a cell file, otherwise perhaps incomplete, or raise CellError."""
-    from hil.cell import Cell
-    from hil.cell.errors import UnknownFieldsError
-    from hil.cell.schema import ControllerTable
-
-    try:
-        return Cell.load(path).controller
-    except UnknownFieldsError as unknown:
-        table = parse_toml(read_text(path)).get("controller")
-        if table is None or any(name.startswith("controller.") for name in unknown.fields):
-            raise
-        try:
-            return ControllerTable.model_validate(table)
-        except ValueError:
-            raise unknown from None
 
 
 _ARPHRD_CAN = "280"

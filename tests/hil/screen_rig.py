@@ -78,6 +78,12 @@ class Terminal:
             assert time.monotonic() < until and self.process.poll() is None, self.seen[-2000:]
             self.look()
 
+    def clear(self) -> None:
+        self.seen = b""
+
+    def stop_reading(self) -> None:
+        self.reads = False
+
     def press(self, keys: str) -> None:
         os.write(self.near, keys.encode())
 

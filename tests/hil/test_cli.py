@@ -144,7 +144,7 @@ def test_the_demo_writes_results_and_ends_with_the_verdict(
         (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell"),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
-            ["import", "csv", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
+            ["import", "log", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],
             "m.toml",
         ),
         (["identify", "x.mcap", "--torque-bandwidth", "wide"], "not a bandwidth"),

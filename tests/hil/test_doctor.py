@@ -6,7 +6,6 @@ import errno
 import io
 import json
 import os
-import re
 import socket
 import subprocess
 import threading
@@ -23,7 +22,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from drivers.exchange.realtime import RealTimeReport
-from hil.cell.errors import UnknownFieldsError
 from hil.cell.schema import CanTable, ControllerTable
 from hil.cli import app
 from hil.doctor import checks as system_checks
@@ -217,15 +215,6 @@ def cell_text(**controller: object) -> str:
         text = text.replace(old, f"{key} = {json.dumps(value)}")
     urdf = CELL_PATH.parent / "ns16.urdf"
     return text.replace('"ns16.urdf"', json.dumps(str(urdf)))
-
-
-def test_an_incomplete_cell_needs_only_its_controller(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text(re.sub(r"(?m)^torque_constant = .*$", 'torque_constant = "?"', cell_text()))
-    assert system_checks.controller_in(path).transport == "simulated"
-    path.write_text(re.sub(r"(?m)^cycle_ms = .*$", 'cycle_ms = "?"', cell_text()))
-    with pytest.raises(UnknownFieldsError, match=r"controller\.cycle_ms"):
-        system_checks.controller_in(path)
 
 
 def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
