@@ -29,7 +29,6 @@ TYPE_OF_SERVICE: Final = 0x28
 """IP_TOS of the manufacturer's library (class AF11)."""
 BUSY_POLL: Final = 50
 """Time that the kernel may poll the network device before it sleeps, µs."""
-_SHORTEST_PLAUSIBLE: Final = HEADER_LENGTH
 # Constants of asm-generic/socket.h that the socket module lacks.
 _SO_TIMESTAMPNS: Final = 35
 _SO_BUSY_POLL: Final = 46
@@ -187,7 +186,7 @@ class UdpTransport:
     def _accepts(self, packet: bytes, sender: tuple[str, int]) -> bool:
         if sender != self._peer:
             # A stray short datagram must not select the port.
-            first = self._peer is None and _SHORTEST_PLAUSIBLE <= len(packet) <= LONGEST
+            first = self._peer is None and HEADER_LENGTH <= len(packet) <= LONGEST
             if sender[0] != self._host or not first:
                 known = self._peer is None and sender[0] == self._host
                 self._count("malformed" if known else "foreign")

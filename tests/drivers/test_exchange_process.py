@@ -460,32 +460,6 @@ class TestStops:
             ask(exchange)
             self.stopped(exchange, controller, by=reason, ends=ends)
 
-    @pytest.mark.parametrize(
-        ("end", "reason"),
-        [
-            ("silent", "the archive process sends no heartbeat"),
-            ("failed", "the archive cannot be written"),
-        ],
-    )
-    def test_end_of_the_archive(self, end, reason):
-        with running(needs_archive=True) as (exchange, controller):
-            control = ControlBlock(exchange.control_fd)
-
-            def beat():
-                exchange.send_heartbeat()
-                control.archive_heartbeat = time.monotonic()
-
-            controller.beat = beat
-            beat()
-            control.archive_state = ArchiveState.READY
-            start_cruise(exchange, controller)
-            controller.cycle_time = PERIOD
-            if end == "silent":
-                controller.beat = exchange.send_heartbeat
-            else:
-                control.archive_state = ArchiveState.FAILED
-            self.stopped(exchange, controller, by=reason, ends=False)
-
     def test_silent_supervisor(self):
         with running() as (exchange, controller):
             start_cruise(exchange, controller)

@@ -28,6 +28,7 @@ from drivers.exchange.control import (
     MAX_INTERVAL,
     OUTCOMES,
     SHORTEST,
+    ArchiveState,
     ControlBlock,
     HeartbeatMonitor,
     bin_of,
@@ -432,6 +433,23 @@ class TestSupervisorHeartbeat:
         for _ in range(2):
             bench.later(0.2 * HEARTBEAT_TIMEOUT)
         assert bench.serving.reason == NO_SUPERVISOR
+
+
+@pytest.mark.parametrize("state", [ArchiveState.READY, ArchiveState.FAILED])
+def test_motion_is_stopped_without_archive(bench, state):
+    """That has failed, or whose process sends no heartbeat."""
+    bench.serving._needs_archive = bench.session.requested = True
+    bench.control.archive_state = ArchiveState.READY
+    for _ in range(100):
+        bench.control.archive_heartbeat = bench.clock.time
+        bench.step()
+    assert bench.session.calls == []
+    bench.control.archive_state = state
+    cycles = 1 if state is ArchiveState.FAILED else round(1.1 * HEARTBEAT_TIMEOUT / STEP)
+    for _ in range(cycles):
+        bench.step()
+    assert "stop" in bench.session.calls
+    assert not bench.serving.reason, "the exchange goes on"
 
 
 class TestHold:

@@ -29,7 +29,7 @@ from sim_fixtures import (
     ns16,
 )
 from sim_fixtures.controller import RUN_UP, OwnMotion
-from sim_fixtures.program import MISSING, Answer, LoopProgram, StartStep
+from sim_fixtures.program import MISSING, Answer, LoopProgram
 from tests.fault_matrix import small_cell
 from tests.sim_fixtures.bench import DRIVE, SMOOTH_Q, TRUTH, make_drive, motor_matrix, play
 
@@ -565,22 +565,6 @@ class TestProgram:
             loop.advance(FINE, at_rest=True)
         return phases
 
-    @pytest.mark.parametrize(("answer", "phase"), [(FINE, Phase.DRIVE_OFF), (MISSING, Phase.ENDED)])
-    def test_a_warm_start_begins_with_an_init_packet_to_be_answered(
-        self, answer: Answer, phase: Phase
-    ) -> None:
-        loop = self.program(cold_start=False)
-        assert loop.start_step is StartStep.INIT
-        loop.advance(answer, at_rest=True)
-        assert loop.phase is phase
-        assert ("init" in loop.reason) is (answer is MISSING)
-
-    def test_phases_last_as_long_as_set(self) -> None:
-        loop = self.program(Phase.DRIVE_OFF)
-        closed = [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
-        assert self.phases_to(loop, Phase.OPENING) == closed
-        assert self.phases_to(loop, Phase.OPEN) == [Phase.OPENING] * 5  # an axis every other cycle
-
     def test_one_axis_opens_alone(self) -> None:
         """The others stay closed, and the PC has the arm as soon as that axis is open."""
         loop = self.program(Phase.OPEN, only_axis=2)
@@ -612,11 +596,12 @@ class TestProgram:
         self.phases_to(loop, Phase.ENDED)
         assert loop.reason == f"open mode was lost 3 times in a row: {reason}"
 
-    def test_finish_waits_until_the_arm_is_at_rest(self) -> None:
-        loop = self.program(Phase.OPEN)
+    def test_phases_last_as_long_as_set_and_the_end_waits_until_the_arm_is_at_rest(self) -> None:
+        loop = self.program(Phase.DRIVE_OFF)
+        closed = [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
+        assert self.phases_to(loop, Phase.OPENING) == closed
+        assert self.phases_to(loop, Phase.OPEN) == [Phase.OPENING] * 5  # an axis every other cycle
         loop.finish()
-        for at_rest, phase in ((False, Phase.OPEN), (True, Phase.CLOSING)):
-            loop.advance(FINE, at_rest=at_rest)
-            assert loop.phase is phase
-        phases = self.phases_to(loop, Phase.ENDED)
-        assert phases[-3:] == [Phase.SHUTDOWN, Phase.SHUTDOWN, Phase.ENDING]
+        loop.advance(FINE, at_rest=False)
+        assert loop.phase is Phase.OPEN
+        assert self.phases_to(loop, Phase.ENDED)[-3:] == [Phase.SHUTDOWN] * 2 + [Phase.ENDING]

@@ -198,20 +198,6 @@ def test_a_stretched_cycle_waits_for_its_answer_and_the_next_begins_after_it():
     assert max(waited[:20] + waited[21:]) <= T + 1e-12
 
 
-def test_at_the_end_a_silent_pc_is_waited_for_once():
-    requests = iter([Request.CONTINUE] * 5)
-    summary, cabinet, _ = served(
-        only(lambda k: k < 10),
-        request=lambda _: next(requests, Request.END),
-        stretch=0.5,
-        patience=1.0,
-        options={"at_rest": False},
-        cycles=10_000,
-    )
-    assert (summary.stretched, summary.missed) == (1, len(cabinet.accepted) - 10)
-    assert len(cabinet.accepted) > 400
-
-
 def test_the_first_packet_is_repeated_until_it_is_answered():
     summary, _, link = served(only(lambda k: k >= 3))
     assert summary.knocks == 4

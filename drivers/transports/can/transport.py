@@ -374,11 +374,8 @@ class CanSpec:
     def rates(self) -> BusRates:
         """Profile and bit rates."""
         standard = BusRates(self.profile)
-        return BusRates(
-            self.profile,
-            standard.bitrate if self.bitrate is None else self.bitrate,
-            standard.data_bitrate if self.data_bitrate is None else self.data_bitrate,
-        )
+        data_bitrate = self.data_bitrate or standard.data_bitrate
+        return BusRates(self.profile, self.bitrate or standard.bitrate, data_bitrate)
 
     def check(self, mode: int | None = None) -> None:
         """Check that this bus can carry the session, and motions in this open mode.
