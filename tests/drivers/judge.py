@@ -98,8 +98,8 @@ class Conduct:
         n = len(self.arms)
         received, answer = oracle.parse(packet, n), oracle.parse(reply, n)
         assert len(reply) == oracle.length(n)
-        assert answer.number == oracle.answer_number(received.number)
-        assert answer.functionality == oracle.ZERO
+        assert answer.number == oracle.answer_number(received.number), "another number"
+        assert answer.functionality == oracle.ZERO, "function bytes"
         safe = oracle.safe_answer(received, self.arms)
         on = received.status[self.arm - 1] == oracle.DRIVE_ON
         modes = [received.axes[slot].mode for slot in self.slots]
@@ -180,7 +180,7 @@ class Conduct:
             expected[self.arm - 1] = 1
             assert in_open_mode, "the end of open mode was asked for outside of it"
             self._count("exit asked")
-        assert answer.status == bytes(expected)
+        assert answer.status == bytes(expected), "status bytes"
 
     def _note(self, on: bool, modes: list[int]) -> None:
         """Closed axes end the barrier; a drive that is off, or an unknown mode, begins it."""
@@ -197,7 +197,8 @@ class Conduct:
         drive_off = oracle.drive_off(answer)
         echoed = [axis.mode for axis in safe.axes]  # of a drive that is off: whatever it was
         reported = [k for k, mode in enumerate(modes) if mode in REFUSALS and mode != echoed[k]]
-        assert drive_off or (len(reported) == 1 and reported[0] in self.slots), modes
+        one_508 = [modes[k] for k in reported] == [oracle.FOLLOWING_ERROR]
+        assert drive_off or (one_508 and reported[0] in self.slots), modes
         for slot, (ours, theirs) in enumerate(zip(answer.axes, safe.axes, strict=True)):
             assert ours.mode == theirs.mode or slot in reported
             for word, wanted in zip(ours.d, theirs.d, strict=True):
@@ -229,7 +230,7 @@ class Conduct:
         fields = MODE_FIELDS[self.mode]
         for slot in self.slots:
             axis = answer.axes[slot]
-            assert axis.mode == self.mode
+            assert axis.mode == self.mode, "another mode"
             assert axis == axis.keep(*fields), "a field that this mode has no use for"
         assert np.isfinite(a).all(), "not finite, and sent"
         assert (np.abs(r[2] - r[0]) <= self.threshold * (1 + 2e-6)).all(), "following error"

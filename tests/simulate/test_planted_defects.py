@@ -80,7 +80,7 @@ DEFECTS: dict[str, tuple[Plant, tuple[str, ...], str]] = {
     "open mode is left before the arm settles": (leaves_at_once, ("lose@{moving}x4",), "rest"),
     "a lost record is not stated": (loses_a_record, (), "archives"),
     "a truncated archive is valid": (
-        ignores_checksums, ("power-cut@{late}x2:keep=0.6",), "folder"),
+        ignores_checksums, ("power-cut@{late}x2:keep=0.6",), "resume"),
 }  # fmt: skip
 """Defect, script with which it has an effect, and the law that finds it."""
 

@@ -12,14 +12,12 @@ from .archives import archives
 from .estimated import estimate
 from .folders import folder
 from .guarded import guard
-from .judged import judge
 from .replies import replies
 from .rest import rest
 from .resumed import resume
 
 LAWS: dict[str, Law] = {
     "replies": replies,
-    "judge": judge,
     "guard": guard,
     "rest": rest,
     "archives": archives,

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from drivers.events import MotionEnded, MotionStarted
 from hil.archive import open_archive
 from hil.errors import ArchiveError
+from tests.drivers import oracle
 from tests.simulate.observed import Life, Observed
 
 from .archived import Archived, read
 from .conversation import Talk, heard
-from .open_mode import modes_of
-from .wire import Array, Gears
+from .wire import REFUSALS, Array, Gears
 
 _EPS: Final = float(np.finfo(np.float64).eps)
 _FLUSHED: Final = 0.1  # duration of a chunk [s]
@@ -224,7 +224,7 @@ def _made_of(one: Placed, gears: Gears, constants: Array) -> Iterator[str]:
     for name in _SAME:
         if not np.array_equal(records[name], cycles[name]):
             yield f"{name} is not that of the cycle exchanged"
-    if talk.safe is not None and talk.init.slots:
+    if talk.init.slots:
         yield from _decoded(talk, rows, cycles, gears, constants)
 
 
@@ -258,9 +258,11 @@ def _decoded(
     )
     if np.any(np.abs(cycles["torque"][finite] - torque) > 16.0 * len(slots) * _EPS * (scale + 1.0)):
         yield "torque is not that of the current"
-    modes = modes_of(talk)
-    sent = cycles["commanded_position"]
-    led = (modes.all_ready & ~modes.refused)[rows]
+    settings, sent = talk.life.settings, cycles["commanded_position"]
+    wanted, answered = (side.mode[rows][:, slots] for side in (talk.received, talk.answer))
+    on = talk.received.status[rows, int(settings.get("arm", 1)) - 1] == oracle.DRIVE_ON
+    refused = (np.isin(answered, REFUSALS) & (answered != wanted)).any(axis=1)
+    led = (wanted == int(settings.get("mode", 4))).all(axis=1) & on & ~refused
     if talk.usable and not np.array_equal(np.isfinite(sent).all(axis=1) & led, led):
         yield "a set-point was sent that is not in its record"
     given = np.isfinite(sent) & led[:, np.newaxis]
@@ -272,8 +274,7 @@ def _decoded(
     )
     if np.any(given & (np.abs(motor - on_wire) > allowed)):
         yield "a recorded set-point is not the one that was sent"
-    held = np.isfinite(sent) & ~talk.safe.on[rows][:, slots] if talk.safe is not None else given
-    if held.any() or np.isfinite(sent[modes.refused[rows]]).any():
+    if np.isfinite(sent[~on | refused]).any():
         yield "a set-point is recorded where none was allowed"
 
 

@@ -16,7 +16,7 @@ from tests.drivers import oracle
 from tests.drivers.oracle import LAST, Kind, Reception, number_of
 from tests.simulate.observed import Exchanged, Life, Observed
 
-from .wire import CLOSED, PAUSES, Flags, Init, Packets, SafeAnswers, safe_answers
+from .wire import CLOSED, PAUSES, Flags, Init, Packets
 
 INIT_TIMEOUT = 300.0
 SILENCE_TIMEOUT = 1.0  # s; defaults of a session
@@ -39,7 +39,6 @@ class Talk:
     silent: Flags  # (m,) whether a silence preceded the packet
     received: Packets
     answer: Packets
-    safe: SafeAnswers | None  # None if the axis map is invalid
 
     @cached_property
     def record(self) -> NDArray[np.intp]:
@@ -220,18 +219,9 @@ class _Classifier:
         fit = [k for k, one in enumerate(rows) if len(one.replies[0]) >= oracle.length(init.n_axes)]
         received = Packets.of([rows[k].packet for k in fit], init.n_axes)
         answer = Packets.of([rows[k].replies[0] for k in fit], init.n_axes)
-        return Talk(
-            life,
-            init,
-            usable,
-            events,
-            part.at,
-            np.array([part.index[k] for k in fit], np.intp),
-            np.array([part.silent[k] for k in fit], np.bool_),
-            received,
-            answer,
-            None if init.arms is None else safe_answers(received, init.arms),
-        )
+        index = np.array([part.index[k] for k in fit], np.intp)
+        silent = np.array([part.silent[k] for k in fit], np.bool_)
+        return Talk(life, init, usable, events, part.at, index, silent, received, answer)
 
 
 def _by_session(life: Life) -> list[tuple[Event, ...]]:

@@ -1,6 +1,6 @@
-"""Vectorised decoding of packets and safe answers, independent of the product.
+"""Vectorised decoding of packets, independent of the product.
 
-Layout, codes and the safe answer are those of `tests/drivers/oracle.py`.
+Layout and codes are those of `tests/drivers/oracle.py`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,8 @@ PER_ARM: Final = 10
 REFUSALS: Final = (oracle.DRIVE_OFF_REQUEST, oracle.FOLLOWING_ERROR)
 CLOSED: Final = (0, 10, 501)
 PAUSES: Final = (500, 502)
-MODE, D1, D2, D3, D4, D5 = range(6)
-"""Columns of an axis block."""
+MODE, D1 = range(2)  # columns of an axis block
 _WORDS: Final = 9
-_ECHOED: Final = {0: (D1, D2), 501: (D1, D2), 10: (D1, D2, D3, D4, D5)}
-_RETURNED: Final = _ECHOED | dict.fromkeys(oracle.HOLDS_A_POSITION, (D1,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,44 +62,6 @@ class Packets:
 def next_number(number: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the number of the answer to each packet."""
     return np.where(number == 0x7FFF, 1, number + 1).astype(np.int32)
-
-
-@dataclass(frozen=True, eq=False)
-class SafeAnswers:
-    """Answers to packets without set-points."""
-
-    status: NDArray[np.uint8]  # (m, 4)
-    words: Words  # (m, n, 9)
-    on: Flags  # (m, n) whether the drive of each slot's arm is on
-    held: Flags  # (m, n) open slots with their drive on, whose target is returned
-
-
-def safe_answers(received: Packets, arms: Sequence[int]) -> SafeAnswers:
-    """Return the safe answers; `arms` is the arm of each slot, from 1."""
-    arm = np.array(arms, np.intp) - 1
-    arm_on = received.status == oracle.DRIVE_ON
-    on = arm_on[:, arm]
-    mode = received.mode
-    known = np.zeros(mode.shape, np.bool_)
-    keep = np.zeros((*mode.shape, _WORDS), np.bool_)
-    held = np.zeros(mode.shape, np.bool_)
-    for value in np.unique(mode).tolist():
-        here = mode == value
-        if value in oracle.TAKES_INCREMENTS:
-            known |= here
-            continue
-        known |= here & (~on | (value in _RETURNED))
-        keep[here & ~on, D1:] = True
-        if value in _RETURNED:
-            for column in _RETURNED[value]:
-                keep[:, :, column] |= here & on
-            if value in oracle.HOLDS_A_POSITION:
-                held |= here & on
-    words = np.where(keep, received.words, np.int32(0))
-    words[:, :, MODE] = np.where(known, mode, 0)
-    of_an_arm = np.isin(np.arange(N_ARMS), arm)
-    status = np.where(arm_on | ~of_an_arm, 0, received.status).astype(np.uint8)
-    return SafeAnswers(status, words, on, held)
 
 
 @dataclass(frozen=True, eq=False)
