@@ -196,7 +196,7 @@ def with_set_points(
         now, reply = change(row - first), bytearray(one.replies[0])
         origin = drives.joint_position(np.zeros(len(q)))
         q = q + drives.joint_position(np.full(len(q), now)) - origin
-        position = np.float32(drives.motor_revolutions(q))
+        position = np.asarray(drives.motor_revolutions(q), np.float32)
         for joint, slot in enumerate(slots):
             at = 16 + 36 * slot
             step = float(np.frombuffer(reply[at + 4 : at + 8], np.float32)[0]) + now - before

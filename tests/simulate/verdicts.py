@@ -8,22 +8,21 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
 
 from drivers.events import AnswersLost, Event, GapSeen, InitReceived, LinkLost, MotionEnded
+from tests.drivers import oracle
 from tests.simulate.laws import LAWS as OTHERS
-from tests.simulate.observed import Broken, Exchanged, Law, Life, Observed
+from tests.simulate.laws.conversation import heard
+from tests.simulate.observed import Broken, Law, Life, Observed
 from tests.simulate.scenes import NEIGHBOURS
 from tests.simulate.script import DISTURBS_THE_ARM, DRAWS, kind_of, parse_script
 from tests.simulate.world import Twin, UndisturbedError, play, twin_of
 
 _NUMBERS: Final = 0x7FFF  # largest packet number
-_HEADER, _AXIS, _INIT = 12, 36, 1200  # bytes
-_DRIVE_ON: Final = 5
 
 
 def gaps(seen: Observed) -> Iterator[str]:
@@ -33,26 +32,20 @@ def gaps(seen: Observed) -> Iterator[str]:
     """
     most = seen.cell.controller.max_gap
     for number, life in enumerate(seen.runs, start=1):
-        for first, second in pairwise(one for one in life.exchanged if one.record >= 0):
-            missed = (_number(second) - _number(first)) % _NUMBERS - 1
-            outcome = _outcome_of_motion(life, first, second)
-            if most < missed < _NUMBERS // 2 and outcome == "completed":
-                text = f"run {number}: {missed} packets missed before packet {_number(second)}"
+        ends = [event for _, event in life.events if isinstance(event, MotionEnded)]
+        completed = {end.interval: end.cycle for end in ends if end.outcome == "completed"}
+        rows = life.records[[one.record for one in life.exchanged if one.record >= 0]]
+        speed = rows["commanded_velocity"]
+        moves = np.append(np.nan_to_num(speed).any(axis=1), [True, True])
+        missed = np.diff(rows["number"]) % _NUMBERS - 1
+        # Set-points move before a gap and for some cycles after it.
+        amid = moves[:-3] & moves[1:-2] & moves[2:-1] & moves[3:]
+        amid &= np.isfinite(speed[1:]).all(axis=1)
+        for at in np.flatnonzero(amid & (missed > most) & (missed < _NUMBERS // 2)):
+            row = rows[at + 1]
+            if completed.get(int(row["interval"]), -1) >= row["cycle"]:
+                text = f"run {number}: {missed[at]} packets missed before packet {row['number']}"
                 yield f"{text}, {most} are allowed, and the motion completed"
-
-
-def _outcome_of_motion(life: Life, first: Exchanged, second: Exchanged) -> str | None:
-    """Return the outcome of a motion whose set-points moved before and after a gap."""
-    before, after = life.records[first.record], life.records[second.record]
-    sped = np.nan_to_num(before["commanded_velocity"]).any()
-    if not sped or not np.isfinite(after["commanded_velocity"]).all():
-        return None
-    later = life.records[second.record : second.record + 3]["commanded_velocity"]
-    if not np.nan_to_num(later).any(axis=1).all():
-        return None  # at its end
-    ends = (event for _, event in life.events if isinstance(event, MotionEnded))
-    same = (end for end in ends if end.interval == int(after["interval"]))
-    return next((end.outcome for end in same if end.cycle >= int(after["cycle"])), None)
 
 
 def piles(seen: Observed) -> Iterator[str]:
@@ -60,35 +53,16 @@ def piles(seen: Observed) -> Iterator[str]:
 
     Answers to the others would run the motion ahead of the arm (ARCHITECTURE.md).
     """
-    mode = seen.cell.controller.mode
-    end = _HEADER + _AXIS * (len(seen.cell.joint_names) + seen.controller.foreign_axes)
     for number, life in enumerate(seen.runs, start=1):
-        answered = [one for one in life.exchanged if one.replies and one.record >= 0]
-        for first, second in pairwise(answered):
-            together = first.cycle == second.cycle and first.packet[:4] != second.packet[:4]
-            opens = len(second.packet) < _INIT and _opens(second.packet[:end], mode)
-            if together and opens and _kind(first, end) == _kind(second, end):
-                text = f"run {number}: packets {_number(first)} and {_number(second)}"
+        for talk in heard(seen)[number - 1].talks:
+            received, cycle = talk.received, np.array([life.exchanged[k].cycle for k in talk.index])
+            together = (np.diff(cycle) == 0) & (np.diff(received.number) != 0)
+            kind = np.concatenate((received.status, received.mode), axis=1)
+            on = (received.status == oracle.DRIVE_ON).any(axis=1)
+            opens = on & (received.mode == seen.cell.controller.mode).any(axis=1)
+            for at in np.flatnonzero(together & (kind[1:] == kind[:-1]).all(axis=1) & opens[1:]):
+                text = f"run {number}: packets {received.number[at]} and {received.number[at + 1]}"
                 yield f"{text} waited together; both were answered in open mode"
-
-
-def _number(one: Exchanged) -> int:
-    return int.from_bytes(one.packet[:4], "little")
-
-
-def _kind(one: Exchanged, end: int) -> tuple[int, bytes, bytes]:
-    """Return length, status and modes, without the bytes after the axes, from `end` on."""
-    return len(one.packet), one.packet[4:8], one.packet[_HEADER:end:_AXIS]
-
-
-def _opens(packet: bytes, mode: int) -> bool:
-    """Whether a cyclic packet has an axis in open mode, with a drive on."""
-    if _DRIVE_ON not in packet[4:8]:
-        return False
-    return any(
-        int.from_bytes(packet[at : at + 4], "little") == mode
-        for at in range(_HEADER, len(packet) - _AXIS + 1, _AXIS)
-    )
 
 
 _NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
