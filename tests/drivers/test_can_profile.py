@@ -18,7 +18,6 @@ from drivers.transports.can.profile import (
     CLASSIC_MODE_CODES,
     FD_MODE_CODES,
     LOAD_LIMIT,
-    LONGEST,
     NEVER,
     BusRates,
     CanBusLoadError,
@@ -480,30 +479,6 @@ class TestSegments:
         assert [joined.add(payload, 0.0) for payload in payloads] == [None] * len(payloads)
         joined.add(b"\x00\x01next", 10.0)
         assert discarded["corrupt"] + discarded["torn"] + discarded["malformed"] >= 1
-
-    @pytest.mark.parametrize("size", [8, 64])
-    @pytest.mark.parametrize("length", [1, 12, 62, 63, 732, 1200, LONGEST])
-    def test_packets_of_every_length_are_assembled(self, size, length):
-        packet = np.random.default_rng(length).bytes(length)
-        joined = SegmentAssembler(size, Counter())
-        *early, last = [joined.add(part, 0.0) for part in segments(packet, size, 7)]
-        assert early == [None] * len(early)
-        assert last == packet
-
-    @pytest.mark.parametrize("length", [0, LONGEST + 1])
-    def test_invalid_packet_length_is_refused(self, length):
-        with pytest.raises(ValueError, match=f"not {length}"):
-            segments(bytes(length), 64, 0)
-
-    @pytest.mark.parametrize("size", [8, 64])
-    def test_lost_segment_loses_the_packet(self, size):
-        discarded = Counter()
-        joined = SegmentAssembler(size, discarded)
-        truncated, complete = segments(bytes(732), size, 0), segments(b"whole" * 20, size, 1)
-        del truncated[3]
-        out = [joined.add(part, 0.0) for part in (*truncated, *complete)]
-        assert [packet for packet in out if packet is not None] == [b"whole" * 20]
-        assert discarded == {"torn": 1}
 
     def test_repeated_transfer_is_delivered_once(self):
         joined = SegmentAssembler(8, Counter())

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
 import pytest
 
 from drivers import TransportClosed
@@ -44,30 +45,19 @@ class TransportContract:
         assert [near.receive(PATIENCE)[0] for _ in range(5)] == [0, 1, 2, 3, 4]
 
     def test_no_packet_is_none_after_the_timeout(self, link):
-        near, _ = link
+        near, far = link
         before = near.now
         assert near.receive(0.05) is None
         assert near.now - before >= 0.05 * (1.0 - 1e-9)
-
-    def test_zero_timeout_does_not_wait(self, link):
-        near, _ = link
-        took = []
+        times = []
         for _ in range(5):
-            before = near.now
-            assert near.receive(0.0) is None
-            took.append(near.now - before)
-        assert min(took) < 0.01
-
-    def test_time_is_monotonic(self, link):
-        near, far = link
-        times = [near.now]
-        for _ in range(3):
             far.send(bytes(48))
             near.receive(PATIENCE)
             times.append(near.now)
-            near.receive(0.001)
+            assert near.receive(0.0) is None
             times.append(near.now)
         assert times == sorted(times)
+        assert min(np.diff(times)[::2]) < 0.01, "no wait"
 
     def test_forgotten_peer_is_received_again(self, link):
         near, far = link

@@ -101,16 +101,6 @@ def test_inverse_dynamics_of_a_step_give_the_applied_torque() -> None:
     assert smooth_steps > 50
 
 
-def test_rotors_count_as_armature() -> None:
-    plants = rigid_plant(FRICTIONLESS), rigid_plant(PlantTruth.frictionless(np.zeros(6)))
-    difference = full_inertia(plants[0]) - full_inertia(plants[1])
-    np.testing.assert_allclose(difference, np.diag(TRUTH.rotor_inertia), atol=1e-12)
-    for plant in plants:
-        plant.step(gravity_torque(plant) + 10.0, 1e-6)
-        expected = np.linalg.solve(full_inertia(plant), np.full(6, 10.0))
-        np.testing.assert_allclose(plant.acceleration, expected, rtol=1e-4)
-
-
 class TestStandstill:
     def test_stiction_holds_a_resting_arm(self) -> None:
         plant = rigid_plant()
@@ -119,16 +109,6 @@ class TestStandstill:
         np.testing.assert_array_equal(plant.position, START)
         np.testing.assert_array_equal(plant.velocity, 0.0)
         np.testing.assert_allclose(plant.friction_torque, push, rtol=1e-9)
-
-    @pytest.mark.parametrize("joint", range(6))
-    @pytest.mark.parametrize(("factor", "moves"), [(0.999, False), (1.02, True)])
-    def test_an_axis_breaks_loose_just_above_its_coulomb_torque(
-        self, joint: int, factor: float, moves: bool
-    ) -> None:
-        plant = rigid_plant()
-        torque = gravity_torque(plant)
-        torque[joint] += factor * TRUTH.coulomb[joint]
-        assert bool(steps(plant, 10, torque).velocity[joint] > 0.0) is moves
 
     def test_a_pushed_arm_comes_to_rest_and_stays_there(self) -> None:
         plant = rigid_plant()
