@@ -59,7 +59,7 @@ LONG: Final = (
     "hil/test_testing_plugin.py",
     "hil/test_viewers.py",
     "identification/test_instrumental.py",
-    "identification/test_inner_prediction.py",
+    "identification/test_selection.py",
     "identification/test_payload.py",
     "identification/test_search.py",
     "identification/test_verdict.py",

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from identification.errors import ShapeError
-from identification.excitation.collision.bodies import Box, Workspace, link_bodies
-from identification.excitation.collision.checker import CollisionChecker
+from identification import ShapeError
+from identification.excitation import Box, CollisionChecker, Workspace
+from identification.excitation.collision.bodies import link_bodies
 from planner import FourierSeries, JointLimits, PiecewiseCubic, plan
 from sim_fixtures.ns16 import urdf_text
 from tests.hil.simulated_logs import urdf_path

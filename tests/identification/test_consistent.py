@@ -4,25 +4,19 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import approx_fprime
 
-from identification import Factor, FrictionLaw, RobotModel
-from identification.estimators.consistent import (
-    Cone,
-    Shrinkage,
-    Smooth,
+from identification import (
+    Coupling,
+    Factor,
+    FrictionLaw,
+    RobotModel,
     consistent_estimate,
-    fit_shrunk,
-    follow_path,
-    polish,
-    shrunk_values,
+    fit_least_squares,
+    write_urdf,
 )
-from identification.estimators.least_squares import fit_least_squares
-from identification.export.urdf import NotConsistentError, write_urdf
+from identification.estimators.consistent import Shrinkage, fit_shrunk, shrunk_values
+from identification.export.urdf import NotConsistentError
 from identification.factor.factor import joint_weights, rows_of, total_factor
-from identification.model.coupling import Coupling
 from identification.model.pseudo_inertia import pseudo_inertia
 from tests.identification import two_link
 from tests.identification.two_link import (
@@ -245,60 +239,6 @@ class TestDrives:
         friction = [(terms | {"f1": 0.9, "fs": 0.7})[symbol] for symbol in symbols]
         found = simulated(values_of(model, friction), 0.0, 1, model=model)
         np.testing.assert_allclose(found.friction, friction, rtol=0.02)
-
-
-def a_problem(seed):
-    """Two links, three further variables of which two are not negative; few data."""
-    rng = np.random.default_rng(seed)
-    rows, columns = np.triu_indices(4)
-    entries = np.zeros((10, 4, 4))
-    entries[np.arange(10), rows, columns] = entries[np.arange(10), columns, rows] = 1.0
-    return Smooth(
-        R=rng.normal(size=(12, 23)),
-        z=rng.normal(scale=5.0, size=12),
-        weight=10.0 ** rng.uniform(-1, 1),
-        cones=(Cone(np.arange(20).reshape(2, 10), entries),),
-        centre=np.zeros(3),
-        not_negative=np.array([20, 21]),
-    )
-
-
-def start(scale=1.0):
-    unit = np.eye(4)[np.triu_indices(4)]
-    return scale * np.concatenate([unit, unit, np.ones(3)])
-
-
-class TestNewton:
-    @given(st.integers(0, 2**16))
-    @settings(max_examples=20)
-    def test_gradient_and_hessian_are_the_derivatives(self, seed):
-        problem = a_problem(seed)
-        u = start() + 0.05 * np.random.default_rng(seed).normal(size=23)
-        gradient, hessian = problem.derivatives(u)
-        scale = np.abs(hessian).max()
-        np.testing.assert_allclose(
-            gradient, approx_fprime(u, problem.value, 1e-7), atol=1e-4 * np.abs(gradient).max()
-        )
-        numeric = approx_fprime(u, lambda x: problem.derivatives(x)[0], 1e-7)
-        np.testing.assert_allclose(hessian, numeric, atol=1e-4 * scale)
-
-    @given(st.integers(0, 2**16))
-    @settings(max_examples=20)
-    def test_all_starts_reach_the_same_minimum(self, seed):
-        problem = a_problem(seed)
-        found = [
-            polish(problem, start()),
-            polish(problem, start(3.0)),
-            follow_path(problem, start(), lambda _: problem.weight),
-        ]
-        assert all(one.converged for one in found)
-        for one in found[1:]:
-            np.testing.assert_allclose(one.u, found[0].u, atol=1e-6)
-        u = found[0].u
-        assert np.all(u[[20, 21]] >= 0.0)
-
-    def test_a_start_outside_has_not_converged(self):
-        assert not polish(a_problem(0), start(-1.0)).converged
 
 
 @pytest.fixture(scope="module")

@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from identification.errors import IdentificationError
-from identification.estimators.covariance import (
-    cluster_covariance,
-    leverage_corrected,
-    spread,
-)
+from identification.estimators.covariance import cluster_covariance, spread
 from identification.estimators.least_squares import estimate_repetitions
 from identification.estimators.losses import Huber, Loss, Tukey
 from identification.estimators.prior import GaussianPrior, fit_with_prior, nominal_prior, with_prior
@@ -124,25 +120,6 @@ class TestBlocks:
         assert 0.90 <= covered.mean() <= 0.99
         assert covered[elbow].min() > 0.85
         assert np.all(np.median(np.array(alone) / classical, axis=0)[elbow] > 1.0)
-
-    def test_a_direction_of_one_block_uses_other_blocks(self):
-        rng = np.random.default_rng(0)
-        blocks, k = 30, 3
-        shares = np.zeros((blocks, k, k))
-        shares[:, 0, 0] = shares[:, 1, 1] = 1.0 / blocks
-        shares[4, 2, 2] = 1.0
-        effect = 7.0
-        scores = np.sqrt(effect / blocks) * rng.standard_normal((blocks, k))
-        scores[:, 2] = 0.0  # exactly fitted
-        rows = leverage_corrected(shares, scores)
-        covariance = rows.T @ rows
-        usual = leverage_corrected(shares[:, :2, :2], scores[:, :2])
-        assert len(usual) == blocks
-        np.testing.assert_allclose(covariance[:2, :2], usual.T @ usual)
-        assert covariance[2, 2] == pytest.approx(np.diag(usual.T @ usual).mean(), rel=0.1)
-        # At least the variance of white noise.
-        quiet = leverage_corrected(shares, 1e-3 * scores)
-        assert (quiet.T @ quiet)[2, 2] == pytest.approx(1.0)
 
     @pytest.mark.parametrize("shared", [0.0, 0.09])
     def test_correlation_of_neighbouring_blocks_counts(self, shared):
@@ -400,15 +377,6 @@ class TestPosterior:
         assert np.isfinite(found.estimate.std).all()
         # No parameter is less certain than before.
         assert (found.ratio <= 1.0 + 1e-9).all()
-
-    def test_unknown_parameters_stay_at_the_prior_mean(self):
-        prior = nominal_prior(MODEL, known=ROTORS)
-        found = with_prior(MODEL, Factor.of(MODEL, noisy(held_elbow=True)), prior)
-        assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
-        assert np.isinf(found.estimate.std[-3])
-        unknown = np.array([name in found.estimate.undetermined for name in found.estimate.names])
-        np.testing.assert_array_equal(found.ratio[unknown], 1.0)
-        np.testing.assert_array_equal(found.estimate.values[unknown], 0.0)
 
     @pytest.mark.parametrize("correlation", [0.0, 0.05])
     def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):

@@ -422,21 +422,6 @@ class TestViolations:
         assert f"at {violation.time:.3f} s" in text
         assert "joints at (-0." in text
 
-    @pytest.mark.parametrize(
-        ("shortest", "longest", "side"), [(5.0, 9.0, "least"), (0.0, 1.0, "most")]
-    )
-    def test_a_motion_too_short_or_too_long_is_named(self, swing, shortest, longest, side):
-        constraints = Constraints(ROD_LIMITS, min_duration=shortest, max_duration=longest)
-        (violation,) = constraints.violations(swing, sampled(swing))
-        bound = shortest or longest
-        assert (violation.kind, violation.value, violation.bound) == (
-            "duration",
-            swing.duration,
-            bound,
-        )
-        assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
-        assert f"at {side} {bound:g} s" in str(violation)
-
 
 ARM_LIMITS = JointLimits([-2.5] * 2, [2.5] * 2, [3.0] * 2, [10.0] * 2, [100.0] * 2)
 MODEL = RobotModel.from_urdf(URDF)
@@ -482,16 +467,6 @@ class TestSamples:
         for motion in (ends, middles):
             for series, expected in zip(motion[1:4], trajectory.sample(motion.time), strict=True):
                 np.testing.assert_array_equal(series, expected)
-
-    @pytest.mark.parametrize(
-        ("length", "period", "steps"),
-        [(16.0, 0.001, 16000), (16.0, 0.008, 2000), (8.008, 0.008, 1001)],
-    )
-    def test_whole_periods_get_no_further_sample(self, length, period, steps):
-        """The paper's N is 2000; 8.008 s over 8 ms is more than 1001 by rounding."""
-        swing = FourierSeries(np.zeros(2), np.ones((2, 1)), np.ones((2, 1)), length)
-        assert sampled(swing, period).n_samples == steps + 1
-        assert midpoints(swing, period).n_samples == steps
 
 
 HAND = np.array([[2.0, 1.0], [1.0, 3.0]])  # det = 5, inverse [[3, -1], [-1, 2]] / 5
@@ -682,16 +657,6 @@ class TestScale:
             assert better - worse == pytest.approx(1.0)
         worst = scale.fitness([[-np.inf, np.inf], [-1e4, 1653.0]], HALF)
         assert worst[0] == -np.inf < worst[1]
-
-    def test_it_uses_feasible_motions_if_there_are_enough(self, random_motions):
-        size, coupled = random_motions
-        expected = Scale.of(scores_of(size, coupled))
-        broken = np.arange(300) < 100
-        far = np.append(np.full(100, -500.0), size), np.append(np.full(100, 1000.0), coupled)
-        assert Scale.of(scores_of(*far, excess=broken)) == expected
-        assert Scale.of(scores_of(size, coupled, excess=np.arange(200) < 195)) == expected
-        holes = np.append(size, -np.inf), np.append(coupled, np.inf)
-        assert Scale.of(scores_of(*holes)) == expected
 
     @pytest.mark.parametrize("count", [0, 1, 5])
     def test_it_needs_different_motions(self, count):

@@ -16,8 +16,9 @@ import pytest
 
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
-from identification.excitation import CollisionChecker, CollisionModelError, Workspace
-from identification.export.friction import friction_curve, friction_torque
+from identification.excitation.collision.bodies import Workspace
+from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.errors import CollisionModelError
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import (
     AGREES,
@@ -42,7 +43,7 @@ from identification.signals.noise import noiseless_above
 from identification.signals.smoothing import LowPassShape, low_passed
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
-from tests.identification.two_link import URDF, as_samples, one_sine, values_of
+from tests.identification.two_link import URDF
 from tests.identification.two_link import URDF as TWO_LINK
 
 INERTIAL = (
@@ -654,45 +655,6 @@ class TestTexts:
         where = {"mjcf": "frictionloss", "urdf": "friction"}[form]
         found = [float(one.get(where, 0)) for one in root.iter() if where in one.attrib]
         assert found == f0
-
-
-F0, F1, FO = np.array([4.0, 2.0]), np.array([1.5, 0.8]), np.array([0.5, -0.25])
-
-
-def model_with(**law):
-    return RobotModel.from_urdf(URDF, friction=FrictionLaw(third=None, offset=True, **law))
-
-
-def planted(model):
-    return values_of(model, np.concatenate([F0, F1, FO]), (0.4, 0.1))
-
-
-def samples_of(model, bandwidth=None):
-    motion = one_sine(np.arange(3000) * 2e-3, phase=(0.0, 0.0))
-    samples = as_samples(
-        model,
-        motion,
-        np.zeros((3000, 2)),
-        usable=np.ones((3000, 2), dtype=np.bool_),
-        position_bandwidth=np.full(2, 10.0),
-        torque_bandwidth=None if bandwidth is None else np.full(2, bandwidth),
-    ).with_friction_direction(model)
-    return replace(samples, torque=samples.predicted_torque(model, planted(model)))
-
-
-class TestFrictionCurve:
-    """Friction of a joint over speed."""
-
-    def test_agrees_with_the_data(self):
-        """Torque minus the other parts is on the curve for a perfect model."""
-        model = model_with()
-        values, samples = planted(model), samples_of(model)
-        speed = samples.motion.velocity[:, 0]
-        curve = friction_curve(model, values, 0, float(speed.min()), float(speed.max()))
-        on_it = np.interp(speed, curve.speed, curve.torque)
-        sliding = np.abs(speed) > 1e-3
-        data = friction_torque(model, values, samples)[:, 0]
-        np.testing.assert_allclose(data[sliding], on_it[sliding], atol=1e-6)
 
 
 class TestNoise:

@@ -3,17 +3,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from identification.estimators.instrumental import (
+from identification import (
+    FrictionLaw,
+    Motion,
+    RobotModel,
+    estimate,
     estimate_instrumental,
-    partial_r2,
+    instrument_factor,
     planned_motion,
-    same_plan,
 )
-from identification.factor.columns import instrument_factor, measured_part
-from identification.factor.factor import estimate
-from identification.model.friction import FrictionLaw
-from identification.model.motion import Motion
-from identification.model.robot import RobotModel
+from identification.estimators.instrumental import partial_r2, same_plan
+from identification.factor.columns import measured_part
 from identification.signals.smoothing import fit_smoothing_spline
 from tests.identification import two_link
 from tests.identification.two_link import URDF, as_samples, four_sines, truth

@@ -1,6 +1,8 @@
-"""The model: torque, base parameters, friction, coupled motors, springs, locked joints."""
+"""The model: torque, regressor, base parameters, friction, couplings, springs, locked joints."""
 
+import gc
 import math
+import weakref
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
 from identification.export.urdf import write_urdf
-from identification.factor.factor import Factor, estimate
+from identification.factor.factor import Factor, estimate, joined
 from identification.model.base_parameters import TOLERANCE
 from identification.model.coupling import Coupling
 from identification.model.elements import (
@@ -38,11 +40,13 @@ from identification.model.pseudo_inertia import (
     pseudo_inertia,
     reference_bodies,
 )
+from identification.model.regressor import CHUNK
 from identification.model.robot import RobotModel, StandardLayout
+from identification.selection.essential import eliminate
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 from tests.identification import two_link
 from tests.identification.robots import NS16_TURNS, one_joint, random_urdf, robot_text, some_bodies
-from tests.identification.two_link import MODEL, a_motion, truth
+from tests.identification.two_link import MODEL, a_motion, coloured, recording, truth
 from tests.identification.two_link import URDF as TWO_LINK
 
 TILTED = (2.0, -3.0, -9.0)
@@ -162,26 +166,6 @@ LAYOUT = StandardLayout((True, False, True, False), rotor_inertia=True, pairs=PA
 
 
 class TestStandardLayout:
-    def test_parameters_have_indices_and_units(self):
-        """Joint by joint, couplings last; rotors of prismatic joints have mass."""
-        assert LAYOUT.size == len(LAYOUT.names) == len(LAYOUT.units) == 46
-        assert LAYOUT.names[22:33] == (
-            "I3xx", "I3xy", "I3xz", "I3yy", "I3yz", "I3zz", "mc3x", "mc3y", "mc3z", "m3", "I3m",
-        )  # fmt: skip
-        assert LAYOUT.names[44:] == ("I12", "I24")
-        assert LAYOUT.links[2].tolist() == list(range(22, 32))
-        assert LAYOUT.rotors.tolist() == [10, 21, 32, 43]
-        assert LAYOUT.couplings.tolist() == [44, 45]
-        assert [LAYOUT.units[k] for k in LAYOUT.rotors] == ["kg m²", "kg", "kg m²", "kg"]
-        # torque of a revolute joint per acceleration of a prismatic one; force per acceleration
-        assert [LAYOUT.units[k] for k in LAYOUT.couplings] == ["kg m", "kg"]
-        assert LAYOUT.split([0, 9, 10, 25, 45]) == (
-            [[0, 9], [], [3], []], [True, False, False, False], [1],
-        )  # fmt: skip
-        many = StandardLayout((True,) * 12, rotor_inertia=True, pairs=((0, 11), (10, 11)))
-        assert many.names[-2:] == ("I1_12", "I11_12")
-        assert len(set(many.names)) == many.size
-
     def test_the_rotors_make_a_symmetric_matrix(self):
         matrix = LAYOUT.rotor_matrix(np.arange(46.0))
         assert np.array_equal(matrix, matrix.T)
@@ -788,3 +772,99 @@ class TestIdentifiedElements:
         found = consistent_estimate(model, factor, free)
         assert len(found.friction) == len(model.friction.terms)
         assert np.all(np.abs(found.estimate.values - values)[own] <= 4.5 * free.std[own])
+
+
+def some_states(m, seed=3):
+    q, qd, qdd = np.random.default_rng(seed).uniform(-3.0, 3.0, (3, m, 6))
+    return q, qd, qdd
+
+
+class TestRegressor:
+    def test_blocks_have_only_columns_that_act_on_the_joint(self, ns16):
+        regressor = ns16.regressor(*some_states(50))
+        both = zip(regressor.blocks, regressor.columns, strict=True)
+        for number, (block, columns) in enumerate(both, start=1):
+            names = [ns16.parameter_names[c] for c in columns]
+            assert block.shape == (50, len(names))
+            assert len(set(names)) == len(names)
+            link = [int("".join(filter(str.isdigit, n.split("_")[-1]))) for n in names]
+            assert min(link) >= number, "a link that the joint does not move"
+            alone = [n for n in names if "_" in n or (n.endswith("m") and n[0] == "I")]
+            assert all(str(number) in n for n in alone)
+        # the last joint: link, rotor, friction
+        assert len(regressor.columns[5]) == 8 + 3
+
+    @pytest.mark.parametrize("m", [0, 1, 2, 63, 65, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 77])
+    def test_samples_are_independent(self, ns16, m):
+        q, qd, qdd = some_states(m)
+        whole = ns16.regressor(q, qd, qdd)
+        assert [len(block) for block in whole.blocks] == [m] * 6
+        for t in {0, m // 2, m - 1} if m else ():
+            alone = ns16.regressor(q[t : t + 1], qd[t : t + 1], qdd[t : t + 1])
+            for long, short in zip(whole.blocks, alone.blocks, strict=True):
+                assert np.allclose(long[t], short[0], rtol=1e-13, atol=1e-13)
+
+    def test_threads_do_not_share_working_arrays(self, ns16):
+        first, second = some_states(300, seed=1), some_states(300, seed=2)
+        alone = [np.concatenate([b.copy() for b in rows]) for _, rows in ns16.plan.chunks(*first)]
+        together = []
+        for (_, rows), _ in zip(ns16.plan.chunks(*first), ns16.plan.chunks(*second), strict=True):
+            together.append(np.concatenate([b.copy() for b in rows]))
+        assert np.array_equal(np.hstack(alone), np.hstack(together))
+
+    @pytest.mark.parametrize("angle", [0.0, np.pi / 2, np.pi, -np.pi, 1e4])
+    def test_it_is_continuous_at_all_angles(self, ns16, angle):
+        # tan(q / 2), from which the rotation is computed, has a pole at pi
+        q, qd, qdd = some_states(3)
+        q[:] = angle
+        nearby = ns16.regressor(q + 1e-9, qd, qdd)
+        for at, near in zip(ns16.regressor(q, qd, qdd).blocks, nearby.blocks, strict=True):
+            assert np.all(np.isfinite(at))
+            assert np.allclose(at, near, atol=1e-6)
+
+    def test_working_arrays_are_freed_with_the_model(self):
+        """Without the cycle collector, which may run minutes later."""
+        model = RobotModel.from_urdf(urdf_text())
+        model.regressor(*some_states(CHUNK))
+        plan = weakref.ref(model.plan)
+        gc.disable()
+        try:
+            del model
+            assert plan() is None
+        finally:
+            gc.enable()
+
+
+@pytest.fixture(scope="module")
+def samples():
+    motion = a_motion(5.0)
+    return recording(coloured(np.random.default_rng(7), 1000, 5e-3, 0.02), motion)
+
+
+class TestBlocksOfTime:
+    def test_blocks_can_be_selected_joined_and_merged(self, samples):
+        phase = Factor.by_time(MODEL, samples)
+        half = len(phase) // 2
+        again = joined([phase.blocks(slice(0, half)), phase.blocks(slice(half, None))])
+        weights = np.array([0.5, 2.0])
+        np.testing.assert_array_equal(again.by_block(weights), phase.by_block(weights))
+        dense = np.tensordot(weights, phase.gram, axes=1)
+        for length in (1, 3, len(phase)):
+            merged = phase.merged(length)
+            assert len(merged) == -(-len(phase) // length)
+            np.testing.assert_allclose(merged.by_block(weights).sum(axis=0), dense, rtol=1e-12)
+        order = np.array([5, 0, 3])
+        place = np.append(order, MODEL.n_parameters)
+        some = phase.restricted(order)
+        assert some.parameter_names == tuple(MODEL.parameter_names[k] for k in order)
+        np.testing.assert_allclose(
+            some.by_block(weights), phase.by_block(weights)[:, place[:, None], place], rtol=1e-12
+        )
+
+    def test_blocks_without_rows_change_nothing(self, samples):
+        late = replace(samples, origin=samples.origin - 3.0)
+        phase, same = (Factor.by_time(MODEL, one) for one in (late, samples))
+        assert len(phase) == len(same) + 24
+        assert len(phase.occupied()) == len(same)
+        training = eliminate(MODEL, phase, same).estimate
+        assert training.names == eliminate(MODEL, same, same).estimate.names

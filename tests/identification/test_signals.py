@@ -442,16 +442,6 @@ class TestSamples:
 
         assert misfit(Preprocessing(torque_bandwidth=4.0)) < 0.05 * misfit(Preprocessing())
 
-    def test_smooth_torque_filters_the_regressor_equally(self):
-        recording = smooth_recording(noise=0.5)
-        known = {"noise_variance": QUANTISATION, "torque_variance": np.full(2, 0.25)}
-        samples = prepare(recording, MODEL, **known, options=Preprocessing(smooth_torque=True))
-        removed = recording.torque - samples.torque
-        np.testing.assert_allclose(np.mean(removed**2, axis=0), 0.25, rtol=0.1)
-        # The residual contains the noise that the smoother passes.
-        error = (samples.torque - samples.predicted_torque(MODEL, TRUTH))[samples.usable]
-        assert np.sqrt(np.mean(error**2)) < 0.2
-
     def test_invalid_recordings_and_bandwidths_raise(self):
         valid = smooth_recording()
         with pytest.raises(RecordingError, match="no joint torque"):

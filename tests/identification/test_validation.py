@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.signal import lfilter
 
-from identification.errors import IdentificationError
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import estimate_repetitions
 from identification.factor.factor import Estimate, Factor, estimate, joint_weights, solve
@@ -23,7 +22,6 @@ from identification.signals.recording import Recording
 from identification.signals.samples import Samples
 from identification.validation.calibration import TorqueMeans, calibrate, inner_errors
 from identification.validation.evidence import repetition_noise
-from identification.validation.finding import Thresholds
 from identification.validation.plausibility import (
     Implausible,
     check_consistency,
@@ -42,9 +40,6 @@ from identification.validation.prediction import (
 from identification.validation.residuals import (
     FEWEST_BLOCKS,
     HARMONICS,
-    BlockMean,
-    FrictionDrift,
-    Ripple,
     autocorrelation,
     block_mean,
     check_residuals,
@@ -52,8 +47,7 @@ from identification.validation.residuals import (
 )
 from tests.hil.identified_arm import a_motion as sines
 from tests.hil.identified_arm import packaged_urdf
-from tests.identification.test_essential import NOISE as PLANTED_NOISE
-from tests.identification.test_essential import a_motion as three_sines
+from tests.identification.test_selection import ARM_NOISE, three_sines
 from tests.identification.test_verdict import an_error, finding_of, judged
 from tests.identification.two_link import (
     MODEL,
@@ -242,11 +236,6 @@ class TestInnerFolds:
         left = samples.torque[:800] - samples.predicted_torque(MODEL, rest)[:800]
         np.testing.assert_allclose(errors[:8], left.reshape(8, 100, 2).mean(axis=1), atol=1e-8)
 
-    def test_two_seconds_are_too_short(self):
-        samples = recording(np.zeros((LENGTH, 2)), MOTION)
-        with pytest.raises(IdentificationError, match="too short"):
-            calibrated(samples.between(0, 400), samples.between(CUT, LENGTH))
-
 
 class TestTorqueMeans:
     def test_edges_are_excluded_and_rest_included(self):
@@ -266,7 +255,7 @@ STEP = 4e-3
 VALUES = values_of(MODEL, [4.0, 2.0, 1.5, 0.8])
 GEAR = np.diag([100.0, -80.0])
 RESIDUAL_NOISE = 0.5
-MEMORY = 0.05  # s, of the unit_noise noise
+MEMORY = 0.05  # s, of the noise
 
 
 def unit_noise(rng, shape, memory=MEMORY):
@@ -424,66 +413,6 @@ class TestResidualChecks:
         np.testing.assert_array_equal(found.share, 0.0)
 
 
-NAMES = ("shoulder", "elbow")
-LIMIT = Thresholds()
-
-
-def ripple(size):
-    mean = np.zeros((2, len(HARMONICS), 2))
-    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
-    std = np.full_like(mean, 1e-6)
-    return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
-
-
-def drift(*change):
-    """Return a drift over ten parts with small scatter."""
-    total = np.array(change)
-    return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
-
-
-@pytest.fixture(scope="module")
-def valid():
-    return replace(patterns_of(), ripple=None, drift=None, rms=np.full(2, 0.01))
-
-
-class TestPatterns:
-    """Findings of a verdict on patterns."""
-
-    def found(self, valid, check, **changes):
-        return finding_of(check, NAMES, residuals=replace(valid, **changes))
-
-    def test_untested_patterns_have_no_finding(self, valid):
-        checks = {one.check for one in judged(NAMES, residuals=valid).findings}
-        assert "whiteness" in checks and not {"torque ripple", "friction over time"} & checks
-
-    @pytest.mark.parametrize(
-        ("share", "level"),
-        [(0.0, "good"), (0.9 * LIMIT.ripple, "information"), (1.1 * LIMIT.ripple, "doubtful")],
-    )
-    def test_large_ripple_is_doubtful(self, valid, share, level):
-        found = self.found(valid, "torque ripple", ripple=ripple(share * valid.torque_rms[1]))
-        assert found.level == level and "shoulder" not in found.words
-        expected = f"elbow (4 per motor turn, {share:.1%} of its torque)"
-        assert (expected in found.words) == (level != "good")
-
-    @pytest.mark.parametrize(
-        ("change", "share", "level", "words"),
-        [
-            ((1e-5, -1e-5), 1.0, "good", "did not change"),
-            ((0.02, 0.0), 1.0, "information", "shoulder by +2.0%, at most 2.0% of an axis"),
-            ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
-            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: elbow by -20.0%"),
-        ],
-    )
-    def test_drift_is_judged_by_its_torque(self, valid, change, share, level, words):
-        friction = np.array([share, 1.0])
-        found = self.found(
-            valid, "friction over time", drift=drift(*change), friction_share=friction
-        )
-        assert found.level == level and words in found.words
-        assert (found.role == "cause") == (level == "doubtful")
-
-
 def parameters(model=MODEL, **changes):
     """Parameters of the URDF with rotors and friction, and with changes by name."""
     standard = dict(zip(model.layout.names, model.nominal, strict=True))
@@ -560,9 +489,7 @@ class TestSigns:
 
 
 def runs(**changes):
-    return [
-        simulated(MODEL, parameters(**changes), three_sines(k), PLANTED_NOISE, k) for k in (1, 2)
-    ]
+    return [simulated(MODEL, parameters(**changes), three_sines(k), ARM_NOISE, k) for k in (1, 2)]
 
 
 def consistency_of(recordings):

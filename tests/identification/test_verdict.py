@@ -15,9 +15,10 @@ from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.validation.causes import Cause, Fault, Kind, find_causes
 from identification.validation.evidence import CellContext, Evidence, gather
+from identification.validation.finding import Thresholds
 from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
-from identification.validation.verdict import Thresholds, judge
+from identification.validation.verdict import judge
 from sim_fixtures.ns16 import load_truth, urdf_text
 from tests.identification.robots import ns16_values
 from tests.identification.two_link import as_samples, sine_motion

@@ -563,9 +563,6 @@ def test_no_corner_is_planned_with_an_unknown_solver(monkeypatch, version):
             flown(points, SIX_AXES)
 
 
-coordinates = st.floats(-3.0, 3.0)
-
-
 class TestPassing:
     """Where a motion is nearest to a point."""
 
@@ -577,24 +574,6 @@ class TestPassing:
         passed = passing(line, np.array([1.37, 0.5]))
         assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
         assert passed.distance == pytest.approx(0.5, abs=1e-12)
-
-    @given(
-        arrays(np.float64, (2, 3), elements=coordinates),
-        arrays(np.float64, (2, 4), elements=coordinates),
-        arrays(np.float64, 2, elements=coordinates),
-    )
-    def test_no_sample_is_nearer(self, start, jerks, point):
-        knots = np.tile(np.linspace(0.0, 1.0, 5), (1, 2, 1))
-        (motion,) = Block.from_jerks(start[None], knots, jerks[None]).tables()
-        passed = passing(motion, point)
-        q = motion.sample(np.linspace(0.0, 1.0, 2001))[0]
-        sampled = np.linalg.norm(q - point, axis=1).min()
-        # Two dips of like depth between the looks at a path may be mistaken for one another.
-        between = 0.5 / 64 * np.linalg.norm(motion.extrema().velocity)
-        assert sampled - 0.0005 * between * 64 <= passed.distance <= sampled + between
-        # The path has this distance at this time.
-        reached = motion.sample_one(passed.time)[0]
-        assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
 
 
 fractions = st.one_of(st.sampled_from([0.0, 0.2, 1.0]), st.floats(0.0, 1.0))

@@ -1,0 +1,386 @@
+"""Essential parameters, and settings chosen by predicting parts of the fitted data."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import butter, sosfilt, sosfiltfilt
+
+from identification.errors import IdentificationError
+from identification.estimators.torque_channel import possible_low_passes
+from identification.factor.factor import Factor, estimate
+from identification.model.elements import TorqueRipple
+from identification.model.friction import FrictionLaw
+from identification.model.motion import Motion
+from identification.model.robot import RobotModel
+from identification.selection.essential import CutRule, choose_essential, eliminate
+from identification.selection.inner_prediction import (
+    DELAY,
+    LOW_PASS,
+    Question,
+    Settings,
+    choose_settings,
+)
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
+from identification.signals.smoothing import FORWARDS, WITHOUT_PHASE, LowPassShape, low_passed
+from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import ns16_values
+from tests.identification.two_link import (
+    MODEL,
+    NOISE,
+    URDF,
+    a_motion,
+    simulated,
+    sine_motion,
+    truth,
+)
+
+ARM_NOISE = np.array([3.0, 0.6])
+
+
+ARM = RobotModel.from_urdf(URDF, friction=FrictionLaw(third="quadratic", offset=True))
+# Without offsets and without quadratic friction.
+TRUTH = np.concatenate([truth(), np.zeros(4)])
+
+
+def three_sines(seed, n=2, duration=12.0, step=0.005):
+    time = np.arange(0.0, duration, step)
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0.2, 0.5, (3, n))
+    w, phase = rng.uniform(2.0, 9.0, (3, n)), rng.uniform(0.0, 6.0, (3, n))
+    return sine_motion(time, a, w, phase)
+
+
+def factors(model, values, seed=0):
+    """Return factors of a fitted and of another motion."""
+    runs = (simulated(model, values, three_sines(k), ARM_NOISE, seed + k) for k in (1, 2))
+    return tuple(Factor.by_time(model, run) for run in runs)
+
+
+class TestElimination:
+    """Parameters are removed while unseen motion is predicted as well."""
+
+    def test_zero_parameters_are_removed(self):
+        nothing = {"f2_1", "f2_2", "fo_1", "fo_2"}
+        gone = []
+        for seed in range(0, 40, 2):
+            result = eliminate(ARM, *factors(ARM, TRUTH, seed))
+            gone += result.removed
+            assert not {"f0_1", "f0_2", "f1_1", "f1_2", "mc2z", "I2yy"} & set(result.removed)
+        counts = {name: gone.count(name) for name in nothing}
+        assert min(counts.values()) >= 17, counts  # of 20
+        assert set(gone) <= nothing | {"mc2x", "mc1x"}  # small in the URDF: 0.12 and 0.03 kg m
+
+    def test_a_step_is_the_least_squares_fit_of_the_columns_left(self):
+        runs = [simulated(ARM, TRUTH, three_sines(k), ARM_NOISE, k) for k in (1, 2)]
+        training, unseen = (Factor.by_time(ARM, run) for run in runs)
+        weights = np.array([0.2, 3.0])
+        result = eliminate(ARM, training, unseen, weights=weights)
+        left = [ARM.parameter_names.index(name) for name in result.estimate.names]
+        rows, torque = [], []
+        for run in runs:
+            dense = ARM.regressor(*run.motion[1:]).dense(ARM.n_parameters)
+            rows.append(np.where(run.usable[..., None], dense, 0.0))
+            torque.append(np.where(run.usable, run.torque, 0.0))
+        scale = np.sqrt(weights)
+        fitted = (rows[0] * scale[:, None])[:, :, left].reshape(-1, len(left))
+        expected = np.linalg.lstsq(fitted, (torque[0] * scale).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(result.estimate.values, expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(result.values[left], expected, rtol=1e-6, atol=1e-8)
+        assert np.count_nonzero(result.values) == len(left)
+        for step_error, part in ((result.chosen.in_sample, 0), (result.chosen.held_out, 1)):
+            error = torque[part] - rows[part][:, :, left] @ expected
+            assert step_error == pytest.approx(
+                np.linalg.norm(error) / np.linalg.norm(torque[part]), rel=1e-6
+            )
+        length = np.linalg.norm(fitted, axis=0)
+        assert result.estimate.condition == pytest.approx(np.linalg.cond(fitted / length), rel=1e-5)
+
+    def test_the_path_removes_the_most_uncertain_parameter(self):
+        training, unseen = factors(ARM, TRUTH)
+        result = eliminate(ARM, training, unseen)
+        full = estimate(ARM, training)
+        relative = full.std / np.abs(full.values)
+        assert result.steps[0].removed is None
+        assert result.steps[0].spread == pytest.approx(relative.max() / relative.min(), rel=1e-9)
+        assert result.steps[1].removed == full.names[int(relative.argmax())]
+        assert result.steps[0].largest_relative_std == pytest.approx(relative.max(), rel=1e-9)
+        assert [step.left for step in result.steps] == list(range(ARM.n_parameters, 0, -1))
+        errors = [step.in_sample for step in result.steps]
+        # Monotonic with weights; nearly so without.
+        assert errors[-1] > 5.0 * errors[0]
+        removed = [step.removed for step in result.steps[1:]]
+        assert len(set(removed)) == len(removed)
+
+    def test_a_parameter_needed_by_unseen_motion_stays(self):
+        values = TRUTH.copy()
+        values[ARM.parameter_names.index("fo_2")] = 1.0
+        training, unseen = factors(ARM, values)
+        blind = eliminate(ARM, training, unseen, rule=CutRule(spread=4.0, overall=9.0, axis=9.0))
+        result = eliminate(ARM, training, unseen, rule=CutRule(spread=4.0))
+        assert "f1_1" in blind.removed  # a friction of 1.5 N·m·s/rad, among a noise of 3 N·m
+        assert "f1_1" in result.refused
+        assert "f1_1" in result.reason
+        assert result.chosen.held_out < blind.chosen.held_out - 0.001
+
+    @settings(max_examples=15)
+    @given(st.integers(0, 2**16))
+    def test_removals_up_to_the_cut_satisfy_the_rule(self, seed):
+        model = RobotModel.from_urdf(URDF, friction=FrictionLaw(offset=True))
+        values = np.random.default_rng(seed).normal(0.0, 2.0, model.n_parameters)
+        result = eliminate(model, *factors(model, values, seed))
+        rule = CutRule()
+        best = min(step.held_out for step in result.steps[: result.cut + 1])
+        assert result.chosen.held_out <= best + 2.0 * rule.overall
+        assert set(result.refused).isdisjoint(result.removed)
+        assert set(result.removed) | set(result.estimate.names) == set(model.parameter_names)
+        if not result.refused:
+            assert result.chosen.spread < rule.spread
+
+    def test_undetermined_parameters_are_removed_first(self):
+        motion = three_sines(1)
+        held = Motion(motion.time, *(part * [1.0, 0.0] for part in motion[1:4]))
+        training = Factor.by_time(ARM, simulated(ARM, TRUTH, held, ARM_NOISE, 3))
+        result = eliminate(ARM, training, training)
+        full = estimate(ARM, training)
+        lost = [
+            after
+            for before, after in pairwise(result.steps)
+            if np.isinf(before.largest_relative_std)
+        ]
+        assert {"f0_2", "f1_2", "f2_2", "fo_2"} <= {step.removed for step in lost}
+        assert len(lost) < len(full.undetermined)  # one parameter of a combination can stay
+        assert result.estimate.undetermined == ()
+        assert np.all(np.isfinite(result.estimate.std))
+
+    def test_95_percent_intervals_cover_88_to_99_percent(self):
+        covered = []
+        for seed in range(0, 60, 2):
+            result = eliminate(ARM, *factors(ARM, TRUTH, seed))
+            one = result.estimate
+            true = TRUTH[[ARM.parameter_names.index(name) for name in one.names]]
+            covered.append(np.abs(one.values - true) < one.interval_factor * one.std)
+        assert 0.88 <= np.mean(np.concatenate(covered)) <= 0.995
+        assert one.units == tuple(ARM.units[ARM.parameter_names.index(name)] for name in one.names)
+        assert "essential" in one.method
+        assert "cluster-robust" in one.method
+
+    def test_the_ns16_predicts_equally_with_fewer_parameters(self):
+        model = RobotModel.from_urdf(urdf_text())
+        values = ns16_values(model)
+        noise = np.array([20.0, 20.0, 12.0, 2.0, 2.0, 1.5])
+        training, unseen = (
+            Factor.by_time(model, simulated(model, values, three_sines(k, 6, step=0.01), noise, k))
+            for k in (1, 2)
+        )
+        result = eliminate(model, training, unseen)
+        assert {f"f2_{joint}" for joint in range(1, 7)} <= set(result.removed)
+        assert {f"f{k}_{joint}" for joint in range(1, 7) for k in (0, 1)} <= set(
+            result.estimate.names
+        )
+        assert result.chosen.left < 45
+        assert result.chosen.held_out < result.steps[0].held_out + 0.001
+
+
+def runs_of(model, truth, seed, count):
+    seeds = range(seed, seed + count)
+    return [simulated(model, truth, three_sines(k), ARM_NOISE, k) for k in seeds]
+
+
+def factors_of(model, runs):
+    return [Factor.by_time(model, run) for run in runs]
+
+
+class TestChoice:
+    def test_empty_factors_raise(self):
+        (training,) = factors_of(ARM, runs_of(ARM, TRUTH, 1, 1))
+        with pytest.raises(IdentificationError, match="no usable held-out sample"):
+            choose_essential(ARM, training, [Factor.zero(ARM)])
+        with pytest.raises(IdentificationError, match="no usable fitted"):
+            eliminate(ARM, Factor.zero(ARM), training)
+
+
+CAUSAL = LowPassShape(order=2, causal=True)
+RATE = 200.0  # Hz
+BANDWIDTH = 3.0  # Hz
+
+
+def a_recording(model=MODEL, values=None, *, noise=0.05, duration=10.0, shape=None, seed=5):
+    """Simulate a motion with noise on torque and position, through a Butterworth low-pass."""
+    motion = a_motion(duration)
+    direction = model.friction.direction(*motion[:3])
+    rng = np.random.default_rng(seed)
+    torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
+    position = motion.position + 1e-6 * rng.standard_normal(torque.shape)
+    torque += noise * rng.standard_normal(torque.shape)
+    if shape is not None:
+        sections = butter(shape.order, BANDWIDTH, fs=RATE, output="sos")
+        torque = (sosfilt if shape.causal else sosfiltfilt)(sections, torque, axis=0)
+    return Recording(motion.time, position, MODEL.joint_names, torque)
+
+
+def cut(recording):
+    """Return the number of rows that are fitted."""
+    return round(0.7 * recording.n_samples)
+
+
+def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=None):
+    """Choose settings on the fitted rows, or on all of them with a leak."""
+    fitted = recording if leaks else recording.between(0, cut(recording))
+
+    def ready(model, how):
+        return [prepare(fitted, model, options=how)]
+
+    def possible(model, how):
+        return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
+
+    start = Settings(MODEL, Preprocessing())
+    return choose_settings(ready, start, questions, possible, ripples=[ripple])
+
+
+class TestChosenSettings:
+    @pytest.mark.parametrize("distance", [1e-4, 1e-3])
+    def test_the_true_presliding_is_found(self, distance):
+        recording = a_recording(MODEL.with_friction(presliding=distance))
+        settings, _ = chosen(recording, {"presliding", "bandwidth"})
+        assert settings.model.friction.laws[0].presliding == distance
+
+    def test_the_true_friction_term_is_found(self):
+        cubic = MODEL.with_friction(third="cubic")
+        settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
+        assert settings.model.friction.laws[0].third == "cubic"
+
+    def test_no_friction_term_is_added_without_cause(self):
+        settings, _ = chosen(a_recording(), {"friction"})
+        assert settings.model.friction.laws[0].third is None
+
+    def test_torque_ripple_is_estimated_only_if_present(self):
+        ripple = [TorqueRipple(name, ((name, 40.0),), (2,)) for name in MODEL.joint_names]
+        rippled = MODEL.with_elements(ripple)
+        strong = a_recording(rippled, np.append(truth(), [0.0, 0.4, 0.3, 0.0]))
+        settings, _ = chosen(strong, {"ripple"}, ripple=ripple)
+        assert settings.model.parameter_names == rippled.parameter_names
+        settings, _ = chosen(a_recording(), {"ripple"}, ripple=ripple)
+        assert settings.model.parameter_names == MODEL.parameter_names
+
+    @pytest.mark.parametrize(("shape", "name"), [(None, DELAY), (CAUSAL, LOW_PASS)])
+    def test_a_delay_is_not_called_a_low_pass(self, shape, name):
+        """Delay and low-pass of equal lag each predict best where they are the cause."""
+        recording = a_recording()
+        time, torque = recording.time, recording.torque
+        if shape is None:
+            late = [np.interp(time - CAUSAL.lag(6.0), time, one) for one in torque.T]
+            changed = replace(recording, torque=np.column_stack(late))
+        else:
+            changed = replace(recording, torque=low_passed(time, torque, 6.0, shape))
+        filtered = Preprocessing(torque_bandwidth=6.0, torque_shape=CAUSAL)
+        settings, choices = chosen(changed, {"low-pass"}, low_passes=(filtered,))
+        assert name in [one.name for one in choices if one.chosen]
+        assert (settings.preprocessing.torque_bandwidth is None) == (name == DELAY)
+
+    def test_least_squares_stays_if_it_predicts_equally(self):
+        settings, choices = chosen(a_recording(), {"estimator"})
+        assert settings.shrinkage.strength == 0.0
+        assert choices[-1].candidates[choices[-1].chosen] == "least squares"
+
+    def test_a_joint_may_rest_in_some_segments(self):
+        """Joints that move one after the other have segments without rows."""
+        recording = a_recording()
+        position = recording.position.copy()
+        position[:350, 0] = position[350, 0]
+        rested = replace(recording, position=position)
+        _, choices = chosen(rested, {"presliding", "rows", "estimator"})
+        assert [one.name for one in choices][-1] == "estimator"
+        assert all(np.isfinite(one.errors).all() for one in choices)
+
+
+class TestHeldOutRows:
+    """The torque of held-out rows has no effect on any choice."""
+
+    QUESTIONS = frozenset[Question]({"bandwidth", "presliding", "rows", "friction", "estimator"})
+
+    @staticmethod
+    def corrupted(recording):
+        torque = recording.torque.copy()
+        rest = slice(cut(recording), None)
+        torque[rest] += 40.0 * np.sign(np.sin(7.0 * recording.time[rest, None]))
+        return replace(recording, torque=torque)
+
+    def errors(self, recording, *, leaks):
+        return [one.errors for one in chosen(recording, set(self.QUESTIONS), leaks=leaks)[1]]
+
+    def test_changing_them_has_no_effect(self):
+        recording = a_recording()
+        sound = self.errors(recording, leaks=False)
+        assert sound == self.errors(self.corrupted(recording), leaks=False)
+
+    def test_a_leak_would_be_detected(self):
+        recording = a_recording()
+        sound = self.errors(recording, leaks=True)
+        assert sound != self.errors(self.corrupted(recording), leaks=True)
+
+
+def held_out_error(recording, settings):
+    """Return ||tau - tau_hat|| / ||tau|| of the held-out rows."""
+    model = settings.model
+    fitted, rest = (
+        prepare(recording.between(*part), model, options=settings.preprocessing)
+        for part in ((0, cut(recording)), (cut(recording), recording.n_samples))
+    )
+    values = estimate(model, Factor.of(model, fitted)).values
+    error = rest.torque - rest.predicted_torque(model, values)
+    return float(np.linalg.norm(error) / np.linalg.norm(rest.torque))
+
+
+def low_pass_of(shape, seed=0):
+    """Return a filtered recording and the chosen settings."""
+    questions = frozenset[Question]({"bandwidth", "presliding", "rows", "low-pass"})
+    recording = a_recording(noise=0.5 * NOISE, duration=20.0, shape=shape, seed=seed)
+    return recording, chosen(recording, questions)[0]
+
+
+@cache
+def unfiltered_error():
+    return held_out_error(*low_pass_of(None))
+
+
+class TestLowPass:
+    @pytest.mark.parametrize("causal", [False, True])
+    @pytest.mark.parametrize("order", [1, 2, 4])
+    def test_a_planted_one_is_found(self, order, causal):
+        """Its bandwidth within 20 %; the error rises by at most 30 %."""
+        recording, settings = low_pass_of(LowPassShape(order, causal))
+        assert settings.preprocessing.torque_bandwidth == pytest.approx(BANDWIDTH, rel=0.2)
+        assert settings.preprocessing.torque_shape.causal == causal
+        assert held_out_error(recording, settings) < 1.3 * unfiltered_error()
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_none_is_found_in_unfiltered_torque(self, seed):
+        assert low_pass_of(None, seed)[1].preprocessing.torque_bandwidth is None
+
+
+class TestLowPassShape:
+    """Gain at the bandwidth: 1/2 without phase, 1/sqrt(2) if causal."""
+
+    @pytest.mark.parametrize("shape", [*WITHOUT_PHASE, *FORWARDS], ids=str)
+    def test_gain_at_the_bandwidth(self, shape):
+        time = np.arange(4000) / RATE
+        sine = np.sin(2.0 * np.pi * BANDWIDTH * time)[:, None]
+        inner = low_passed(time, sine, BANDWIDTH, shape)[1000:3000]
+        gain = inner.std() / sine[1000:3000].std()
+        assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
+
+    def test_samples_filter_their_regressor_by_it(self):
+        shape = LowPassShape(order=1, causal=True)
+        how = Preprocessing(torque_bandwidth=BANDWIDTH, torque_shape=shape)
+        samples = prepare(a_recording(duration=20.0), MODEL, options=how)
+        unfiltered = replace(samples, torque_bandwidth=None)
+        expected = low_passed(
+            samples.motion.time, unfiltered.predicted_torque(MODEL, truth()), BANDWIDTH, shape
+        )
+        assert samples.predicted_torque(MODEL, truth()) == pytest.approx(expected, abs=1e-9)
