@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -43,41 +43,25 @@ def test_invalid_numbers_are_refused_with_their_option(
     assert not journal.exists()
 
 
-@dataclass(frozen=True)
-class LongCommand:
-    """A command, how it is called, and a line of its journal."""
-
-    main: Callable[[list[str]], int]
-    arguments: list[str]
-    line: dict[str, Any]
-
-
-COMMANDS = {
-    "endurance": LongCommand(endurance.main, ["--merge"], {"kind": "begin", "rate": 1000}),
-    "deaths": LongCommand(
-        process_death.main,
-        ["--rounds", "1"],
-        {"round": 3, "broken": [], "seconds": 9.0, "processor": 2.0},
-    ),
-    "simulate": LongCommand(
-        simulate.main, ["--seeds", "1"], asdict(Verdict(3, "an arm", (), (), (), (), 9))
-    ),
-}
+COMMANDS: dict[str, tuple[Command, list[str], dict[str, Any]]] = {
+    "endurance": (endurance.main, ["--merge"], {"kind": "begin", "rate": 1000}),
+    "deaths": (process_death.main, ["--rounds", "1"],
+               {"round": 3, "broken": [], "seconds": 9.0, "processor": 2.0}),
+    "simulate": (simulate.main, ["--seeds", "1"],
+                 asdict(Verdict(3, "an arm", (), (), (), (), 9))),
+}  # fmt: skip
+"""Long commands, how they are called, and a line of their journals."""
 OTHERS = {
     "a list": b"[1, 2]\n",
     "notes": b"milk\n",
     "another coding": b"\xff\xfe\n",
     "no number": b'{"round": [], "harm": "", "broken": [], "seconds": 1, "processor": 1}\n',
-    **{name: json.dumps(command.line).encode() + b"\n" for name, command in COMMANDS.items()},
+    **{name: json.dumps(line).encode() + b"\n" for name, (_, _, line) in COMMANDS.items()},
 }
 
 
-def number(entry: dict[str, int]) -> int:
-    return entry["n"]
-
-
 def read(path: Path) -> list[int]:
-    return entries(path, number, "number")
+    return entries(path, lambda entry: entry["n"], "number")
 
 
 @pytest.mark.parametrize("sync_every", [0.0, 60.0])
@@ -113,9 +97,6 @@ def test_a_line_that_is_no_entry_is_named(tmp_path: Path, line: str) -> None:
     with pytest.raises(JournalError) as caught:
         read(path)
     assert str(caught.value) == f"{path}, line 2 is no number; name another --journal"
-
-
-def test_unreadable_journals_are_errors(tmp_path: Path) -> None:
     with pytest.raises(JournalError, match="cannot be read"):
         read(tmp_path)
     with pytest.raises(JournalError, match="cannot be written: Is a directory"):
@@ -140,8 +121,8 @@ def test_journals_of_other_commands_are_refused_unchanged(
 ) -> None:
     path = tmp_path / "j.jsonl"
     path.write_bytes(OTHERS[other])
-    command = COMMANDS[name]
-    assert command.main([*command.arguments, "--journal", str(path)]) == 2
+    command, arguments, _ = COMMANDS[name]
+    assert command([*arguments, "--journal", str(path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"{path}, line 1 is no " in line
     assert line.endswith("; name another --journal")
