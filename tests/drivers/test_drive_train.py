@@ -115,12 +115,6 @@ def test_many_samples_at_once_equal_one_at_a_time():
         np.testing.assert_allclose(method(q), [method(row) for row in q], rtol=1e-13)
 
 
-def test_arm_of_three_joints():
-    train = DriveTrain(*(np.array(FIELDS[name][:3]) for name in FIELDS))
-    assert train.n_joints == 3
-    np.testing.assert_allclose(train.joint_position(train.motor_revolutions([1, 2, 3])), [1, 2, 3])
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [
