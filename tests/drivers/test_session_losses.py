@@ -581,12 +581,6 @@ class TestTargets:
         sent.add(1.0)
         sent.refuse(24.0, missed=1)
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf])
-    def test_target_that_is_not_finite(self, value):
-        target = np.where(np.arange(N) == 4, value, TURNS)
-        error = refused(Check.FINITE, Sent(0.0).set_points.check, target, 0, 3)
-        assert (error.joint, error.cycle) == (4, 3)
-
     def test_selected_joints(self):
         sent, others = Sent(0.24), np.arange(N) != 1
         assert sent.check(9.0, where=others) == 0
@@ -627,21 +621,6 @@ class TestSentAgain:
             sent.add(step)
         assert found == counts
 
-    def test_extrapolated_target_is_no_loss(self):
-        sent = Sent(SLOW)
-        sent.add(1.0)
-        sent.add(2.1)
-        sent.add(-1.0)  # one more of these steps is a tenth of a step from two set-points ago
-        assert sent.check(-1.0, 1) == 0
-
-    def test_joint_furthest_behind(self):
-        sent = Sent(SLOW)
-        sent.step = SLOW * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
-        for _ in range(4):
-            sent.add(1.0)
-        target = sent.last - sent.step * np.array([0, 1, 0, 0, 2, 0])
-        assert sent.set_points.check(target, 0, 1) == 2
-
     @pytest.mark.parametrize(("share", "again"), [(3.99, False), (4.01, True)])
     def test_small_step_is_not_repeated(self, share, again):
         sent = Sent(share * STANDSTILL)
@@ -674,12 +653,3 @@ class TestSentAgain:
             if not stopping:
                 sent.set_points.repeat()
                 sent.check(0.0)
-
-    def test_begin_resets_the_history(self):
-        sent = Sent(SLOW)
-        assert sent.check(-1.0) == 1
-        sent.set_points.begin(TURNS)
-        sent.last = TURNS
-        sent.add(1.0)
-        assert sent.check(-1.0) == 1
-        sent.refuse(25.0)

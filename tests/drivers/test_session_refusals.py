@@ -743,16 +743,6 @@ class TestOtherAxes:
         rig.lose_target(value)
         assert rig.session.counters.refused == 2
 
-    def test_no_motion_begins(self, arm, value):
-        rig = OtherAxis(arm)
-        rig.close()
-        rig.axes["mode"][6] = Mode.POSITION
-        rig.lose_target(value)
-        rig.session.request(source := Cruise())
-        assert all_drive_off(rig.cycle(mode=Mode.POSITION))
-        assert source.begun_at is None
-        assert rig.ended.outcome == "refused"
-
     def test_echo_with_its_drive_off(self, arm, value):
         rig = OtherAxis(arm)
         rig.close()
@@ -763,13 +753,6 @@ class TestOtherAxes:
         answer = CyclicPacket.decode(rig.send(packet), N + 1)
         assert answer.axes[6].tobytes() == CyclicPacket.decode(packet, N + 1).axes[6].tobytes()
         assert not rig.seen(Refused)
-
-    def test_with_the_drive_of_the_moved_arm_off(self, arm, value):
-        rig = OtherAxis(arm)
-        rig.status = 0
-        rig.start()
-        rig.axes["mode"][6] = Mode.POSITION
-        rig.lose_target(value)
 
 
 @pytest.mark.parametrize(

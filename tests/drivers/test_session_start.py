@@ -563,20 +563,6 @@ def adopted(ours: DriveTrain, **changes) -> InitCheck:
     return compare(ours, PERIOD, init, 1, True)
 
 
-@pytest.mark.parametrize("n", [3, 4, 6])
-def test_coupling_of_axes_of_the_arm(n):
-    ours = arm(n)
-    theirs = adopted(ours, calibration=ours.calibration + 0.5)
-    assert theirs.adopted
-    train = theirs.drive_train
-    assert train.n_joints == n
-    expected = COUPLING if n == 6 else (0.0, 0.0, 0.0)
-    assert (train.k54, train.k64, train.k65) == pytest.approx(expected, rel=1e-6)
-    np.testing.assert_allclose(train.calibration, ours.calibration + 0.5)
-    np.testing.assert_array_equal(train.torque_constant, ours.torque_constant)
-    assert train.gear_ratio.dtype == train.calibration.dtype == np.float64
-
-
 @pytest.mark.parametrize(("k54", "fits"), [(0.0, True), (0.02, False)])
 def test_arm_of_five_joints_has_no_coupling(k54, fits):
     ours = arm(5)
