@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,30 +73,17 @@ def attach_memory(fd: int) -> mmap.mmap:
     return mmap.mmap(fd, os.fstat(fd).st_size)
 
 
-class _Kind(NamedTuple):
-    """Kind of a ring: tag in its header, name of its memory, its rows, unit of their width."""
-
-    tag: int
-    name: str
-    rows: str
-    unit: str
-
-
-_CYCLES: Final = _Kind(0x31474E4952434948, "hil-cycles", "cycle records", "joints")
+_TAG: Final = 0x31474E4952434948
 _HEADER_BYTES: Final = 256
 # Indices of 8-byte words, those of different writers on different cache lines.
-_TAG, _WIDTH, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
+_KIND, _JOINTS, _CAPACITY, _WRITTEN, _READ = 0, 1, 2, 8, 16
 
 
-class _Ring:
-    """Rows behind a header, with the position of a reader.
+class RingReader:
+    """Reader of a ring of cycle records of `n_joints` joints.
 
     Args:
-        kind: of rows.
-        width: of a row, in the unit of its kind.
-        dtype: of a row.
-        capacity: rows of its own memory; only without `fd`.
-        fd: descriptor of memory created by `_create`.
+        fd: descriptor of memory of `CycleRing.shared`.
         acknowledge: write the position of this reader to the memory, so that the writer counts rows
             overwritten before they were read; for one reader at a time.
 
@@ -107,43 +94,24 @@ class _Ring:
         ValueError: the memory is not such a ring.
     """
 
-    def __init__(
-        self,
-        kind: _Kind,
-        width: int,
-        dtype: np.dtype[np.void],
-        *,
-        capacity: int = 0,
-        fd: int | None = None,
-        acknowledge: bool = True,
-    ) -> None:
-        size = _HEADER_BYTES + capacity * dtype.itemsize
-        memory = memoryview(bytearray(size)) if fd is None else memoryview(attach_memory(fd))
-        self._words = words = memory.cast("B")[:_HEADER_BYTES].cast("q")
-        if fd is None:
-            words[_TAG], words[_WIDTH], words[_CAPACITY] = kind.tag, width, capacity
-        if len(words) < _HEADER_BYTES // 8 or words[_TAG] != kind.tag:
-            raise ValueError(f"this memory is not a ring of {kind.rows}")
-        if words[_WIDTH] != width:
-            raise ValueError(f"this ring is for {words[_WIDTH]} {kind.unit}, not {width}")
-        self.capacity = int(words[_CAPACITY])
-        self._memory = memory.cast("B")[_HEADER_BYTES:]
-        self.rows: NDArray[np.void] = np.frombuffer(self._memory, dtype, self.capacity)
+    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
+        self._map(memoryview(attach_memory(fd)), n_joints)
         # Beside another process the row behind the last one written may be half overwritten.
-        self._readable = self.capacity if fd is None else self.capacity - 1
+        self._readable = self.capacity - 1
         self._acknowledge = acknowledge
         self._read = self._oldest()
-        self.missed = 0
 
-    @staticmethod
-    def _create(kind: _Kind, width: int, dtype: np.dtype[np.void], capacity: int) -> int:
-        """Return a descriptor of memory for `capacity` rows."""
-        if capacity < 2:
-            raise ValueError(f"a shared ring of {capacity} {kind.rows}; at least 2 are needed")
-        fd = create_memory(kind.name, _HEADER_BYTES + capacity * dtype.itemsize)
-        words = memoryview(attach_memory(fd)).cast("B")[:_HEADER_BYTES].cast("q")
-        words[_WIDTH], words[_CAPACITY], words[_TAG] = width, capacity, kind.tag
-        return fd
+    def _map(self, memory: memoryview, n_joints: int) -> None:
+        self._words = words = memory.cast("B")[:_HEADER_BYTES].cast("q")
+        if len(words) < _HEADER_BYTES // 8 or words[_KIND] != _TAG:
+            raise ValueError("this memory is not a ring of cycle records")
+        if words[_JOINTS] != n_joints:
+            raise ValueError(f"this ring is for {words[_JOINTS]} joints, not {n_joints}")
+        self.n_joints = n_joints
+        self.capacity = int(words[_CAPACITY])
+        data = memory.cast("B")[_HEADER_BYTES:]
+        self.rows: NDArray[np.void] = np.frombuffer(data, cycle_dtype(n_joints), self.capacity)
+        self.missed = 0
 
     def _oldest(self) -> int:
         return max(0, self._words[_WRITTEN] - self._readable)
@@ -161,42 +129,28 @@ class _Ring:
         return rows[overwritten:]
 
 
-class RingReader(_Ring):
-    """Reader of a ring of cycle records of `n_joints` joints; see `_Ring` for `acknowledge`."""
+class CycleRing(RingReader):
+    """The last `capacity` cycle records, written in place; `shared` ones can be read elsewhere.
 
-    def __init__(self, fd: int, n_joints: int, *, acknowledge: bool = True) -> None:
-        super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), fd=fd, acknowledge=acknowledge)
-
-
-class _Writer(_Ring):
-    """Writer of a ring; if rows are not drained in time, the oldest are overwritten.
+    If records are not drained in time, the oldest are overwritten.
 
     Attributes:
         fd: descriptor of the memory, -1 for its own memory.
-        written: rows written.
-        overflow: rows overwritten before they were drained.
+        written: records written.
+        overflow: records overwritten before they were drained.
     """
 
-    fd: int
-    written: int
-    overflow = 0
-
-    def commit(self) -> None:
-        """Add the row filled last to the ring."""
-        words, written = self._words, self.written
-        if words[_READ] <= written - self.capacity:
-            self.overflow += 1
-        self.written = words[_WRITTEN] = written + 1
-
-
-class CycleRing(_Writer):
-    """The last `capacity` cycle records, written in place; `fd` is that of `shared` memory."""
-
     def __init__(self, n_joints: int, capacity: int = 4096, *, fd: int | None = None) -> None:
-        super().__init__(_CYCLES, n_joints, cycle_dtype(n_joints), capacity=capacity, fd=fd)
+        if fd is None:
+            own = memoryview(bytearray(_HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize))
+            _describe(own, n_joints, capacity)
+            self._map(own, n_joints)
+            self._readable, self._acknowledge, self._read = capacity, True, 0
+        else:
+            super().__init__(fd, n_joints)
         self.fd = -1 if fd is None else fd
         self.written = self._words[_WRITTEN]
-        self.n_joints = n_joints
+        self.overflow = 0
         # Column views: assigning through them costs a third of assigning to a record's field.
         self.cycle = self.rows["cycle"]
         self.arrival = self.rows["arrival"]
@@ -213,8 +167,19 @@ class CycleRing(_Writer):
     @classmethod
     def shared(cls, n_joints: int, capacity: int) -> Self:
         """Allocate shared memory for `capacity` records."""
-        dtype = cycle_dtype(n_joints)
-        return cls(n_joints, fd=cls._create(_CYCLES, n_joints, dtype, capacity))
+        if capacity < 2:
+            raise ValueError(f"a shared ring of {capacity} cycle records; at least 2 are needed")
+        size = _HEADER_BYTES + capacity * cycle_dtype(n_joints).itemsize
+        fd = create_memory("hil-cycles", size)
+        _describe(memoryview(attach_memory(fd)), n_joints, capacity)
+        return cls(n_joints, fd=fd)
+
+    def commit(self) -> None:
+        """Add the row filled last to the ring."""
+        words, written = self._words, self.written
+        if words[_READ] <= written - self.capacity:
+            self.overflow += 1
+        self.written = words[_WRITTEN] = written + 1
 
     def _block(self, names: tuple[str, ...]) -> Array:
         """Return consecutive joint fields of all rows as one array (capacity, count, n)."""
@@ -237,3 +202,9 @@ class CycleRing(_Writer):
         """Return a copy of the newest `count` records (or all of them), oldest first."""
         count = min(count, self.written, self.capacity)
         return self.rows.take(np.arange(self.written - count, self.written), mode="wrap")
+
+
+def _describe(memory: memoryview, n_joints: int, capacity: int) -> None:
+    """Write the header of a ring."""
+    words = memory.cast("B")[:_HEADER_BYTES].cast("q")
+    words[_JOINTS], words[_CAPACITY], words[_KIND] = n_joints, capacity, _TAG
