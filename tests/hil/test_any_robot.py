@@ -13,7 +13,6 @@ from scipy.signal import butter, sosfilt, sosfiltfilt
 
 from hil.identify.options import FIXED, Options
 from hil.identify.prepared import Prepared, prepare_sources
-from hil.identify.settings import stated_settings
 from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, Use, import_log
 from hil.progress import Silent
@@ -211,14 +210,3 @@ class TestFilteredTorque:
             assert preprocessing.torque_shape.causal
             assert preprocessing.torque_delay == 0.0
             assert found.delays is None
-
-
-class TestFixedOptions:
-    def test_nothing_is_decided(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def never(*_: object, **__: object) -> None:
-            raise AssertionError("something was asked")
-
-        for name in ("choose_settings", "estimate_delay", "possible_low_passes"):
-            monkeypatch.setattr(f"hil.identify.settings.{name}", never)
-        found = prepared(tmp_path, 2, causal=True, options=FIXED)
-        assert found.settings == stated_settings(found.sources.cell, FIXED)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 from pydantic import BaseModel
@@ -31,7 +30,6 @@ from .identified_arm import (
     IdentifiedArm,
     a_motion,
     identified_arm,
-    packaged_urdf,
     write_exports,
 )
 
@@ -84,81 +82,6 @@ def test_files_with_provenance_are_written(arm: IdentifiedArm, tmp_path: Path) -
     assert json.loads((tmp_path / "parameters.json").read_text())["provenance"] == PROVENANCE
     for name in ALL - {"parameters.json"}:
         assert "sha256 0a1b" in (tmp_path / name).read_text(), name
-
-
-def robots() -> Iterator[tuple[str, str, str]]:
-    yield "slider", "", '[robot.friction]\nthird = "cubic"'
-    yield "panda.urdf", "locked = {panda_finger_joint1 = 0.02, panda_finger_joint2 = 0.01}", ""
-    coupling = np.eye(6)
-    coupling[5, 4] = 0.4
-    yield (
-        "ur5_robot.urdf",
-        'payload = {mass = 2.0, centre = [0.0, 0.0, 0.1], frame = "tool0"}',
-        f"[robot.coupling]\nmotor_from_joint = {coupling.tolist()}\n"
-        "[robot.friction]\nstribeck = 0.1\nasymmetric = true",
-    )
-
-
-@pytest.fixture(scope="module", params=robots(), ids=lambda case: case[0])
-def any_arm(request: pytest.FixtureRequest) -> IdentifiedArm:
-    name, robot, tables = request.param
-    urdf = SLIDER if name == "slider" else packaged_urdf(name)
-    return identified_arm(urdf, f"{robot}\n{tables}")
-
-
-def test_urdf_rotors_and_friction_give_the_torque(any_arm: IdentifiedArm, tmp_path: Path) -> None:
-    """From the files: pinocchio on the URDF, and JSON."""
-    parameters = parameters_of(any_arm, tmp_path)
-    model, consistent = any_arm.cell.model, any_arm.consistency.consistent
-    motion = a_motion(model.n_joints, seed=5)
-    every = slice(None, None, 40)
-    q, qd, qdd = (array[every] for array in motion[1:4])
-    moving = np.all(np.abs(qd) > 0.02, axis=1)
-    q, qd, qdd = q[moving], qd[moving], qdd[moving]
-    rigid = rigid_torque(tmp_path / "identified.urdf", parameters, q, qd, qdd)
-    rotors = qdd @ np.array(parameters["standard"]["rotor_matrix"])
-    total = rigid + rotors + friction_torque(parameters, qd)
-    expected = model.torque(consistent.estimate.values, q, qd, qdd)
-    np.testing.assert_allclose(total, expected, atol=1e-7 * np.abs(expected).max())
-
-
-def rigid_torque(urdf: Path, parameters: dict[str, Any], q: Array, qd: Array, qdd: Array) -> Array:
-    """Return pinocchio's inverse dynamics with locked joints."""
-    model = pin.buildModelFromUrdf(str(urdf))
-    held = pin.neutral(model)
-    for name, position in parameters["locked_joints"].items():
-        held[model.joints[model.getJointId(name)].idx_q] = position
-    locked = [model.getJointId(name) for name in parameters["locked_joints"]]
-    model = pin.buildReducedModel(model, locked, held)
-    model.gravity.linear = np.array(parameters["gravity"])
-    data, still = model.createData(), pin.neutral(model)
-    order = [model.joints[model.getJointId(name)].idx_v for name in parameters["joints"]]
-    torque = np.empty_like(q)
-    for k in range(len(q)):
-        p, v, a = (np.empty(model.nv) for _ in range(3))
-        p[order], v[order], a[order] = q[k], qd[k], qdd[k]
-        torque[k] = pin.rnea(model, data, pin.integrate(model, still, p), v, a)[order]
-    return torque
-
-
-def friction_torque(parameters: dict[str, Any], speeds: Array) -> Array:
-    """Return the friction of joints and coupled motors by the formulas of docs/results.md."""
-
-    def of(law: dict[str, Any], values: dict[str, float], v: Array) -> Array:
-        sign, third = np.sign(v), v * np.abs(v) if law["third"] == "quadratic" else v**3
-        slow = sign * np.exp(-((v / law["stribeck"]) ** 2)) if law["stribeck"] else 0.0 * v
-        terms = {"f0": sign, "f1": v, "fd": abs(v), "f2": third, "fs": slow, "fo": np.ones_like(v)}
-        return np.asarray(sum(value * terms[symbol] for symbol, value in values.items()))
-
-    laws, standard = parameters["friction_laws"], parameters["standard"]
-    joints = zip(laws, standard["links"], speeds.T, strict=True)
-    torque = np.column_stack([of(law, link["friction"], v) for law, link, v in joints])
-    for name, value in standard["motor_friction"].items():
-        symbol, motor = name.split("_m")
-        motors = dict.fromkeys(key.split("_m")[1] for key in standard["motor_friction"])
-        share = np.array(parameters["motor_speeds"][[*motors].index(motor)])
-        torque += np.outer(of(laws[int(motor) - 1], {symbol: value}, speeds @ share), share)
-    return torque
 
 
 def table(path: Path) -> list[dict[str, str]]:

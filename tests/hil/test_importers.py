@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import resource
@@ -14,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from time import monotonic
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ from hil.archive import ArchiveHeader, Findings, Samples, open_archive
 from hil.cli import app
 from hil.errors import InputError, SourceError
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Robot, import_log
+from hil.importers import ColumnMap, Robot
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format
@@ -41,7 +41,6 @@ from identification import FrictionLaw
 from tests.hil.simulated_logs import (
     JOINTS,
     Simulated,
-    column_map,
     simulate,
     three_joint_robot,
 )
@@ -71,23 +70,143 @@ def file(tmp_path: Path) -> Path:
     return log(tmp_path / "a.csv", VALUES, HEADER)
 
 
-class TestColumns:
-    @pytest.mark.parametrize("position", ["q{}", ("q1", "q2", "q3"), (1, 2, 3), ("q1", 2, "q3")])
-    def test_by_pattern_name_and_index(self, file, robot, position):
-        found = read(file, robot, position={"columns": position}, torque={"columns": "tau{}"})
-        assert np.array_equal(found["position"], VALUES[:, 1:4])
-        assert np.array_equal(found["torque"], VALUES[:, 4:])
+Q, TAU, TIME = VALUES[:, 1:4], VALUES[:, 4:], VALUES[:, 0]
+WIDE = np.random.default_rng(7).normal(size=(20, 5))
+QUOTED = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
+TURNED = ("ankle", "hip", "knee")
+Q_TAU = {"position": {"columns": "q"}, "torque": {"columns": "tau"}}
+TABLE = {"position": {"columns": (1, 2, 3)}, "torque": {"columns": (4, 5, 6)}}
+FILES = {"position": {"files": "q_{}.txt", "columns": (1,)}, "torque": {"files": "tau{}.dat"}}
+ROWS = {"array": "all", "joints_along": "rows"}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Logs of `Q`, `TAU` and `TIME`, and of the five columns of `WIDE`."""
+    root = tmp_path_factory.mktemp("logs")
+    log(root / "a.csv", VALUES, HEADER)
+    log(root / "quoted.txt", VALUES, QUOTED)
+    log(root / "short.csv", VALUES[:-1], HEADER)
+    log(root / "from0.csv", Q, "q0,q1,q2")
+    for first in (0, 1):
+        log(root / f"wide{first}.csv", WIDE, ",".join(f"q{k + first}" for k in range(5)))
+    for name in ("run", "wide"):
+        (root / name).mkdir()
+    for joint in range(3):
+        run, one = root / "run", joint + 1
+        np.savetxt(run / f"q_{one}.txt", VALUES[:, [0, one]], fmt="%.17g")
+        np.savetxt(run / f"tau{joint}.dat", TAU[:, joint], fmt="%.17g")
+        np.savetxt(run / f"late_{one}.txt", VALUES[:, [0, one]] + [0.001 * joint, 0.0])
+        np.save(run / f"q{one}.npy", Q[:, joint])
+        log(run / f"{one}.csv", VALUES[:, [0, one]], f"t,angle{one}")
+    np.savetxt(run / "t.txt", TIME)
+    np.savetxt(run / "short.dat", TAU[:5, 0])
+    for k in range(4):
+        np.savetxt(root / "wide" / f"q{k}.txt", WIDE[:, k])
+    np.save(root / "all.npy", VALUES)
+    joints = {f"q{j + 1}": Q[:, j] for j in range(3)} | dict(zip("abc", TAU.T, strict=True))
+    for name, content in {
+        "upright": {"q": Q, "tau": TAU},
+        "flat": {"q": Q.T, "tau": TAU.T},
+        "joints": joints,
+        "from0": {f"q{k}": Q[:, k] for k in range(3)},
+        "rows": {"all": np.vstack([TAU.T, Q.T]), "t": TIME},
+        "wide": {f"q{k}": WIDE[:, k] for k in range(4)},
+        "square": {"p": Q[:3]},
+        "narrow": {"p": Q[:, :2]},
+        "lengths": {"a": TIME, "b": TIME[1:]},
+        "text": {"p": np.array(["x"])},
+    }.items():
+        np.savez_compressed(root / f"{name}.npz", **content)  # type: ignore[arg-type]
+    return root
+
+
+def columns_of(columns: object) -> dict[str, object]:
+    return {"position": {"columns": columns}}
+
+
+READ: list[tuple[str, dict[str, Any], NDArray[np.float64], NDArray[np.float64] | None]] = [
+    *(
+        ("a.csv", {**columns_of(columns), "torque": {"columns": "tau{}"}}, Q, TAU)
+        for columns in ("q{}", ("q1", "q2", "q3"), (1, 2, 3), ("q1", 2, "q3"))
+    ),
+    ("quoted.txt", {}, Q, None),
+    ("a.csv", {"joints": TURNED}, Q[:, [1, 2, 0]], None),
+    ("wide1.csv", {"joints": ("ext", "ankle", "knee", "hip", "ext_2")}, WIDE[:, [3, 2, 1]], None),
+    ("wide1.csv", columns_of(("q2", "q3", "q5")), WIDE[:, [1, 2, 4]], None),
+    ("from0.csv", {}, Q, None),
+    ("from0.npz", {}, Q, None),
+    *((f"run{file}", FILES, Q, TAU) for file in ("", "/q_1.txt", "/t.txt")),
+    ("run", {"position": {"files": "q{}.npy"}}, Q, None),
+    ("run", {"position": {"files": "{}.csv", "columns": "angle{}"}}, Q, None),
+    (
+        "run",
+        {"position": {"files": ("q_3.txt", "q_1.txt", "q_2.txt"), "columns": (1,)},
+         "joints": TURNED},
+        Q, None,
+    ),
+    ("run", {**FILES, "time": {"column": 0}}, Q, TAU),
+    ("run", {**FILES, "time": {"file": "t.txt"}}, Q, TAU),
+    ("upright.npz", Q_TAU, Q, TAU),
+    ("flat.npz", Q_TAU, Q, TAU),
+    ("joints.npz", {"torque": {"columns": ("c", "a", "b")}}, Q, TAU[:, [2, 0, 1]]),
+    ("all.npy", {**TABLE, "time": {"column": 0, "array": "array"}}, Q, TAU),
+    ("rows.npz", {"position": {"columns": (3, 4, 5), **ROWS}, "time": {"column": "t"}}, Q, None),
+]  # fmt: skip
+REFUSED: list[tuple[str, dict[str, Any], str]] = [
+    ("a.csv", columns_of("pos{}"),
+     "no column 'pos1' for hip, joint 1 of 3.*there are t, q1, q2.*--lock-others"),
+    ("a.csv", {"torque": {"columns": (4, 5, 9)}}, "torque.columns: there is no column 9"),
+    ("a.csv", {"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
+    ("a.csv", {"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
+    ("a.csv", {"drive": {"gear_ratio": (1, 0, 2)}}, "no motor would move one of the joints"),
+    ("a.csv", {"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
+    ("a.csv", {"torque": {"columns": "tau{}", "file": "short.csv"}},
+     "differ in length: position 20, torque 19"),
+    ("run", {**FILES, "position": {"files": "late_{}.txt", "columns": (1,)}, "time": {"column": 0}},
+     r"late_2\.txt: time: has other times than late_1\.txt"),
+    *(("run", {"position": position}, sentence) for position, sentence in (
+        ({"files": "q_{}.txt"}, r"q_1\.txt: .*shape \(20, 2\), expected one column"),
+        ({"files": "p{}.txt"}, r"position.files: there is no file 'p1.txt' for hip, joint 1"),
+        ({"files": ("q_1.txt",)}, "position.files: has 1 entries; one for each of the joints"),
+        ({"files": ("tau0.dat", "tau1.dat", "short.dat")}, "tau1.dat 20, short.dat 5"),
+        ({}, r'run: position.file: is a folder; name a file in it: file = "q.txt"'),
+    )),
+    *((f"wide{k}.csv", {}, rf"columns: 5 columns are called 'q{{}}' \(q{k} to q{k + 4}\).* 3 joints"
+       ": hip.*joints.*list 3") for k in (0, 1)),
+    ("wide.npz", {}, r"4 columns are called 'q\{\}' \(q0 to q3\)"),
+    ("wide", {"position": {"files": "q{}.txt"}}, r"4 files are called 'q\{\}.txt'"),
+    ("rows.npz", {"position": {"columns": (4, 5, 6), **ROWS}}, "'all' has no row 6; it has 6"),
+    ("square.npz", columns_of("q"), r"there is no array 'q'; its arrays are p \(3, 3\)"),
+    ("upright.npz", {"position": {}}, "the name of the array is missing; its arrays are q"),
+    ("square.npz", {"position": {}},
+     'square matrix; state whether joints are along "columns" or "rows"'),
+    ("narrow.npz", {"position": {}}, r"shape \(20, 2\), joints along its columns, and there are 3"),
+    ("narrow.npz", {"position": {"columns": (0, 1, 7), "array": "p"}}, "no column 7; it has 2"),
+    ("lengths.npz", columns_of(("a", "b", "a")), "a 20, b 19, a 20"),
+    ("text.npz", {"position": {}}, "has no array of numbers"),
+]  # fmt: skip
+
+
+class TestMaps:
+    @pytest.mark.parametrize(("source", "entries", "position", "torque"), READ)
+    def test_columns_files_and_arrays_are_found(
+        self, place, robot, source, entries, position, torque
+    ):
+        found = read(place / source, robot, **entries)
+        assert np.array_equal(found["position"], position)
+        assert ("torque" in found) == (torque is not None)
+        if torque is not None:
+            assert np.array_equal(found["torque"], torque)
+        if "time" in entries:
+            assert found["stamp"] / 1e9 == pytest.approx(TIME)
         assert "motor_current" not in found
 
-    def test_comments_quotes_and_joints_in_another_order(self, tmp_path, robot):
-        header = '# made by hand\n% 2020\n\n"t", "q1", "q2", "q3", "a", "b", "c"'
-        found = read(log(tmp_path / "a.txt", VALUES, header), robot)
-        assert np.array_equal(found["position"], VALUES[:, 1:4])
-        file = log(tmp_path / "a.csv", VALUES, "t,q1,q2,q3,v1,v2,v3")
-        velocity = {"columns": "v{}", "unit": "deg/s"}
-        found = read(file, robot, velocity=velocity, joints=("ankle", "hip", "knee"))
-        assert np.array_equal(found["position"], VALUES[:, [2, 3, 1]])
-        assert found["velocity"] == pytest.approx(np.radians(VALUES[:, [5, 6, 4]]), rel=1e-15)
+    @pytest.mark.parametrize(("source", "entries", "sentence"), REFUSED)
+    def test_a_map_that_does_not_fit_is_refused(self, place, robot, source, entries, sentence):
+        with pytest.raises(SourceError, match=sentence):
+            read(place / source, robot, **entries)
+        assert not (place / source).with_suffix(".mcap").exists()
 
 
 TIMES = [
@@ -173,23 +292,6 @@ class TestUnitsAndGears:
 
 class TestBadInput:
     @pytest.mark.parametrize(
-        ("entries", "sentence"),
-        [
-            ({"position": {"columns": "pos{}"}},
-             "no column 'pos1' for hip, joint 1 of 3.*there are t, q1, q2.*--lock-others"),
-            ({"torque": {"columns": (4, 5, 9)}}, r"torque.columns: there is no column 9"),
-            ({"torque": {"columns": (4, 5)}}, "has 2 entries; one for each of the joints hip"),
-            ({"joints": ("a", "b", "c")}, "names the joints a, b, c; the robot's joints are hip"),
-            ({"drive": {"gear_ratio": (1, 0, 2)}}, "no motor would move one of the joints"),
-            ({"torque": {"columns": "tau{}", "file": "t.csv"}}, r"t\.csv: cannot be read"),
-        ],
-    )  # fmt: skip
-    def test_a_map_that_does_not_fit_is_refused(self, file, robot, entries, sentence):
-        with pytest.raises(SourceError, match=sentence):
-            read(file, robot, **entries)
-        assert not file.with_suffix(".mcap").exists()
-
-    @pytest.mark.parametrize(
         ("line", "found"),
         [
             ("0.1,1,x,3,4,5,6", "'x' in column q2, not a number"),
@@ -206,9 +308,6 @@ class TestBadInput:
             read(file, robot, time={"column": "t"})
 
     def test_unusable_files_are_refused(self, tmp_path, file, robot):
-        log(tmp_path / "tau.csv", VALUES[:-1], HEADER)
-        with pytest.raises(SourceError, match="differ in length: position 20, torque 19"):
-            read(file, robot, torque={"columns": "tau{}", "file": "tau.csv"})
         (tmp_path / "b.csv").write_text("t,q1\n")
         with pytest.raises(SourceError, match="has no row of numbers"):
             read(tmp_path / "b.csv", robot)
@@ -216,105 +315,6 @@ class TestBadInput:
         longer = log(tmp_path / "c.csv", VALUES, "t,q1,q2,q3")
         with pytest.raises(SourceError, match=r"4 names .* rows of 7 numbers; name the other"):
             read(longer, robot)
-
-
-QUANTITIES = {
-    "position": {"files": "q_{}.txt", "columns": (1,)},
-    "torque": {"files": "tau{}.dat"},
-}
-
-
-class TestFilePerJoint:
-    """Quantities with one file per joint, beside the log or in the folder that is named."""
-
-    @pytest.fixture
-    def folder(self, tmp_path):
-        place = tmp_path / "run"
-        place.mkdir()
-        for joint in range(3):
-            np.savetxt(place / f"q_{joint + 1}.txt", VALUES[:, [0, joint + 1]], fmt="%.17g")
-            np.savetxt(place / f"tau{joint}.dat", VALUES[:, joint + 4], fmt="%.17g")
-        np.savetxt(place / "t.txt", VALUES[:, 0])
-        return place
-
-    @pytest.mark.parametrize("source", [".", "q_1.txt", "t.txt"])
-    def test_pattern_numbers_from_1_or_0(self, folder, robot, source):
-        columns = column_map(**QUANTITIES)
-        path = import_log(folder / source, folder / "a.mcap", robot=robot, columns=columns)
-        archive = open_archive(path)
-        assert np.array_equal(archive.columns["position"], VALUES[:, 1:4])
-        assert np.array_equal(archive.columns["torque"], VALUES[:, 4:])
-        assert "q_2.txt" in archive.header.entries["source"]
-
-    def test_list_of_files_arrays_and_column_per_file(self, folder, robot):
-        for joint in range(3):
-            np.save(folder / f"q{joint + 1}.npy", VALUES[:, joint + 1])
-            header = f"t,angle{joint + 1}"
-            log(folder / f"{joint + 1}.csv", VALUES[:, [0, joint + 1]], header)
-        files = ("q_3.txt", "q_1.txt", "q_2.txt")
-        for position, joints in [
-            ({"files": files, "columns": (1,)}, ("ankle", "hip", "knee")),
-            ({"files": "q{}.npy"}, JOINTS),
-            ({"files": "{}.csv", "columns": "angle{}"}, JOINTS),
-        ]:
-            found = read(folder, robot, position=position, joints=joints)
-            assert np.array_equal(found["position"], VALUES[:, 1:4])
-
-    def test_time_in_each_file_or_in_its_own(self, folder, robot):
-        for time in ({"column": 0}, {"file": "t.txt"}):
-            read(folder, robot, **QUANTITIES, time=time)
-            time = open_recording(folder.with_suffix(".mcap")).time
-            assert time == pytest.approx(VALUES[:, 0])
-
-    def test_files_with_different_times_are_refused(self, folder, robot):
-        np.savetxt(folder / "q_2.txt", VALUES[:, [0, 2]] + [0.001, 0.0])
-        with pytest.raises(SourceError, match=r"q_2\.txt: time: has other times than q_1\.txt"):
-            read(folder, robot, **QUANTITIES, time={"column": 0})
-
-    @pytest.mark.parametrize(
-        ("position", "sentence"),
-        [
-            ({"files": "q_{}.txt"}, r"q_1\.txt: .*shape \(20, 2\), expected one column"),
-            ({"files": "p{}.txt"}, r"position.files: there is no file 'p1.txt' for hip, joint 1"),
-            ({"files": ("q_1.txt",)}, "position.files: has 1 entries; one for each of the joints"),
-            ({"files": ("tau0.dat", "tau1.dat", "short.dat")}, "tau1.dat 20, short.dat 5"),
-            ({}, r'run: position.file: is a folder; name a file in it: file = "q.txt"'),
-        ],
-    )
-    def test_a_map_that_does_not_fit_is_refused(self, folder, robot, position, sentence):
-        np.savetxt(folder / "short.dat", VALUES[:5, 4])
-        with pytest.raises(SourceError, match=sentence):
-            read(folder, robot, position=position)
-
-
-class TestMoreColumnsThanJoints:
-    WIDE = np.random.default_rng(7).normal(size=(20, 5))
-
-    def test_are_refused_with_both_remedies(self, tmp_path, robot):
-        for first in (0, 1):
-            header = ",".join(f"q{k + first}" for k in range(5))
-            file = log(tmp_path / f"{first}.csv", self.WIDE, header)
-            expected = rf"5 columns are called 'q{{}}' \(q{first} to q{first + 4}\).* 3 joints: hip"
-            with pytest.raises(SourceError, match=f"columns: {expected}.*joints.*list 3"):
-                read(file, robot)
-        np.savez(tmp_path / "a.npz", **{f"q{k}": self.WIDE[:, k] for k in range(4)})
-        with pytest.raises(SourceError, match=r"4 columns are called 'q\{\}' \(q0 to q3\)"):
-            read(tmp_path / "a.npz", robot)
-        for k in range(4):
-            np.savetxt(tmp_path / f"q{k}.txt", self.WIDE[:, k])
-        with pytest.raises(SourceError, match=r"4 files are called 'q\{\}.txt'"):
-            read(tmp_path, robot, position={"files": "q{}.txt"})
-
-    def test_the_map_may_name_all_joints_or_the_columns(self, tmp_path, robot):
-        file = log(tmp_path / "a.csv", self.WIDE, "q1,q2,q3,q4,q5")
-        for entries, expected in [
-            ({"joints": ("ext", "ankle", "knee", "hip", "ext_2")}, [3, 2, 1]),
-            ({"position": {"columns": ("q2", "q3", "q5")}}, [1, 2, 4]),
-        ]:
-            assert np.array_equal(read(file, robot, **entries)["position"], self.WIDE[:, expected])
-        np.savez(tmp_path / "b.npz", **{f"q{k}": self.WIDE[:, k] for k in range(3)})
-        for source in (tmp_path / "b.npz", log(tmp_path / "c.csv", self.WIDE[:, :3], "q0,q1,q2")):
-            assert np.array_equal(read(source, robot)["position"], self.WIDE[:, :3])
 
 
 class TestMapFile:
@@ -357,9 +357,6 @@ class TestMapFile:
 
 
 Floats = NDArray[np.float64]
-Q = np.random.default_rng(5).normal(size=(40, 3))
-TAU = np.random.default_rng(6).normal(size=(40, 3))
-TIME = 0.01 * np.arange(40)
 
 
 def read_arrays(source: Path, robot: Robot, **entries: object) -> dict[str, Floats]:
@@ -367,43 +364,13 @@ def read_arrays(source: Path, robot: Robot, **entries: object) -> dict[str, Floa
 
 
 class TestArrays:
-    @pytest.mark.parametrize("transposed", [False, True])
-    def test_a_matrix_either_way_round(self, tmp_path, robot, transposed):
-        q, tau = (Q.T, TAU.T) if transposed else (Q, TAU)
-        np.savez(tmp_path / "a.npz", q=q, tau=tau)
-        entries = {"position": {"columns": "q"}, "torque": {"columns": "tau"}}
-        found = read(tmp_path / "a.npz", robot, **entries)
-        assert np.array_equal(found["position"], Q)
-        assert np.array_equal(found["torque"], TAU)
-
-    def test_arrays_of_joints_or_columns_of_one_matrix(self, tmp_path, robot):
-        arrays = {f"q{j + 1}": Q[:, j] for j in range(3)} | dict(zip("abc", TAU.T, strict=True))
-        np.savez_compressed(tmp_path / "a.npz", **arrays)
-        found = read(tmp_path / "a.npz", robot, torque={"columns": ("c", "a", "b")})
-        assert np.array_equal(found["position"], Q)
-        assert np.array_equal(found["torque"], TAU[:, [2, 0, 1]])
-        np.save(tmp_path / "a.npy", np.column_stack([TIME, Q, TAU]))
-        entries = {"position": {"columns": (1, 2, 3)}, "torque": {"columns": (4, 5, 6)}}
-        time = {"column": 0, "array": "array"}
-        found = read(tmp_path / "a.npy", robot, time=time, **entries)
-        assert np.array_equal(found["torque"], TAU)
-        assert found["stamp"].tolist() == [10_000_000 * k for k in range(40)]
-
-    def test_rows_of_a_matrix(self, tmp_path, robot):
-        np.savez(tmp_path / "a.npz", all=np.vstack([TAU.T, Q.T]), t=TIME)
-        position = {"columns": (3, 4, 5), "array": "all", "joints_along": "rows"}
-        found = read(tmp_path / "a.npz", robot, position=position, time={"column": "t"})
-        assert np.array_equal(found["position"], Q)
-        with pytest.raises(SourceError, match="'all' has no row 6; it has 6"):
-            read(tmp_path / "a.npz", robot, position=position | {"columns": (4, 5, 6)})
-
     @pytest.mark.parametrize(
         ("stamps", "unit"),
         [
-            (1_700_000_000_123_456 + 10_000 * np.arange(40), "us"),
-            (np.datetime64("2024-05-01T12:00:00") + np.arange(40) * np.timedelta64(10, "ms"), "s"),
+            (1_700_000_000_123_456 + 10_000 * np.arange(20), "us"),
+            (np.datetime64("2024-05-01T12:00:00") + np.arange(20) * np.timedelta64(10, "ms"), "s"),
             (-3.0 + TIME[:, None], "s"),
-            (1e6 + 10.0 * np.arange(40.0), "ms"),
+            (1e6 + 10.0 * np.arange(20.0), "ms"),
         ],
     )
     def test_stamps_of_any_kind(self, tmp_path, robot, stamps, unit):
@@ -422,35 +389,6 @@ class TestArrays:
         (tmp_path / "a.m").write_text(f"% a log\nT = [0.01];\nq = [ {rows} ]; % rad\n")
         found = read_arrays(tmp_path / "a.m", robot, position={"columns": "q"})
         assert np.array_equal(found["position"], Q)
-
-    @pytest.mark.parametrize(
-        ("arrays", "position", "sentence"),
-        [
-            ({"p": Q}, {"columns": "q"}, r"there is no array 'q'; its arrays are p \(40, 3\)"),
-            ({"p": Q, "r": Q}, {}, "the name of the array is missing; its arrays are p"),
-            ({"p": Q[:3]}, {}, 'square matrix; state whether joints are along "columns" or "rows"'),
-            ({"p": Q[:, :2]}, {}, r"shape \(40, 2\), joints along its columns, and there are 3"),
-            ({"p": Q}, {"columns": (0, 1, 7), "array": "p"}, r"'p' has no column 7; it has 3"),
-            ({"a": TIME, "b": TIME[1:]}, {"columns": ("a", "b", "a")}, "a 40, b 39, a 40"),
-            ({"p": np.array(["x"])}, {}, "has no array of numbers"),
-        ],
-    )
-    def test_refusal_names_available_arrays(self, tmp_path, robot, arrays, position, sentence):
-        np.savez(tmp_path / "a.npz", **arrays)
-        with pytest.raises(SourceError, match=sentence):
-            read_arrays(tmp_path / "a.npz", robot, position=position)
-
-
-def stored(kind: str) -> bytes:
-    """Return a file with `t` and `q`."""
-    file, arrays = io.BytesIO(), {"t": TIME, "q": Q}
-    if kind == "npy":
-        np.save(file, Q)
-    elif kind == "npz":
-        np.savez_compressed(file, **arrays)
-    else:
-        savemat(file, arrays, do_compression=kind == "compressed mat")
-    return file.getvalue()
 
 
 def opaque(name: str) -> bytes:
@@ -500,7 +438,7 @@ class TestStructs:
     def test_missing_field_is_named_with_the_others(self, tmp_path, robot):
         savemat(tmp_path / "a.mat", {"log": LOG, "k": 3.0})
         problem = "position.columns: there is no array 'log.joint.x'; its arrays are .*log.joint.q"
-        with pytest.raises(SourceError, match=rf"a\.mat: {problem} \(40, 3\)"):
+        with pytest.raises(SourceError, match=rf"a\.mat: {problem} \(20, 3\)"):
             read_arrays(tmp_path / "a.mat", robot, position={"columns": "log.joint.x"})
 
     @pytest.mark.parametrize("position", ["q", "log.joint.q"])
@@ -520,11 +458,11 @@ class TestStructs:
 
 
 class TestUntrustedFiles:
-    @pytest.mark.parametrize("kind", ["npz", "npy", "mat", "compressed mat"])
-    def test_damaged_files_raise_no_other_error(self, tmp_path, kind):
-        rng, intact = np.random.default_rng(1), stored(kind)
-        path = tmp_path / f"a.{kind.split()[-1]}"
-        refused = 0
+    @pytest.mark.parametrize("compressed", [False, True])
+    def test_damaged_files_raise_no_other_error(self, tmp_path, compressed):
+        rng, path = np.random.default_rng(1), tmp_path / "a.mat"
+        savemat(path, {"t": TIME, "q": Q}, do_compression=compressed)
+        intact, refused = path.read_bytes(), 0
         for _ in range(40):
             data = bytearray(intact)
             data[rng.integers(min(len(data), 400))] = rng.integers(256)
@@ -553,7 +491,8 @@ class TestUntrustedFiles:
         with zipfile.ZipFile(path, "a") as archive:
             with archive.open("bomb.npy", "w") as bomb:
                 np.lib.format.write_array_header_1_0(bomb, forged | {"shape": (10**12, 3)})
-            archive.writestr("truncated.npy", stored("npy")[:-1])
+            np.save(tmp_path / "q.npy", Q)
+            archive.writestr("truncated.npy", (tmp_path / "q.npy").read_bytes()[:-1])
         assert np.array_equal(read_arrays(path, robot, position={"columns": "q"})["position"], Q)
         for name, sentence in {
             "bomb": "too large to be read at once; save the log in parts",
@@ -649,7 +588,7 @@ class TestTextMatrices:
 
 
 def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
-    more = np.column_stack([Q[:, 2], np.full(40, 9.0), Q[:, :2]])
+    more = np.column_stack([Q[:, 2], np.full(20, 9.0), Q[:, :2]])
     np.savez(tmp_path / "a.npz", q=more)
     found = read_arrays(
         tmp_path / "a.npz",

@@ -60,21 +60,16 @@ def test_recording_has_columns_and_provenance(tmp_path: Path) -> None:
     assert "missing" not in recording.provenance
 
 
-def test_lost_packets_are_gaps(tmp_path: Path) -> None:
+def test_lost_packets_and_replies_not_accepted_are_gaps(tmp_path: Path) -> None:
     rows = records()
     rows["gap"][120] = 2
+    unaccepted = int(rows["cycle"][150])
     rows = np.delete(rows, [118, 119, 300, 301])  # the second hole was never reported
-    recording = open_recording(archive(tmp_path / NAME, rows))
-    assert np.flatnonzero(recording.gap_before).tolist() == [118, 298]
-    assert [(s.start, s.stop) for s in recording.segments()] == [(0, 118), (118, 298), (298, 396)]
+    recording = open_recording(archive(tmp_path / NAME, rows, lost=unaccepted))
+    assert np.flatnonzero(recording.gap_before).tolist() == [118, 148, 298]
+    parts = [(one.start, one.stop) for one in recording.segments()]
+    assert parts == [(0, 118), (118, 148), (148, 298), (298, 396)]
     assert recording.time[118] == pytest.approx(0.240)
-
-
-def test_replies_not_accepted_are_gaps(tmp_path: Path) -> None:
-    rows = records()
-    path = archive(tmp_path / NAME, rows, lost=int(rows["cycle"][150]))
-    segments = open_recording(path).segments()
-    assert [(s.start, s.stop) for s in segments] == [(0, 150), (150, 400)]
 
 
 def test_truncated_archive_gives_its_intact_part(tmp_path: Path) -> None:

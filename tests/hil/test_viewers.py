@@ -4,23 +4,16 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
-from drivers.record import cycle_dtype
-from hil.archive import ArchiveWriter, Samples, open_archive, write_samples
+from hil.archive import Samples, open_archive, write_samples
 from hil.campaign import Campaign
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
@@ -29,75 +22,6 @@ from hil.plots.archive_view import (
     draw_archive,
     view_of,
 )
-from sim_fixtures.ns16 import URDF_PATH
-
-VIEWERS = Path(__file__).parents[2] / "examples" / "viewers"
-STATES = ("/joint_states", "/joint_states_commanded")
-
-Messages = Mapping[str, list[tuple[int, Any]]]
-
-
-def messages(path: Path) -> Messages:
-    """Log time [ns] and decoded message by topic, as another program reads them."""
-    found: dict[str, list[tuple[int, Any]]] = {}
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
-        for _, channel, message, decoded in reader.iter_decoded_messages():
-            found.setdefault(channel.topic, []).append((message.log_time, decoded))
-    return found
-
-
-@pytest.fixture(scope="module")
-def six(tmp_path_factory: pytest.TempPathFactory) -> Messages:
-    """Messages of an archive of the NS 16."""
-    path = tmp_path_factory.mktemp("six") / "move_000_a1.mcap"
-    names = tuple(f"joint_{k}" for k in range(1, 7))
-    rows = np.zeros(100, cycle_dtype(6))
-    rows["cycle"] = np.arange(100)
-    rows["commanded_position"] = rows["commanded_velocity"] = np.nan
-    urdf = {"robot.urdf": URDF_PATH.read_bytes()}
-    with ArchiveWriter(
-        path, joint_names=names, period=0.002, metadata={}, attachments=urdf, durable=False
-    ) as archive:
-        archive.event(0, "MotionStarted", "off we go")
-        archive.write(rows, np.ones((100, 6)))
-        archive.close("completed")
-    return messages(path)
-
-
-class TestLayouts:
-    """Every topic and field that a layout names is in an archive of an arm of six joints."""
-
-    def test_foxglove(self, six: Messages) -> None:
-        layout = json.loads((VIEWERS / "foxglove.json").read_text())
-        panels = layout["configById"]
-        assert set(re.findall(r'"([\w ]+![\w]+)"', json.dumps(layout["layout"]))) == set(panels)
-        paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
-        assert len(paths) == 30
-        for text in paths:
-            topic, word, index = re.fullmatch(r"(/\w+)\.(\w+)\[(\d)\]", text).groups()  # type: ignore[union-attr]
-            assert np.isfinite(getattr(six[topic][0][1], word)[int(index)])
-        named = {*panels["3D!arm"]["topics"], panels["RosOut!events"]["topicToRender"]}
-        assert named <= set(six)
-
-    def test_plotjuggler(self, six: Messages) -> None:
-        """It calls the numbers of a JointState topic/joint/word."""
-        root = ElementTree.parse(VIEWERS / "plotjuggler.xml").getroot()
-        series = {
-            f"{topic}/{joint}/{word}"
-            for topic in STATES
-            for word in ("position", "velocity", "effort")
-            for joint, _ in zip(
-                six[topic][0][1].name, getattr(six[topic][0][1], word), strict=False
-            )
-        }
-        curves = [curve.get("name") for curve in root.iter("curve")]
-        assert len(curves) == 30
-        assert set(curves) <= series
-        for splitter in root.iter("DockSplitter"):
-            sizes = [float(size) for size in splitter.attrib["sizes"].split(";")]
-            assert len(sizes) == int(splitter.attrib["count"]) == len(splitter.findall("DockArea"))
-            assert sum(sizes) == pytest.approx(1.0)
 
 
 @pytest.fixture
