@@ -17,8 +17,7 @@ from drivers.errors import DriverError
 from drivers.transports.base import TransportError
 from hil.errors import ControllerFault, InputError
 from hil.reading import parse_port
-from sim_fixtures import ControllerSettings, SimulatedController, serve
-from sim_fixtures.program import Phase
+from sim_fixtures import ControllerSettings, Phase, SimulatedController, serve
 from sim_fixtures.settings import PlantDiverged
 
 _PR_SET_TIMERSLACK: Final = 29

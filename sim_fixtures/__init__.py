@@ -7,10 +7,9 @@ is also tested against captures of foreign programs.
 from __future__ import annotations
 
 from sim_fixtures.arm import UnmodelledEffects
-from sim_fixtures.controller import SimulatedController
+from sim_fixtures.controller import Phase, SimulatedController
 from sim_fixtures.drive import SimulatedDrive
 from sim_fixtures.plant import ElasticPlant, Plant, PlantTruth
-from sim_fixtures.program import Phase
 from sim_fixtures.settings import (
     ControllerSettings,
     PlantDiverged,

@@ -18,9 +18,8 @@ from hil.progress import say_at_once
 from hil.serving import Served, buttons, open_controller_link, realtime_process, serve_session
 from hil.simulation import controller_settings, own_postures, simulated_controller
 from hil.terminal_text import plural, printable
-from sim_fixtures import ControllerSettings, SimulatedController
+from sim_fixtures import ControllerSettings, Phase, SimulatedController
 from sim_fixtures.faults import parse_fault, split_faults
-from sim_fixtures.program import Phase
 from sim_fixtures.serve import PATIENCE, Latencies, ServeCounts
 
 WORDS: Final = {

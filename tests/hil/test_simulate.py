@@ -31,8 +31,8 @@ from hil.motion_checks import MotionChecks
 from hil.progress import say_at_once
 from hil.serving import Buttons, open_controller_link
 from hil.simulation import controller_settings, own_postures, simulated_controller, simulated_link
+from sim_fixtures import Phase
 from sim_fixtures.ns16 import CELL_PATH
-from sim_fixtures.program import Phase
 from sim_fixtures.serve import Request
 
 FOREIGN = [sys.executable, str(Path(__file__).with_name("foreign_pc.py"))]

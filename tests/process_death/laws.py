@@ -20,7 +20,7 @@ from hil.archive import Archive, ArchiveName, ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.campaign.folder import Entry
 from hil.errors import ArchiveError
-from sim_fixtures.program import Phase
+from sim_fixtures import Phase
 from tests.process_death.controller import REST, at_rest
 from tests.process_death.rig import Seen
 

@@ -17,7 +17,7 @@ import pytest
 from drivers.record import cycle_dtype
 from hil.campaign.plan import design
 from hil.progress import Silent
-from sim_fixtures.program import Phase
+from sim_fixtures import Phase
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.controller import ROW
 from tests.process_death.laws import (

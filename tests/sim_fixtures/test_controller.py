@@ -28,8 +28,7 @@ from sim_fixtures import (
     SimulatedController,
     ns16,
 )
-from sim_fixtures.controller import RUN_UP, OwnMotion
-from sim_fixtures.program import MISSING, Answer, LoopProgram
+from sim_fixtures.controller import MISSING, RUN_UP, Answer, LoopProgram, OwnMotion
 from tests.fault_matrix import small_cell
 from tests.sim_fixtures.bench import DRIVE, SMOOTH_Q, TRUTH, make_drive, motor_matrix, play
 

@@ -16,7 +16,7 @@ from drivers.events import MotionEnded
 from drivers.states import State
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerFault, HilError
-from sim_fixtures.program import Phase
+from sim_fixtures import Phase
 from tests.simulate.observed import Life, Observed
 from tests.simulate.script import DISTURBS_THE_ARM, kind_of
 
