@@ -1,5 +1,6 @@
-"""Covariance, robust estimates, and estimates with a prior: intervals cover, limits are known."""
+"""Robust, consistent and prior estimates, their covariance, and the delay of the torque."""
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -9,24 +10,55 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from identification.errors import IdentificationError
-from identification.estimators.covariance import cluster_covariance, spread
-from identification.estimators.least_squares import estimate_repetitions
-from identification.estimators.losses import Huber, Loss, Tukey
-from identification.estimators.prior import GaussianPrior, fit_with_prior, nominal_prior, with_prior
-from identification.estimators.robust import robust_estimate
-from identification.factor.factor import Factor, NormalEquations, estimate, solve
+from identification import (
+    Coupling,
+    Factor,
+    FrictionLaw,
+    GaussianPrior,
+    Huber,
+    IdentificationError,
+    Payload,
+    Preprocessing,
+    Recording,
+    RobotModel,
+    Tukey,
+    consistent_estimate,
+    estimate,
+    estimate_delay,
+    estimate_repetitions,
+    fit_least_squares,
+    fit_with_prior,
+    nominal_prior,
+    prepare,
+    rate_products,
+    robust_estimate,
+    with_prior,
+    with_uncertain_delay,
+    write_urdf,
+)
+from identification.estimators.consistent import Shrinkage, fit_shrunk, shrunk_values
+from identification.estimators.covariance import spread
+from identification.estimators.delay import LONGEST_DELAY
+from identification.estimators.losses import Loss
+from identification.export.urdf import NotConsistentError
+from identification.factor.factor import joint_weights, rows_of, solve, total_factor
+from identification.model.pseudo_inertia import pseudo_inertia
+from identification.signals.smoothing import low_pass
 from tests.identification.two_link import (
     MODEL,
     NOISE,
+    URDF,
     P,
     a_motion,
     coloured,
+    four_sines,
     gaussian,
     one_sine,
     recording,
     simulated,
+    sine_motion,
     truth,
+    values_of,
 )
 
 
@@ -45,19 +77,6 @@ class TestRepeatedRecordings:
         assert np.median(many.std / 4.0 / many.pooled.std) < 0.1
         error = np.abs(many.pooled.values - truth())
         assert np.mean(error < many.pooled.interval_factor * many.pooled.std) > 0.85
-
-    def test_they_are_added_at_equal_times_of_the_motion(self):
-        """The same motion with another clock."""
-        motion = a_motion(4.0)
-        early = recording(np.zeros((len(motion.time), 2)), motion)
-        late = replace(
-            early,
-            motion=motion._replace(time=motion.time + 7.3),
-            origin=early.origin + 7.3,
-        )
-        one, two = (Factor.by_time(MODEL, samples) for samples in (early, late))
-        for both, own in zip((one + two).gram, one.gram, strict=True):
-            np.testing.assert_allclose(both, 2.0 * own, rtol=1e-9, atol=1e-8)
 
 
 class TestBlocks:
@@ -120,20 +139,6 @@ class TestBlocks:
         assert 0.90 <= covered.mean() <= 0.99
         assert covered[elbow].min() > 0.85
         assert np.all(np.median(np.array(alone) / classical, axis=0)[elbow] > 1.0)
-
-    @pytest.mark.parametrize("shared", [0.0, 0.09])
-    def test_correlation_of_neighbouring_blocks_counts(self, shared):
-        """Mean of blocks that are correlated with the next one."""
-        rng = np.random.default_rng(3)
-        blocks, k = 300, 40
-        weight = (1.0 - np.sqrt(1.0 - 4.0 * shared**2)) / (2.0 * shared) if shared else 0.0
-        white = rng.standard_normal((blocks + 1, k)) / np.sqrt(blocks * (1.0 + weight**2))
-        scores = white[1:] + weight * white[:-1]
-        information = np.tile(np.eye(k) / blocks, (blocks, 1, 1))
-        solution = solve(NormalEquations(np.eye(k), scores.sum(axis=0)))
-        found = cluster_covariance(information, scores, solution)
-        assert found.blocks == blocks // 2
-        assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
 
 
 LOSSES = [Huber(), Tukey()]
@@ -444,3 +449,389 @@ class TestNominalPrior:
         bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
         with pytest.raises(IdentificationError, match="no inertia"):
             nominal_prior(bare)
+
+
+def with_friction(*friction):
+    """Return the true parameters of the two links with other friction."""
+    return np.concatenate([truth()[: MODEL.base.rank], friction])
+
+
+def five_sines(model, seed, samples=2000):
+    """Return five sines per joint, similar for all seeds."""
+    rng = np.random.default_rng(seed)
+    shape = (5, model.n_joints)
+    time = np.arange(samples) * 4e-3
+    size = np.linspace(1.0, 0.2, 5)[:, None]
+    pace = np.linspace(0.5, 4.0, 5)[:, None] * rng.uniform(0.9, 1.1, shape)
+    return sine_motion(time, size, pace, rng.uniform(0.0, 6.0, shape))
+
+
+def measured(model, motion, values, noise, seed):
+    """Return torque with noise, a share of each joint's RMS."""
+    rms = np.sqrt((model.torque(values, *motion[1:]) ** 2).mean(axis=0))
+    return simulated(model, values, motion, noise * rms, seed).torque
+
+
+def fitted(model, motion, torque, **options):
+    return consistent_estimate(model, Factor.from_samples(model, motion, torque), **options)
+
+
+def fit_of(values, noise, seed, *, model=MODEL, samples=2000):
+    """Return the estimate of an arm with these parameters."""
+    motion = five_sines(model, seed, samples)
+    return fitted(model, motion, measured(model, motion, values, noise, seed))
+
+
+def error_rise(found):
+    """Return the rise of the relative error on the fitted rows."""
+    return found.relative_error - found.unconstrained_relative_error
+
+
+def assert_consistent(model, found):
+    """Check the definition of consistency by eigenvalues."""
+    rows = found.standard.reshape(model.n_joints, -1)
+    for xx, xy, xz, yy, yz, zz, hx, hy, hz, m, *rotor in rows:
+        tensor = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        h = np.array([hx, hy, hz])
+        about_centre = tensor - (h @ h * np.eye(3) - np.outer(h, h)) / m
+        moments = np.linalg.eigvalsh(about_centre)
+        assert m > 0.0
+        assert moments[0] > 0.0
+        assert moments[0] + moments[1] > moments[2]
+        assert all(r >= 0.0 for r in rotor)
+    for name, value in zip(found.estimate.names, found.estimate.values, strict=True):
+        assert value >= 0.0 or not name.startswith(("f0", "f1"))
+
+
+LARGE = 1e2  # times the nominal bodies, kg m² of rotor, or N·m of friction
+
+
+def largest_gain(gradient, at, nominal):
+    """Return a bound on how much consistent parameters can decrease a convex function.
+
+    The function stays above its tangent. The gradient of a link is a matrix Z with <Z, J(x)> =
+    gradient x, not negative if Z is positive semidefinite. Small violations are multiplied by
+    LARGE.
+    """
+    upper = np.triu_indices(4)
+    basis = np.zeros((10, 4, 4))
+    basis[np.arange(10), upper[0], upper[1]] += 0.5
+    basis[np.arange(10), upper[1], upper[0]] += 0.5
+    products = pseudo_inertia(np.eye(10)).reshape(10, 16) @ basis.reshape(10, 16).T
+    missing = 0.0
+    n = len(nominal)
+    others = np.delete(gradient, [i for f in range(n) for i in range(11 * f, 11 * f + 10)])
+    missing += float(np.maximum(-others, 0.0).sum())
+    for link, inertial in enumerate(nominal):
+        entries = np.linalg.solve(products, gradient[11 * link : 11 * link + 10])
+        dual = np.tensordot(entries, basis, axes=1)
+        frame = np.linalg.cholesky(pseudo_inertia(inertial))
+        missing += max(-float(np.linalg.eigvalsh(frame.T @ dual @ frame)[0]), 0.0)
+    return float(gradient @ at) + LARGE * missing
+
+
+class TestConsistentEstimate:
+    @pytest.mark.parametrize(("noise", "samples"), [(0.5, 150), (0.3, 300), (0.02, 2000)])
+    def test_base_parameters_follow_from_standard_ones(self, noise, samples):
+        """These are consistent with poor data; good data are hardly changed."""
+        found, rank = fit_of(truth(), noise, 1, samples=samples), MODEL.base.rank
+        assert_consistent(MODEL, found)
+        assert found.status == "optimal" and np.all(found.margin > 0.0)
+        expected = MODEL.base.grouping @ found.standard
+        np.testing.assert_allclose(found.estimate.values[:rank], expected, atol=1e-12)
+        np.testing.assert_array_equal(found.estimate.values[rank:], found.friction)
+        if noise == 0.02:
+            assert np.abs(found.shift).max() < 0.1 and error_rise(found) < 1e-5
+
+    def test_exact_nominal_data_return_all_parameters(self):
+        """Parameters without effect on the torque are nominal."""
+        values = values_of(MODEL, [4.0, 2.0, 1.5, 0.8])
+        np.testing.assert_allclose(fit_of(values, 0.0, 3).standard, MODEL.nominal, atol=1e-4)
+
+    def test_negative_friction_becomes_zero(self):
+        found = fit_of(with_friction(-1.0, 2.0, 1.5, -0.3), 0.01, 4)
+        for name in ("f0_1", "f1_2"):
+            assert found.unconstrained.value(name) < 0.0
+            assert found.estimate.value(name) == pytest.approx(0.0, abs=1e-3)
+        assert_consistent(MODEL, found)
+
+    def test_no_other_consistent_parameters_fit_better(self):
+        values = with_friction(-1.0, 2.0, 1.5, 0.8)
+        values[MODEL.parameter_names.index("I2yy")] = -0.1  # active constraints
+        motion = five_sines(MODEL, 6)
+        torque = measured(MODEL, motion, values, 0.4, 6)
+        found = fitted(MODEL, motion, torque, prior_weight=1e-4)
+        # The same objective from the samples, and its gradient.
+        factor = Factor.from_samples(MODEL, motion, torque)
+        weights = joint_weights(factor)
+        root, target = rows_of(factor.weighted(weights))
+        excess = float(np.sum((root @ found.estimate.values - target) ** 2))
+        assert excess > 100.0
+        rank, s = MODEL.base.rank, len(MODEL.layout.names)
+        mapping = np.zeros((MODEL.n_parameters, s + 4))
+        mapping[:rank, :s] = MODEL.base.grouping
+        mapping[rank:, s:] = np.eye(4)
+        rows = MODEL.regressor(*motion[1:]).dense(MODEL.n_parameters) @ mapping
+        x = np.concatenate([found.standard, found.friction])
+        gradient = 2.0 * np.einsum("tj,j,tjk->k", rows @ x - torque, weights, rows)
+        assert largest_gain(gradient, x, MODEL.chain.inertial) < 1e-2 * excess
+
+    @pytest.mark.parametrize("noise", [0.1, 0.01, 0.0])
+    def test_inconsistent_data_give_the_closest_parameters(self, noise):
+        """As after a wrong sign of one torque, for any noise."""
+        values = with_friction(-1.0, 2.0, 1.5, 0.8)
+        values[MODEL.parameter_names.index("I2yy")] = -0.3
+        found = fit_of(values, noise, 6)
+        assert_consistent(MODEL, found)
+        assert "no consistent parameters fit" in found.status
+        assert error_rise(found) > 0.02
+
+    def test_errors_and_covariance_are_correct(self):
+        motion = five_sines(MODEL, 7, samples=300)
+        torque = measured(MODEL, motion, truth(), 0.3, 7)
+        found = fitted(MODEL, motion, torque)
+        error = MODEL.torque(found.estimate.values, *motion[1:]) - torque
+        rms = np.sqrt((error**2).mean(axis=0))
+        np.testing.assert_allclose(found.estimate.noise_std, rms, rtol=1e-6)
+        relative = np.linalg.norm(error) / np.linalg.norm(torque)
+        assert found.relative_error == pytest.approx(relative, rel=1e-6)
+        assert "covariance of the unconstrained estimate" in found.estimate.method
+        np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
+
+    def test_a_resting_joint_keeps_its_nominal_link(self):
+        law = FrictionLaw(third=None)
+        model = RobotModel.from_urdf(URDF, friction=law, gravity=(0, 0, 0))
+        motion = five_sines(model, 10)
+        for array in motion[1:4]:
+            array[:, 1] = 0.0
+        values = values_of(model, [4.0, 2.0, 1.5, 0.8])
+        torque = measured(model, motion, values, 0.01, 10)
+        mask = np.zeros(torque.shape, dtype=np.bool_)
+        mask[:, 0] = True
+        found = consistent_estimate(model, Factor.from_samples(model, motion, torque, mask))
+        assert_consistent(model, found)
+        assert {"f0_2", "f1_2"} <= set(found.estimate.undetermined)
+        assert np.all(np.isfinite(found.standard))
+        np.testing.assert_allclose(found.standard[20], model.nominal[20], rtol=0.5)  # m2
+
+
+class TestDrives:
+    """Coupled drives, and friction of more than three terms."""
+
+    TURNS = np.array([[1.0, 0.0], [0.5, 1.0]])
+
+    def coupled(self, inertia):
+        law = FrictionLaw(third=None)
+        model = RobotModel.from_urdf(URDF, friction=law, coupling=Coupling(self.TURNS))
+        standard = model.nominal
+        standard[model.layout.rotors] = 0.4, 0.1
+        standard[model.layout.couplings] = inertia
+        return model, standard
+
+    @pytest.mark.parametrize("inertia", [0.12, 0.6, -0.6])
+    def test_the_rotor_matrix_is_positive(self, inertia):
+        """At no cost if the true one is."""
+        model, standard = self.coupled(inertia)
+        friction = np.full(len(model.friction.terms), 0.8)
+        values = np.concatenate([model.base.grouping @ standard, friction])
+        found = fit_of(values, 0.01, 1, model=model)
+        assert np.linalg.eigvalsh(model.layout.rotor_matrix(found.standard))[0] > 0.0
+        assert np.all(found.margin > 0.0)
+        assert (error_rise(found) < 1e-4) == (inertia == 0.12)
+
+    def test_inconsistent_coupling_inertias_raise(self):
+        model, standard = self.coupled(0.3)
+        with pytest.raises(NotConsistentError, match="coupling"):
+            write_urdf(URDF, model, standard)
+
+    def test_all_friction_terms_dissipate(self):
+        """True friction: larger viscous difference than viscosity, smaller friction at rest."""
+        law = FrictionLaw(third=None, asymmetric=True, stribeck=0.3)
+        model = RobotModel.from_urdf(URDF, friction=law)
+        terms = {"f0": 1.0, "f1": 0.3, "fd": 0.6, "fs": -2.0, "fo": 0.2}
+        symbols = [term.symbol for term in model.friction.terms]
+        values = values_of(model, [terms[symbol] for symbol in symbols])
+        found = fit_of(values, 0.01, 1, model=model)
+        for own in model.friction.table(found.friction):
+            assert own["f0"] >= 0.0
+            assert own["f0"] + own["fs"] >= -1e-12
+            assert abs(own["fd"]) <= own["f1"] + 1e-12
+        # Consistent parameters are recovered.
+        friction = [(terms | {"f1": 0.9, "fs": 0.7})[symbol] for symbol in symbols]
+        found = fit_of(values_of(model, friction), 0.0, 1, model=model)
+        np.testing.assert_allclose(found.friction, friction, rtol=0.02)
+
+
+@pytest.fixture(scope="module")
+def samples():
+    motion = a_motion()
+    return recording(gaussian(np.random.default_rng(3), motion), motion)
+
+
+@pytest.fixture(scope="module")
+def equations(samples):
+    total = total_factor(MODEL, [samples])
+    return total.weighted(joint_weights(total))
+
+
+class TestShrunkEstimate:
+    def test_strength_zero_is_least_squares(self, samples):
+        shrunk = fit_shrunk(MODEL, [samples], Shrinkage(0.0))
+        free = fit_least_squares(MODEL, [samples])
+        np.testing.assert_allclose(shrunk.values, free.values, rtol=1e-9)
+        np.testing.assert_allclose(shrunk.covariance, free.covariance, rtol=1e-6)
+
+    def test_infinite_strength_is_the_consistent_solution(self, samples):
+        total = total_factor(MODEL, [samples])
+        centre = consistent_estimate(MODEL, total, prior_weight=0.1).estimate.values
+        shrunk = fit_shrunk(MODEL, [samples], Shrinkage(math.inf))
+        np.testing.assert_array_equal(shrunk.values, centre)
+
+    def test_it_solves_the_penalised_equations(self, equations):
+        """(A + s D) (x - c) = b - A c with D = diag(A), for any centre c."""
+        far = truth() + 1.0
+        values = shrunk_values(equations, far, 0.3)
+        penalised = equations.A + 0.3 * np.diag(np.diag(equations.A))
+        residual = equations.b - equations.A @ far - penalised @ (values - far)
+        assert np.abs(residual).max() < 1e-8 * np.abs(equations.b).max()
+
+
+TRUTH = truth()
+STEP = 1e-3
+UNEVEN = np.cumsum(STEP * np.random.default_rng(5).uniform(0.4, 1.6, 6000))
+CARRYING = RobotModel.from_urdf(
+    URDF, friction=FrictionLaw(third=None), payload=Payload(mass=60.0, centre=(0.3, 0.1, 0.0))
+)
+
+
+def four_sines_at(time, speed=1.0):
+    """Position, velocity and acceleration (m, 2) of four sines for each joint."""
+    return four_sines(time, speed)[1:4]
+
+
+def delayed(
+    delays, *, model=MODEL, seed=0, speed=1.0, torque_noise=1.0, position_noise=2e-5, time=None
+):
+    """Simulate two links whose torque is logged `delays` [s] after the position."""
+    if time is None:
+        time = np.arange(6000) * STEP
+    rng = np.random.default_rng(seed)
+    late = [four_sines_at(time - delay, speed) for delay in np.broadcast_to(delays, 2)]
+    torque = np.column_stack(
+        [(model.torque(TRUTH, *one) + model.load_torque(*one))[:, j] for j, one in enumerate(late)]
+    )
+    shape = torque.shape
+    return Recording(
+        time=time,
+        position=four_sines_at(time, speed)[0] + position_noise * rng.standard_normal(shape),
+        joint_names=model.joint_names,
+        torque=torque + torque_noise * np.array([1.0, 0.2]) * rng.standard_normal(shape),
+    )
+
+
+class TestDelay:
+    @pytest.mark.parametrize(
+        ("planted", "near", "options"),
+        [
+            (3.7e-4, 5e-6, {"torque_noise": 0.0, "position_noise": 1e-8}),
+            (3.7e-4, 1e-4, {"time": UNEVEN, "torque_noise": 0.3}),
+            # Of many cycles.
+            *((planted, 3e-4, {}) for planted in (-0.043, 0.01, 0.048)),
+            # The known torque of a payload, subtracted with another delay.
+            (0.01, 1e-4, {"model": CARRYING, "torque_noise": 0.1}),
+        ],
+    )
+    def test_it_is_found(self, planted, near, options):
+        options = {"model": MODEL} | options
+        found = estimate_delay(delayed(delays=planted, **options), options["model"])
+        assert found.delay == pytest.approx(planted, abs=near)
+        assert found.applied == found.delay
+
+    def test_it_is_found_in_a_filtered_torque(self):
+        time = np.arange(0.0, 8.0, 0.004)
+        recording = delayed(delays=0.003, time=time, torque_noise=0.3)
+        filtered = replace(recording, torque=low_pass(time, recording.torque, 8.0))
+        found = estimate_delay(filtered, MODEL, options=Preprocessing(torque_bandwidth=8.0))
+        assert found.delay == pytest.approx(0.003, abs=4e-4)
+
+    def test_noise_does_not_bias_it_and_the_interval_covers(self):
+        """Mean within its standard error, scatter over seeds as estimated."""
+        found = [estimate_delay(delayed(1.6e-3, seed=seed), MODEL) for seed in range(12)]
+        error = np.array([one.delay - 1.6e-3 for one in found])
+        claimed = np.sqrt(np.mean([one.std**2 for one in found]))
+        scatter = error.std(ddof=1)
+        assert abs(error.mean()) < 3.0 * scatter / np.sqrt(len(found)) + 5e-6
+        # The standard deviation of 12 samples has an error of 21 %.
+        assert abs(np.log(claimed / scatter)) < 3 * 0.21
+        assert all(one.significant for one in found)
+
+    def test_a_delay_beyond_the_range_is_undetermined(self):
+        found = estimate_delay(delayed(0.06), MODEL)
+        assert found.reason == "the residual decreases up to the longest delay tested"
+        assert found.applied == 0.0
+
+    def test_it_is_found_beside_an_assumed_delay(self):
+        recording = delayed(0.004)
+        found = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.003))
+        assert found.delay == pytest.approx(0.004, abs=3e-4)
+        assert found.significant
+        right = estimate_delay(recording, MODEL, options=Preprocessing(torque_delay=0.004))
+        assert not right.significant
+        assert right.applied == 0.004
+
+    def test_presliding_friction_is_read_at_the_same_time(self):
+        law = FrictionLaw(third=None, presliding=1e-3)
+        model = RobotModel.from_urdf(URDF, friction=law)
+        time = np.arange(6000) * STEP
+        late = four_sines_at(time - 0.005)
+        direction = model.friction.direction(time, late[0], late[1])
+        recording = replace(delayed(0.0, model=model), torque=model.torque(TRUTH, *late, direction))
+        assert estimate_delay(recording, model).delay == pytest.approx(0.005, abs=5e-5)
+
+
+class TestUndeterminedDelay:
+    def test_a_slow_motion_does_not_determine_it(self):
+        slow = estimate_delay(delayed(0.0, speed=0.05), MODEL)
+        assert not slow.determined
+        assert slow.applied == 0.0
+        line = slow.describe()
+        assert line.startswith("all axes: not determined; 95 % interval of ± ")
+        assert line.endswith("the torques change too slowly, or are too noisy")
+        unknown = replace(slow, std=np.inf)
+        assert unknown.variance == pytest.approx(LONGEST_DELAY**2 / 3.0)
+        assert replace(slow, std=1e-4).variance == pytest.approx(1e-8)
+
+    def test_an_uncertain_significant_delay_is_applied(self):
+        found = estimate_delay(delayed(0.045, speed=0.2, seed=2), MODEL)
+        assert found.reason is not None and found.significant
+        assert found.applied == found.delay
+        line = found.describe()
+        assert line.endswith("cycles), significantly different from the 0 ms assumed")
+
+    def test_a_recording_without_motion_raises(self):
+        still = delayed(0.0, speed=0.0)
+        with pytest.raises(IdentificationError, match="not one usable sample"):
+            estimate_delay(still, MODEL)
+
+
+class TestDelayUncertainty:
+    def fit(self, model, samples):
+        return estimate(model, Factor.of(model, samples), np.array([1.0, 25.0]))
+
+    def test_the_sensitivity_is_the_derivative_of_the_estimate(self):
+        """Compared with fits at delays half a millisecond shorter and longer."""
+        recording = delayed(0.004, torque_noise=0.0, position_noise=1e-8)
+
+        def samples(delay):
+            options = Preprocessing(torque_delay=delay, left_out="slow", rigid_bandwidth=40.0)
+            return prepare(recording, MODEL, options=options)
+
+        middle = samples(0.004)
+        fitted, products = self.fit(MODEL, middle), rate_products(MODEL, middle)
+        fitted = replace(fitted, noise_std=np.array([1.0, 0.2]))  # as weighted
+        wider = with_uncertain_delay(fitted, Factor.of(MODEL, middle), products, 0.25)
+        ends = [self.fit(MODEL, samples(0.004 + side)).values for side in (-5e-4, 5e-4)]
+        slope = (ends[1] - ends[0]) / 1e-3
+        added = wider.covariance - fitted.covariance
+        np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
+        np.testing.assert_array_equal(wider.values, fitted.values)

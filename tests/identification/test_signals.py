@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import quad
-from scipy.interpolate import BSpline
 from scipy.signal import butter, sosfiltfilt
 
 from identification.model.coupling import Coupling
@@ -70,10 +68,6 @@ RESTING = changed("commanded_position", slice(None), 1, 0.3).commanded_position
 
 
 class TestChecks:
-    def test_a_valid_recording_is_unchanged(self):
-        recording = a_recording()
-        assert recording.checked(NAMES) is recording
-
     @given(
         channel=st.sampled_from(["position", "torque"]),
         sample=st.integers(0, 199),
@@ -198,14 +192,6 @@ class TestRepetitions:
 
 
 class TestTimeBase:
-    @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
-    def test_an_even_clock_is_uniform(self, rate):
-        base = time_base(1.7e9 + np.arange(2000) / rate)  # seconds since 1970, as ROS stamps
-        assert base.uniform
-        assert base.rate == pytest.approx(rate, rel=1e-4)
-        assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
-        assert len(base.describe()) == 1
-
     @pytest.mark.parametrize("seed", range(5))
     def test_late_stamps_are_not_missing_samples(self, seed):
         random = np.random.default_rng(seed)
@@ -300,30 +286,6 @@ class TestSmoothingSpline:
             error = (spline(time, 2) - sines(time, 2))[200:-200]
             assert np.std(error) < 0.01 * np.std(sines(time, 2))
 
-    def test_it_minimises_squares_plus_roughness(self):
-        # Small enough for a dense solution by SciPy splines and quadrature.
-        rng = np.random.default_rng(5)
-        time = np.sort(rng.uniform(0.0, 1.0, 40))
-        values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
-        spline = fit_smoothing_spline(time, values[:, None], np.array([0.05**2]))
-        k = len(spline.coefficients)
-        knots = spline.start + spline.spacing * np.arange(-5, k + 1)
-        basis = BSpline(knots, np.eye(k), 5)
-        third = basis.derivative(3)
-        roughness = np.zeros((k, k))
-        for i in range(k):
-            for j in range(max(0, i - 5), i + 1):
-                pieces = [
-                    quad(lambda t, i=i, j=j: third(t)[i] * third(t)[j], *knots[p : p + 2])[0]
-                    for p in range(max(i, 5), min(j + 6, k))
-                ]
-                roughness[i, j] = roughness[j, i] = sum(pieces)
-        density = len(time) / (time[-1] - time[0])
-        penalty = density / (2.0 * np.pi * spline.bandwidth[0]) ** 6
-        rows = basis(time)
-        dense = np.linalg.solve(rows.T @ rows + penalty * roughness, rows.T @ values)
-        np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
-
 
 TRUTH = truth()
 
@@ -372,11 +334,6 @@ class TestNoise:
         values = 0.4 + creeps * (1e-4 * time + slip)[:, None] + noise
         np.testing.assert_allclose(np.sqrt(standstill_variance(time, values)), size, rtol=0.1)
 
-    def test_a_constant_reading_has_no_variance(self):
-        assert standstill_variance(np.arange(500) * 1e-3, np.full((500, 1), 0.4))[0] < 1e-40
-        with pytest.raises(RecordingError, match="20 samples"):
-            standstill_variance(np.arange(19) * 1e-3, np.zeros((19, 2)))
-
 
 class TestSamples:
     def test_smoothed_motion_is_accurate_in_usable_rows(self):
@@ -385,10 +342,6 @@ class TestSamples:
         for smoothed, exact in zip(samples.motion[1:4], motion(recording.time), strict=True):
             error = (smoothed - exact)[samples.usable.all(axis=1)]
             assert np.sqrt(np.mean(error**2)) < 2e-3 * np.std(exact)
-
-    def test_the_torque_is_left_as_measured(self):
-        recording = smooth_recording(noise=0.5)
-        assert prepare(recording, MODEL).torque is recording.torque
 
     def test_derivatives_do_not_cross_a_gap(self):
         whole = smooth_recording()

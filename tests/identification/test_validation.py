@@ -38,7 +38,6 @@ from identification.validation.prediction import (
     slow_error,
 )
 from identification.validation.residuals import (
-    FEWEST_BLOCKS,
     HARMONICS,
     autocorrelation,
     block_mean,
@@ -322,16 +321,6 @@ class TestCorrelation:
             naive += abs(noise.mean()) < 1.96 * noise.std() / np.sqrt(len(noise))
         assert 0.90 < inside / seeds < 0.98
         assert naive / seeds < 0.6
-
-    def test_repeated_errors_are_not_more_certain(self):
-        rng = np.random.default_rng(3)
-        motion = np.array([rng.standard_normal((40, 1)), np.ones((40, 1))])
-        once, thrice = block_mean([motion]), block_mean([motion] * 3, repeated=3)
-        other = block_mean([motion] * 3)
-        assert thrice.mean[0] == pytest.approx(once.mean[0])
-        assert thrice.std[0] == pytest.approx(once.std[0])
-        assert other.std[0] == pytest.approx(once.std[0] / np.sqrt(3.0), rel=0.02)
-        assert np.isnan(block_mean([np.ones((2, FEWEST_BLOCKS - 1, 1))]).mean).all()
 
 
 class TestResidualChecks:

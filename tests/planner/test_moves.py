@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -157,23 +156,6 @@ class TestMotion:
                 assert (passage.how == "flown") == (passage.fly == asked)
         assert motion.targets[-1].how == "stopped"
 
-    @given(problems(), st.floats(0.02, 1.0))
-    @settings(max_examples=60)
-    def test_stops_take_longer_than_fly_by_and_less_with_more_speed(self, problem, share):
-        points, moves, limits, overrides = problem
-        motion = plan_moves(points[0], moves, limits, overrides)
-        stopping = [replace(move, fly_percent=0.0) for move in moves]
-        stops = plan_moves(points[0], stopping, limits, overrides)
-        assert stops.duration == pytest.approx(motion.duration_with_stops, rel=1e-14)
-        # Equal but for the rounding of a sum in which a corner replaces times by themselves.
-        assert motion.duration <= stops.duration * (1 + 1e-13)
-        for corner in motion.corners:
-            if corner.join is not None:
-                assert corner.join.duration <= corner.leave + corner.enter
-        slower = replace(overrides, speed=share * overrides.speed)
-        slow = plan_moves(points[0], stopping, limits, slower)
-        assert stops.duration <= slow.duration * (1 + 1e-13)
-
 
 def ramps(motion):
     """Largest acceleration while speeding up and while slowing down, along a line."""
@@ -220,21 +202,6 @@ class TestShares:
 
 class TestCorners:
     """How fly-by shapes a whole motion."""
-
-    def test_corners_not_rounded_as_requested_are_reported(self):
-        a, b, c = random_points(7, 3)
-        repeated = plan_moves(a, [Move(p, fly_percent=50) for p in (b, b, c)], SIX_AXES)
-        assert (repeated.reduced_corners, repeated.stopped_corners) == (0, 0)  # nothing to round
-        reduced = 0
-        for seed in range(300):
-            a, b, c = random_points(seed, 3)
-            # Joint 5 reverses exactly on its limit while joint 0 determines the time.
-            moves = [Move(p, fly_percent=100) for p in (SIX_AXES.upper, c)]
-            motion = plan_moves(a, moves, SIX_AXES)
-            assert motion.reduced_corners == (motion.targets[0].how == "reduced")
-            assert motion.stopped_corners == (motion.targets[0].how == "stopped")
-            reduced += motion.reduced_corners
-        assert reduced > 0
 
     def test_a_miss_at_three_neighbouring_shares_is_avoided(self):
         # Speeds 0.07 % apart: at the second, full, 0.999 and 0.97 of the corner fall on a miss.
