@@ -209,40 +209,24 @@ def _flip(rng: Random, data: bytes, _: bytes) -> Changed:
     return bytes(changed), f"at {places}"
 
 
-def _burst(rng: Random, data: bytes, _: bytes) -> Changed:
-    at, length = rng.randrange(len(data)), rng.randrange(1, 5000)
-    noise = rng.randbytes(min(length, len(data) - at))
-    return data[:at] + noise + data[at + length :], f"at {at}, {length} bytes"
-
-
-def _zeroed_sector(rng: Random, data: bytes, _: bytes) -> Changed:
-    size = rng.choice(SECTORS)
-    at = rng.randrange(0, len(data), size)
-    return data[:at] + bytes(min(size, len(data) - at)) + data[at + size :], f"at {at}, {size}"
-
-
-def _copied_sector(rng: Random, data: bytes, other: bytes) -> Changed:
-    """From this archive or the other one."""
-    source, size = rng.choice((data, other)), rng.choice(SECTORS)
-    at, begin = rng.randrange(0, len(data), size), rng.randrange(0, len(source), size)
+def _overwritten(rng: Random, data: bytes, other: bytes, what: str) -> Changed:
+    """A burst of noise, or a sector that is zeroed or copied from this archive or the other."""
+    size = rng.randrange(1, 5000) if what == "noise" else rng.choice(SECTORS)
+    at = rng.randrange(0, len(data), 1 if what == "noise" else size)
+    source = {"noise": rng.randbytes(size), "zeros": bytes(size)}.get(
+        what, rng.choice((data, other))
+    )
+    begin = rng.randrange(0, len(source), size)
     part = source[begin : begin + min(size, len(data) - at)]
     return data[:at] + part + data[at + len(part) :], f"at {at} from {begin}, {len(part)} bytes"
 
 
-def _cut(rng: Random, data: bytes, _: bytes) -> Changed:
-    length = rng.randrange(len(data))
-    return data[:length], f"to {length} bytes"
-
-
-def _zeroed_tail(rng: Random, data: bytes, _: bytes) -> Changed:
-    """As after a power failure on file systems that set the length first."""
-    at = rng.randrange(0, len(data), rng.choice(SECTORS))
-    return data[:at] + bytes(len(data) - at), f"from {at} on"
-
-
-def _grown(rng: Random, data: bytes, _: bytes) -> Changed:
-    length = rng.randrange(1, 5000)
-    return data + rng.randbytes(length), f"by {length} bytes"
+def _ended(rng: Random, data: bytes, _: bytes, what: str) -> Changed:
+    """Cut, zeroed as after a power failure on some file systems, or with bytes behind it."""
+    at = rng.randrange(0, len(data), rng.choice((1, *SECTORS)))
+    if what == "grown":
+        return data + rng.randbytes(1 + at % 5000), f"by {1 + at % 5000} bytes"
+    return data[:at] + bytes((len(data) - at) * (what == "zeros")), f"at {at}"
 
 
 def _swapped_chunks(rng: Random, data: bytes, _: bytes) -> Changed:
@@ -250,26 +234,13 @@ def _swapped_chunks(rng: Random, data: bytes, _: bytes) -> Changed:
     return data[:a] + data[c:d] + data[b:c] + data[a:b] + data[d:], f"at {a} and {c}"
 
 
-def _doubled_chunk(rng: Random, data: bytes, _: bytes) -> Changed:
-    begin, end = rng.choice(chunks(data))
-    return data[:end] + data[begin:], f"at {begin}"
-
-
-def _missing_chunk(rng: Random, data: bytes, _: bytes) -> Changed:
-    begin, end = rng.choice(chunks(data))
-    return data[:begin] + data[end:], f"at {begin}"
-
-
-def _foreign_chunk(rng: Random, data: bytes, other: bytes) -> Changed:
-    """The same chunk of the other archive instead, with its checksum."""
+def _replaced_chunk(rng: Random, data: bytes, other: bytes, what: str) -> Changed:
+    """Of the other archive it is the same chunk, with its checksum, or all from there on."""
     (begin, end), (a, b) = rng.choice([*zip(chunks(data), chunks(other), strict=False)])
-    return data[:begin] + other[a:b] + data[end:], f"at {begin}"
-
-
-def _foreign_tail(rng: Random, data: bytes, other: bytes) -> Changed:
-    """The content of the other archive from some chunk on."""
-    (begin, _), (a, _) = rng.choice([*zip(chunks(data), chunks(other), strict=False)])
-    return data[:begin] + other[a:], f"from {begin} on"
+    if what == "foreign tail":
+        return data[:begin] + other[a:], f"from {begin} on"
+    part = {"missing": b"", "doubled": 2 * data[begin:end], "foreign": other[a:b]}[what]
+    return data[:begin] + part + data[end:], f"at {begin}"
 
 
 def _no_checksum(rng: Random, data: bytes, _: bytes) -> Changed:
@@ -293,17 +264,17 @@ def _index_unchecked(rng: Random, data: bytes, _: bytes) -> Changed:
 
 KINDS: Final[dict[str, Callable[[Random, bytes, bytes], Changed]]] = {
     "bits flipped": _flip,
-    "a burst of noise": _burst,
-    "a sector zeroed": _zeroed_sector,
-    "a sector copied": _copied_sector,
-    "cut": _cut,
-    "the tail zeroed": _zeroed_tail,
-    "bytes added": _grown,
+    "a burst of noise": partial(_overwritten, what="noise"),
+    "a sector zeroed": partial(_overwritten, what="zeros"),
+    "a sector copied": partial(_overwritten, what="copy"),
+    "cut": partial(_ended, what="cut"),
+    "the tail zeroed": partial(_ended, what="zeros"),
+    "bytes added": partial(_ended, what="grown"),
     "chunks swapped": _swapped_chunks,
-    "a chunk doubled": _doubled_chunk,
-    "a chunk missing": _missing_chunk,
-    "a foreign chunk": _foreign_chunk,
-    "a foreign tail": _foreign_tail,
+    "a chunk doubled": partial(_replaced_chunk, what="doubled"),
+    "a chunk missing": partial(_replaced_chunk, what="missing"),
+    "a foreign chunk": partial(_replaced_chunk, what="foreign"),
+    "a foreign tail": partial(_replaced_chunk, what="foreign tail"),
     "no checksum": _no_checksum,
     "no checksum of the index": _index_unchecked,
 }

@@ -27,8 +27,6 @@ from hil.cli import app
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
 from hil.progress import Silent
 from hil.simulation import controller_settings, simulated_controller
-from hil.study import study_settings
-from hil.study.settings import StudyFolder
 from tests.disk.disks import (
     CHANGES,
     CREATE,
@@ -161,15 +159,6 @@ def test_failing_disk_costs_one_motion_only(disk: Disk, designed: Designed) -> N
     assert rounds(disk, designed, range(2)) >= 1
 
 
-@pytest.mark.parametrize("operation", [CREATE, WRITE])
-def test_manifest_that_cannot_be_written_is_reported(
-    disk: Disk, designed: Designed, operation: str
-) -> None:
-    campaign = rehearsed(disk, f"manifest_{operation}", designed)
-    rule = Rule((operation,), "manifest.json*", after=2, times=1, error="EIO")
-    assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
-
-
 def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) -> None:
     """Without a manifest it would look like one whose cell file was edited."""
     root = disk.root / "half"
@@ -198,32 +187,6 @@ def test_rehearsal_passes_after_a_disk_error(disk: Disk, designed: Designed) -> 
 @pytest.mark.slow
 def test_many_failures_cost_one_motion_only(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(100, 140)) > 20
-
-
-REFUSED = [Rule((operation,), error="EIO") for operation in (SYNC, RENAME)]
-REFUSAL = r"cannot be written \(.+\).*nothing there was changed: make room"
-
-
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
-
-
-class TestStudy:
-    """Files of a study are written completely or not at all."""
-
-    @pytest.mark.parametrize("rule", REFUSED)
-    def test_failed_start_leaves_an_empty_folder(
-        self, disk: Disk, tmp_path: Path, rule: Rule
-    ) -> None:
-        folder, settings = StudyFolder(disk.root / tmp_path.name), study_settings(quick=True)
-        folder.root.mkdir()
-        disk.do_wrong(rule)
-        with pytest.raises(OutputError, match=rf"study\.json {REFUSAL}"):
-            folder.begin(settings)
-        assert disk.do_wrong()
-        assert names(folder.root) == []
-        folder.begin(settings)
-        assert names(folder.root) == ["study.json"]
 
 
 STAGES: dict[str, tuple[str, tuple[str, ...]]] = {

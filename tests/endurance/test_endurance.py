@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import mmap
-import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,7 +13,7 @@ import numpy as np
 import pytest
 
 from drivers.exchange.control import BINS, upper_edge
-from tests.endurance.__main__ import main, own_memory
+from tests.endurance.__main__ import main
 from tests.endurance.verdict import PROCESSES, Line, Piece, judge, read_journal
 from tests.journal import Journal
 
@@ -115,22 +113,6 @@ def test_pieces_of_a_journal_are_merged(tmp_path: Path, capsys: pytest.CaptureFi
     run = ["--minutes", "1", "--folder", str(folder), "--journal"]
     assert main([*run, str(tmp_path / "other.jsonl")]) == 2
     assert not folder.exists()
-
-
-def test_own_memory_excludes_mapped_files(tmp_path: Path) -> None:
-    pid, size = os.getpid(), 40 * MIB
-    (tmp_path / "library").write_bytes(b"x" * size)
-    before = own_memory(pid)
-    with mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as made:
-        made.write(b"x" * size)
-        after = own_memory(pid)
-        assert after - before == pytest.approx(size, rel=0.1)
-        with (
-            (tmp_path / "library").open("rb") as file,
-            mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped,
-        ):
-            assert mapped[::4096] == b"x" * (size // 4096)
-            assert own_memory(pid) - after < size / 10
 
 
 @pytest.mark.slow
