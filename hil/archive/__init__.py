@@ -1,6 +1,5 @@
 """Archives: one MCAP file per interval of motion, complete in itself, readable by other tools."""
 
-from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CONTROLLER_PROGRAM,
     FORMAT_VERSION,
@@ -12,6 +11,7 @@ from hil.archive.header import (
 )
 from hil.archive.reader import Archive, open_archive
 from hil.archive.recorder import ArchiveSpec, Recorder
+from hil.archive.schema import ArchivedEvent, Level
 from hil.archive.writer import ArchiveWriter, Samples, write_samples
 
 __all__ = [

@@ -18,9 +18,8 @@ from hil.archive.header import (
     is_supported,
     motion_name,
 )
-from hil.archive.reader import open_archive, scan_archive, scan_file
+from hil.archive.reader import Scan, open_archive, scan_archive, scan_file
 from hil.archive.repair import is_intact
-from hil.archive.scan import Scan
 
 OUTCOMES = ("completed", REJECTED, "stopped", "refused", "lost", "void", "interrupted", "unknown")
 

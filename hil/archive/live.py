@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.exchange.event_log import ExchangeEvent
-from hil.archive.events import ArchivedEvent
 from hil.archive.recorder import describe, level_of
 from hil.archive.schema import (
     COMMANDED,
     CYCLE,
     EVENT_CHANNEL,
     MEASURED,
+    ArchivedEvent,
     Channel,
     cycle_messages,
     profile,

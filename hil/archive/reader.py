@@ -1,24 +1,474 @@
-"""Reading of archives: complete ones, and truncated ones up to their last complete chunk."""
+"""Reading of archives: complete ones, and truncated ones up to their last complete chunk.
+
+Records are verified in order, up to the first damage. The checksum of a chunk does not show that it
+belongs to this recording: a file system may put a chunk of another archive in its place. The
+outcome therefore lists the checksums of all chunks in order; where this list is missing, cycle
+numbers must increase.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import os
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, Final
 
 import numpy as np
+from mcap.records import Header
 from numpy.typing import NDArray
 
 from drivers.record import cycle_dtype
-from hil.archive.cdr import Rows
-from hil.archive.events import ArchivedEvent
-from hil.archive.header import FORMAT_VERSION, METADATA, ArchiveHeader, ArchiveOutcome
-from hil.archive.scan import ALWAYS, Scan
-from hil.archive.schema import CYCLE, LATER_FIELDS
+from hil.archive import container, schema
+from hil.archive.cdr import LayoutError, MessageLayout, Rows
+from hil.archive.chunk import ChunkParser, Content, Messages
+from hil.archive.container import Damage, Head, Record
+from hil.archive.header import (
+    FORMAT_VERSION,
+    METADATA,
+    OUTCOME,
+    ArchiveHeader,
+    ArchiveOutcome,
+    HeaderError,
+    checksum,
+    is_supported,
+)
+from hil.archive.schema import ArchivedEvent
 from hil.errors import ArchiveError, ArchiveVersionError, NotAnArchiveError
 from hil.reading import open_file, parse_json
+
+NUMBERS = (schema.CYCLE, schema.MEASURED, schema.COMMANDED, schema.MOTOR_CURRENT)
+"""Channels with one message per sample."""
+ALWAYS: Final = -(1 << 63), 1 << 63  # ns, before and after every stamp
+
+_BATCH: Final = 1 << 20  # bytes of chunks decoded at once: few calls, and all in the cache
+_SEQUENCES = 1 << 32  # message numbers are modulo this
+_LEAST = 8  # bytes of a file for one sample, of an arm at rest
+_COLUMN_OF: Final = {"effort": "torque"}  # names of message fields that differ from the column's
+_DEFINITIONS = (container.SCHEMA, container.CHANNEL)
+_CONTENT = frozenset(
+    {container.HEADER, container.CHUNK, container.ATTACHMENT, container.METADATA, *_DEFINITIONS}
+)
+
+
+class Scan:
+    """The verified content of an archive.
+
+    Args:
+        fields: columns wanted, None for all.
+        times: range of the stamps wanted [ns]; chunks outside, by the index, are not read.
+        all_channels: whether to verify also the channels that only viewers read.
+
+    Attributes:
+        heads: of the records with content.
+        metadata, header: the ``hil`` record as read, and parsed: None where invalid
+            (`header_error`) or of another version.
+        outcome: the ``hil.outcome`` record, None if it was not reached.
+        stated: the outcome wherever it is in the file, empty if it cannot be found.
+        mixed: whether begin and end are of two recordings; the samples may be of either.
+        events: those of the times wanted.
+        counts: verified messages by topic.
+        chunks: number of valid chunks.
+        damage: the first one, None without.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        *,
+        fields: Collection[str] | None = (),
+        times: tuple[int, int] = ALWAYS,
+        all_channels: bool = False,
+    ) -> None:
+        self.size = os.fstat(stream.fileno()).st_size
+        self.heads: list[Head] = []
+        self.metadata: dict[str, str] | None = None
+        self.header: ArchiveHeader | None = None
+        self.header_error: HeaderError | None = None
+        self.outcome: ArchiveOutcome | None = None
+        self.attachments: dict[str, bytes] = {}
+        self.events: list[ArchivedEvent] = []
+        self.parser = ChunkParser()
+        self.counts: dict[str, int] = {}
+        self.chunks = 0
+        self.damage: Damage | None = None
+        self._fields, self._times, self._all_channels = fields, times, all_channels
+        self._skipped = False  # whether chunks were left out: channels continue at any number
+        self._buffer = memoryview(bytearray(_BATCH))
+        self._pending: list[tuple[int, slice]] = []  # offset of each chunk, its place in the buffer
+        self._place = 0  # of the next chunk in the list of checksums
+        self._next: dict[str, int] = {}
+        self._numbers: set[str] = set()
+        self._newest = -1  # stamp of a cycle [ns]
+        self._layouts: dict[str, MessageLayout] = {}
+        self._raw: dict[tuple[str, str], Rows] = {}  # columns as bytes, which are copied faster
+        self._stamps = np.zeros(0, np.int64)
+        self._count = 0
+        end = self._find_heads(stream)
+        self.stated, self.mixed, self._chunk_list = self._stated_outcome(stream)
+        expected = min(self.stated.samples or 0, self.size // _LEAST)
+        self._room = expected if times == ALWAYS and fields != () else 0
+        try:
+            self._read(stream, end)
+        except Damage as damage:
+            self.damage = damage
+
+    @property
+    def topics(self) -> Collection[str]:
+        """The channels of the samples and the events."""
+        recorded = schema.CYCLE in self.parser.topics
+        samples = (schema.CYCLE,) if recorded else (schema.MEASURED, schema.MOTOR_CURRENT)
+        return (*samples, schema.EVENTS)
+
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns wanted and ``stamp``, contiguous and read-only, all of the same length."""
+        columns: dict[str, NDArray[Any]] = {"stamp": self._stamps[: self._count]}
+        for (topic, name), raw in self._raw.items():
+            dtype = self._layouts[topic].dtype[name]
+            base, shape = dtype.subdtype or (dtype, ())
+            columns[_COLUMN_OF.get(name, name)] = raw[: self._count].view(base).reshape(-1, *shape)
+        for column in columns.values():
+            column.flags.writeable = False
+        return columns
+
+    @property
+    def samples(self) -> int:
+        """Number of valid samples."""
+        return max(self.counts.get(topic, 0) for topic in NUMBERS)
+
+    def shortfalls(self) -> Iterator[str]:
+        """Yield a sentence for what the file states to contain and does not."""
+        for name in self.header.attachments if self.header else ():
+            if name not in self.attachments:
+                yield f"attachment {name!r} is missing"
+        outcome = self.outcome
+        if outcome is None:
+            yield "the outcome is missing"
+            return
+        found = {
+            "samples": (outcome.samples, self.samples),
+            "events": (outcome.events, self.counts.get(schema.EVENTS, 0)),
+        }
+        if self._chunk_list is not None:
+            found["chunks"] = len(self._chunk_list), self.chunks
+        for key, (stated, count) in found.items():
+            if stated != count:
+                yield f"{stated} {key} were written, {count} are there"
+
+    def _find_heads(self, stream: BinaryIO) -> int | Damage:
+        """Find the records with content; return the end of the data section, or the damage."""
+        try:
+            self.heads += container.heads(stream, self.size, _CONTENT)
+        except Damage as damage:
+            return damage
+        return self.heads.pop().end
+
+    def _stated_outcome(
+        self, stream: BinaryIO
+    ) -> tuple[ArchiveOutcome, bool, NDArray[np.uint32] | None]:
+        """Return the outcome, whether it is of another recording, and its list of chunks.
+
+        The outcome is empty where it is damaged or of another recording; there is no list in older
+        files, and in those that another program has copied, maybe into other chunks: it has written
+        its own name.
+        """
+        found: dict[str, dict[str, str]] = {}
+        library = ""
+        for head in self.heads:
+            with suppress(Damage):
+                if head.opcode == container.METADATA:
+                    name, entries = self._verified_metadata(container.read_record(stream, head))
+                    found.setdefault(name, entries)
+                elif head.opcode == container.HEADER:
+                    record = container.read_record(stream, head)
+                    library = library or container.parse(Header, record).library
+        try:
+            header, outcome = ArchiveHeader.of(found[METADATA]), ArchiveOutcome.of(found[OUTCOME])
+        except (HeaderError, KeyError):
+            return ArchiveOutcome(), False, None
+        if not outcome.belongs_to(header):
+            return ArchiveOutcome(), True, None
+        checksums = outcome.chunks if library == schema.LIBRARY else None
+        return outcome, False, None if checksums is None else np.array(checksums, np.uint32)
+
+    def _read(self, stream: BinaryIO, end: int | Damage) -> None:
+        """Read the wanted records in order, up to the first damage, which is raised."""
+        outside = _chunks_outside(stream, self.size, self._times)
+        try:
+            for head in self.heads:
+                if head.opcode == container.CHUNK and head.offset in outside:
+                    self._flush()
+                    self._place, self._skipped = self._place + 1, True
+                    self._next.clear()
+                else:
+                    self._add(container.read_record(stream, head))
+        finally:
+            self._flush()  # pending chunks precede any damage found so far
+        if isinstance(end, Damage):
+            raise end
+        container.check_end(stream, self.size, end)
+        chunks = self._chunk_list
+        if outside and chunks is not None and self._place < len(chunks):
+            raise Damage(self.size, "is not there: a chunk is missing")
+        if not outside and self.header is not None:  # else some other MCAP file
+            for text in self.shortfalls():
+                raise Damage(self.size, f"is not there: {text}")
+
+    def _add(self, record: Record) -> None:
+        """Verify the next record, and add its content; `Damage` if it is not the next one."""
+        offset = record.offset
+        if record.opcode == container.CHUNK:
+            if self.metadata is None:
+                return  # some other MCAP file
+            head = container.parse_chunk(record)
+            data = container.chunk_data(head, offset)
+            self._check_order(head.uncompressed_crc, offset)
+            self._add_chunk(data, offset)
+        elif record.opcode == container.ATTACHMENT:
+            attachment = container.parse_attachment(record)
+            if attachment.name in self.attachments:
+                raise Damage(offset, f"(attachment {attachment.name!r}) is there a second time")
+            self.attachments[attachment.name] = attachment.data
+        elif record.opcode == container.METADATA:
+            self._add_metadata(record)
+        elif record.opcode in _DEFINITIONS:
+            self.parser.define(record)
+
+    @staticmethod
+    def _verified_metadata(record: Record) -> tuple[str, dict[str, str]]:
+        """Return name and entries, without the checksum that they must have if they are ours."""
+        name, entries = container.parse_metadata(record)
+        ours = name in (METADATA, OUTCOME)
+        if ours and entries.pop("checksum", None) != checksum(entries):
+            raise Damage(record.offset, f"(metadata {name!r}) fails its checksum")
+        return name, entries
+
+    def _add_metadata(self, record: Record) -> None:
+        """Add header or outcome: one each, of this version and of the same recording."""
+        offset = record.offset
+        name, entries = self._verified_metadata(record)
+        if name not in (METADATA, OUTCOME):
+            return
+        if (self.metadata if name == METADATA else self.outcome) is not None:
+            raise Damage(offset, f"(metadata {name!r}) is there a second time")
+        if name == OUTCOME:
+            outcome = ArchiveOutcome.of(entries)
+            if not outcome.belongs_to(self.header):
+                raise Damage(offset, "(metadata 'hil.outcome') is that of another recording")
+            self.outcome = outcome
+            return
+        self.metadata = entries
+        if not is_supported(entries):
+            raise Damage(offset, "is of another version")
+        try:
+            self.header = ArchiveHeader.of(entries)
+        except HeaderError as error:
+            self.header_error = error
+            problem = f"(metadata {METADATA!r}) cannot be used: {error}"
+            raise Damage(offset, problem) from error
+
+    def _check_order(self, crc: int, offset: int) -> None:
+        """Check that the chunk with this checksum is the next of those that were written."""
+        if self.mixed:
+            reason = "(chunk) may be of either of two: the outcome is that of another recording"
+            raise Damage(offset, reason)
+        chunks = self._chunk_list
+        if chunks is None:
+            return
+        if self._place < len(chunks) and chunks[self._place] == crc:
+            self._place += 1
+        elif crc in chunks:
+            raise Damage(offset, "(chunk) does not continue the one before, by the outcome's list")
+        else:
+            raise Damage(offset, "(chunk) is of another recording, by the outcome's list")
+
+    def _add_chunk(self, data: bytes, offset: int) -> None:
+        """Decode the content of a chunk, or buffer it to decode several at once."""
+        begin = self._pending[-1][1].stop if self._pending else 0
+        if begin + len(data) >= len(self._buffer):
+            self._flush()
+            begin = 0
+        if len(data) >= len(self._buffer):
+            self._decode(data, offset)
+            self.chunks += 1
+        else:
+            self._pending.append((offset, slice(begin, begin + len(data))))
+            self._buffer[begin : begin + len(data)] = data
+            if not self.parser.channels:  # they are in the first
+                self._flush()
+
+    def _flush(self) -> None:
+        """Decode the buffered chunks: all at once, or one by one where that fails."""
+        pending, self._pending = self._pending, []
+        if len(pending) > 1:
+            try:
+                self._decode(self._buffer[: pending[-1][1].stop], pending[0][0], several=True)
+                self.chunks += len(pending)
+                return
+            except Damage:
+                pass  # in one of them
+        for offset, place in pending:
+            self._decode(self._buffer[place], offset)
+            self.chunks += 1
+
+    def _decode(self, data: Content, offset: int, *, several: bool = False) -> None:
+        """Add messages that must be the next of their channels; else none of them.
+
+        Several chunks at once must not define channels.
+        """
+        parser = self.parser
+        before = dict(parser.schemas), dict(parser.channels)
+        try:
+            by_number = parser.messages(data, offset)
+            if several and parser.channels.keys() != before[1].keys():
+                raise Damage(offset, "(chunk) defines a channel")
+            if unknown := by_number.keys() - parser.channels.keys():
+                raise Damage(offset, f"(chunk) has messages of an unknown channel {min(unknown)}")
+            found = {parser.channels[number].topic: one for number, one in by_number.items()}
+            wanted = [topic for topic in self.topics if topic in found]
+            numbers = found.keys() & set(NUMBERS)
+            new = self._numbers not in (set(), numbers) or numbers.isdisjoint(wanted)
+            if numbers and new:
+                raise Damage(offset, "(chunk) has samples in other channels than those before")
+            verified = found if self._all_channels else {topic: found[topic] for topic in wanted}
+            self._check_sequences(verified, offset)
+            newest = self._check_times(verified, offset)
+            layouts = self._check_layouts(verified, offset)
+            events = self._decode_events(verified, offset)
+        except Damage:
+            parser.schemas, parser.channels = before
+            raise
+        self._newest = max(self._newest, newest)
+        self._numbers = self._numbers or numbers
+        for topic, messages in verified.items():
+            self._next[topic] = int(messages.of_heads("sequence")[-1]) + 1
+            self.counts[topic] = self.counts.get(topic, 0) + len(messages)
+        self._layouts |= layouts
+        self.events += [one for one in events if self._times[0] <= one.stamp < self._times[1]]
+        self._append({topic: found[topic] for topic in wanted if topic != schema.EVENTS})
+
+    def _check_layouts(
+        self, found: Mapping[str, Messages], offset: int
+    ) -> dict[str, MessageLayout]:
+        """Return the layouts of messages of numbers; `Damage` if messages of one differ."""
+        assert self.header is not None
+        layouts = {}
+        for topic in found.keys() & set(NUMBERS):
+            messages, layout = found[topic], self._layouts.get(topic)
+            if layout is None:
+                record, first = self.parser.schema(topic), bytes(messages.data[0][0])
+                try:
+                    layout = schema.message_layout(topic, self.header.joint_names, record, first)
+                except LayoutError as error:
+                    raise Damage(offset, f"(chunk) has messages of {topic}: {error}") from error
+            if not all(map(layout.matches, messages.data)):
+                raise Damage(offset, "(chunk) has messages that differ from those before")
+            layouts[topic] = layout
+        return layouts
+
+    @staticmethod
+    def _decode_events(found: Mapping[str, Messages], offset: int) -> list[ArchivedEvent]:
+        if schema.EVENTS not in found:
+            return []
+        try:
+            return [ArchivedEvent.decode(message) for message in found[schema.EVENTS].all()]
+        except LayoutError as error:
+            problem = f"(chunk) has an event that cannot be read: {error}"
+            raise Damage(offset, problem) from error
+
+    def _append(self, found: Mapping[str, Messages]) -> None:
+        """Copy verified messages of the wanted channels and times into the columns."""
+        if not found:
+            return
+        stamps, chosen = next(iter(found.values())).stamps, None
+        if self._times != ALWAYS:
+            chosen = (stamps >= self._times[0]) & (stamps < self._times[1])
+            stamps = stamps[chosen]
+        begin, self._count = self._count, self._count + len(stamps)
+        room = max(self._room, len(self._stamps))
+        if self._count > room:
+            room = 2 * self._count
+        if room > len(self._stamps):
+            self._stamps = np.resize(self._stamps, room)
+            self._raw = {key: np.resize(raw, room) for key, raw in self._raw.items()}
+        self._stamps[begin : self._count] = stamps
+        for topic, messages in found.items():
+            fields: Mapping[str, Any] = self._layouts[topic].dtype.fields or {}
+            columns = []
+            for name, (dtype, start, *_) in fields.items():
+                wanted = self._fields is None or _COLUMN_OF.get(name, name) in self._fields
+                if wanted and name not in ("sec", "nanosec"):
+                    if (topic, name) not in self._raw:
+                        self._raw[topic, name] = np.empty(room, f"V{dtype.itemsize}")
+                    columns.append((self._raw[topic, name], start))
+            first, at = 0, begin
+            for data in messages.data:
+                part = slice(first, first + len(data))
+                first = part.stop
+                rows = data if chosen is None else data[chosen[part]]
+                now = slice(at, at + len(rows))
+                at = now.stop
+                for raw, start in columns:
+                    raw[now] = rows[:, start : start + raw.itemsize].view(raw.dtype)[:, 0]
+
+    def _check_sequences(self, found: Mapping[str, Messages], offset: int) -> None:
+        """Check that no message is missing or repeated, but for those that a repair has lost."""
+        for topic, messages in found.items():
+            sequence = messages.of_heads("sequence")
+            if (np.diff(sequence) != 1).any():
+                raise Damage(offset, "(chunk) has messages out of order")
+            first = int(sequence[0])
+            gap = first - self._next.get(topic, first if self._skipped else 0)
+            gap %= _SEQUENCES
+            if gap > _SEQUENCES // 2:
+                raise Damage(offset, "(chunk) repeats messages of those before")
+            if gap and not self.stated.repaired:
+                reason = "(chunk) does not continue the one before it: a chunk is missing"
+                raise Damage(offset, reason)
+
+    def _check_times(self, found: Mapping[str, Messages], offset: int) -> int:
+        """Check that cycles increase, and that all channels have the same times without cycles.
+
+        Returns:
+            The newest stamp [ns], -1 without cycles.
+        """
+        samples = [topic for topic in found if topic in NUMBERS]
+        timed = [schema.CYCLE] if schema.CYCLE in samples else samples
+        if not timed:
+            return -1
+        stamps = [found[topic].stamps for topic in timed]
+        stamp = stamps[0]
+        if not all(map(len, stamps)):
+            raise Damage(offset, "(chunk) has messages without a stamp")
+        if not all(np.array_equal(one, stamp) for one in stamps):
+            raise Damage(offset, "(chunk) has channels of different times")
+        if timed[0] != schema.CYCLE:
+            return -1
+        if (np.diff(stamp) <= 0).any():
+            raise Damage(offset, "(chunk) has cycles that do not increase")
+        if stamp[0] <= self._newest:
+            raise Damage(offset, "(chunk) has cycles that do not follow those before")
+        return int(stamp[-1])
+
+
+def _chunks_outside(stream: BinaryIO, size: int, times: tuple[int, int]) -> Collection[int]:
+    """Return the places of chunks without messages of these times, by the index.
+
+    The first is read anyway: it defines the channels.
+    """
+    if times == ALWAYS:
+        return ()
+    chunks = container.read_chunk_index(stream, size)
+    first = min((one.chunk_start_offset for one in chunks), default=0)
+    return {
+        one.chunk_start_offset
+        for one in chunks
+        if one.chunk_start_offset != first
+        and not (one.message_start_time < times[1] and one.message_end_time >= times[0])
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +572,8 @@ class Archive:
         for name in rows.dtype.names or ():
             if name in self.columns:
                 rows[name] = self.columns[name]
-            elif name not in LATER_FIELDS:
-                raise ArchiveError(self.path, f"has no column {name}", field=CYCLE)
+            elif name not in schema.LATER_FIELDS:
+                raise ArchiveError(self.path, f"has no column {name}", field=schema.CYCLE)
         return rows
 
 

@@ -35,7 +35,7 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
     Leaving,
 )
-from hil.archive.events import Level
+from hil.archive.schema import Level
 from hil.archive.writer import ArchiveWriter
 
 _TEXTS: Final[Mapping[type, tuple[Level, str]]] = {

@@ -18,7 +18,6 @@ from mcap.records import Attachment, Metadata
 from numpy.typing import NDArray
 
 from hil.archive.cdr import Rows
-from hil.archive.events import ArchivedEvent, Level
 from hil.archive.header import (
     CHUNKS,
     DESCRIPTION,
@@ -40,7 +39,9 @@ from hil.archive.schema import (
     MEASURED,
     MOTOR_CURRENT,
     PROFILE,
+    ArchivedEvent,
     Batch,
+    Level,
     cycle_messages,
     description_message,
     profile,
