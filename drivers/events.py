@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.drive_train import DriveTrain
 from drivers.errors import RefusalError
 from drivers.packets import InitPacket
 from drivers.states import State
@@ -38,12 +39,13 @@ class Counters:
 class InitReceived:
     """The controller started a session.
 
-    `unusable` is why the arm cannot be moved in it, or None; `differences` from the cell name
-    axis and both values; `adopted`: the controller's gear ratios, calibration and coupling are
-    used.
+    `drive_train` is the one to use; `unusable` is why the arm cannot be moved, or None;
+    `differences` from the cell name axis and both values; `adopted`: the controller's gear ratios,
+    calibration and coupling are used.
     """
 
     init: InitPacket = field(repr=False)
+    drive_train: DriveTrain = field(repr=False)
     unusable: str | None
     differences: tuple[str, ...] = ()
     adopted: bool = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriveTrainError, PacketError
+from drivers.events import InitReceived
 from drivers.packets import InitPacket
 
 Array = NDArray[np.float64]
@@ -25,23 +26,6 @@ _COUPLING: Final = 1.0
 """Largest magnitude of a wrist coupling."""
 _FLOOR: Final = float(np.spacing(np.float32(1.0)))
 """Resolution of float32 within one motor revolution, far below an encoder's increment."""
-
-
-@dataclass(frozen=True, eq=False)
-class InitCheck:
-    """Comparison of an init packet with the cell.
-
-    Attributes:
-        drive_train: the one to use: the cell's, or that with adopted values of the controller.
-        differences: each names the axis and both values.
-        unusable: why the arm cannot be moved, or None.
-        adopted: the controller's values are used.
-    """
-
-    drive_train: DriveTrain
-    differences: tuple[str, ...]
-    unusable: str | None
-    adopted: bool
 
 
 def is_narrower(theirs: Array, ours: Array) -> NDArray[np.bool_]:
@@ -61,7 +45,7 @@ def compare(
     arm: int,
     accept: bool,
     other_axes: frozenset[tuple[int, int]] = frozenset(),
-) -> InitCheck:
+) -> InitReceived:
     """Compare an init packet with the cell, for an arm from 1.
 
     With a wrong gear ratio, calibration or coupling the arm moves elsewhere, so any difference
@@ -70,11 +54,13 @@ def compare(
     its targets are not checked. Undefined values (NaN, or 0 for a ratio), values far off, another
     cycle than `period` (s) and a joint that is not open cannot be accepted.
     """
-    fixed = _timing(period, init) + _axis_map(drive_train.n_joints, init, arm)
-    unknown = _unknown_axes(drive_train.n_joints, init, arm, other_axes)
+    fixed, unknown = _axes(drive_train.n_joints, init, arm, other_axes)
+    if not math.isclose(init.period, period, rel_tol=1e-9):
+        ours = f"{1e3 * period:g} ms in the cell"
+        fixed = (f"cycle is {init.sample_time} ms in the controller, {ours}", *fixed)
     values = _values(drive_train, init, arm)
     differences = (*fixed, *unknown, *values)
-    refused = InitCheck(drive_train, differences, "; ".join(differences) or None, False)
+    refused = InitReceived(init, drive_train, "; ".join(differences) or None, differences)
     if not (unknown or values) or not accept:
         return refused
     theirs = drive_train
@@ -86,41 +72,27 @@ def compare(
         fixed = (*fixed, f"the controller's values cannot be accepted: {error}")
     if fixed:
         return replace(refused, unusable="; ".join(fixed))
-    return InitCheck(theirs, differences, None, True)
+    return InitReceived(init, theirs, None, differences, True)
 
 
-def _timing(period: float, init: InitPacket) -> tuple[str, ...]:
-    if math.isclose(init.period, period, rel_tol=1e-9):
-        return ()
-    ours = f"{1e3 * period:g}"
-    return (f"cycle is {init.sample_time} ms in the controller, {ours} ms in the cell",)
-
-
-def _axis_map(n_joints: int, init: InitPacket, arm: int) -> tuple[str, ...]:
-    try:
-        is_open = {axis.axis for axis in init.open_axes() if axis.arm == arm}
-    except PacketError as error:
-        return (str(error),)
-    return tuple(
-        f"axis {axis + 1} of arm {arm} is not open in the controller, joint {axis + 1} in the cell"
-        for axis in range(n_joints)
-        if axis not in is_open
-    )
-
-
-def _unknown_axes(
+def _axes(
     n_joints: int, init: InitPacket, arm: int, other_axes: frozenset[tuple[int, int]]
-) -> tuple[str, ...]:
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return joints that are not open, or why that is unknown, and open axes that are unknown."""
     try:
-        is_open = [(axis.arm, axis.axis + 1) for axis in init.open_axes()]
-    except PacketError:
-        return ()
-    known = other_axes | {(arm, joint + 1) for joint in range(n_joints)}
-    return tuple(
-        f"axis {axis} of arm {of} is open in the controller; the cell does not know it"
-        for of, axis in sorted(is_open)
-        if (of, axis) not in known
+        is_open = {(axis.arm, axis.axis + 1) for axis in init.open_axes()}
+    except PacketError as error:
+        return (str(error),), ()
+    joints = {(arm, joint + 1) for joint in range(n_joints)}
+    missing = tuple(
+        f"axis {axis} of arm {arm} is not open in the controller, joint {axis} in the cell"
+        for _, axis in sorted(joints - is_open)
     )
+    unknown = tuple(
+        f"axis {axis} of arm {of} is open in the controller; the cell does not know it"
+        for of, axis in sorted(is_open - joints - other_axes)
+    )
+    return missing, unknown
 
 
 def _too_far_off(ours: DriveTrain, theirs: DriveTrain) -> tuple[str, ...]:

@@ -268,10 +268,8 @@ class PositionMode(OpenMode):
 
     def enter(self) -> None:
         """Send the target received as the first set-point, at rest."""
-        self._require_fresh(_NEEDED_FIRST, Check.FIRST_AGE, self._every)
-        target = self._raw[TARGET].copy()
-        position = self._measured[0].copy()
-        self._check_start(target)
+        super().require_start()
+        target, position = self._raw[TARGET].copy(), self._measured[0].copy()
         self._guard.begin(position, self._cycle)
         self._check_feedback(target)
         if self._feed_forward is not None:

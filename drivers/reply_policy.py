@@ -60,7 +60,7 @@ class ReplyPolicy:
 
     Attributes:
         init: the init packet.
-        init_check: comparison of the init packet with the cell, and the drive train to use.
+        received: comparison of the init packet with the cell, and the drive train to use.
         unusable: why the arm cannot be moved in this session, or None.
         reader: reads status and modes of the packets.
         frame: buffer of the reply.
@@ -84,8 +84,8 @@ class ReplyPolicy:
         only_axis: int | None,
     ) -> None:
         self.init = init
-        self.init_check = compare(drive_train, guard.period, init, arm, accept, other_axes)
-        self.unusable = self.init_check.unusable
+        self.received = compare(drive_train, guard.period, init, arm, accept, other_axes)
+        self.unusable = self.received.unusable
         self.frame = ReplyFrame(init.n_axes)
         self._arm = arm
         self._max_gap = max_gap
@@ -107,7 +107,7 @@ class ReplyPolicy:
             own = range(init.n_axes) if axes is None else [a.slot for a in axes if a.arm == arm]
             self.reader = Reader(np.array(own, np.intp), arms, arm, mode)
             return
-        self._wire = wire = ArmWire(self.init_check.drive_train, init, arm, only_axis)
+        self._wire = wire = ArmWire(self.received.drive_train, init, arm, only_axis)
         self.reader = Reader(wire.joint_slots, arms, arm, mode, wire.opened)
         if mode in CORRECTION_MODES:
             self._open_mode = CorrectionMode(guard, wire, self.frame, mode)
@@ -131,6 +131,8 @@ class ReplyPolicy:
     ) -> bytes:
         """Fill the frame for the machine's state, which is the one that the packet leads to.
 
+        Returns the 4 status bytes. Raises RefusalError if no set-point may be sent.
+
         Args:
             machine: state and motion.
             reading: status and modes of the packet.
@@ -139,12 +141,6 @@ class ReplyPolicy:
             commanded: (2, n) NaN, to be filled where set-points are sent.
             without_reply: packets before this one without a reply.
             paused: this packet arrived late by the clock.
-
-        Returns:
-            The 4 status bytes.
-
-        Raises:
-            RefusalError: no set-point may be sent.
         """
         state, cycle, open_mode = machine.state, machine.cycle, self._open_mode
         if open_mode is not None:

@@ -50,7 +50,7 @@ import numpy as np
 
 from drivers.drive_train import Ages, DriveTrain
 from drivers.errors import ModeRefused, PacketError, RefusalError, as_refusal
-from drivers.events import Event, InitReceived, LinkLost, PacketRejected, Refused
+from drivers.events import Event, LinkLost, PacketRejected, Refused
 from drivers.execution import execution_of
 from drivers.guard import Guard
 from drivers.motion_source import CorrectionSource, MotionSource
@@ -240,7 +240,7 @@ class Session(StateMachine):
     @property
     def drive_train(self) -> DriveTrain:
         """Drive train in use: the cell's, or the one with adopted values of the controller."""
-        return self._drive_train if self._policy is None else self._policy.init_check.drive_train
+        return self._drive_train if self._policy is None else self._policy.received.drive_train
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; rejected packets last, by kind."""
@@ -333,8 +333,7 @@ class Session(StateMachine):
         self._policy = policy = self._make_policy(init)
         self._sequence.restart(INIT_NUMBER, self._silence_timeout / max(init.period, 1e-3))
         self.cycle = 0
-        check = policy.init_check
-        self._events.append(InitReceived(init, check.unusable, check.differences, check.adopted))
+        self._events.append(policy.received)
         return self._finish(packet, echo(packet), now)
 
     def _expects_sync(self, number: int, powered: bool) -> bool:

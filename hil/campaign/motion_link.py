@@ -23,7 +23,7 @@ from drivers.events import InitReceived, MotionEnded, Refused
 from drivers.exchange.event_log import ExchangeEvent
 from drivers.exchange.process import ExchangeProcess, WithdrawnError
 from drivers.guard import Guard
-from drivers.init_check import InitCheck, compare, float32_text, is_narrower
+from drivers.init_check import compare, float32_text, is_narrower
 from drivers.motion_source import MotionSource
 from drivers.packets import InitPacket
 from drivers.session import Session
@@ -584,7 +584,7 @@ def narrower_limits(cell: Cell, connection: Connection, limit: Limit) -> tuple[s
     )
 
 
-def _accepted(cell: Cell, init: InitPacket) -> InitCheck:
+def _accepted(cell: Cell, init: InitPacket) -> InitReceived:
     """Compare an init packet with the cell, accepting its figures where possible."""
     table = cell.controller
     others = frozenset(table.other_axes)

@@ -20,7 +20,7 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import InitCheck, compare, is_narrower
+from drivers.init_check import compare, is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
@@ -551,7 +551,7 @@ def arm(n: int) -> DriveTrain:
     )
 
 
-def adopted(ours: DriveTrain, **changes) -> InitCheck:
+def adopted(ours: DriveTrain, **changes) -> InitReceived:
     """The controller's values, accepted."""
     n = ours.n_joints
     described = {

@@ -79,7 +79,8 @@ def ended(outcome: str, cycle: int) -> MotionEnded:
 
 
 def a_new_session() -> InitReceived:
-    return InitReceived(InitPacket.decode(bytes_of_an_init()), None)
+    train = Cell.load(CELL_PATH).drive_train
+    return InitReceived(InitPacket.decode(bytes_of_an_init()), train, None)
 
 
 def bytes_of_an_init() -> bytes:
