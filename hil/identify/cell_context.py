@@ -19,8 +19,12 @@ from identification.signals.masks import SATURATED
 from identification.signals.samples import Samples
 from identification.validation.evidence import CellContext
 from identification.validation.finding import Finding, joined
-from identification.validation.plausibility import InertiaRatio, inertia_ratio, nominal_scale
-from identification.validation.position_jumps import position_jumps
+from identification.validation.plausibility import (
+    InertiaRatio,
+    inertia_ratio,
+    nominal_scale,
+    position_jumps,
+)
 from identification.validation.prediction import PredictionError, pooled_error
 
 from .prepared import Prepared

@@ -3,8 +3,7 @@
 # ruff: noqa: F401
 import types
 
-from identification.excitation.collision.bodies import Box, Workspace
-from identification.excitation.collision.checker import CollisionChecker, Contact
+from identification.excitation.collision import Box, CollisionChecker, Contact, Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
@@ -16,6 +15,7 @@ from identification.excitation.constraints import (
 from identification.excitation.criteria import (
     CRITERIA,
     Criteria,
+    Objective,
     condition_number,
     correlation,
     coupling_index,
@@ -33,7 +33,6 @@ from identification.excitation.errors import (
 )
 from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
-from identification.excitation.objective import Objective
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import (
     Method,

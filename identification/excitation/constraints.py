@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.checker import CollisionChecker, Contact
+from identification.excitation.collision import CollisionChecker, Contact
 from identification.excitation.violation import Kind, Violation
 from identification.model.motion import Motion
 from identification.model.robot import RobotModel

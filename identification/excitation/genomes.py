@@ -9,7 +9,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import DesignError
 from planner import (
     FourierSeries,

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision import CollisionChecker
 from identification.excitation.constraints import CurrentModel, check_motion, clearance
 from identification.excitation.excitation import ViaPointMotion
 from identification.excitation.genomes import straight_path

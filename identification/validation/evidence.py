@@ -26,9 +26,9 @@ from identification.validation.plausibility import (
     Implausible,
     InertiaRatio,
     NominalScale,
+    PositionJump,
     implausibilities,
 )
-from identification.validation.position_jumps import PositionJump
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identification.excitation import CRITERIA, validation_motions
-from identification.excitation.collision.bodies import Workspace
-from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision import CollisionChecker, Workspace
 from identification.excitation.constraints import (
     SAMPLE_PERIOD,
     Constraints,
@@ -26,6 +25,7 @@ from identification.excitation.constraints import (
 )
 from identification.excitation.criteria import (
     Criteria,
+    Objective,
     correlation,
     coupling_index,
     coupling_index_max,
@@ -35,7 +35,6 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
-from identification.excitation.objective import Objective
 from identification.excitation.searches.scores import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.violation import KINDS, NoFeasibleMotionError

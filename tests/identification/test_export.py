@@ -16,8 +16,7 @@ import pytest
 
 from identification.errors import ModelError, ShapeError
 from identification.estimators.consistent import consistent_estimate
-from identification.excitation.collision.bodies import Workspace
-from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision import CollisionChecker, Workspace
 from identification.excitation.errors import CollisionModelError
 from identification.export.parameters import parameters_csv, parameters_json
 from identification.export.simulators import (

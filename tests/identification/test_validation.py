@@ -29,8 +29,8 @@ from identification.validation.plausibility import (
     inertia_matrices,
     inertia_ratio,
     nominal_scale,
+    position_jumps,
 )
-from identification.validation.position_jumps import position_jumps
 from identification.validation.prediction import (
     PredictionError,
     pooled_error,

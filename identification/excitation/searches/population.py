@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.constraints import SAMPLE_PERIOD, Constraints, midpoints, sampled
-from identification.excitation.criteria import Criteria
+from identification.excitation.criteria import Criteria, Objective
 from identification.excitation.genomes import Genome, Motion
-from identification.excitation.objective import Objective
 from identification.excitation.searches.scores import Scores, unplanned
 from identification.excitation.violation import Violation, excess_by_kind
 from planner import PlannerCrashed, PlannerError, PlanningTimedOut

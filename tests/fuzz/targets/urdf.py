@@ -14,7 +14,7 @@ from hil.importers import Robot
 from hil.new import cell_of_urdf
 from identification.errors import ModelError
 from identification.excitation import Workspace
-from identification.excitation.collision.checker import CollisionChecker
+from identification.excitation.collision import CollisionChecker
 from identification.excitation.errors import CollisionModelError
 from identification.model.kinematics import chain_from_urdf
 from identification.model.robot import RobotModel

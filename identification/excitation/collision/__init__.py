@@ -1,1 +1,0 @@
-"""Collisions of an arm with itself and with obstacles."""
