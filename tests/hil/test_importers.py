@@ -318,15 +318,6 @@ class TestBadInput:
 
 
 class TestMapFile:
-    def test_reads_toml(self, tmp_path):
-        (tmp_path / "map.toml").write_text(
-            'sample_rate = 5000.0\n[position]\ncolumns = "Joint_{}"\nside = "motor"\n'
-            "[drive]\ngear_ratio = [32.0, 45]\ncoupling = [[2, 1, 32.0]]\n"
-        )
-        loaded = ColumnMap.load(tmp_path / "map.toml")
-        assert loaded.drive.coupling == ((2, 1, 32.0),)
-        assert loaded.position.side == "motor"
-
     RATE = "sample_rate = 5\n"
     POSITION = "[position]\ncolumns = 'q{}'\n"
     COUPLED = "[drive]\ngear_ratio = [1, 1]\ncoupling = [[2, 2, 1.0]]\n"
@@ -527,14 +518,6 @@ def test_any_name_of_a_file_or_joint_gives_a_valid_cell_file(name: str) -> None:
 
 
 class TestTextMatrices:
-    @pytest.mark.parametrize("transposed", [False, True])
-    def test_one_file_per_quantity_without_header(self, tmp_path, robot, transposed):
-        for name, values in (("q", Q), ("tau", TAU)):
-            np.savetxt(tmp_path / f"{name}.txt", values.T if transposed else values, fmt="%.17e")
-        found = read_arrays(tmp_path / "q.txt", robot, torque={"file": "tau.txt"})
-        assert np.array_equal(found["position"], Q)
-        assert np.array_equal(found["torque"], TAU)
-
     def test_channels_along_lines_with_their_names(self, tmp_path, robot):
         rows = [("time", TIME), *((f"q{j + 1}", Q[:, j]) for j in range(3))]
         lines = [" ".join([name, *(repr(float(v)) for v in values)]) for name, values in rows]
@@ -588,25 +571,18 @@ class TestTextMatrices:
 
 
 def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
-    more = np.column_stack([Q[:, 2], np.full(20, 9.0), Q[:, :2]])
-    np.savez(tmp_path / "a.npz", q=more)
-    found = read_arrays(
-        tmp_path / "a.npz",
-        robot,
-        joints=(JOINTS[2], "gripper", *JOINTS[:2]),
-        position={"columns": "q", "scale": (2.0, 1.0, 1.0, 1.0), "offset": (0.5, 0, 0, 0)},
-    )
-    assert found["position"][:, :2] == pytest.approx(Q[:, :2])
-    assert found["position"][:, 2] == pytest.approx(2.0 * (Q[:, 2] + 0.5))
-    np.savez(tmp_path / "a.npz", q=Q[:, :2])
+    columns = np.column_stack([Q[:, 2], np.full(20, 9.0), Q[:, :2]])
+    np.savez(tmp_path / "a.npz", q=columns, two=Q[:, :2])
+    position = {"columns": "q", "scale": (2.0, 1.0, 1.0, 1.0), "offset": (0.5, 0, 0, 0)}
+    joints = (JOINTS[2], "gripper", *JOINTS[:2])
+    found = read(tmp_path / "a.npz", robot, joints=joints, position=position)
+    expected = np.column_stack([Q[:, :2], 2.0 * (Q[:, 2] + 0.5)])
+    assert found["position"] == pytest.approx(expected)
+    entries = {"joints": JOINTS[:2], "position": {"columns": "two"}}
     with pytest.raises(SourceError, match="--locked NAME, or all: --lock-others"):
-        read_arrays(tmp_path / "a.npz", robot, joints=JOINTS[:2], position={"columns": "q"})
-    path = tmp_path / "two.urdf"
-    path.write_text(robot.urdf)
-    locked = Robot.from_urdf(path, locked={"ankle": 0.3})
-    found = read_arrays(tmp_path / "a.npz", locked, joints=JOINTS[:2], position={"columns": "q"})
-    assert np.array_equal(found["position"], Q[:, :2])
-    assert open_recording(tmp_path / "a.mcap").joint_names == JOINTS[:2]
+        read(tmp_path / "a.npz", robot, **entries)
+    locked = Robot.from_urdf(tmp_path / "three.urdf", locked={"ankle": 0.3})
+    assert np.array_equal(read(tmp_path / "a.npz", locked, **entries)["position"], Q[:, :2])
 
 
 def test_child_process_has_limited_memory_also_after_a_restart() -> None:

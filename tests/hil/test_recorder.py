@@ -13,20 +13,17 @@ from numpy.typing import NDArray
 
 from drivers.drive_train import DriveTrain
 from drivers.events import (
-    Event,
     InitReceived,
     LinkLost,
     MotionEnded,
     MotionStarted,
-    PacketRejected,
     StateChanged,
 )
 from drivers.packets import InitPacket
 from drivers.record import cycle_dtype
 from drivers.states import State
-from hil.archive import Archive, ArchiveSpec, Level, Recorder, open_archive
+from hil.archive import Archive, ArchiveSpec, Recorder, open_archive
 from hil.archive.process import BUFFERED_CYCLES, PreTriggerBuffer
-from hil.archive.recorder import describe, level_of
 from hil.cell import Cell
 from hil.simulation import simulated_controller
 from sim_fixtures.ns16 import CELL_PATH
@@ -136,18 +133,6 @@ class TestRecorder:
         assert "no valid packet for 1.200 s" in silent
         assert lost == "7 records overwritten"
         assert archive.columns["torque"] == pytest.approx(GEAR * CONSTANT * 2.0), "of these drives"
-
-
-@pytest.mark.parametrize(
-    ("event", "text"),
-    [
-        (PacketRejected("stale", 2, "number 9 is old"), "packets stale: 2 (number 9 is old)"),
-        (LinkLost(1.2, State.OPEN, 30), "no valid packet for 1.200 s in state OPEN; stale"),
-    ],
-)
-def test_event_texts(event: Event, text: str) -> None:
-    assert text in describe(event)
-    assert level_of(event) == (Level.ERROR if isinstance(event, LinkLost) else Level.WARN)
 
 
 def at(*numbers: int) -> NDArray[np.void]:
