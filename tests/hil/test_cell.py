@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from importlib import metadata
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,7 +20,6 @@ from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
 from hil.cell.text import replaced_value, urdf_limits
-from hil.design import preset, problem_of
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from sim_fixtures.plant import build_model
 from tests.hil.new_cells import TWO_JOINTS
@@ -182,40 +180,37 @@ def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folde
 
 
 def test_a_cell_is_moved_and_changed_in_its_text_too(folder: Path, ns16: Cell) -> None:
+    path = edited(folder, (r'^urdf = "', 'urdf = "models/'))
     (folder / "models").mkdir()
     (folder / "ns16.urdf").rename(folder / "models" / "ns16.urdf")
-    path = folder / "cell.toml"
-    path.write_text(path.read_text("utf-8").replace('"ns16.urdf"', '"models/ns16.urdf"'), "utf-8")
     moved = Cell.load(path).with_urdf(folder / "models" / "cell.toml", "robot.urdf")
-    assert moved.file.cell.urdf == "robot.urdf"
-    assert moved.urdf == URDF_PATH.read_text("utf-8")
+    assert (moved.file.cell.urdf, moved.urdf) == ("robot.urdf", URDF_PATH.read_text("utf-8"))
     cell = ns16.with_campaign(repetitions=7, simulation_seed=5)
     again = Cell.from_texts(cell.text, cell.urdf, cell.path)
     assert (again.campaign.repetitions, again.simulation.seed, again.campaign.seed) == (7, 5, 1)
-    text = "[a]\nseed = 1 # one\n[b] # comment\nseed = 2\n"
-    assert replaced_value(text, "b", "seed", 7) == "[a]\nseed = 1 # one\n[b] # comment\nseed = 7\n"
-    assert "other = 3" in replaced_value(text, "a", "other", 3)
-    assert replaced_value("[ a ]\n  x = 1", "a", "x", '"\\u00e1"') == '[ a ]\n  x = "\\u00e1"'
-    with pytest.raises(ValueError, match="no header line"):
-        replaced_value(text, "c", "seed", 7)
 
 
-def test_a_cell_on_a_bus_names_its_adapter(ns16: Cell) -> None:
-    """What the bus cannot carry is refused with the bus named."""
-    with pytest.raises(CellError, match=r"needs a table \[controller\.can\]"):
-        ns16.with_link(transport="can")
-    adapter = CanTable(interface="virtual", channel="arm", profile="fd")
-    on_bus = ns16.with_link(transport="can", can=adapter)
-    assert on_bus.controller.can == adapter
-    again = on_bus.with_link(can=adapter.model_copy(update={"channel": "other"}))
-    assert again.controller.can.channel == "other"
-    assert again.text.count("[controller.can]") == 1
-    classic = ns16.with_link(transport="can", can=adapter.model_copy(update={"profile": "classic"}))
-    with pytest.raises(CellError, match=r"controller\.can"):
-        classic.transport_spec()
+@pytest.mark.parametrize(
+    ("text", "table", "key", "value", "changed"),
+    [
+        ("[a]\nx = 1 # one\n[b] # b\nx = 2\n", "b", "x", 7, "[a]\nx = 1 # one\n[b] # b\nx = 7\n"),
+        ("[a]\nx = 1\n[b]\n", "a", "y", 3, "[a]\ny = 3\nx = 1\n[b]\n"),
+        ("[ a ]\n  x = 1", "a", "x", '"\\u00e1"', '[ a ]\n  x = "\\u00e1"'),
+        ("[a]\n", "c", "x", 7, None),
+    ],
+)
+def test_a_value_is_replaced_in_its_table(
+    text: str, table: str, key: str, value: float | str, changed: str | None
+) -> None:
+    if changed is None:
+        with pytest.raises(ValueError, match="no header line"):
+            replaced_value(text, table, key, value)
+    else:
+        assert replaced_value(text, table, key, value) == changed
 
 
 def test_link_and_session_are_as_the_cell_describes_them(ns16: Cell) -> None:
+    """What a bus cannot carry is refused with the bus named."""
     with pytest.raises(CellError, match="has no link"):
         ns16.transport_spec()
     local = ns16.with_link(transport="udp", host="127.0.0.1", port=2001, bind="127.0.0.1")
@@ -229,14 +224,17 @@ def test_link_and_session_are_as_the_cell_describes_them(ns16: Cell) -> None:
         "other_axes": frozenset({(1, 7), (2, 1)}),
         "settle_cycles": round(ns16.campaign.settle_s / ns16.period),
     }
-
-
-@pytest.mark.parametrize(
-    ("host", "simulated"),
-    [("127.0.0.1", True), ("127.1.2.3", True), ("10.2.12.150", False), ("controller", False)],
-)
-def test_only_this_computer_is_known_to_be_no_robot(ns16: Cell, host: str, simulated: bool) -> None:
-    assert ns16.with_link(transport="udp", host=host).only_simulated is simulated
+    adapter = CanTable(interface="virtual", channel="arm", profile="fd")
+    on_bus = ns16.with_link(transport="can", can=adapter)
+    again = on_bus.with_link(can=adapter.model_copy(update={"channel": "other"}))
+    assert (on_bus.controller.can, again.controller.can.channel) == (adapter, "other")
+    assert again.text.count("[controller.can]") == 1
+    classic = ns16.with_link(transport="can", can=adapter.model_copy(update={"profile": "classic"}))
+    with pytest.raises(CellError, match=r"controller\.can"):
+        classic.transport_spec()
+    for host in ("127.0.0.1", "127.1.2.3", "10.2.12.150", "controller"):
+        reached = ns16.with_link(transport="udp", host=host)
+        assert reached.only_simulated is host.startswith("127.")
 
 
 def test_the_third_nominal_coefficient_may_be_left_out(folder: Path, ns16: Cell) -> None:
@@ -249,9 +247,8 @@ def test_the_third_nominal_coefficient_may_be_left_out(folder: Path, ns16: Cell)
 
 def test_limits_without_a_drive_train_are_held_against_the_urdf_too(ns16: Cell) -> None:
     limits = ns16.text[ns16.text.index("[limits]") : ns16.text.index("[drive_train]")]
-    limits = limits.replace('"controller"', '"urdf"').replace(
-        "upper_deg = [180.0", "upper_deg = [999"
-    )
+    for old, new in (('"controller"', '"urdf"'), ("upper_deg = [180.0", "upper_deg = [999")):
+        limits = limits.replace(old, new)
     with pytest.raises(CellError, match="exceeds the"):
         Cell.from_texts(f'[cell]\nname = "x"\nurdf = "u"\n{limits}', ns16.urdf, Path("cell.toml"))
 
@@ -259,7 +256,6 @@ def test_limits_without_a_drive_train_are_held_against_the_urdf_too(ns16: Cell) 
 def test_a_sliding_joint_is_refused_by_name_where_degrees_are_given(folder: Path) -> None:
     text = (folder / "ns16.urdf").read_text("utf-8")
     sliding = re.sub(r'(name="joint_3"\s+type=)"revolute"', r'\1"prismatic"', text)
-    assert sliding != text
     (folder / "ns16.urdf").write_text(sliding, "utf-8")
     sentence = error_of(folder, ("^margin = 0.05", "margin = 0.04"))
     for words in ("cell.toml: limits: is in degrees", "joint_3 is prismatic", 'type = "fixed"'):
@@ -376,30 +372,6 @@ def test_the_document_and_the_schema_name_the_same_fields_and_defaults() -> None
     # Of one joint, only what is written counts.
     schema["robot.friction.joints"] = dict.fromkeys(schema["robot.friction.joints"], "not set")
     assert documented() == schema
-
-
-@pytest.fixture
-def ur10(tmp_path: Path) -> Path:
-    """The cell file of the worked example beside its URDF and meshes."""
-    try:
-        package = metadata.distribution("example-robot-data")
-    except metadata.PackageNotFoundError:
-        pytest.skip("the package example-robot-data, which has the UR10's URDF, is not installed")
-    share = Path(str(package.locate_file("cmeel.prefix/share")))
-    urdf = share / "example-robot-data/robots/ur_description/urdf/ur10_robot.urdf"
-    (tmp_path / "ur10_robot.urdf").write_bytes(urdf.read_bytes())
-    (tmp_path / "share").symlink_to(share)
-    (example,) = re.findall(
-        r"```toml\n(\[cell\]\nname = \"UR10\".*?)```", DOCUMENT.read_text("utf-8"), re.S
-    )
-    (tmp_path / "cell.toml").write_text(example, "utf-8")
-    return tmp_path / "cell.toml"
-
-
-def test_the_worked_example_can_be_designed_for_with_all_checks(ur10: Path) -> None:
-    problem = problem_of(Cell.load(ur10), preset("b"))
-    assert problem.constraints.currents is not None
-    assert ("base_link", "upper_arm_link") in problem.constraints.checker.pairs
 
 
 DRAKES = TWO_JOINTS.replace('"1.0"', '"1.0" encoding="GB2312"').replace(

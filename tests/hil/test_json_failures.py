@@ -91,40 +91,34 @@ def test_json_of_an_error_has_its_parts_and_status() -> None:
     assert found == [4, 2, 1]
 
 
-class TestDisk:
-    """Errors of a disk are not bad input: exit status 1."""
+@pytest.mark.parametrize(
+    "number", [errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG]
+)
+def test_errors_of_a_disk_are_not_bad_input(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit status 1, also for an archive that cannot grow, here or in its own process."""
+    refusal = OSError(number, os.strerror(number))
+    with pytest.raises(HilError) as of_folder, convert_write_errors(tmp_path):
+        raise refusal
 
-    @pytest.fixture(params=[errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS, errno.EFBIG])
-    def refusal(self, request: pytest.FixtureRequest) -> OSError:
-        return OSError(request.param, os.strerror(request.param))
+    def refuse(*_: object) -> int:
+        raise refusal
 
-    def test_an_archive_that_cannot_grow(
-        self, refusal: OSError, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def refuse(*_: object) -> int:
-            raise refusal
+    samples = Samples(np.arange(3) * 10**7, np.zeros((3, 1)))
+    monkeypatch.setattr("hil.archive.writer.os.write", refuse)
+    with pytest.raises(ArchiveWriteError) as of_archive:
+        write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})
+    failed = write_error(Failed(1, "a.mcap", "cannot be written further", "make room", number))
+    for error in (of_folder.value, of_archive.value, failed):
+        assert exit_code_of(error) == as_json(error)["exit_code"] == 1
 
-        samples = Samples(np.arange(3) * 10**7, np.zeros((3, 1)))
-        monkeypatch.setattr("hil.archive.writer.os.write", refuse)
-        with pytest.raises(ArchiveWriteError) as caught:
-            write_samples(tmp_path / "a.mcap", samples, joint_names=("a",), metadata={})
-        assert exit_code_of(caught.value) == 1
-        assert as_json(caught.value)["exit_code"] == 1
 
-    def test_one_that_the_archive_process_could_not_write(self, refusal: OSError) -> None:
-        failed = Failed(1, "a.mcap", "cannot be written further", "make room", refusal.errno)
-        assert exit_code_of(write_error(failed)) == 1
-        assert exit_code_of(write_error(Failed(1, "a.mcap", "exists already", "", None))) == 2
-
-    def test_folder_and_tables(self, refusal: OSError, tmp_path: Path) -> None:
-        with pytest.raises(HilError) as caught, convert_write_errors(tmp_path):
-            raise refusal
-        assert exit_code_of(caught.value) == 1
-
-    def test_a_name_that_cannot_be_used_is_bad_input(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError) as caught:
-            make_folder(tmp_path / ("a" * 300))
-        assert exit_code_of(caught.value) == 2
+def test_names_that_cannot_be_used_are_bad_input(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        make_folder(tmp_path / ("a" * 300))
+    exists = write_error(Failed(1, "a.mcap", "exists already", "", None))
+    assert exit_code_of(caught.value) == exit_code_of(exists) == 2
 
 
 @pytest.mark.parametrize(("raised", "code"), [(KeyboardInterrupt(), 130), (MemoryError(), 1)])

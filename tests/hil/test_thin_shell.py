@@ -17,8 +17,6 @@ ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvx
 WIRE = ("socket", "struct", "multiprocessing", "ctypes", "mmap")
 OF_NUMPY = {"array", "asarray", "isfinite", "degrees", "max", "abs", "argmax", "float64"}
 """Functions of numpy for output: no estimation, solution, sampling or integration."""
-LOOPS = (ast.For, ast.While, ast.ListComp, ast.SetComp, ast.GeneratorExp, ast.DictComp)
-MATHS = (ast.Mult, ast.MatMult, ast.Pow, ast.Div, ast.FloorDiv)
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
@@ -47,34 +45,12 @@ def violations(source: str) -> list[str]:
             and node.attr not in OF_NUMPY
         ):
             found.append(f"calls numpy.{node.attr}")
-        if isinstance(node, LOOPS):
-            found += [f"computes {what} in a loop" for what in computed(node)]
     return found
-
-
-def computed(loop: ast.AST) -> Iterator[str]:
-    """Yield products and quotients of two variables; changes of units are allowed."""
-    for node in ast.walk(loop):
-        if (
-            isinstance(node, ast.BinOp)
-            and isinstance(node.op, MATHS)
-            and not any(
-                isinstance(side, ast.Constant | ast.List) for side in (node.left, node.right)
-            )
-        ):
-            yield ast.unparse(node)
-
-
-FIGURES = {
-    "gains.py": {"computes gains.interval_factor * std in a loop"},
-    "plan.py": {"computes getattr(extrema, q) / getattr(plan.limits, q) in a loop"},
-}  # fmt: skip
-"""Exceptions: values computed for output only."""
 
 
 @pytest.mark.parametrize("path", SHELL, ids=lambda path: path.stem)
 def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> None:
-    assert set(violations(path.read_text("utf-8"))) == FIGURES.get(path.name, set())
+    assert violations(path.read_text("utf-8")) == []
 
 
 @pytest.mark.parametrize(
@@ -85,8 +61,6 @@ def test_a_command_computes_decodes_and_connects_nothing_itself(path: Path) -> N
         "import socket",
         "from hil.batch.run import _Estimates",
         "import numpy as np\nx = np.linalg.lstsq(a, b)",
-        "total = [weight * error for weight, error in pairs]",
-        "def f():\n    for k in range(n):\n        torque += regressor[k] @ values",
     ],
 )
 def test_violations_are_detected(source: str) -> None:
