@@ -119,30 +119,14 @@ class TestFigures:
         assert (len(nine), nine[1], nine[4]) == (9, nine[3], six[1])
 
 
-class TestRefusals:
-    def test_the_same_recording_on_both_sides_is_named(self, folder: Path) -> None:
-        empty = [folder / "empty.mcap"]
-        with pytest.raises(InputError, match="is a copy of"):
-            find_payload(empty, empty, Silent())
-
-    def test_another_arm_is_named(self, folder: Path, tmp_path: Path) -> None:
-        time = np.arange(0.0, 6.0, 8e-3)
-        other = archived(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
-        with pytest.raises(ArchiveError, match=r"ur10\.mcap.*another arm .* robot\.urdf"):
-            find_payload([folder / "empty.mcap"], [other], Silent())
-
-    @pytest.mark.parametrize(
-        ("arguments", "sentence"),
-        [
-            (("empty.mcap",), "give both: hil payload BARE"),
-            (("empty.mcap", *BOTH[:2], "--check", "mass"), "'mass' is not NAME=NUMBER"),
-        ],
-    )
-    def test_incomplete_arguments_are_refused(
-        self, folder: Path, arguments: tuple[str, ...], sentence: str
-    ) -> None:
-        with pytest.raises(InputError, match=sentence):
-            run(folder, *arguments)
+def test_the_same_recording_and_another_arm_are_named(folder: Path, tmp_path: Path) -> None:
+    empty = [folder / "empty.mcap"]
+    with pytest.raises(InputError, match="is a copy of"):
+        find_payload(empty, empty, Silent())
+    time = np.arange(0.0, 6.0, 8e-3)
+    other = archived(tmp_path / "ur10.mcap", simulate("ur10_robot.urdf", time, seed=1))
+    with pytest.raises(ArchiveError, match=r"ur10\.mcap.*another arm .* robot\.urdf"):
+        find_payload(empty, [other], Silent())
 
 
 CONSTANTS = np.array([0.12, 0.12, 0.1, 0.08, 0.05, 0.04])  # N·m/A, motor side
@@ -175,17 +159,13 @@ def currents(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def gains(folder: Path, *arguments: str) -> tuple[int, str]:
-    return run(folder, *arguments, command="gains")
-
-
-def gains_json(folder: Path, *arguments: str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(gains(folder, *arguments, "--json")[1])
+def gains(folder: Path, *arguments: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(run(folder, *arguments, "--json", command="gains")[1])
     return found
 
 
 def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
-    found = gains_json(currents, "empty.mcap", *BOTH)
+    found = gains(currents, "empty.mcap", *BOTH)
     assert found["side"] == "motor"
     assert found["payload_kg"] == {"empty.mcap": None, "full.mcap": 4.0}
     known = 0
@@ -200,7 +180,7 @@ def test_the_constants_lie_in_their_intervals(currents: Path) -> None:
 
 
 def test_the_output_is_an_entry_of_the_column_map(currents: Path) -> None:
-    status, text = gains(currents, "empty.mcap", *BOTH, "--quiet")
+    status, text = run(currents, "empty.mcap", *BOTH, "--quiet", command="gains")
     pasted = tomllib.loads(text)["torque_constant"]
     assert (len(pasted) == len(CONSTANTS)) == (status == 0)
     assert "# shoulder_lift_joint ±" in text
@@ -214,7 +194,7 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
         slow = simulate("ur5_robot.urdf", time, seed=seed, pace=0.1, load=body)
         noise = 0.1 * np.random.default_rng(seed).standard_normal(slow.torque.shape)  # N·m
         archive_of_currents(tmp_path, name, replace(slow, torque=slow.torque + noise))
-    status, text = gains(tmp_path, "empty.mcap", *BOTH, "-q")
+    status, text = run(tmp_path, "empty.mcap", *BOTH, "-q", command="gains")
     assert status == 5
     assert "nan,  # shoulder_pan_joint: not determined; " in text
     assert "shoulder_lift_joint ±" in text
@@ -225,19 +205,21 @@ def test_a_vertical_axis_in_slow_motion_has_no_constant(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "sentence"),
+    ("command", "arguments", "sentence"),
     [
-        (("empty.mcap", "--loaded", "full.mcap"), "--mass: the payload needs a mass above 0"),
-        (("empty.mcap", "--mass", "4"), "has no recording with this payload"),
-        (("empty.mcap", *BOTH[:4], "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
-        (("empty.mcap",), r"without a known payload.*--loaded ARCHIVE"),
+        ("payload", (), "give both: hil payload BARE"),
+        ("payload", (*BOTH[:2], "--check", "mass"), "'mass' is not NAME=NUMBER"),
+        ("gains", BOTH[:2], "--mass: the payload needs a mass above 0"),
+        ("gains", ("--mass", "4"), "has no recording with this payload"),
+        ("gains", (*BOTH[:4], "--centre", "1,2"), "--centre: '1,2' is not 3 numbers"),
+        ("gains", (), r"without a known payload.*--loaded ARCHIVE"),
     ],
 )
-def test_incomplete_arguments_of_gains_are_refused(
-    currents: Path, arguments: tuple[str, ...], sentence: str
+def test_incomplete_arguments_are_refused(
+    currents: Path, command: str, arguments: tuple[str, ...], sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
-        gains(currents, *arguments)
+        run(currents, "empty.mcap", *arguments, command=command)
 
 
 def test_archives_of_a_folder_are_used(currents: Path, tmp_path: Path) -> None:
@@ -245,9 +227,9 @@ def test_archives_of_a_folder_are_used(currents: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="contains no complete archive; give archives"):
         gains(currents, str(tmp_path))
     (tmp_path / "empty.mcap").symlink_to(currents / "empty.mcap")
-    loads = gains_json(currents, str(tmp_path), *BOTH)["payload_kg"]
+    loads = gains(currents, str(tmp_path), *BOTH)["payload_kg"]
     assert loads == {"empty.mcap": None, "full.mcap": 4.0}
     (tmp_path / "empty.mcap").unlink()
     (tmp_path / "empty.mcap").symlink_to(currents / "full.mcap")
-    loads = gains_json(currents, "empty.mcap", "--loaded", str(tmp_path), *BOTH[2:])["payload_kg"]
+    loads = gains(currents, "empty.mcap", "--loaded", str(tmp_path), *BOTH[2:])["payload_kg"]
     assert sorted(loads.values(), key=bool) == [None, 4.0]

@@ -37,14 +37,14 @@ def violations(source: str) -> list[str]:
             found.append(f"imports {name}")
         if top in OURS and any(part.startswith("_") for part in name.split(".")):
             found.append(f"imports {name}, which is private")
-    for node in ast.walk(tree):
-        if (
-            isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Name)
-            and node.value.id == "np"
-            and node.attr not in OF_NUMPY
-        ):
-            found.append(f"calls numpy.{node.attr}")
+    found += [
+        f"calls numpy.{node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "np"
+        and node.attr not in OF_NUMPY
+    ]
     return found
 
 
