@@ -193,14 +193,6 @@ def test_a_picture_that_cannot_be_written_is_a_warning(invoke, copied):
     assert not list(copied.glob("*.tmp"))
 
 
-def test_an_exhausted_search_is_reported(invoke, settings, tmp_path):
-    settings.write_text(SETTINGS + "crossover = 0.0\nmutation = 0.0\n")
-    given = (CELL_PATH, "--settings", settings, "--kinematic", "-o", tmp_path / "out")
-    output = invoke(*given).output
-    assert "ended after 1 of 2 generations: mating gave no new motions" in output
-    assert "100 %" in output
-
-
 def test_json_agrees_with_the_file(bare):
     printed, found = json.loads(bare[1]), DesignResult.load(bare[0])
     for name in ("log10_det", "coupling_index", "condition"):

@@ -14,7 +14,6 @@ from hil.design.result import _seal, fingerprint
 from hil.design.run import Designed, DesignFolder, run_design
 from hil.errors import InputError
 from hil.progress import Silent
-from identification.excitation import Objective
 from sim_fixtures.ns16 import CELL_PATH
 
 TINY = {"population": 8, "generations": 2, "polish": 0}
@@ -58,17 +57,6 @@ def test_the_file_restores_everything(made, ns16):
     assert again.data["software"] == done.result.data["software"]
     assert {"hil", "ruckig", "pymoo", "cma", "numpy"} <= again.data["software"].keys()
     assert "polished_from" not in again.data
-
-
-def test_criteria_are_sampled_every_millisecond(made, ns16):
-    excitation = load_design(made[0].result)
-    again = Objective(ns16.model).criteria(excitation.trajectory, 0.001)
-    assert again == excitation.criteria
-    assert excitation.criteria.n_samples == pytest.approx(
-        1000 * excitation.trajectory.duration, abs=2
-    )
-    assert excitation.criteria.condition is not None
-    assert excitation.criteria.scaled_condition is not None
 
 
 def test_a_motion_that_was_changed_is_refused(made, text, tmp_path):

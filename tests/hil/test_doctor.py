@@ -385,16 +385,6 @@ def test_what_is_found_is_judged(
     assert word in "\n".join([found.found, *found.remedy])
 
 
-@given(text=st.text())
-def test_invalid_kernel_files_never_stop_the_examination(
-    tmp_path_factory: pytest.TempPathFactory, text: str
-) -> None:
-    idle = {"cpuidle__state0__latency": text, "cpuidle__state0__disable": text}
-    files = processors(2, cpufreq__scaling_governor=text, **idle)
-    system = MadeUp(tmp_path_factory.mktemp("nonsense"), files, {})
-    assert all(check.found for check in system_checks.computer_checks(NOTHING, system))
-
-
 @pytest.mark.parametrize(
     ("trial", "statuses"),
     [

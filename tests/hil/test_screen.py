@@ -30,7 +30,7 @@ from hil.campaign.operator import (
 )
 from hil.cell import Cell
 from hil.cell.schema import CanTable
-from hil.progress import Bar, LineReporter, Silent, put, reporter
+from hil.progress import Bar, LineReporter, Silent, reporter
 from hil.screen import (
     Keyboard,
     Screen,
@@ -125,16 +125,6 @@ class TestPicture:
         ):
             screen = Screen.of(changed, Stop(), quiet=True)
             assert name in screen_lines(120, 24, screen)[0]
-
-
-def test_only_a_terminal_wraps_lines() -> None:
-    sentence = "one sentence that is [longer] than any line of this terminal is wide :smile:"
-    for terminal in (True, False):
-        out = StringIO()
-        put(Console(file=out, width=30, force_terminal=terminal, color_system=None), sentence)
-        rows = out.getvalue().splitlines()
-        assert " ".join(row.strip() for row in rows) == sentence
-        assert (len(rows) > 1) is terminal
 
 
 # --- keys ------------------------------------------------------------------------------------
