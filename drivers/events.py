@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.drive_train import DriveTrain
 from drivers.errors import RefusalError
 from drivers.packets import InitPacket
 from drivers.states import State
@@ -39,16 +38,13 @@ class Counters:
 class InitReceived:
     """The controller started a session.
 
-    `drive_train` is the one to use; `unusable` is why the arm cannot be moved, or None;
-    `differences` from the cell name axis and both values; `adopted`: the controller's gear ratios,
-    calibration and coupling are used.
+    `unusable` is why the arm cannot be moved, or None; `differences` from the cell name axis and
+    both values.
     """
 
     init: InitPacket = field(repr=False)
-    drive_train: DriveTrain = field(repr=False)
     unusable: str | None
     differences: tuple[str, ...] = ()
-    adopted: bool = False
 
 
 @dataclass(frozen=True)

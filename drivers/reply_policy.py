@@ -60,14 +60,14 @@ class ReplyPolicy:
 
     Attributes:
         init: the init packet.
-        received: comparison of the init packet with the cell, and the drive train to use.
+        received: comparison of the init packet with the cell.
         unusable: why the arm cannot be moved in this session, or None.
         reader: reads status and modes of the packets.
         frame: buffer of the reply.
 
     Args:
         init: the init packet.
-        others: as of `Session`; `accept` is its `accept_init`.
+        others: as of `Session`.
     """
 
     def __init__(
@@ -78,13 +78,12 @@ class ReplyPolicy:
         guard: Guard,
         arm: int,
         mode: int,
-        accept: bool,
         other_axes: frozenset[tuple[int, int]],
         max_gap: int,
         only_axis: int | None,
     ) -> None:
         self.init = init
-        self.received = compare(drive_train, guard.period, init, arm, accept, other_axes)
+        self.received = compare(drive_train, guard.period, init, arm, other_axes)
         self.unusable = self.received.unusable
         self.frame = ReplyFrame(init.n_axes)
         self._arm = arm
@@ -107,7 +106,7 @@ class ReplyPolicy:
             own = range(init.n_axes) if axes is None else [a.slot for a in axes if a.arm == arm]
             self.reader = Reader(np.array(own, np.intp), arms, arm, mode)
             return
-        self._wire = wire = ArmWire(self.received.drive_train, init, arm, only_axis)
+        self._wire = wire = ArmWire(drive_train, init, arm, only_axis)
         self.reader = Reader(wire.joint_slots, arms, arm, mode, wire.opened)
         if mode in CORRECTION_MODES:
             self._open_mode = CorrectionMode(guard, wire, self.frame, mode)

@@ -153,9 +153,6 @@ class Session(StateMachine):
         settle_cycles: cycles for which the end of a motion is held before open mode is left.
         init_timeout: silence allowed before the init packet and in a pause, s.
         silence_timeout: silence allowed otherwise, s.
-        accept_init: adopt the controller's gear ratios, calibration and coupling where they
-            differ from the cell's but are not far off, and accept further open axes, instead of
-            refusing to move.
         other_axes: (arm, axis), both from 1, that may be open although the cell has no such joint.
         only_axis: the only joint, from 1, that the controller opens; the others have to stay
             closed. None where it opens all.
@@ -180,7 +177,6 @@ class Session(StateMachine):
         settle_cycles: int = 200,
         init_timeout: float = 300.0,
         silence_timeout: float = 1.0,
-        accept_init: bool = False,
         other_axes: Collection[tuple[int, int]] = (),
         only_axis: int | None = None,
     ) -> None:
@@ -211,7 +207,6 @@ class Session(StateMachine):
             guard=guard,
             arm=arm,
             mode=mode,
-            accept=accept_init,
             other_axes=frozenset(other_axes),
             max_gap=max_gap,
             only_axis=only_axis,
@@ -239,8 +234,8 @@ class Session(StateMachine):
 
     @property
     def drive_train(self) -> DriveTrain:
-        """Drive train in use: the cell's, or the one with adopted values of the controller."""
-        return self._drive_train if self._policy is None else self._policy.received.drive_train
+        """Drive train of the cell."""
+        return self._drive_train
 
     def events(self) -> list[Event]:
         """Return the events since the last call, in order; rejected packets last, by kind."""

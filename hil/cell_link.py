@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from hil.archive.live import LiveView, LiveViewError
+from hil.campaign.link import MotionLink
 from hil.campaign.live_link import LiveLink
-from hil.campaign.motion_link import MotionLink
 from hil.cell import Cell
 from hil.simulation import simulated_link
 
@@ -16,14 +16,12 @@ from hil.simulation import simulated_link
 def cell_link(
     cell: Cell,
     *,
-    accept_init: bool = False,
     only_axis: int | None = None,
     live: LiveView | None = None,
 ) -> Iterator[MotionLink]:
     """Open the link of a cell; leaving the context stops the arm and closes the link.
 
-    With transport "simulated" the controller is simulated in this process, in virtual time. With
-    `accept_init` the controller's gear ratios, calibration and coupling replace the cell's;
+    With transport "simulated" the controller is simulated in this process, in virtual time.
     `only_axis`, from 1, is the only one to be open.
 
     Raises:
@@ -34,7 +32,7 @@ def cell_link(
         require_real_time(cell, live)
         yield simulated_link(cell, only_axis=only_axis)
         return
-    with LiveLink.open(cell, accept_init=accept_init, only_axis=only_axis, live=live) as link:
+    with LiveLink.open(cell, only_axis=only_axis, live=live) as link:
         yield link
 
 

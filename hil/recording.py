@@ -16,7 +16,7 @@ from hil.version import software
 
 if TYPE_CHECKING:
     from hil.archive.recorder import Recorded
-    from hil.campaign.motion_link import MotionLink, Watch
+    from hil.campaign.link import MotionLink, Watch
     from hil.campaign.operator import Stop
 
 KINDS = ("excitation", "validation", "standstill")

@@ -73,39 +73,10 @@ class StepResult(Frozen):
     details: list[str]
 
 
-class RecordedResult(Frozen):
-    """One recorded motion."""
-
-    archive: str
-    kind: str
-    when: str | None  #: Start, ISO 8601 (UTC); null in virtual time
-    seconds: float
-    cycles: int
-    missed: int  #: Packets that did not arrive
-    late: int  #: Late replies
-    not_accepted: int  #: Replies that the controller did not accept
-    lost: int  #: Cycles that were not archived
-    outcome: str
-    why: str  #: Reason of the outcome
-
-
-class WarmUpResult(Frozen):
-    """Friction during warm-up, per motion."""
-
-    verdict: str  #: One of `warm`, `not warm`, `going on`
-    threshold: float  #: Relative change per motion below which the arm is warm
-    friction: list[list[float | None]]
-    """Of each motion and joint, N·m or N; null for a joint that hardly moves."""
-    change: list[float | None]
-    """Largest relative change of any joint from motion to motion; null if unknown."""
-
-
 class ConductResult(Frozen):
     """Execution of a campaign."""
 
     steps: list[StepResult]
-    warm_up: WarmUpResult | None
-    recorded: list[RecordedResult]  #: Archives of the manifest, in chronological order
 
 
 class JointJudgement(Frozen):

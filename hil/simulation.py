@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.campaign import Link
+from hil.campaign.link import Link
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
 from sim_fixtures import (

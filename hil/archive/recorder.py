@@ -74,8 +74,6 @@ def describe(event: ExchangeEvent) -> str:
     match event:
         case InitReceived() if event.unusable:
             return event.unusable
-        case InitReceived():
-            details = "".join(f"; {one}" for one in event.differences)
         case PacketRejected() if event.reason:
             details = f" ({event.reason})"
         case HoldChanged():

@@ -1,40 +1,37 @@
-"""Campaign: plan, run, archive; resumable."""
+"""Campaign: plan, run, archive; resumable. Names are imported on first use."""
 
-from hil.archive.recorder import Recorded
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from .campaign import Campaign
-from .errors import (
-    CampaignFolderError,
-    MotionFailedError,
-    MotionRefusedError,
-    NotRehearsedError,
-)
-from .folder import CampaignFolder
-from .intervals import Interval, require_runnable
-from .link import Link
-from .live_link import LiveLink
-from .motion_link import MotionLink, Progress
-from .operator import Stop, stop_on_interrupt
-from .plan import CampaignPlan, PlannedMotion, design, plan_around
+if TYPE_CHECKING:
+    from .campaign import Campaign as Campaign
+    from .errors import CampaignFolderError as CampaignFolderError
+    from .errors import MotionFailedError as MotionFailedError
+    from .errors import MotionRefusedError as MotionRefusedError
+    from .errors import NotRehearsedError as NotRehearsedError
+    from .folder import CampaignFolder as CampaignFolder
+    from .link import Link as Link
+    from .link import MotionLink as MotionLink
+    from .link import Progress as Progress
+    from .operator import Stop as Stop
+    from .operator import stop_on_interrupt as stop_on_interrupt
+    from .plan import CampaignPlan as CampaignPlan
+    from .plan import PlannedMotion as PlannedMotion
+    from .plan import design as design
+    from .plan import plan_around as plan_around
 
-__all__ = [
-    "Campaign",
-    "CampaignFolder",
-    "CampaignFolderError",
-    "CampaignPlan",
-    "Interval",
-    "Link",
-    "LiveLink",
-    "MotionFailedError",
-    "MotionLink",
-    "MotionRefusedError",
-    "NotRehearsedError",
-    "PlannedMotion",
-    "Progress",
-    "Recorded",
-    "Stop",
-    "design",
-    "plan_around",
-    "require_runnable",
-    "stop_on_interrupt",
-]
+_HOME = {
+    "Campaign": "campaign",
+    "CampaignFolder": "folder",
+    **dict.fromkeys(("Link", "MotionLink", "Progress"), "link"),
+    **dict.fromkeys(("Stop", "stop_on_interrupt"), "operator"),
+    **dict.fromkeys(("CampaignPlan", "PlannedMotion", "design", "plan_around"), "plan"),
+}
+
+if not TYPE_CHECKING:  # which would accept any name
+
+    def __getattr__(name: str) -> Any:
+        module = _HOME.get(name, "errors" if name.endswith("Error") else None)
+        if module is None:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        return getattr(import_module(f"{__name__}.{module}"), name)

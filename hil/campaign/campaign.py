@@ -15,6 +15,7 @@ from hil.cell import Cell
 from hil.design.run import DESIGN_FILES
 from hil.errors import HilError, InputError, OutputError
 from hil.files import make_folder, write_atomically
+from hil.identify.options import Options
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from identification.excitation import Excitation
@@ -22,16 +23,15 @@ from identification.excitation import Excitation
 from .errors import CampaignFolderError
 from .folder import LOCK, CampaignFolder
 from .intervals import require_runnable
-from .motion_link import MotionLink
+from .link import MotionLink
 from .operator import Operator, Stop, Unattended
 from .plan import CampaignPlan, plan_around
-from .rehearsal import Rehearsal
+from .rehearsal import SEED, Rehearsal, rehearse
+from .run import Run, RunResult
 from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
-    from hil.identify import Identification, Options
-
-    from .run import RunResult
+    from hil.identify import Identification
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,7 +142,7 @@ class Campaign:
         """Run the plan on a simulated copy of the cell, and judge it.
 
         The result is in `rehearsal.json` and is valid while cell, URDF and plan are unchanged. A
-        passed rehearsal is not repeated, a stopped one is resumed.
+        passed rehearsal is not repeated.
 
         Args:
             reporter: receives the progress.
@@ -152,18 +152,12 @@ class Campaign:
 
         Raises:
             MotionRefusedError: a motion breaks a limit of the cell.
-            OperatorStopError: it was stopped; its recordings remain.
+            OperatorStopError: it was stopped.
             CampaignFolderError: the folder was changed, or is in use by a run.
         """
-        from .rehearsal_run import SEED, rehearse  # which runs campaigns
-
-        return rehearse(
-            self,
-            reporter or Silent(),
-            seed=SEED if seed is None else seed,
-            stop=stop,
-            again=again,
-        )
+        reporter, stop = reporter or Silent(), stop or Stop()
+        seed = SEED if seed is None else seed
+        return rehearse(self, reporter, seed=seed, stop=stop, again=again)
 
     def identify(
         self, options: Options | None = None, *, reporter: Reporter | None = None
@@ -174,7 +168,7 @@ class Campaign:
             InputError: there is no complete excitation yet, or the archives cannot be used.
             OutputError: the folder cannot be written to.
         """
-        from hil.identify import Options, identify_campaign  # which knows campaign folders
+        from hil.identify.run import identify_campaign  # which loads matplotlib, as below
         from hil.outcome import write_outcome
 
         reporter = reporter or Silent()
@@ -188,7 +182,7 @@ class Campaign:
             InputError: nothing can be identified yet.
             OutputError: the folder cannot be written to.
         """
-        from hil.outcome import rewrite_report  # which knows identifications
+        from hil.outcome import rewrite_report
 
         steps = {step.name: step.state for step in self.status().steps}
         if steps["identify"] == "done":
@@ -246,8 +240,6 @@ class Campaign:
             CampaignFolderError: the folder was changed, or is in use by another run.
             OutputError: a result cannot be written.
         """
-        from .run import Run  # which `hil status` does not need
-
         return Run(
             self,
             link,

@@ -86,26 +86,7 @@ class RepetitionsRejectedError(HilError):
     def __init__(self, motion: str, reasons: Sequence[str]) -> None:
         super().__init__(
             f"{motion} was rejected {plural(len(reasons), 'time')}, the last time because "
-            f"{reasons[-1]}; all attempts are archived with their reasons: find the cause, "
-            "then run the campaign again to continue."
-        )
-
-
-class ArmChangedError(RepetitionsRejectedError):
-    """Later attempts agree with each other, and not with the accepted repetitions.
-
-    `reference` and `later` are file names of the accepted and of the later, rejected archives.
-    """
-
-    def __init__(
-        self, motion: str, differs: str, reference: Sequence[str], later: Sequence[str]
-    ) -> None:
-        self.reference, self.later = tuple(reference), tuple(later)
-        HilError.__init__(
-            self,
-            f"{motion}: the last {len(later)} attempts ({', '.join(later)}) agree with each other, "
-            f"and not with the {len(reference)} repetitions that count ({', '.join(reference)}): "
-            f"{differs}. Check the arm: payload, tool, cables, belts, brakes, obstacles. If it "
-            "can be restored, do so and run the campaign again; if the later attempts are right, "
-            "begin a new campaign.",
+            f"{reasons[-1]}; all attempts are archived with their reasons. Check the arm: payload, "
+            "tool, cables, belts, brakes, obstacles. Remove the cause and run the campaign again, "
+            "or begin a new one if the arm stays as it is."
         )

@@ -145,6 +145,12 @@ class Entry:
         if Path(self.name).name != self.name or not self.name.strip("."):
             raise ValueError(f"{self.name!r} is not the name of a file in archives/")
 
+    @property
+    def kind(self) -> str:
+        """Kind of its motion; "" for another file name."""
+        name = ArchiveName.parse(self.name)
+        return "" if name is None else name.kind
+
 
 @dataclass(frozen=True)
 class _Manifest:

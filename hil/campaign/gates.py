@@ -12,7 +12,7 @@ from hil.errors import ArchiveError
 from .dry_run import DryRunStage, not_accepted, yes_or_no
 from .errors import CampaignFolderError, DryRunError, NotRehearsedError
 from .folder import CampaignFolder
-from .motion_link import Connection, narrower_limits
+from .link import Connection, narrower_limits
 from .rehearsal import Rehearsal
 
 if TYPE_CHECKING:
@@ -130,22 +130,14 @@ def require_as_rehearsed(run: Run, connection: Connection) -> None:
     """Refuse a controller whose figures are not those of the rehearsal and the checks.
 
     Raises:
-        NotRehearsedError: names the differences, or joints with a narrower following-error
-            threshold in the controller, and both thresholds.
+        NotRehearsedError: names joints with a narrower following-error threshold in the
+            controller, and both thresholds.
     """
-    root, cell = run.folder.root, run.cell
-    if connection.adopted and connection.differences:
-        raise NotRehearsedError(
-            root,
-            "was rehearsed and checked with the cell file's drive train, and this link uses the "
-            f"controller's ({'; '.join(connection.differences)})",
-            "write the controller's figures into the cell file and rehearse",
-        )
-    below = narrower_limits(cell, connection, "following_error")
+    below = narrower_limits(run.cell, connection, "following_error")
     if not below:
         return
     raise NotRehearsedError(
-        root,
+        run.folder.root,
         "was planned and rehearsed with wider following-error thresholds than those of the "
         f"controller ({'; '.join(below)})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "

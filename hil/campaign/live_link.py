@@ -63,7 +63,7 @@ from hil.cell.cell import is_local
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.terminal_text import plural
 
-from .motion_link import (
+from .link import (
     END_TIMEOUT,
     Connection,
     Counts,
@@ -72,7 +72,6 @@ from .motion_link import (
     StartTimeout,
     Steering,
     Watch,
-    active_drive_train,
     active_guard,
     described,
     recording_end,
@@ -290,7 +289,6 @@ class LiveLink(MotionLink):
         cell: Cell,
         *,
         transport: TransportSpec | None = None,
-        accept_init: bool = False,
         only_axis: int | None = None,
         realtime: RealTimeSettings | None = None,
         finish: Callable[[], None] = lambda: None,
@@ -303,7 +301,6 @@ class LiveLink(MotionLink):
         Args:
             cell: the cell.
             transport: in place of the cell's own.
-            accept_init: use the controller's figures where they differ from the cell's.
             only_axis: the only axis, from 1, that is opened; None for all.
             realtime: what the exchange requests from the system.
             finish: asks the controller to end the session.
@@ -321,7 +318,7 @@ class LiveLink(MotionLink):
             drive_train=cell.drive_train,
             guard_limits=cell.guard_limits,
             period=cell.period,
-            session=cell.session_settings(accept_init=accept_init, only_axis=only_axis),
+            session=cell.session_settings(only_axis=only_axis),
             realtime=realtime or RealTimeSettings(),
             preload=("planner",),
         )
@@ -383,8 +380,7 @@ class LiveLink(MotionLink):
     @contextmanager
     def open_archive(self, spec: ArchiveSpec, *, own_motion: bool) -> Iterator[None]:
         """See `MotionLink.open_archive`; what is still open at an error is closed with the link."""
-        drives = active_drive_train(self.cell, self.connection)
-        spec = described(spec, self.connection, drives)
+        drives, spec = self.cell.drive_train, described(spec, self.connection)
         self.view.lost = None
         self.job += 1
         self.open_path = str(spec.path)
@@ -581,8 +577,7 @@ class LiveLink(MotionLink):
 
     def _await_end(self, spec: ArchiveSpec, steering: Steering, stop: Stop) -> MotionEnded:
         view, due, stop_sent = self.view, math.inf, False
-        drives = active_drive_train(self.cell, self.connection)
-        guard = active_guard(self.cell, drives, self.connection.init)
+        drives, guard = self.cell.drive_train, active_guard(self.cell, self.connection.init)
         while True:
             self.heart.turn()
             view.poll()

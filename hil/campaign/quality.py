@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -51,7 +51,7 @@ bound of later ones."""
 _WIDE: Final = 3.0  # Least bound as a multiple of the median difference of the earlier ones
 _OUTLYING: Final = 6.0  # Robust standard deviations above the median difference
 _FEWEST_ALIKE: Final = 2
-"""Least number of rejected attempts that agree before the reference is questioned."""
+"""Least number of attempts that agree with each other before the first repetition is rejected."""
 
 Motion = PiecewiseCubic | FourierSeries
 
@@ -61,17 +61,11 @@ class Problem:
     """Why a motion is rejected.
 
     Attributes:
-        by_hand: whether the operator held or slowed it.
         differs: whether its only problem is a difference from the repetitions before it.
-        reference, later: if the arm may have changed: file names of the repetitions that count, and
-            of the attempts that agree with it.
     """
 
     sentence: str
-    by_hand: bool = False
     differs: bool = False
-    reference: tuple[str, ...] = ()
-    later: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return self.sentence
@@ -156,8 +150,7 @@ def incomplete_or_slowed(executed: Executed, trajectory: Motion, cell: Cell) -> 
     at = int(np.argmax(off > OFF_PATH)) * cell.period
     return Problem(
         f"it was held or slowed about {at:.1f} s after its start, so it is no repetition; leave "
-        "the override at 100 %",
-        by_hand=True,
+        "the override at 100 %"
     )
 
 
@@ -290,10 +283,8 @@ class ArchiveReview:
             if executed is not None:
                 self._check.accept(executed)
             return None
-        amend_outcome(self._folder.archives / name, REJECTED, problem.sentence)
-        self._folder.add(name, REJECTED, problem.sentence)
-        self.rejected.append(Rejected(name, problem.sentence))
-        return replace(problem, later=(*problem.later, name)) if problem.reference else problem
+        self._reject(name, problem.sentence)
+        return problem
 
     def adopt(self, intervals: Sequence[Interval], made: Callable[[ArchiveHeader], bool]) -> None:
         """Enter archives of an earlier run that was killed before it entered them."""
@@ -318,52 +309,43 @@ class ArchiveReview:
         """Return the problem of a repetition, None for none.
 
         Where enough later attempts agree with each other and not with the only accepted one, that
-        one is rejected instead. Where two or more accepted ones agree, the operator has to decide.
+        one is rejected instead.
         """
-        problem = self._check.problem(executed)
-        if problem is None or not problem.differs:
+        problem, good = self._check.problem(executed), self._folder.completed("excitation")
+        if problem is None or not problem.differs or len(good) != 1:
             return problem
-        good = self._folder.completed("excitation")
-        alike, with_accepted = self._alike(executed)
-        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)
-        if len(alike) + 1 < max(enough, with_accepted + 2):
+        alike = self._alike(executed)
+        if len(alike) + 1 < max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions):
             return problem
-        if len(good) > 1:
-            return replace(problem, reference=tuple(path.name for path in good), later=alike)
+        name = good[0].name
         reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
-        for path in good:
-            amend_outcome(path, REJECTED, reason)
-            self._folder.add(path.name, REJECTED, reason)
-            self.rejected.append(Rejected(path.name, reason))
-            self.notes.append(
-                f"{path.name} was the only repetition that counted, and was rejected because "
-                f"{len(alike) + 1} later ones agree with each other and not with it: it was "
-                "disturbed, or the arm was changed after it"
-            )
+        self._reject(name, reason)
+        self.notes.append(
+            f"{name} was the only repetition that counted, and was rejected because "
+            f"{len(alike) + 1} later ones agree with each other and not with it: it was "
+            "disturbed, or the arm was changed after it"
+        )
         self._check = RepetitionCheck(self._cell, self._motion)
         return None
 
-    def _alike(self, executed: Executed) -> tuple[tuple[str, ...], int]:
-        """Return attempts that agree with this one and each other, and how many with accepted ones.
+    def _reject(self, name: str, reason: str) -> None:
+        amend_outcome(self._folder.archives / name, REJECTED, reason)
+        self._folder.add(name, REJECTED, reason)
+        self.rejected.append(Rejected(name, reason))
 
-        Only valid attempts that were rejected since the last accepted one are compared.
-        """
-        rejected = list[str]()
-        for entry in self._folder.manifest():
-            name = ArchiveName.parse(entry.name)
-            if name is not None and name.kind == "excitation":
-                rejected = [*rejected, entry.name] if entry.outcome == REJECTED else []
-        check, alike, with_accepted = RepetitionCheck(self._cell, self._motion), list[str](), 0
+    def _alike(self, executed: Executed) -> list[str]:
+        """Return the rejected, valid attempts that agree with this one and with each other."""
+        check, alike = RepetitionCheck(self._cell, self._motion), list[str]()
         check.accept(executed)
-        for one in rejected:
+        for entry in self._folder.manifest():
+            if (entry.kind, entry.outcome) != ("excitation", REJECTED):
+                continue
             with suppress(ArchiveError):
-                other = self._executed(one)
-                if problem_of(other, self._motion, self._cell) is None:
-                    with_accepted += self._check.problem(other) is None
-                    if check.problem(other) is None:
-                        check.accept(other)
-                        alike.append(one)
-        return tuple(alike), with_accepted
+                other = self._executed(entry.name)
+                if check.problem(other) is None:
+                    check.accept(other)
+                    alike.append(entry.name)
+        return alike
 
     def _executed(self, name: str) -> Executed:
         return Executed.of(open_archive(self._folder.archives / name, fields=FIELDS))

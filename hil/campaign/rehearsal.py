@@ -1,16 +1,58 @@
-"""Result of a rehearsal: `rehearsal.json`, written by `hil.campaign.rehearsal_run`."""
+"""Rehearsal: runs the plan of a campaign on a simulated arm close to the nominal one.
+
+Masses, inertias, rotors and friction are varied within `SPREAD` of their nominal values. A cell
+without `[simulation]` gets one from `[nominal]` and the defaults below.
+"""
 
 from __future__ import annotations
 
+import json
+import shutil
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
+import numpy as np
+import pinocchio
+from numpy.typing import NDArray
 from pydantic import StrictBool, model_validator
 
-from hil.files import write_output
+from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
+from hil.archive import open_archive
+from hil.cell import Cell
+from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
+from hil.files import make_folder, write_output
+from hil.identify.estimating import estimate_with
+from hil.identify.options import FIXED
+from hil.identify.prepared import prepare_sources
+from hil.identify.sources import gather_sources
+from hil.motion_checks import PLANNED_CURRENT
+from hil.progress import Reporter
 from hil.results import Frozen
+from hil.simulation import (
+    controller_settings,
+    planted_values,
+    simulated_controller,
+    simulated_provenance,
+)
+from hil.version import software
+from identification.distributions import normal_limit
+from identification.errors import IdentificationError
+from identification.signals.recording import RecordingError
+from identification.validation.prediction import pooled_error, prediction_error
+from sim_fixtures import ServoSettings, SimulationError, UnmodelledEffects
 
+from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder, load_record
+from .intervals import planned_intervals, require_runnable
+from .link import Link
+from .operator import Stop
+
+if TYPE_CHECKING:
+    from .campaign import Campaign
+
+Array = NDArray[np.float64]
 
 FORMAT_VERSION: Final = 1
 AS_MODELLED: Final = "as modelled"
@@ -97,3 +139,391 @@ class Rehearsal(Frozen):
                 "is in rehearsal.json (not_seen)"
             )
         return f"the rehearsal failed: {'; '.join(self.failures)}"
+
+
+SPREAD: Final = 0.1  # Largest relative deviation of the simulated parameters from the nominal ones
+NOISE_SHARE: Final = 0.005  # Noise of the current, rms, as a share of the weakest motor's limit
+RESOLUTION_SHARE: Final = 0.001  # Resolution of the target current, as a share of the same limit
+FAULT_EVERY: Final = 3.0  # Mean time between two faults of the link, s
+LOOP_CYCLES: Final = 0.5
+"""Mean delay of a target current, cycles: it acts over the cycle before the packet."""
+RESONANCE: Final = 500.0
+"""Resonance of a main axis, rotor against link, rad/s, where the cell has no elasticity."""
+FASTEST: Final = 800.0
+"""Highest resonance in any posture, rad/s: the simulated arm has steps of half a cycle."""
+POSTURES: Final = 60  # Postures in which the resonances are computed
+MAIN_AXES: Final = 3
+SLOWEST_LOOP: Final = 0.002
+"""Slowest current loop, s; a slower one makes the simulated arm oscillate."""
+_HORIZON: Final = 4.0
+"""Period of link faults as a multiple of the motions' duration: moves take time, too."""
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A simulated arm for a rehearsal.
+
+    Attributes:
+        cell: with a simulated controller; its `[simulation]` has the varied parameters.
+        truth: simulated parameters (p,) in the order of the model.
+        assumed: assumed properties, in sentences.
+        seed: of the variation.
+    """
+
+    cell: Cell
+    truth: Array
+    assumed: tuple[str, ...]
+    seed: int
+
+    @classmethod
+    def of(cls, cell: Cell, *, seed: int, repetitions: int) -> Twin:
+        """Return an arm with random parameters for a cell."""
+        rng = np.random.default_rng(seed)
+        planted = _varied(cell, rng)
+        settings, assumed = _simulation(cell, planted, seed)
+        twin = cell.with_values(
+            {
+                **{f"simulation.{key}": value for key, value in settings.items()},
+                "controller.transport": "simulated",
+                "campaign.repetitions": min(repetitions, cell.campaign.repetitions),
+            }
+        )
+        return cls(twin, planted_values(twin), tuple(assumed), seed)
+
+    def link(self, seconds: float, *, effects: bool) -> Link:
+        """Return a link in virtual time to the arm, with random faults."""
+        table = self.cell.controller
+        # The current loop has the delay of `[controller] current_delay_cycles`.
+        lag = (LOOP_CYCLES - table.current_delay_cycles) * self.cell.period
+        settings = replace(
+            controller_settings(self.cell, effects=effects),
+            servo=ServoSettings(current_lag=float(np.clip(lag, 0.0, SLOWEST_LOOP))),
+            # `[controller] max_gap` missed packets in a row end no motion.
+            missed_replies=table.max_gap + 1,
+            while_silent="continue",
+        )
+        controller = simulated_controller(
+            self.cell, settings=settings, effects=effects, seed=self.seed
+        )
+        faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
+        return Link.over(
+            SimulatedTransport(controller, faults), self.cell, finish=controller.finish
+        )
+
+    @property
+    def provenance(self) -> dict[str, str]:
+        """Metadata of a rehearsal's archive, with the simulated parameters."""
+        planted = dict(zip(self.cell.model.parameter_names, self.truth.tolist(), strict=True))
+        return {
+            **simulated_provenance(self.cell, effects=False),
+            "rehearsal": "yes",
+            "planted": json.dumps(planted),
+        }
+
+
+def link_faults(cell: Cell, seconds: float, seed: int) -> tuple[Fault, ...]:
+    """Return single packets lost (if `max_gap` allows), doubled or late within `seconds`."""
+    rng = np.random.default_rng([seed, 7])
+    cycles = round(seconds / cell.period)
+    count = max(1, round(seconds / FAULT_EVERY))
+    kinds = ["delay", "duplicate", *(["lose"] if cell.controller.max_gap else [])]
+    faults: list[Fault] = []
+    # Not in the packets of the start.
+    for cycle in sorted(rng.integers(1000, max(1001, cycles), count).tolist()):
+        match kinds[rng.integers(len(kinds))]:
+            case "delay":
+                faults.append(Delay(cycle, cycles=float(rng.uniform(0.1, 0.8))))
+            case "duplicate":
+                faults.append(Duplicate(cycle))
+            case _:
+                faults.append(Lose(cycle))
+    return tuple(faults)
+
+
+def _varied(cell: Cell, rng: np.random.Generator) -> dict[str, list[float]]:
+    """Return inertias, rotors and friction varied about those of the URDF and `[nominal]`."""
+    nominal = cell.nominal
+    n = len(cell.joint_names)
+
+    def varied(values: list[float]) -> list[float]:
+        factors = 1.0 + SPREAD * rng.uniform(-1.0, 1.0, n)
+        return (np.array(values) * factors).tolist()  # type: ignore[no-any-return]
+
+    return {
+        "inertia_scale": varied([1.0] * n),
+        "rotor_inertia": varied(nominal.rotor_inertia),
+        "coulomb": varied(nominal.coulomb),
+        "viscous": varied(nominal.viscous),
+        "third": varied(nominal.third or [0.0] * n),
+    }
+
+
+def _simulation(
+    cell: Cell, planted: dict[str, list[float]], seed: int
+) -> tuple[dict[str, Any], list[str]]:
+    """Return `[simulation]` of the simulated arm, and what in it is assumed."""
+    table: dict[str, Any] = {**planted, "seed": seed}
+    assumed = []
+    given = cell.file.simulation
+    if given is None:
+        weakest = min(cell.drive_table.current_limit)
+        table["initial_deg"] = cell.campaign.home_deg
+        table["current_noise"] = NOISE_SHARE * weakest
+        table["current_resolution"] = RESOLUTION_SHARE * weakest
+        assumed.append(
+            f"the current has a noise of {table['current_noise']:.3g} A rms and a resolution of "
+            f"{table['current_resolution']:.3g} A ({NOISE_SHARE:.1%} and {RESOLUTION_SHARE:.1%} of "
+            "the weakest motor's limit)"
+        )
+    if given is None or not (
+        given.torque_ripple or given.friction_drift or any(given.elasticity) or given.delay
+    ):
+        effects = _ordinary_effects(cell, np.array(planted["rotor_inertia"]))
+        table |= asdict(effects) | {"elasticity": list(effects.elasticity)}
+        assumed.append(
+            f"effects that the model leaves out have default sizes: torque ripple of "
+            f"{effects.torque_ripple:.0%} of the Coulomb torque, friction that falls by "
+            f"{effects.friction_drift:.0%}, springs in the main axes, {1e3 * effects.delay:g} ms "
+            "of delay"
+        )
+    unknown = [key for key in ("rotor_inertia", "coulomb", "viscous") if not any(planted[key])]
+    if unknown:
+        assumed.append(f"[nominal] has only zeros for {', '.join(unknown)}: so has the arm")
+    return table, assumed
+
+
+def _ordinary_effects(cell: Cell, rotors: Array) -> UnmodelledEffects:
+    """Return effects of default sizes, with springs that suit the arm.
+
+    No resonance exceeds `FASTEST` in any of `POSTURES` random postures. Where axes are almost
+    parallel, the effective inertia beyond a spring is much below that of its link.
+    """
+    n, limits = len(rotors), cell.joint_limits
+    model = pinocchio.buildModelFromXML(cell.urdf)
+    data = model.createData()
+
+    def inertia(posture: Array) -> Array:
+        upper = np.triu(pinocchio.crba(model, data, posture))
+        return np.asarray(upper + np.triu(upper, 1).T)
+
+    links = inertia(cell.home).diagonal()
+    reduced = rotors * links / np.maximum(rotors + links, np.finfo(np.float64).tiny)
+    soft = (np.arange(n) < MAIN_AXES) & (reduced > 0.0)
+    compliance = np.zeros(n)
+    compliance[soft] = 1.0 / (reduced[soft] * RESONANCE**2)
+    root, fastest = 1.0 / np.sqrt(compliance[soft]), 0.0
+    shares = np.random.default_rng(0).random((POSTURES, n))
+    for posture in [cell.home, *(limits.lower + shares * (limits.upper - limits.lower))]:
+        if soft.any():
+            whole = inertia(posture) + np.diag(np.where(soft, 0.0, rotors))
+            mobility = np.linalg.inv(whole)[np.ix_(soft, soft)] + np.diag(1.0 / rotors[soft])
+            found = float(np.linalg.eigvalsh(root[:, None] * mobility * root)[-1])
+            fastest = max(fastest, found)
+    compliance *= max(1.0, float(np.sqrt(fastest)) / FASTEST) ** 2
+    return replace(UnmodelledEffects.default_sizes(n), elasticity=tuple(compliance.tolist()))
+
+
+MOST_SIGMA: Final = 4.0
+"""Largest deviation of an estimate from the simulated value, in standard deviations."""
+MOST_ERROR: Final = 1.2
+"""Largest error on unseen motion, as a multiple of that of the simulated parameters."""
+SATURATED: Final = 0.99  # Share of the current limit from which a motor is saturated
+
+
+def criterion(
+    name: str, value: float | None, bound: float, text: str, remedy: str = ""
+) -> Criterion:
+    """Return a criterion that is met by a finite value up to `bound`; else with a remedy."""
+    finite = None if value is None or not np.isfinite(value) else value
+    passed = finite is not None and finite <= bound
+    sentence = text if passed or not remedy else f"{text}: {remedy}"
+    return Criterion(name=name, value=finite, bound=bound, passed=passed, sentence=sentence)
+
+
+def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> Criterion:
+    """Judge the largest current of any motor, as a share of its limit."""
+    worst, motor, where = 0.0, 0, ""
+    limit = cell.drive_train.current_limit
+    for entry in folder.manifest():
+        current = np.abs(open_archive(folder.archives / entry.name).columns["target_current"])
+        share = np.nan_to_num(current).max(axis=0, initial=0.0) / limit
+        if share.max() > worst:
+            worst, motor, where = float(share.max()), int(share.argmax()), entry.name
+    return criterion(
+        f"current ({name})",
+        worst,
+        bound,
+        f"{name}: the largest current is {worst:.0%} of its limit (motor of "
+        f"{cell.joint_names[motor]}, {where}), at most {bound:.0%} is allowed",
+    )
+
+
+def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
+    """Judge an identification from the archives: determined, correct, predictive."""
+    bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
+    kinds = ("excitation", "validation", "standstill")
+    paths = [path for kind in kinds for path in folder.completed(kind)]
+    try:
+        prepared = prepare_sources(gather_sources(paths, FIXED.split), FIXED, reporter)
+        estimation = estimate_with(prepared, FIXED, reporter)
+    except (InputError, IdentificationError, RecordingError) as error:
+        problem = f"cannot be determined: the identification failed ({error})"
+        return [
+            criterion(name, None, bound, f"{name}: {problem}") for name, bound in bounds.items()
+        ]
+    model, found = twin.cell.model, estimation.result.pooled
+    undetermined = found.undetermined
+    deviation = found.interval_factor / normal_limit(0.025) * found.std
+    apart = np.abs(found.values - twin.truth) / deviation
+    known = np.isfinite(apart)
+    farthest = int(np.argmax(np.where(known, apart, 0.0)))
+    ours, theirs = (
+        pooled_error(prediction_error(model, values, prepared.held_out)).rms
+        for values in (found.values, twin.truth)
+    )
+    ratio = ours / np.maximum(theirs, np.finfo(np.float64).tiny)
+    joint = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
+    return [
+        criterion(
+            "excitation",
+            float(len(undetermined)),
+            bounds["excitation"],
+            f"parameters not determined by the excitation: {', '.join(undetermined) or 'none'}",
+            "design a motion that moves every joint",
+        ),
+        criterion(
+            "parameters",
+            float(apart[farthest]),
+            MOST_SIGMA,
+            f"the errors of {known.sum()} parameters are at most {apart[farthest]:.3g} standard "
+            f"deviations ({found.names[farthest]}), {MOST_SIGMA:g} are allowed",
+            "the drive train or the model of the cell file is not that of the arm",
+        ),
+        criterion(
+            "unseen motion",
+            float(ratio[joint]),
+            MOST_ERROR,
+            f"on unseen motion the torque error is {ratio[joint]:.2f} times what noise leaves "
+            f"({twin.cell.joint_names[joint]}), at most {MOST_ERROR:g} is allowed",
+            "design a better excitation (`hil design`)",
+        ),
+    ]
+
+
+REPETITIONS: Final = 3
+"""Repetitions of the excitation: enough for their scatter, few enough for a minute."""
+SEED: Final = 1
+
+
+def rehearse(
+    campaign: Campaign, reporter: Reporter, *, seed: int, stop: Stop, again: bool
+) -> Rehearsal:
+    """Run the plan twice on the simulated arm, and judge it; see `Campaign.rehearse`.
+
+    Changes of the cell file are accepted until the campaign has recordings, but not during the
+    rehearsal (CampaignFolderError).
+    """
+    folder = campaign.folder
+    with folder.locked():
+        plan_hash = folder.hash_of(campaign.cell, campaign.plan)
+        folder.accept_changes()
+        require_runnable(campaign.cell, campaign.plan)
+        before = None
+        with suppress(HilError):  # a file that cannot be read is replaced
+            before = Rehearsal.load(folder)
+        same = before is not None and (before.plan_hash, before.seed) == (plan_hash, seed)
+        if before is not None and same and before.passed and not again:
+            reporter.say("this plan has passed its rehearsal already")
+            return before
+        shutil.rmtree(folder.rehearsed, ignore_errors=True)
+        make_folder(folder.rehearsed)
+        found = _rehearsed(campaign, plan_hash, reporter, seed, stop)
+        if folder.hash_of(campaign.cell, campaign.plan) != plan_hash:
+            raise CampaignFolderError(
+                folder.root, "a mesh was changed during the rehearsal", "rehearse again"
+            )
+        found.save(folder.rehearsal)
+        return found
+
+
+def _rehearsed(
+    campaign: Campaign, plan_hash: str, reporter: Reporter, seed: int, stop: Stop
+) -> Rehearsal:
+    """Run the plan in the folder of the rehearsal and judge it."""
+    twin = Twin.of(campaign.cell, seed=seed, repetitions=REPETITIONS)
+    for sentence in twin.assumed:
+        reporter.say(f"assumed: {sentence}")
+    criteria: list[Criterion] = []
+    seconds = 0.0
+    for name, where, effects in ((AS_MODELLED, "plain", False), (EFFECTS, "effects", True)):
+        # One repetition shows the effects that the model leaves out.
+        cell = twin.cell.with_campaign(repetitions=1) if effects else twin.cell
+        rehearsal = campaign.create(campaign.folder.rehearsed / where, cell, campaign.plan)
+        reporter.say(f"rehearsing on a simulated arm, {name}")
+        motions = planned_intervals(rehearsal.cell, rehearsal.plan)
+        planned = sum(one.trajectory.duration for one in motions)
+        link = twin.link(planned, effects=effects)
+        failure = _failure(rehearsal, link, twin, reporter, stop)
+        seconds += link.cycles * cell.period
+        criteria.append(
+            criterion(
+                f"motions ({name})",
+                float(bool(failure)),
+                0.0,
+                f"{name}: {failure or 'every motion was completed'}",
+            )
+        )
+        if rehearsal.folder.manifest():
+            bound = SATURATED if effects else PLANNED_CURRENT
+            criteria.append(of_currents(twin.cell, rehearsal.folder, name, bound))
+        if failure:
+            break  # the other criteria would fail for the same reason
+        if not effects:
+            criteria += of_estimate(twin, rehearsal.folder, reporter)
+    names = {one.name for one in criteria}
+    return Rehearsal(
+        plan_hash=plan_hash,
+        seed=seed,
+        passed=names == {*CRITERIA} and all(one.passed for one in criteria),
+        criteria=criteria,
+        assumed=[*twin.assumed],
+        not_seen=_not_seen(campaign.cell),
+        repetitions=twin.cell.campaign.repetitions,
+        motion_seconds=seconds,
+        software=software(),
+    )
+
+
+def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, stop: Stop) -> str:
+    """Run what is missing; return the failure in a sentence, "" for none."""
+    try:
+        rehearsal.run(
+            link, stop, reporter, provenance=twin.provenance, durable=False, unrehearsed=True
+        )
+    except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
+        if stop.requested:
+            raise OperatorStopError("the rehearsal was stopped; rehearse again") from error
+        if isinstance(error, MotionFailedError):
+            return error.sentence
+        return str(error).rstrip(".")
+    return ""
+
+
+def _not_seen(cell: Cell) -> list[str]:
+    """Return what no simulation of this cell file can detect."""
+    known = cell.file.simulation
+    given = set() if known is None else known.drive_train.model_fields_set
+    unknown = [
+        name for name in ("gear_ratio", "joint_sign", "joint_offset_deg") if name not in given
+    ]
+    sentences = [
+        "torque constants and current limits: the simulated motors have those of the cell file",
+        "floor, walls and shapes: they are checked, but as the cell file and the URDF have them",
+    ]
+    if unknown:
+        sentences.append(
+            f"{', '.join(unknown)} of [drive_train]: the simulated arm takes them from there, so "
+            "that errors in them are not detected; the controller's init packet (gears, coupling) "
+            "and the dry run (signs) detect them, or a table [simulation.drive_train] now"
+        )
+    return sentences

@@ -10,24 +10,26 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.archive import ArchiveHeader, ArchiveName, ArchiveSpec, open_archive
+from hil.archive import ArchiveHeader, ArchiveSpec, open_archive
 from hil.archive.live import LiveView
 from hil.cell import Cell
+from hil.cell_link import cell_link
 from hil.errors import ArchiveError
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Task
 from hil.reading import parse_json
 from hil.recording import archive_spec, origin_of, with_present_date
+from hil.simulation import simulated_provenance
 from hil.version import software
 from identification.excitation.excitation import trajectory_from_dict
 
 from .dry_run import OVERRIDE, SIMULATED, DryRunStage, DryRunState, yes_or_no
-from .errors import ArmChangedError, MotionFailedError, RepetitionsRejectedError
+from .errors import MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder
 from .gates import require_as_rehearsed, require_gates
 from .intervals import (
@@ -38,9 +40,8 @@ from .intervals import (
     player_of,
     require_allowed,
 )
-from .link import Link
+from .link import NOT_STARTED, Link, MotionLink, active_checks, narrower_limits
 from .live_link import LiveLink
-from .motion_link import NOT_STARTED, MotionLink, active_checks, narrower_limits
 from .operator import Operator, RunWatch, Stop
 from .plan import CampaignPlan, moves_to_dict
 from .quality import ArchiveReview, Rejected
@@ -50,9 +51,6 @@ if TYPE_CHECKING:
     from .campaign import Campaign
 
 Array = NDArray[np.float64]
-
-MOST_BY_HAND: Final = 10
-"""Attempts at one motion that the operator, or a script in his place, may hold or slow."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,7 @@ class Run:
             self.plan_hash = self.folder.hash_of(self.cell, self.plan)
             dry_run, warm_up = DryRunStage(self), WarmUpStage(self)
             require_gates(self, dry_run)
-            self.review.adopt([*self.wanted, *dry_run.intervals, *warm_up.next_motion()], self.made)
+            self.review.adopt([*self.wanted, *dry_run.intervals], self.made)
             slow, full = dry_run.missing(), [] if self.dry_run_only else self.missing()
             if not slow:
                 dry_run.accept()
@@ -171,8 +169,6 @@ class Run:
         self, warm_up: WarmUpStage, slow: Sequence[Interval], full: Sequence[Interval]
     ) -> Iterator[Runner]:
         """Connect the controller, check all motions with its limits, and close the link after."""
-        from hil.cell_link import cell_link  # which opens links of campaigns
-
         cell, reporter = self.cell, self.reporter
         checks = MotionChecks.of(cell)
         if checks.not_checked is not None:
@@ -228,8 +224,6 @@ class Run:
         if not self.virtual:
             own = origin_of(self.cell, only_simulated=self.simulated, virtual=False)
         elif self.given_provenance is None:
-            from hil.simulation import simulated_provenance  # which opens links of this package
-
             own = simulated_provenance(self.cell, effects=False)
         return {**own, **(self.given_provenance or {}), SIMULATED: yes_or_no(self.simulated)}
 
@@ -346,16 +340,13 @@ class Runner:
     ) -> str:
         """Run motion `number` (from 1) of `total` until it passes its check; return its archive.
 
-        An attempt that the operator held or slowed counts as failed only if less than full speed is
-        still requested; the others are limited separately, for a script that slows each attempt.
         `warm_up` warms the arm up before each attempt, and judges whether it was warm at its start.
 
         Raises:
             RepetitionsRejectedError: it failed too often.
-            ArmChangedError: later attempts agree with each other, and not with those that count.
         """
-        run, reasons, by_hand = self._run, list[str](), list[str]()
-        while len(reasons) <= run.cell.campaign.bad_repetitions and len(by_hand) < MOST_BY_HAND:
+        run, reasons = self._run, list[str]()
+        while len(reasons) <= run.cell.campaign.bad_repetitions:
             if warm_up is not None:
                 warm_up.rewarm(self)
             name = self.run_motion(interval, number, total)
@@ -369,15 +360,8 @@ class Runner:
             run.reporter.say(
                 f"{interval} ({name}) is rejected: {problem.sentence}; the motion is run again"
             )
-            if problem.later:
-                raise ArmChangedError(
-                    str(interval), problem.sentence, problem.reference, problem.later
-                )
-            failed = not problem.by_hand or run.watch.request().override < 1.0
-            (reasons if failed else by_hand).append(problem.sentence)
-        raise RepetitionsRejectedError(
-            str(interval), reasons if len(by_hand) < MOST_BY_HAND else by_hand
-        )
+            reasons.append(problem.sentence)
+        raise RepetitionsRejectedError(str(interval), reasons)
 
     def go_back(self, most: float = 1.0) -> None:
         """Go home, and from there to the first position; `most` is the largest override."""
@@ -432,11 +416,10 @@ class Runner:
 def seen_in_dry_run(folder: CampaignFolder) -> list[tuple[Array, Array]]:
     """Return start and end (n,) [rad] of the moves of a dry run, by its archives."""
     entries = [one for one in folder.manifest() if one.outcome == "completed"]
-    kinds = [name.kind if (name := ArchiveName.parse(one.name)) else "" for one in entries]
-    last = max((k for k, kind in enumerate(kinds) if kind == "dryrun"), default=0)
+    last = max((k for k, one in enumerate(entries) if one.kind == "dryrun"), default=0)
     found = []
-    for entry, kind in zip(entries[:last], kinds[:last], strict=True):
-        if kind == "move":
+    for entry in entries[:last]:
+        if entry.kind == "move":
             with suppress(ArchiveError, ValueError, KeyError, TypeError):  # then it is not seen
                 archive = open_archive(folder.archives / entry.name, fields=())
                 motion = trajectory_from_dict(parse_json(archive.text("plan.json"))["trajectory"])

@@ -1,22 +1,20 @@
-"""Progress of a campaign with the next command, and the conduct of its run for the report."""
+"""Progress of a campaign with the next command, and its conduct for the report."""
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hil.archive import ArchiveName, ArchiveOutcome, open_archive
-from hil.errors import ArchiveError, HilError
+from hil.errors import HilError
 from hil.reading import path_exists
-from hil.results import ConductResult, RecordedResult, Results, StepResult, WarmUpResult
+from hil.results import ConductResult, Results, StepResult
 from hil.terminal_text import plural
 
 from .dry_run import DryRun
-from .folder import CampaignFolder, Entry
+from .folder import CampaignFolder
 from .intervals import planned_intervals
 from .rehearsal import Rehearsal
 from .warmup import WarmUp, drift_wanted
@@ -239,65 +237,25 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     Raises:
         CampaignFolderError: the manifest cannot be read.
     """
-    recorded = [one for one in (_recorded(folder, entry) for entry in folder.manifest()) if one]
-    warm: WarmUp | None = None
-
-    def warm_up() -> Step:
-        nonlocal warm
-        warm = WarmUp.load(folder.warmup, folder.plan_hash)
-        return _warm_up(warm)
-
     steps = {
         "rehearsal": _step(lambda: _rehearsal(folder)),
         "dry run": _step(lambda: _accepted(DryRun.load(folder))),
-        "warm-up": _step(warm_up),
-        "repetitions": _whole(recorded, "excitation"),
-        "validation": _whole(recorded, "validation"),
+        "warm-up": _step(lambda: _warm_up(WarmUp.load(folder.warmup, folder.plan_hash))),
+        "repetitions": _recorded(folder, "excitation"),
+        "validation": _recorded(folder, "validation"),
     }
     return ConductResult(
         steps=[
             StepResult(step=name, done=found.done, words=found.sentence, details=[*found.details])
             for name, found in steps.items()
-        ],
-        warm_up=None
-        if warm is None
-        else WarmUpResult(
-            verdict=warm.outcome,
-            threshold=warm.threshold,
-            friction=[list(one.friction) for one in warm.motions],
-            change=[one if math.isfinite(one) else None for one in warm.changes],
-        ),
-        recorded=recorded,
+        ]
     )
 
 
-def _whole(recorded: list[RecordedResult], kind: str) -> Step:
-    own = [one for one in recorded if one.kind == kind]
-    good = [one for one in own if one.outcome == "completed"]
-    words = f"{len(good)} complete, {sum(one.seconds for one in good):.0f} s of motion"
-    if bad := len(own) - len(good):
-        words += f"; {bad} rejected or ended early"
-    return Step("done" if good else "next", words)
-
-
-def _recorded(folder: CampaignFolder, entry: Entry) -> RecordedResult | None:
-    """Return the conduct of a motion from its archive; None if it cannot be read."""
-    name = ArchiveName.parse(entry.name)
-    try:
-        archive = open_archive(folder.archives / entry.name, fields=())
-    except ArchiveError:
-        return None
-    stamp, outcome = archive.columns["stamp"], archive.outcome or ArchiveOutcome()
-    return RecordedResult(
-        archive=entry.name,
-        kind=archive.kind if name is None else name.kind,
-        when=archive.header.recorded_at,
-        seconds=float(stamp[-1] - stamp[0]) * 1e-9 if len(stamp) else 0.0,
-        cycles=archive.n_samples,
-        missed=outcome.lost_packets or 0,
-        late=outcome.late_replies or 0,
-        not_accepted=outcome.replies_not_accepted or 0,
-        lost=outcome.records_lost or 0,
-        outcome=entry.outcome,
-        why=entry.reason or ("" if entry.outcome == "completed" else outcome.reason),
-    )
+def _recorded(folder: CampaignFolder, kind: str) -> Step:
+    """Return how many motions of a kind are complete, with the reasons of the others."""
+    own = [one for one in folder.manifest() if one.kind == kind]
+    bad = tuple(f"{e.name} {e.outcome}: {e.reason}" for e in own if e.outcome != "completed")
+    good = len(own) - len(bad)
+    rejected = f"; {len(bad)} rejected or ended early" if bad else ""
+    return Step("done" if good else "next", f"{good} complete{rejected}", details=bad)

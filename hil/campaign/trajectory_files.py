@@ -1,13 +1,12 @@
 """Designed motions as files for controllers that `hil` does not drive.
 
 Tables (CSV), ROS 2's `trajectory_msgs/JointTrajectory` and, for arms of six turning joints,
-URScript; and a player of the tables for a Universal Robots arm by ur_rtde.
+URScript.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -16,40 +15,15 @@ from numpy.typing import NDArray
 
 from hil.cell import Cell
 from hil.files import write_files
-from hil.motion_checks import MotionChecks
 from identification.excitation import Excitation
 from planner import Trajectory, to_csv
 
 from .plan import CampaignPlan, plan_around
 
-Array = NDArray[np.float64]
-
-PLAYER: Final = "play_ur.py"
 RATE: Final = 500.0  # Rate of the tables, Hz: the cycle of an e-Series controller
 ROS_RATE: Final = 100.0  # Rate of the points that a trajectory controller interpolates, Hz
 SCRIPT_RATE: Final = 125.0  # Rate of the set-points of a URScript program, Hz
 UR_JOINTS: Final = 6
-
-_PLAYER: Final = '''\
-"""Play a motion on a Universal Robots arm and log it: play_ur.py HOST MOTION.csv LOG.csv"""
-import sys
-from pathlib import Path
-from rtde_control import RTDEControlInterface
-from rtde_receive import RTDEReceiveInterface
-host, motion, log = sys.argv[1:]
-lines = Path(motion).read_text().splitlines()[1:]
-rows = [[float(x) for x in line.split(",")] for line in lines]
-cycle = rows[1][0] - rows[0][0]
-control, receive = RTDEControlInterface(host, 1 / cycle), RTDEReceiveInterface(host, 1 / cycle)
-control.moveJ(rows[0][1::3], 0.2, 0.2)  # slowly to the start: keep a hand on the stop
-receive.startFileRecording(log, ["timestamp", "actual_q", "actual_current", "target_moment"])
-for row in rows:
-    start = control.initPeriod()
-    control.servoJ(row[1::3], 0, 0, cycle, 0.03, 500)
-    control.waitPeriod(start)
-control.servoStop()
-receive.stopFileRecording()
-'''
 
 
 def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[str, ...]:
@@ -60,60 +34,53 @@ def write_trajectories(root: Path, cell: Cell, excitation: Excitation) -> tuple[
         NoExcitationError: no validation motion satisfies the constraints.
         OutputError: the folder cannot be written to; nothing in it was changed.
     """
-    plan = plan_around(cell, excitation, MotionChecks.of(cell))
-    files = trajectory_files(cell, plan)
+    files = trajectory_files(cell, plan_around(cell, excitation))
     write_files(root, files)
     return tuple(files)
 
 
 def trajectory_files(cell: Cell, plan: CampaignPlan) -> dict[str, str]:
-    """Return the texts of all motions of a plan and of the player by file name."""
+    """Return the texts of all motions of a plan by file name."""
     motions = {"excitation": plan.excitation.trajectory}
-    for number, motion in enumerate(plan.validation):
-        motions[f"validation_{number:03d}"] = motion.trajectory
+    motions |= {f"validation_{k:03d}": one.trajectory for k, one in enumerate(plan.validation)}
     scripted = len(cell.joint_names) == UR_JOINTS and bool(cell.model.chain.revolute.all())
     files = {}
-    for name, trajectory in motions.items():
-        files[f"{name}.csv"] = to_csv(trajectory, RATE, cell.joint_names)
-        files[f"{name}.yaml"] = joint_trajectory(trajectory, cell.joint_names)
+    for name, motion in motions.items():
+        files[f"{name}.csv"] = to_csv(motion, RATE, cell.joint_names)
+        files[f"{name}.yaml"] = joint_trajectory(motion, cell.joint_names)
         if scripted:
-            files[f"{name}.script"] = urscript(trajectory, name, cell.campaign.repetitions)
-    if scripted:
-        files[PLAYER] = _PLAYER
+            files[f"{name}.script"] = urscript(motion, name, cell.campaign.repetitions)
     return files
 
 
-def joint_trajectory(trajectory: Trajectory, joint_names: tuple[str, ...]) -> str:
+def joint_trajectory(motion: Trajectory, joint_names: tuple[str, ...]) -> str:
     """Return a motion as YAML of a `trajectory_msgs/msg/JointTrajectory`."""
-
-    def points() -> Iterator[str]:
-        time = _times(trajectory, ROS_RATE)
-        for t, *motion in zip(time, *trajectory.sample(time), strict=True):
-            nanoseconds = round(t * 1e9)
-            for mark, key, values in zip(
-                "-  ", ("positions", "velocities", "accelerations"), motion, strict=True
-            ):
-                yield f"{mark} {key}: {json.dumps((values + 0.0).tolist())}"
-            seconds, rest = divmod(nanoseconds, 1_000_000_000)
-            yield f"  time_from_start: {{sec: {seconds}, nanosec: {rest}}}"
-
-    head = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}"]
-    head += [f"joint_names: {json.dumps(list(joint_names))}", "points:"]
-    return "\n".join([*head, *points()]) + "\n"
+    lines = ["header: {stamp: {sec: 0, nanosec: 0}, frame_id: ''}"]
+    lines += [f"joint_names: {json.dumps(list(joint_names))}", "points:"]
+    times = _times(motion, ROS_RATE)
+    for time, q, qd, qdd in zip(times, *motion.sample(times), strict=True):
+        seconds, nanoseconds = divmod(round(time * 1e9), 1_000_000_000)
+        lines += [
+            f"- positions: {json.dumps((q + 0.0).tolist())}",
+            f"  velocities: {json.dumps((qd + 0.0).tolist())}",
+            f"  accelerations: {json.dumps((qdd + 0.0).tolist())}",
+            f"  time_from_start: {{sec: {seconds}, nanosec: {nanoseconds}}}",
+        ]
+    return "\n".join(lines) + "\n"
 
 
-def urscript(trajectory: Trajectory, name: str, repetitions: int) -> str:
+def urscript(motion: Trajectory, name: str, repetitions: int) -> str:
     """Return a URScript program that repeats a motion of six joints, at rest in between."""
-    cycle = 1.0 / SCRIPT_RATE
-    positions = trajectory.sample(_times(trajectory, SCRIPT_RATE))[0]
+    cycle, positions = 1.0 / SCRIPT_RATE, motion.sample(_times(motion, SCRIPT_RATE))[0]
+    rows = [f"[{', '.join(f'{value:.9f}' for value in q)}]" for q in positions]
     lines = [
         f"def {name}():",
-        f"  movej({_list(positions[0])}, a=0.5, v=0.2)",
+        f"  movej({rows[0]}, a=0.5, v=0.2)",
         "  repetition = 0",
         f"  while repetition < {repetitions}:",
-        *(f"    servoj({_list(q)}, 0, 0, {cycle:g}, 0.03, 500)" for q in positions),
+        *(f"    servoj({row}, 0, 0, {cycle:g}, 0.03, 500)" for row in rows),
         "    stopj(5.0)",
-        f"    movej({_list(positions[0])}, a=0.5, v=0.2)",
+        f"    movej({rows[0]}, a=0.5, v=0.2)",
         "    sleep(1.0)",
         "    repetition = repetition + 1",
         "  end",
@@ -122,12 +89,7 @@ def urscript(trajectory: Trajectory, name: str, repetitions: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _times(trajectory: Trajectory, rate: float) -> Array:
+def _times(motion: Trajectory, rate: float) -> NDArray[np.float64]:
     """Return times (m,) [s] from start to end; the last step may be shorter."""
-    steps = np.arange(0.0, trajectory.duration, 1.0 / rate)
-    return np.append(steps[: -1 if trajectory.duration - steps[-1] < 0.5 / rate else None],
-                     trajectory.duration)  # fmt: skip
-
-
-def _list(values: Array) -> str:
-    return "[" + ", ".join(f"{value:.9f}" for value in values) + "]"
+    steps = np.arange(0.0, motion.duration - 0.5 / rate, 1.0 / rate)
+    return np.append(steps, motion.duration)

@@ -198,7 +198,6 @@ class WarmUpStage:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self._meter: FrictionMeter | None = None
         self._pauses: list[str] = []
         self._threshold = drift_wanted(run.cell, only_simulated=run.simulated)
 
@@ -233,13 +232,17 @@ class WarmUpStage:
         """Run motions until the arm is warm (RepetitionsRejectedError: each attempt was slowed)."""
         if not self._threshold:
             return
-        run, state = self._run, self._present()
+        run, state, settings = self._run, self._present(), self._run.cell.campaign
+        meter = FrictionMeter(run.cell, run.plan.excitation.trajectory)
         while state.outcome == "going on":
             interval, done = self._interval(state), len(state.motions)
-            if done >= run.cell.campaign.warmup_least:
+            if done >= settings.warmup_least:
                 run.watch.expect([interval.trajectory.duration])
-            name = runner.run_until_accepted(interval, done + 1, run.cell.campaign.warmup_most)
-            state = self._saved(state, name, time.time())
+            name = runner.run_until_accepted(interval, done + 1, settings.warmup_most)
+            friction = meter.measure(run.folder.archives / name)
+            state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
+            state = replace(state, moved_at=time.time())
+            state.save(run.folder.warmup)
             run.reporter.say(state.sentence)
 
     def rewarm(self, runner: Runner) -> None:
@@ -252,7 +255,7 @@ class WarmUpStage:
         found = self._cold(began)
         if found is None:
             return None
-        return Problem(f"{found.rested(began)} when it began and was assumed to be cold", True)
+        return Problem(f"{found.rested(began)} when it began and was assumed to be cold")
 
     def motion_ended(self) -> None:
         """Record that a motion that warms the joints has ended."""
@@ -277,30 +280,12 @@ class WarmUpStage:
         plan = self._run.plan
         return Interval("warmup", state.next_index, plan.excitation.trajectory, plan.moves)
 
-    def _saved(self, state: WarmUp, name: str, moved_at: float) -> WarmUp:
-        """Return the warm-up after the motion of an archive, and save it."""
-        run, settings = self._run, self._run.cell.campaign
-        self._meter = self._meter or FrictionMeter(run.cell, run.plan.excitation.trajectory)
-        friction = self._meter.measure(run.folder.archives / name)
-        state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
-        state = replace(state, moved_at=moved_at)
-        state.save(run.folder.warmup)
-        return state
-
     def _present(self) -> WarmUp:
-        """Return the warm-up to continue; a new one if the joints have cooled down.
-
-        A motion in the manifest only was the last one of a run that was killed.
-        """
-        run, state = self._run, self._state()
-        name = run.folder.whole("warmup", state.next_index)
-        last = run.folder.whole("warmup", state.next_index + 1) is None
-        if state.outcome == "going on" and name is not None and last:
-            written = (run.folder.archives / name).stat().st_mtime
-            state = self._saved(state, name, max(state.moved_at or 0.0, written))
+        """Return the warm-up to continue; a new one if the joints have cooled down."""
+        state = self._state()
         if state.motions and state.cold(time.time()):
             rested = state.rested(time.time())
-            run.reporter.say(f"{rested} and is assumed to be cold: warming up again")
+            self._run.reporter.say(f"{rested} and is assumed to be cold: warming up again")
             self._pauses.append(f"{rested} during the campaign, and was warmed up again")
             return state.cooled()
         return state

@@ -238,16 +238,13 @@ class Cell:
             return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
         return table.transport == "simulated"
 
-    def session_settings(
-        self, *, accept_init: bool = False, only_axis: int | None = None
-    ) -> dict[str, Any]:
+    def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
         table, campaign = self.controller, self.file.campaign
         settings: dict[str, Any] = {
             "mode": table.mode,
             "arm": table.arm,
             "max_gap": table.max_gap,
-            "accept_init": accept_init,
             "other_axes": frozenset(table.other_axes),
         }
         if only_axis is not None:

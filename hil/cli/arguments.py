@@ -23,14 +23,6 @@ ArchivesArgument = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-AcceptInitOption = Annotated[
-    bool,
-    typer.Option(
-        "--accept-init",
-        help="Use the controller's gear ratios, calibration and coupling if they differ from the "
-        "cell; the archive records this.",
-    ),
-]
 
 
 Command = Callable[..., None]

@@ -15,9 +15,9 @@ from hil.campaign import (
     CampaignFolderError,
     design,
     plan_around,
-    require_runnable,
     stop_on_interrupt,
 )
+from hil.campaign.intervals import require_runnable
 from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish

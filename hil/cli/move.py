@@ -14,11 +14,11 @@ import numpy as np
 import typer
 
 from hil.campaign import Campaign, MotionLink, stop_on_interrupt
-from hil.campaign.motion_link import active_checks, narrower_limits
+from hil.campaign.link import active_checks, narrower_limits
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
-from hil.cli.arguments import AcceptInitOption, JsonOption
+from hil.cli.arguments import JsonOption
 from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
@@ -36,7 +36,6 @@ def move(
     speed: Annotated[float | None, typer.Option(min=0.1, max=100.0)] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o")] = None,
     yes: Annotated[bool, typer.Option("--yes", "-y")] = False,
-    accept_init: AcceptInitOption = False,
     only_axis: bool = False,
     json: JsonOption = False,
 ) -> None:
@@ -78,7 +77,7 @@ def move(
     if to is not None:
         motion = None if campaign is None else campaign.plan.excitation.trajectory
         wanted = posture(cell, to, None if motion is None else motion.sample(np.array([0.0]))[0][0])
-    with _reserved(campaign), cell_link(cell, accept_init=accept_init, only_axis=axis) as link:
+    with _reserved(campaign), cell_link(cell, only_axis=axis) as link:
         link.connection.report = partial(say, err=True)
         if yes and not link.only_simulated:
             most = 100.0 * cell.campaign.approach_speed

@@ -16,7 +16,7 @@ from hil.archive.recorder import Recorded
 from hil.campaign import Progress, stop_on_interrupt
 from hil.campaign.live_link import LiveLink
 from hil.cell import AngleFrame, Cell
-from hil.cli.arguments import AcceptInitOption, JsonOption, QuietOption, print_json
+from hil.cli.arguments import JsonOption, QuietOption, print_json
 from hil.errors import ControllerFault, HilError, OperatorStopError
 from hil.progress import say
 from hil.recording import archive_path
@@ -32,7 +32,6 @@ def record(
     duration: Annotated[float | None, typer.Option(min=0.001)] = None,
     wait: Annotated[float | None, typer.Option(min=0.0)] = None,
     kind: Literal["excitation", "validation", "standstill"] = "excitation",
-    accept_init: AcceptInitOption = False,
     live: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -67,9 +66,7 @@ def record(
     path = archive_path(output, kind)
     with (
         stop_on_interrupt(twice=True) as stop,
-        LiveLink.open(
-            loaded, accept_init=accept_init, live=None if live is None else LiveView.parse(live)
-        ) as link,
+        LiveLink.open(loaded, live=None if live is None else LiveView.parse(live)) as link,
     ):
         view = View(loaded, quiet=quiet or json)
         link.connection.report = partial(say, err=True)

@@ -20,8 +20,8 @@ from drivers.packets import N_ARMS, InitPacket
 from drivers.transports.base import TransportSpec
 from hil.archive import open_archive
 from hil.campaign import Stop
+from hil.campaign.link import END_TIMEOUT
 from hil.campaign.live_link import ExchangeView
-from hil.campaign.motion_link import END_TIMEOUT
 from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
 from hil.errors import ArchiveError, ControllerFault, OperatorStopError

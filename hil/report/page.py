@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
-from hil.archive.header import ArchiveName
 from hil.report import figures
 from hil.report.rendering import environment, page_bytes
 from hil.report.series import ReportSeries
-from hil.results import RecordedResult, Results, outside_mark
+from hil.results import Results, outside_mark
 from identification.selection.inner_prediction import Choice
 
 _MOST_CANDIDATES: Final = 6
@@ -26,7 +24,6 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
     """
     series = series.checked_for(len(results.joint_names))
     joints, runs = figures.joints_of(results), results.validation
-    recorded = [] if results.conduct is None else results.conduct.recorded
     errors = np.array([[r.overall_relative_error, r.all_rows_relative_error] for r in runs])
     context = {
         "results": results,
@@ -40,8 +37,6 @@ def report_bytes(results: Results, series: ReportSeries) -> bytes:
         "unseen": np.median(errors, axis=0).tolist() if runs else None,
         "worst": max(runs, key=lambda run: run.overall_relative_error) if runs else None,
         "every_row_errors": every_row_errors(results),
-        "when": when(recorded),
-        "motion_name": motion_name,
         "excitation_panels": figures.excitation_panels(series, joints),
         "correlation": figures.correlation_matrix(results),
         "torque_panels": figures.torque_panels(series, joints),
@@ -66,20 +61,3 @@ def shown_candidates(choice: Choice) -> list[int]:
     # The first is the default, with which the others were compared.
     best = sorted(shown[1:], key=lambda k: (k != choice.chosen, choice.errors[k]))
     return [0, *best[: _MOST_CANDIDATES - 1]]
-
-
-def when(recorded: Sequence[RecordedResult]) -> str:
-    """Format the time from the start of the first archive to that of the last."""
-    begins = sorted(one.when for one in recorded if one.when is not None)
-    if not begins:
-        return "No date: virtual time." if recorded else "Nothing was recorded."
-    first, last = (one[:16].replace("T", " ") for one in (begins[0], begins[-1]))
-    if first[:10] == last[:10]:
-        last = last[11:]
-    return f"{first} to {last} (UTC, start of the first and the last motion)."
-
-
-def motion_name(one: RecordedResult) -> str:
-    """Return the motion of an archive, such as "repetition 2"."""
-    name = ArchiveName.parse(one.archive)
-    return one.kind if name is None else name.motion

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from drivers import (
     CyclicPacket,
-    DriveTrain,
     InitPacket,
     InitReceived,
     LinkLost,
@@ -20,22 +18,18 @@ from drivers import (
     RequestError,
     State,
 )
-from drivers.init_check import compare, is_narrower
+from drivers.init_check import is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
 from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
-    MOVE,
-    PERIOD,
     START,
     N,
     Rig,
     all_drive_off,
     closed,
-    drive_train,
     init_packet,
     opened,
     running,
-    smooth_move,
     started,
     still,
 )
@@ -382,7 +376,6 @@ class TestInit:
         (event,) = rig.seen(InitReceived)
         assert event.differences == (event.unusable,)
         assert event.unusable.startswith(words)
-        assert not event.adopted
         assert rig.cycle() is not None
         for _ in range(2):
             assert all_drive_off(rig.cycle(mode=Mode.POSITION))
@@ -398,7 +391,7 @@ class TestInit:
             row[:N] = np.where(row[:N] != 0, np.nextafter(row[:N], up), row[:N])
         for one in (init, init_packet(), described(("gear_ratio", 6, np.nan))):
             _, event = received(one)
-            assert (event.differences, event.unusable, event.adopted) == ((), None, False)
+            assert (event.differences, event.unusable) == ((), None)
 
     @pytest.mark.parametrize(
         ("init", "options", "differences"),
@@ -440,85 +433,22 @@ class TestInit:
         assert len(event.differences) >= len(differences)
 
     @pytest.mark.parametrize(("arm", "axis"), [(1, 7), (2, 1)])
-    @pytest.mark.parametrize("accept", [False, True])
-    def test_accepted_other_axis_is_held(self, arm, axis, accept):
-        options = {"accept_init": True} if accept else {"other_axes": {(arm, axis)}}
-        rig = running(still(3), init=beside(arm, axis), **options)
+    def test_other_axis_is_held(self, arm, axis):
+        rig = running(still(3), init=beside(arm, axis), other_axes={(arm, axis)})
         (event,) = rig.seen(InitReceived)
-        assert (event.unusable, len(event.differences)) == (None, int(accept))
-        assert rig.session.drive_train is rig.train
+        assert (event.unusable, event.differences) == (None, ())
         rig.run_to("completed")
         _, event = received(beside(arm, axis), other_axes={(arm, 8), (3, axis)})
         assert f"axis {axis} of arm {arm}" in event.unusable
 
 
-class TestAcceptedInit:
-    GEAR = ("gear_ratio", 2, -111.5)
-
-    def adopting(self, *changes) -> Rig:
-        """An arm at START by the controller's values."""
-        rig, event = received(described(*changes), accept_init=True)
-        assert (event.unusable, event.adopted) == (None, True)
-        assert len(event.differences) == len(changes)
-        rig.train = rig.session.drive_train
-        rig.put_arm_at(START)
-        return rig
-
-    def test_values_of_the_controller_are_used(self):
-        rig = self.adopting(self.GEAR, ("calibration", 4, 0.75), ("kinematic_influence", 4, 0.004))
-        train, ours = rig.session.drive_train, drive_train()
-        np.testing.assert_array_equal(train.gear_ratio, [-120, 150, -111.5, 90, 80, -60])
-        np.testing.assert_array_equal(train.calibration, [0.5, -1.25, 2, 0, 0.75, -0.75])
-        np.testing.assert_allclose([train.k54, train.k64, train.k65], [0.01, 0.004, 0.03], 1e-6)
-        np.testing.assert_array_equal(train.joint_sign, ours.joint_sign)
-        np.testing.assert_array_equal(train.torque_constant, ours.torque_constant)
-
-    def test_records_and_set_points(self):
-        rig = self.adopting(self.GEAR, ("calibration", 4, 0.75))
-        rig.session.request(smooth_move(MOVE, 300))
-        rig.open()
-        np.testing.assert_allclose(rig.records[-1]["position"], START, atol=1e-6)
-        rig.run_to("completed")
-        end = rig.axes["d"][:, 0]
-        np.testing.assert_allclose(rig.train.joint_position(end), START + MOVE, atol=1e-6)
-        motor = drive_train().motor_revolutions(START + MOVE)
-        assert abs(end[2] - motor[2]) > 0.01
-        np.testing.assert_allclose(end[4] - motor[4], 0.5, atol=1e-5)
-
-    def test_the_guard_stays_with_the_joints(self):
-        rig = self.adopting(self.GEAR)
-        rig.session.request(smooth_move(np.array([0, 0, 2.0, 0, 0, 0]), 3000))
-        rig.open()
-        rig.cycle(3000)
-        assert (rig.refusal.joint, rig.refusal.bound) == (2, pytest.approx(2.0, rel=1e-5))
-        assert 2.0 < rig.refusal.value < 2.01
-
-    @pytest.mark.parametrize(
-        ("init", "words"),
-        [
-            *((described(change), "cannot be accepted") for change in
-              (("gear_ratio", 2, np.nan), ("gear_ratio", 2, 0.0), ("gear_ratio", 2, np.inf),
-               ("calibration", 1, np.nan), ("calibration", 1, -np.inf),
-               ("kinematic_influence", 3, np.nan), ("kinematic_influence", 5, np.inf))),
-            (described(GEAR, sample_time=1), CYCLE),
-            (init_packet(n_axes=5), "axis 6 of arm 1 is not open"),
-        ],
-    )  # fmt: skip
-    def test_invalid_values_are_not_accepted(self, init, words):
-        rig, event = received(init, accept_init=True)
-        assert words in event.unusable
-        assert not event.adopted
-        assert rig.session.drive_train is rig.train
-        with pytest.raises(RequestError, match=words):
-            rig.session.request(still(3))
-
-    def test_next_init_packet_is_compared_with_the_cell(self):
-        rig = self.adopting(self.GEAR)
-        ours = drive_train().gear_ratio
+class TestNextInit:
+    def test_is_compared_with_the_cell(self):
+        rig, event = received(described(("gear_ratio", 2, np.nan)))
+        assert "gear ratio of axis 3" in event.unusable
         rig.init = init_packet()
         rig.start()
-        assert not rig.seen(InitReceived)[-1].adopted
-        np.testing.assert_array_equal(rig.session.drive_train.gear_ratio, ours)
+        assert rig.seen(InitReceived)[-1].unusable is None
         assert rig.state is State.INIT
 
 
@@ -533,64 +463,3 @@ class TestAcceptedInit:
 )
 def test_limit_rounded_to_six_digits_is_not_narrower(theirs, ours, below):
     assert is_narrower(np.array([theirs], dtype=np.float64), np.array([ours])).tolist() == [below]
-
-
-COUPLING = (0.02, 0.003, 0.04)
-
-
-def arm(n: int) -> DriveTrain:
-    """The first joints of the rig's arm, without a wrist where it ends before it."""
-    whole = drive_train()
-    names = ("gear_ratio", "calibration", "joint_sign", "joint_offset")
-    names += ("torque_constant", "current_limit")
-    coupling = COUPLING if n == 6 else (0.0, 0.0, 0.0)
-    return replace(
-        whole,
-        **{name: getattr(whole, name)[:n] for name in names},
-        **dict(zip(("k54", "k64", "k65"), coupling, strict=True)),
-    )
-
-
-def adopted(ours: DriveTrain, **changes) -> InitReceived:
-    """The controller's values, accepted."""
-    n = ours.n_joints
-    described = {
-        "gear_ratio": ours.gear_ratio,
-        "calibration": ours.calibration,
-        "kinematic_influence": [0.0, 0.0, 0.0, *COUPLING],
-    }
-    init = InitPacket.build(n, round(1000 * PERIOD), described | changes)
-    return compare(ours, PERIOD, init, 1, True)
-
-
-@pytest.mark.parametrize(("k54", "fits"), [(0.0, True), (0.02, False)])
-def test_arm_of_five_joints_has_no_coupling(k54, fits):
-    ours = arm(5)
-    influence = [0.0, 0.0, 0.0, k54, 0.003, 0.04]
-    theirs = adopted(ours, calibration=ours.calibration + 0.5, kinematic_influence=influence)
-    assert theirs.adopted == fits
-    assert fits or "values cannot be accepted: drive train k54" in theirs.unusable
-
-
-TURN = np.where(np.arange(6) == 2, arm(6).gear_ratio, 0.0)
-"""Motor revolutions of a turn of joint 3."""
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        *(({"gear_ratio": arm(6).gear_ratio + (factor - 1.0) * TURN}, words) for factor, words in
-          ((0.5, ""), (0.49, "gear ratio of axis 3 is 0.49 times the cell's"),
-           (2.0, ""), (2.01, "gear ratio of axis 3 is 2.01 times the cell's"))),
-        *(({"calibration": arm(6).calibration + turns * TURN}, words) for turns, words in
-          ((1.0, ""), (-1.0, ""), (1.01, "calibration of axis 3 is"))),
-        *(({"kinematic_influence": [0, 0, 0, *np.where(np.arange(3) == entry, k, COUPLING)]},
-           f"{name} is {k:g}, and 1 is the most" if k > 1.0 else "")
-          for entry, name in enumerate(("k54", "k64", "k65")) for k in (1.0, -1.0, 1.01)),
-    ],
-)  # fmt: skip
-def test_values_far_off_are_not_accepted(changes, words):
-    """Twice or half the gear ratio, a turn of the joint, a coupling of 1, and no further."""
-    theirs = adopted(arm(6), **changes)
-    assert theirs.adopted == (not words)
-    assert words in (theirs.unusable or "")

@@ -6,7 +6,7 @@ comes back as received while the drive is off, received targets come back while 
 In open mode it lets one axis swing in a sine from where it stood. It prints one line whenever what
 it receives changes, and a JSON object at the end.
 
-    python foreign_pc.py --port 2001 --mode 5 --exit-after 500
+    python foreign_pc.py --port 2001 --exit-after 500
 """
 
 from __future__ import annotations
@@ -22,26 +22,18 @@ from collections import Counter
 HEADER = struct.Struct("<i4s4s")
 AXIS = struct.Struct("<i8f")
 DRIVE_ON, EXIT = 5, 1
-DRIVING_ON, END, DRIVE_OFF, FOLLOWING = 501, 504, 505, 508
+END, DRIVE_OFF = 504, 505
 OPEN_MODES = (1, 2, 4, 5, 7, 8, 9)
 
 
 def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--bind", default="0.0.0.0")
     parser.add_argument("--manner", choices=("library", "lab"), default="lab")
-    parser.add_argument("--mode", type=int, default=4, help="the mode it expects")
-    parser.add_argument("--axis", type=int, default=1)
     parser.add_argument("--amplitude", type=float, default=0.5, help="motor revolutions")
     parser.add_argument("--sine-period", type=int, default=500, help="cycles")
     parser.add_argument("--exit-after", type=int, default=1000, help="open cycles; 0: never")
     parser.add_argument("--send-505", type=int, default=0, metavar="N", help="in open cycle N")
-    parser.add_argument("--send-508", type=int, default=0, metavar="N", help="in open cycle N")
-    parser.add_argument("--miss", type=int, default=0, metavar="N", help="silent from open cycle N")
-    parser.add_argument("--miss-count", type=int, default=1)
-    parser.add_argument("--wrong-targets", action="store_true", help="D1 = 0 beside 505 and 508")
-    parser.add_argument("--timeout", type=float, default=60.0, help="s of silence, then give up")
     return parser.parse_args()
 
 
@@ -93,7 +85,7 @@ class Program:
         axes = [list(AXIS.unpack_from(data, 12 + 36 * i)) for i in range(self.n)]
         modes = [int(axis[0]) for axis in axes]
         on = status[0] == DRIVE_ON
-        shown = axes[self.options.axis - 1]
+        shown = axes[0]
         self.seen["cyclic"] += 1
         far = self.range[1] - self.range[0] > 1
         self.range = [min(self.range[0], shown[3]), max(self.range[1], shown[3])]
@@ -102,7 +94,7 @@ class Program:
         self.show(
             number,
             f"status {status[0]}, modes {modes}",
-            f"axis {self.options.axis}: D1 {shown[1]:.4f}, D3 {shown[3]:.4f}",
+            f"axis 1: D1 {shown[1]:.4f}, D3 {shown[3]:.4f}",
         )
         if modes[0] == END:
             self.over = True
@@ -130,18 +122,15 @@ class Program:
                 blocks.append(closed_axis([mode]))
         return reply + bytes(8) + b"".join(blocks)
 
-    def while_open(self, reply: bytes, axes: list[list[float]]) -> bytes | None:
+    def while_open(self, reply: bytes, axes: list[list[float]]) -> bytes:
         options, k = self.options, self.open_cycles
         if k == 0:
             self.start = [axis[1] for axis in axes]
             self.excursion = 0.0
         self.open_cycles += 1
-        self.moved = max(self.moved, abs(axes[options.axis - 1][3] - self.start[options.axis - 1]))
-        if options.miss and options.miss <= k < options.miss + options.miss_count:
-            self.seen["kept silent"] += 1
-            return None
-        faults = {options.send_505: DRIVE_OFF, options.send_508: FOLLOWING}
-        code = faults.get(k) if k and not self.fault_sent else None
+        self.moved = max(self.moved, abs(axes[0][3] - self.start[0]))
+        off = options.send_505 == k > 0 and not self.fault_sent
+        self.fault_sent |= off
         leaving = bool(options.exit_after) and k >= options.exit_after
         asks = leaving and (k - options.exit_after) % 100 == 0  # in one packet; again if unheard
         # a sine that begins and ends each turn at rest
@@ -151,15 +140,12 @@ class Program:
         step, self.excursion = wanted - self.excursion, wanted
         blocks = []
         for i, axis in enumerate(axes):
-            moving = i == options.axis - 1
+            moving = i == 0
             mode = int(axis[0])
             demand = self.demand(mode, self.start[i], wanted * moving, step * moving)
-            if code:
-                self.fault_sent = True
-                mode = code if code == DRIVE_OFF or moving else mode
-                demand = (1000.0, 5.0, 0.0, 0.0, 0.0) if options.wrong_targets else demand
+            mode = DRIVE_OFF if off else mode
             blocks.append(AXIS.pack(mode, *demand, 0.0, 0.0, 0.0))
-        self.seen[f"asked for {code}" if code else "exit asked" if asks else "set-points"] += 1
+        self.seen["505" if off else "exit asked" if asks else "set-points"] += 1
         return reply + bytes((EXIT if asks else 0, 0, 0, 0)) + bytes(4) + b"".join(blocks)
 
     def demand(self, mode: int, start: float, wanted: float, step: float) -> tuple[float, ...]:
@@ -189,8 +175,8 @@ def main() -> int:
     options = arguments()
     program = Program(options)
     receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    receiver.bind((options.bind, options.port))
-    receiver.settimeout(options.timeout)
+    receiver.bind(("", options.port))
+    receiver.settimeout(60.0)
     say(f"listening on port {options.port}")
     try:
         while not program.over:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,16 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, MotionRefusedError, design, plan_around
 from hil.campaign.plan import LEAST, quick_settings
 from hil.cell import Cell
+from hil.cli import app
 from hil.cli import demo as demo_module
 from hil.demo_link import SimulatorProcess
-from hil.design import load_design, preset
-from hil.design.run import DesignFolder, run_design
-from hil.identify import Identification, identify_campaign
+from hil.errors import InputError
+from hil.identify import identify_campaign
 from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.outcome import FILES
 from hil.progress import Silent
@@ -33,15 +31,9 @@ from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell
 
 
-@pytest.fixture(scope="module")
-def tiny(cell: Cell) -> Cell:
-    return cell.with_campaign(validation_runs=1)
-
-
 @pytest.mark.parametrize("candidates", [1, 5, 300])
 def test_the_quick_search_tries_no_more_than_it_may(cell: Cell, candidates: int) -> None:
-    text = cell.text.replace("candidates = 20", f"candidates = {candidates}")
-    search = quick_settings(Cell.from_texts(text, cell.urdf, cell.path)).search
+    search = quick_settings(cell.with_values({"campaign.candidates": candidates})).search
     assert search.population * search.generations <= max(LEAST, candidates)
     assert search.population * search.generations > 0.75 * candidates
 
@@ -88,68 +80,19 @@ def _largest_shares(cell: Cell, plan: CampaignPlan) -> list[float]:
     ]
 
 
-def test_a_plan_states_the_criteria_of_its_motion_alone(tiny: Cell, plan: CampaignPlan) -> None:
+def test_a_plan_states_the_criteria_of_its_motion_alone(quick: Cell, plan: CampaignPlan) -> None:
     """Whatever a design was judged by: some parameters, or what it adds to earlier archives."""
     foreign = replace(plan.excitation.criteria, log10_det=1.0, coupling_index=1.0)
-    again = plan_around(tiny, replace(plan.excitation, criteria=foreign))
+    again = plan_around(quick, replace(plan.excitation, criteria=foreign))
     assert again.excitation.criteria == plan.excitation.criteria
 
 
-@pytest.fixture(scope="module")
-def designs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Tiny designs for the NS 16 by method A, which begins elsewhere than at home, and by B."""
-    folder = tmp_path_factory.mktemp("designs")
-    cell = Cell.load(CELL_PATH)
-    small = {"population": 12, "generations": 2, "polish": 0}
-    for method, changes in (("a", {"sines": {"length": 8.0, "ramp": 2.0}}), ("b", {})):
-        settings = preset(method).replaced(search=small, **changes)
-        run_design(DesignFolder(folder / method), cell, settings, Silent())
-    return {method: folder / method / "excitation.toml" for method in ("a", "b")}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "kind"),
-    [
-        pytest.param("a", FourierSeries, id="sines", marks=pytest.mark.slow),
-        pytest.param("b", PiecewiseCubic, id="via points"),
-    ],
-)
-def test_the_demo_runs_a_design_and_identifies_from_its_archives(
-    tmp_path: Path, designs: dict[str, Path], method: str, kind: type
-) -> None:
-    folder, file = tmp_path / "demo", designs[method]
-    fewer = ("--repetitions", "2", "--validation", "1")
-    done = demo(folder, "--excitation", str(file), *fewer, "--quiet")
-    assert done.returncode in (0, 5), done.stderr  # a poor motion may not make a good model
-    campaign, wanted = Campaign.open(folder), load_design(file)
-    assert isinstance(wanted.trajectory, kind)
-    archives = [open_archive(path) for path in campaign.folder.completed("excitation")]
-    assert len(archives) == 2
-    for archive in archives:
-        stored = json.loads(archive.attachments["plan.json"])["excitation"]
-        assert stored["trajectory"] == wanted.trajectory.to_dict()
-        assert stored["method"] == method
-    results = json.loads((folder / "results.json").read_text())["excitation"]
-    assert results["method"] == method
-    assert results["n_sines"] == (3 if method == "a" else None)
-    assert results["n_via"] == (None if method == "a" else 6)
-
-
 def test_a_design_that_cannot_be_read_is_named_first(tmp_path: Path) -> None:
-    folder = tmp_path / "demo"
-    done = demo(folder, "--excitation", str(CELL_PATH), "--quiet")
-    assert done.returncode == 2
-    assert "cell.toml" in done.stderr and "Traceback" not in done.stderr
-    assert not folder.exists()
-
-
-@pytest.mark.slow
-def test_a_campaign_has_one_excitation(tmp_path: Path, designs: dict[str, Path]) -> None:
-    done = demo(tmp_path, "--resume", "--excitation", str(designs["b"]), "--quiet")
-    assert done.returncode == 2
-    assert "contradicts --resume" in done.stderr.replace("\n", " ")
-    assert not list(tmp_path.iterdir())
+    words = ["demo", "--output", str(tmp_path / "demo"), "--excitation", str(CELL_PATH), "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert isinstance(result.exception, InputError)
+    assert "cell.toml" in str(result.exception)
+    assert not (tmp_path / "demo").exists()
 
 
 Run = Callable[..., Campaign]
@@ -192,11 +135,6 @@ def finished(
     return run(tmp_path_factory.mktemp("sines") / "campaign", quick, swinging)
 
 
-@pytest.fixture(scope="module")
-def found(finished: Campaign) -> Identification:
-    return identify_campaign(finished.folder.root, Silent())
-
-
 def test_the_arm_moves_to_the_start_of_the_sines_and_home(finished: Campaign) -> None:
     names = [ArchiveName.parse(entry.name) for entry in finished.folder.manifest()]
     done = [(name.kind, name.index) for name in names if name is not None]
@@ -212,18 +150,16 @@ def test_the_arm_moves_to_the_start_of_the_sines_and_home(finished: Campaign) ->
     assert there[0] == pytest.approx(finished.cell.home, abs=2e-6)
     assert there[-1] == pytest.approx(middle, abs=2e-6)
     assert back[-1] == pytest.approx(finished.cell.home, abs=2e-6)
-
-
-def test_the_archive_carries_the_series_itself(finished: Campaign) -> None:
     for path in finished.folder.completed("excitation"):
         stored = json.loads(open_archive(path).attachments["plan.json"])
-        assert set(stored) == {"excitation"}
+        assert set(stored) == {"excitation"}, "the series itself"
         again = Excitation.from_dict(stored["excitation"])
         assert again.trajectory.to_dict() == finished.plan.excitation.trajectory.to_dict()
 
 
 @pytest.mark.slow
-def test_the_model_of_a_swinging_arm_predicts_unseen_motion(found: Identification) -> None:
+def test_the_model_of_a_swinging_arm_predicts_unseen_motion(finished: Campaign) -> None:
+    found = identify_campaign(finished.folder.root, Silent())
     assert found.verdict.good, found.verdict.line
     coverage = found.results.coverage
     assert coverage is not None and coverage.within_3 >= 55
@@ -269,13 +205,6 @@ def test_short_ramps_are_checked_within_seconds(quick: Cell, ramp: float, size: 
     assert time.process_time() - began < 2.0
 
 
-def demo(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "hil", "demo", "--output", str(folder), *options],
-        capture_output=True, text=True, timeout=300, env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
-
-
 def test_a_simulated_controller_that_fails_gives_its_reason() -> None:
     simulator = SimulatorProcess.start(CELL_PATH, "--udp", "127.0.0.1:1", "--fault", "rain@10")
     try:
@@ -286,23 +215,14 @@ def test_a_simulated_controller_that_fails_gives_its_reason() -> None:
         simulator.end()
 
 
-# --- `hil demo --excitation`
-
-
-@pytest.fixture
-def wild(cell: Cell) -> Excitation:
-    series = FourierSeries(cell.home, np.full((6, 1), 2.0), np.full((6, 1), 3.0), 5.0, 1.0)
-    return Excitation(series, UNKNOWN, method="a", seed=7, tried=1, rejected={})
-
-
 def test_an_earlier_campaign_is_not_removed_for_a_bad_motion(
-    tmp_path: Path, wild: Excitation, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever an earlier one left, with the files that identification writes for other tools."""
-    earlier = tmp_path / "manifest.json"
+    wild = FourierSeries(cell.home, np.full((6, 1), 2.0), np.full((6, 1), 3.0), 5.0, 1.0)
     for name in ("manifest.json", "results.json", "report.html", *FILES):
         (tmp_path / name).write_text("{}")
-    monkeypatch.setattr(demo_module, "_designed", lambda *arguments: wild)
+    monkeypatch.setattr(demo_module, "_designed", lambda *arguments: designed(wild))
     with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):
         demo_module.demo(output=tmp_path, excitation=tmp_path / "x.toml", force=True, quiet=True)
-    assert earlier.read_text() == "{}"
+    assert (tmp_path / "manifest.json").read_text() == "{}"

@@ -216,11 +216,10 @@ def test_link_and_session_are_as_the_cell_describes_them(ns16: Cell) -> None:
     local = ns16.with_link(transport="udp", host="127.0.0.1", port=2001, bind="127.0.0.1")
     assert local.transport_spec() == UdpSpec("127.0.0.1", 2001, "127.0.0.1")
     linked = ns16.with_link(arm=2, other_axes=[[1, 7], [2, 1]])
-    assert linked.session_settings(accept_init=True) == {
+    assert linked.session_settings() == {
         "mode": 4,
         "arm": 2,
         "max_gap": 2,
-        "accept_init": True,
         "other_axes": frozenset({(1, 7), (2, 1)}),
         "settle_cycles": round(ns16.campaign.settle_s / ns16.period),
     }

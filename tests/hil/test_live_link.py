@@ -17,7 +17,7 @@ from drivers.packets import INIT_LENGTH
 from drivers.states import State
 from drivers.transports.base import TransportSpec
 from drivers.transports.udp import UdpSpec
-from hil.archive import ArchiveSpec, open_archive
+from hil.archive import open_archive
 from hil.archive.live import LiveView, LiveViewError
 from hil.campaign import (
     Campaign,
@@ -119,7 +119,7 @@ def test_each_difference_of_the_init_packet_is_named(
     campaign = campaign_of(tmp_path / "init", wrong, plan)
     with (
         loopback_link(campaign.cell, simulated_by=right / "cell.toml", options=PATIENT) as link,
-        pytest.raises(ControllerFault, match=r"k54 of axis 5 .*k65 of axis 6 .*--accept-init"),
+        pytest.raises(ControllerFault, match=r"k54 of axis 5 .*k65 of axis 6 .*correct the cell"),
     ):
         campaign.run(link, Stop(), Silent(), provenance={}, unrehearsed=True)
     assert not list(campaign.folder.archives.iterdir())
@@ -267,70 +267,44 @@ def require_shown(seen: list[MotionProgress]) -> None:
     assert 0.0 < last.current_share.max() < 1.0
 
 
-class Pressed:
-    """Requests what it is set to."""
-
-    def __init__(self) -> None:
-        self.now = OperatorRequest()
-
-    def show(self, progress: MotionProgress) -> None: ...
-
-    def request(self) -> OperatorRequest:
-        return self.now
-
-
-def test_a_request_before_a_motion_begins_is_applied(
+def test_a_hold_while_a_motion_is_handed_over_is_applied(
     cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stop or hold while the archive is created, hold while the motion is handed over."""
+    """And nothing is sent with limits that were not checked."""
     cell = cell.with_link(transport="udp", host="192.0.2.1", bind="127.0.0.1")
+    held, stop = False, Stop()
+
+    class Holding(Operator):
+        def request(self) -> OperatorRequest:
+            return OperatorRequest(held=held)
+
     with loopback_link(cell, options=PATIENT) as link:
         assert link.only_simulated  # though the cell's own host is none of this computer
         where = link.connect(Stop())
-        moves = (Move(where + 0.3, speed=0.3),)
-        motion = plan_moves(where, moves, cell.joint_limits).trajectory
-        opening, submitting = link.open_archive, link.exchange.submit
+        motion = plan_moves(where, (Move(where + 0.3, speed=0.3),), cell.joint_limits).trajectory
+        submitting = link.exchange.submit
 
-        for number, what in enumerate(("stop, opening", "hold, opening", "hold, asked for")):
-            stop, person = Stop(), Pressed()
+        def asked(source: MotionSource, *how: Callable[[], bool]) -> int:
+            nonlocal held
+            held = True
+            threading.Timer(1.5, setattr, (stop, "requested", True)).start()
+            return submitting(source, *how)
 
-            def press(what: str = what, stop: Stop = stop, person: Pressed = person) -> None:
-                stop.requested = what.startswith("stop")
-                person.now = OperatorRequest(held=what.startswith("hold"))
-                threading.Timer(1.5, setattr, (stop, "requested", True)).start()
-
-            @contextmanager
-            def opened(*spec: ArchiveSpec, what: str = what, **how: bool) -> Iterator[None]:
-                with opening(*spec, **how):
-                    if what.endswith("opening"):
-                        press()
-                    yield
-
-            def asked(source: MotionSource, *how: Callable[[], bool], what: str = what) -> int:
-                press() if what.endswith("asked for") else None
-                return submitting(source, *how)
-
-            monkeypatch.setattr(link, "open_archive", opened)
-            monkeypatch.setattr(link.exchange, "submit", asked)
-            path = tmp_path / f"{number}.mcap"
-            player = player_of(cell, motion)
-            spec = spec_of(cell, path)
-            ended = link.run(player, spec, stop, watch=person)
-            assert ended.outcome == "stopped", what
-            archive = open_archive(path)
-            assert archive.complete
-            if archive.n_samples:  # none where it was closed at once
-                assert np.abs(set_points(archive) - where).max(initial=0.0) < 1e-4, what
-            assert ended.reason == "it had not begun"
-            assert "MotionStarted" not in [event.name for event in archive.events]
+        monkeypatch.setattr(link.exchange, "submit", asked)
+        path = tmp_path / "held.mcap"
+        ended = link.run(player_of(cell, motion), spec_of(cell, path), stop, watch=Holding(Stop()))
+        assert (ended.outcome, ended.reason) == ("stopped", "it had not begun")
+        archive = open_archive(path)
+        assert archive.complete
+        if archive.n_samples:  # none where it was closed at once
+            assert np.abs(set_points(archive) - where).max(initial=0.0) < 1e-4
+        assert "MotionStarted" not in [event.name for event in archive.events]
 
         monkeypatch.undo()
         link.view.inits += 1  # another init packet, whose limits were not checked
-        player = player_of(cell, motion)
         path = tmp_path / "next.mcap"
-        spec = spec_of(cell, path)
         with pytest.raises(ControllerFault, match=r"new session .* nothing was sent"):
-            link.run(player, spec, Stop())
+            link.run(player_of(cell, motion), spec_of(cell, path), Stop())
         assert open_archive(path).outcome.outcome == "void"
 
 
@@ -353,14 +327,10 @@ def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:
         assert not link.only_simulated
 
 
-def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell) -> None:
+def test_a_live_view_that_cannot_be_served_is_refused(cell: Cell, tmp_path: Path) -> None:
     pytest.importorskip("foxglove", reason="the extra 'live' is not installed")
-    cell = cell.with_link(transport="udp", host="127.0.0.1", bind="127.0.0.1", port=free_port())
     with pytest.raises(LiveViewError, match="name an address of this computer"):
-        LiveLink.open(cell, live=LiveView("192.0.2.1", 8765))
-
-
-def test_a_live_view_without_an_address_is_refused(tmp_path: Path) -> None:
+        LiveLink.open(on_loopback(cell).with_link(port=free_port()), live=LiveView("192.0.2.1", 1))
     with pytest.raises(LiveViewError, match=r"--live nonsense is not HOST:PORT"):
         record(CELL_PATH, output=tmp_path, live="nonsense")
     assert not list(tmp_path.iterdir())

@@ -8,14 +8,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hil.campaign import plan as campaign_plan
 from hil.campaign.intervals import hold
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
 from hil.design.advice import NoExcitationError
 from hil.motion_checks import MotionChecks, always_so, collision_checker, violation_text
-from identification.excitation import CollisionChecker, NoFeasibleMotionError, Violation, Workspace
+from identification.excitation import CollisionChecker, Violation, Workspace
 from identification.model.motion import Motion
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -130,13 +129,12 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     folder = tmp_path / "meshes" / "arm"
     folder.mkdir(parents=True)
     corners = ("0 0 0", "0.1 0 0", "0 0.1 0", "0 0 0.1")
-    faces = [
-        "facet normal 0 0 1\nouter loop\n"
-        + "".join(f"vertex {corners[k]}\n" for k in face)
-        + "endloop\nendfacet\n"
+    facets = [
+        " ".join(["facet normal 0 0 1 outer loop", *(f"vertex {corners[k]}" for k in face)])
         for face in ((0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3))
     ]
-    (folder / "a.stl").write_text("solid a\n" + "".join(faces) + "endsolid a\n", "utf-8")
+    solid = "".join(f"{facet} endloop endfacet\n" for facet in facets)
+    (folder / "a.stl").write_text(f"solid a\n{solid}endsolid a\n", "utf-8")
     text = replaced_value(BARE_CELL, "cell", "mesh_folders", '["meshes"]')
     path.write_text(text, "utf-8")
     found = Cell.load(path)
@@ -147,19 +145,6 @@ def test_a_missing_mesh_gets_file_mesh_and_remedy(tmp_path: Path) -> None:
     moved = Cell.load(path).with_urdf(tmp_path / "copy" / "cell.toml", "wrist.urdf")
     assert moved.file.cell.mesh_folders == ["../meshes"]
     assert collision_checker(moved).pairs == collision_checker(found).pairs
-
-
-def test_infeasible_validation_motions_are_in_these_angles(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    contact = Violation("collision", "link_2 and floor", 0.01, 0.05, 2.0, tuple(cell.home))
-
-    def nothing(*_: object, **__: object) -> None:
-        raise NoFeasibleMotionError({"collision": 3}, {"collision": contact})
-
-    monkeypatch.setattr(campaign_plan, "random_validation_motions", nothing)
-    with pytest.raises(NoExcitationError, match=r"J3 -90\.0.*teach pendant angles"):
-        campaign_plan._validation_motions(cell, MotionChecks.of(cell))
 
 
 HELD = 2
@@ -179,27 +164,20 @@ def held_torque(cell: Cell) -> float:
     return (1.0 + cell.nominal.uncertainty) * abs(float(gravity[HELD]))
 
 
-@pytest.mark.parametrize(("share", "refused"), [(1.02, False), (0.98, True)])
-def test_home_is_refused_where_gravity_is_beyond_the_limit(
-    cell: Cell, share: float, refused: bool
-) -> None:
+def test_gravity_beyond_a_torque_limit_is_refused(cell: Cell) -> None:
+    """At home, and in a design."""
+    assert cell.torque_limit is MotionChecks.of(cell).currents.torque_limit is None
     torque = [1e4] * 6
-    torque[HELD] = share * held_torque(cell)
-    refusal = MotionChecks.of(limited(cell, torque)).refusal(hold(cell.home, 1.0))
-    assert (refusal is not None) == refused
-    if refusal is not None:
-        assert refusal.startswith("torque of joint_3: ")
-        assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in refusal
-
-
-def test_a_design_satisfies_the_limit_too(cell: Cell) -> None:
-    torque = [1e4] * 6
+    for share in (1.02, 0.98):
+        torque[HELD] = share * held_torque(cell)
+        refusal = MotionChecks.of(limited(cell, torque)).refusal(hold(cell.home, 1.0))
+        assert (refusal is None) == (share > 1.0)
+    assert refusal is not None and refusal.startswith("torque of joint_3: ")
+    assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in refusal
     torque[HELD] = 0.5 * held_torque(cell)
     with pytest.raises(NoExcitationError, match=r"torque of joint_3: .* N·m"):
         problem_of(limited(cell, torque), preset("b"))
-    assert cell.torque_limit is MotionChecks.of(cell).currents.torque_limit is None
-    roomy = limited(cell, [1e4] * 6)
-    currents = problem_of(roomy, preset("b")).constraints.currents
+    currents = problem_of(limited(cell, [1e4] * 6), preset("b")).constraints.currents
     np.testing.assert_array_equal(currents.torque_limit, [1e4] * 6)
 
 

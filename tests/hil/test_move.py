@@ -65,38 +65,36 @@ def test_one_joint_turns_by_so_many_degrees_of_the_teach_pendant(
     assert summary["outcome"] == "completed"
 
 
-class TestOnlyAxis:
-    """The controller's program opens one axis; the others stay in mode 0 and where they are."""
+def test_one_axis_alone_moves_over_a_real_link(ns16: Cell, tmp_path: Path) -> None:
+    """As `docs/connect.md` types it; the others stay in mode 0 and where they are."""
+    out = str(tmp_path / "one.mcap")
+    page = ROOT / "docs" / "connect.md"
+    simulate, moved = (words for words in commands(page) if "--only-axis" in words)
+    options = simulate[simulate.index("--only-axis") :]
+    with UdpController.started(ns16, tmp_path, options=options) as controller:
+        way = [str(controller.cell_path), *moved[3:], "-o", out]
+        assert ran(*way)["outcome"] == "completed"
+    columns = open_archive(out).columns
+    in_interval = columns["interval"] == 0
+    opened = columns["mode"][in_interval] == ns16.controller.mode
+    assert opened[:, 2].any()
+    assert not np.delete(opened, 2, axis=1).any()
+    target = np.degrees(ns16.controller_angles(columns["target_position"][in_interval]))
+    np.testing.assert_allclose(target[-1] - target[0], [0, 0, 2, 0, 0, 0], atol=1e-3)
 
-    def test_it_moves_over_a_real_link(self, ns16: Cell, tmp_path: Path) -> None:
-        """As `docs/connect.md` types it."""
-        out = str(tmp_path / "one.mcap")
-        page = ROOT / "docs" / "connect.md"
-        simulate, moved = (words for words in commands(page) if "--only-axis" in words)
-        options = simulate[simulate.index("--only-axis") :]
-        with UdpController.started(ns16, tmp_path, options=options) as controller:
-            way = [str(controller.cell_path), *moved[3:], "-o", out]
-            assert ran(*way)["outcome"] == "completed"
-        columns = open_archive(out).columns
-        in_interval = columns["interval"] == 0
-        opened = columns["mode"][in_interval] == ns16.controller.mode
-        assert opened[:, 2].any()
-        assert not np.delete(opened, 2, axis=1).any()
-        target = np.degrees(ns16.controller_angles(columns["target_position"][in_interval]))
-        np.testing.assert_allclose(target[-1] - target[0], [0, 0, 2, 0, 0, 0], atol=1e-3)
 
-    def test_it_is_refused_where_others_open_too(self, ns16: Cell, tmp_path: Path) -> None:
-        with UdpController.started(ns16, tmp_path) as controller:
-            way = ["--joint", "3", "--by", "2", "--only-axis", "-o", str(tmp_path)]
-            result = CliRunner().invoke(app, ["move", str(controller.cell_path), *way, "--json"])
-        assert isinstance(result.exception, ControllerFault)
-        assert "joint 1 is in mode 4; the motion needs 0" in str(result.exception)
+def test_one_axis_alone_is_refused_where_others_open_or_turn(ns16: Cell, tmp_path: Path) -> None:
+    def refused(cell: Path, joint: str) -> BaseException | None:
+        way = ["--joint", joint, "--by", "2", "--only-axis", "-o", str(tmp_path), "--json"]
+        return CliRunner().invoke(app, ["move", str(cell), *way]).exception
 
-    def test_a_joint_that_turns_other_motors_is_refused(self) -> None:
-        way = ["--joint", "4", "--by", "2", "--only-axis"]
-        result = CliRunner().invoke(app, ["move", str(CELL_PATH), *way])
-        assert isinstance(result.exception, InputError)
-        assert "joint 4 is moved by the motors of axes 4, 5, 6" in str(result.exception)
+    with UdpController.started(ns16, tmp_path) as controller:
+        error = refused(controller.cell_path, "3")
+    assert isinstance(error, ControllerFault)
+    assert "joint 1 is in mode 4; the motion needs 0" in str(error)
+    error = refused(CELL_PATH, "4")
+    assert isinstance(error, InputError)
+    assert "joint 4 is moved by the motors of axes 4, 5, 6" in str(error)
 
 
 def test_a_campaign_keeps_its_moves_and_knows_its_start(campaign: Campaign, tmp_path: Path) -> None:
@@ -146,17 +144,21 @@ def test_the_path_is_checked_and_not_only_its_ends(ns16: Cell) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [[], ["--to", "home", "--joint", "1"], ["--joint", "1"], ["--to", "home", "--only-axis"],
-     ["--to", "there"], ["--to", "1,2,3"], ["--to", "1,2,3,4,5,nan"]],
-)  # fmt: skip
-def test_one_target_of_six_angles_is_asked_for(arguments: list[str]) -> None:
+    ("arguments", "problem"),
+    [
+        ([], "one target is needed"),
+        (["--to", "home", "--joint", "1"], "one target is needed"),
+        (["--joint", "1"], ""),
+        (["--to", "home", "--only-axis"], ""),
+        (["--to", "there"], "6 angles in degrees"),
+        (["--to", "1,2,3"], "6 angles in degrees"),
+        (["--to", "1,2,3,4,5,nan"], "6 angles in degrees"),
+    ],
+)
+def test_one_target_of_six_angles_is_asked_for(arguments: list[str], problem: str) -> None:
     result = CliRunner().invoke(app, ["move", str(CELL_PATH), *arguments])
     assert isinstance(result.exception, InputError)
-    if len(arguments) == 2 and arguments[1] != "1":
-        assert "6 angles in degrees" in str(result.exception)
-    if arguments in ([], ["--to", "home", "--joint", "1"]):
-        assert "one target is needed" in str(result.exception)
+    assert problem in str(result.exception)
 
 
 def test_a_real_controller_is_not_driven_without_confirmation(

@@ -76,8 +76,7 @@ def ended(outcome: str, cycle: int) -> MotionEnded:
 
 
 def a_new_session() -> InitReceived:
-    train = Cell.load(CELL_PATH).drive_train
-    return InitReceived(InitPacket.decode(bytes_of_an_init()), train, None)
+    return InitReceived(InitPacket.decode(bytes_of_an_init()), None)
 
 
 def bytes_of_an_init() -> bytes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,11 +14,9 @@ from typer.testing import CliRunner
 
 from drivers.drive_train import DriveTrain
 from hil.archive import open_archive
-from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop, design
-from hil.campaign.folder import CampaignFolder
+from hil.campaign import Campaign, CampaignPlan, NotRehearsedError, Stop
 from hil.campaign.gates import require_rehearsed
-from hil.campaign.rehearsal import Rehearsal
-from hil.campaign.rehearsal_run import FASTEST, SPREAD, Twin
+from hil.campaign.rehearsal import CRITERIA, FASTEST, SPREAD, Rehearsal, Twin
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import OperatorStopError
@@ -54,38 +51,12 @@ def designed(tmp_path_factory: pytest.TempPathFactory) -> Campaign:
 
 
 def test_a_good_plan_on_a_right_cell_passes_every_criterion(designed: Campaign) -> None:
+    """With noise and a faulty link."""
     found = Rehearsal.load(designed.folder)
     assert found is not None and found.passed and not found.failures
     assert found.plan_hash == designed.folder.plan_hash
-    assert [one.name for one in found.criteria] == [
-        "motions (as modelled)",
-        "current (as modelled)",
-        "excitation",
-        "parameters",
-        "unseen motion",
-        "motions (with what the model leaves out)",
-        "current (with what the model leaves out)",
-    ]
+    assert [one.name for one in found.criteria] == [*CRITERIA]
     require_rehearsed(designed.folder)
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [("repetitions = 4", "repetitions = 30"), ("gear_ratio = [100.0", "gear_ratio = [101.0")],
-)
-def test_another_cell_needs_another_rehearsal(
-    tmp_path: Path, designed: Campaign, old: str, new: str
-) -> None:
-    folder = CampaignFolder(tmp_path / "campaign")
-    shutil.copytree(designed.folder.root, folder.root)
-    text = folder.cell.read_text()
-    assert old in text
-    folder.cell.write_text(text.replace(old, new, 1))
-    with pytest.raises(NotRehearsedError, match="another cell, URDF or plan"):
-        require_rehearsed(folder)
-
-
-def test_the_plan_is_run_with_noise_and_a_faulty_link(designed: Campaign) -> None:
     twin = Campaign.open(designed.folder.rehearsed / "plain")
     assert twin.plan.to_text() == designed.plan.to_text()
     assert len(twin.folder.completed("excitation")) == 3
@@ -183,40 +154,25 @@ def test_a_report_of_the_archives_has_the_true_parameters(
     assert truths == twin.truth.tolist()
 
 
-class StopsAfter:
+class StopsAfter(Silent):
     """A reporter that asks for a stop as soon as something was recorded."""
 
     def __init__(self, stop: Stop) -> None:
-        self.stop, self.printed = stop, list[str]()
-
-    def say(self, text: str) -> None:
-        self.printed.append(text)
+        self.stop = stop
 
     @contextmanager
     def task(self, title: str, total: float) -> Iterator[Task]:
-        stop = self.stop
-
-        class Stopping:
-            def advance(self, units: float, note: str = "") -> None:
-                stop.requested = True
-
-        yield Stopping()
+        yield Task(lambda *_: setattr(self.stop, "requested", True))
 
 
-def test_a_stopped_rehearsal_resumes_and_a_passed_one_stays(
+def test_a_stopped_rehearsal_has_no_result_and_a_passed_one_stays(
     tmp_path: Path, designed: Campaign
 ) -> None:
-    campaign = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan)
-    stop = Stop()
-    with pytest.raises(OperatorStopError, match="rehearse again to resume it"):
+    campaign, stop = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan), Stop()
+    with pytest.raises(OperatorStopError, match="rehearse again"):
         campaign.rehearse(stop=stop, reporter=StopsAfter(stop))
     assert Rehearsal.load(campaign.folder) is None
-    unmodified = CampaignFolder(campaign.folder.rehearsed / "plain")
-    before = {entry.name: entry.sha256 for entry in unmodified.manifest()}
-    assert before
     assert campaign.rehearse().passed
-    after = {entry.name: entry.sha256 for entry in unmodified.manifest()}
-    assert before.items() <= after.items()
     written = campaign.folder.rehearsal.stat().st_mtime_ns
     assert campaign.rehearse().passed
     assert campaign.folder.rehearsal.stat().st_mtime_ns == written
@@ -284,10 +240,3 @@ def test_springs_of_the_twin_suit_axes_that_carry_each_other(cell: Cell) -> None
         for _ in range(4000):
             plant.step(np.zeros(7), step)
         assert plant.energy() < 2.0 * before
-
-
-@pytest.mark.slow
-def test_a_good_plan_of_seven_joints_passes_every_criterion(cell: Cell, tmp_path: Path) -> None:
-    campaign = Campaign.create(tmp_path / "campaign", cell, design(cell, Silent()))
-    found = campaign.rehearse()
-    assert found.passed, [one.sentence for one in found.criteria if not one.passed]

@@ -255,36 +255,18 @@ def many_choices() -> list[dict[str, object]]:
     ]  # fmt: skip
 
 
-def conduct(**changes: Any) -> dict[str, Any]:
-    """A campaign of two repetitions, one of them run twice, after a warm-up of three motions."""
-    archive = {
-        "kind": "excitation", "when": "2026-03-01T08:00:00+00:00", "seconds": 9.7, "cycles": 4870,
-        "missed": 0, "late": 0, "not_accepted": 0, "lost": 0, "outcome": "completed", "why": "",
-    }  # fmt: skip
-    return {
-        "steps": [
-            {"step": "rehearsal", "done": True, "words": "6 of 6 criteria passed", "details": []},
-            {"step": "dry run", "done": True, "words": "accepted by ada", "details": ["2 late"]},
-        ],
-        "warm_up": {
-            "verdict": "warm",
-            "threshold": 0.002,
-            "friction": [[60.0 - k - j if j else None for j in range(6)] for k in range(3)],
-            "change": [None, 0.02, 0.0015],
-        },
-        "recorded": [
-            archive | {"archive": "excitation_000_a1.mcap", "missed": 3},
-            archive
-            | {"archive": "excitation_001_a1.mcap", "outcome": "rejected", "why": "it was held"},
-            archive | {"archive": "excitation_001_a2.mcap"},
-        ],
-    } | changes
+STEPS = [
+    {"step": "rehearsal", "done": True, "words": "6 of 6 criteria passed", "details": []},
+    {"step": "dry run", "done": True, "words": "accepted by ada", "details": ["2 late"]},
+    {"step": "warm-up", "done": False, "words": "not warm", "details": ["still 1.3%"]},
+]
+"""Conduct of a campaign."""
 
 
 @pytest.fixture(scope="module")
 def results() -> Results:
     """Of a campaign, with everything that a page can show."""
-    return make_results(choices=many_choices(), conduct=conduct())
+    return make_results(choices=many_choices(), conduct={"steps": STEPS})
 
 
 @pytest.fixture(scope="module")
@@ -513,27 +495,11 @@ class TestFigures:
 class TestConduct:
     """How the campaign was run."""
 
-    def test_shows_rejected_motions_with_reason(self, whole: Page) -> None:
-        text = whole.text
-        assert "Execution" in text
-        assert "6 of 6 criteria passed" in text and "Accepted by ada" in text and "2 late" in text
-        assert "Repetition 2 ( excitation_001_a1.mcap ) rejected: it was held" in text
-        assert "3 packets missed (205 in a million)" in text
-        rows = whole.table("Archive")
-        assert [row["Outcome"] for row in rows] == ["completed", "▲ rejected", "completed"]
-        assert [row["Missed"] for row in rows] == ["3", "0", "0"]
-        assert "not warm" not in text
-
-    def test_may_be_missing_empty_or_of_a_cold_arm(self) -> None:
+    def test_shows_steps_and_may_be_missing(self, whole: Page) -> None:
+        for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
+            assert words in whole.text
+        assert "▲ Not warm" in whole.text and "still 1.3%" in whole.text
         assert "Execution" not in rendered(make_results()).text
-        text = rendered(make_results(conduct=conduct(warm_up=None, recorded=[]))).text
-        assert "No archive could be read" in text
-        cold = conduct()
-        cold["warm_up"] |= {"verdict": "not warm"}
-        words = {"done": False, "words": "not warm after 3 motions", "details": ["still 1.3%"]}
-        cold["steps"] = [{"step": "warm-up", **words}]
-        text = rendered(make_results(conduct=cold)).text
-        assert "▲ Not warm after 3 motions" in text and "still 1.3%" in text
 
 
 class TestNumbers:

@@ -65,7 +65,7 @@ def piles(seen: Observed) -> Iterator[str]:
                 yield f"{text} waited together; both were answered in open mode"
 
 
-_NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError", "ArmChangedError"})
+_NEEDS_OPERATOR: Final = frozenset({"RepetitionsRejectedError"})
 
 
 def completion(seen: Observed) -> Iterator[str]:

@@ -24,7 +24,6 @@ ALLOWED_ERRORS: Final = frozenset(
         "MotionFailedError",  # the guard, the link or a stop ended a motion
         "MotionRefusedError",  # the path from the present position is not free: jog the arm
         "RepetitionsRejectedError",  # contact, slip, or a changed arm
-        "ArmChangedError",  # a changed arm
         "DryRunError",  # the dry run is not accepted
         "AgainstGravityError",  # a torque is not accepted
         "OperatorStopError",  # stopped by the operator
