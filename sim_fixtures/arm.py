@@ -113,11 +113,6 @@ class UnmodelledEffects:
             delay=0.0005,
         )
 
-    @property
-    def is_elastic(self) -> bool:
-        """Whether any gear is elastic."""
-        return any(self.elasticity)
-
 
 class TorqueRipple:
     """Torque ripple of amplitudes (n,) [N m] on the joint side, with random phases."""
@@ -197,7 +192,7 @@ class SimulatedArm:
         self._substep = settings.period / settings.substeps
         # closed brakes hold the largest torques of the motors
         holding = [abs(t) for t in drive.joint_torques(drive.current_limit)]
-        if effects.is_elastic:
+        if any(effects.elasticity):
             self.plant: Plant = ElasticPlant(
                 urdf, truth, gravity=gravity, position=position, brake_torque=holding,
                 elasticity=effects.elasticity, step=self._substep,

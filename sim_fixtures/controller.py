@@ -86,15 +86,8 @@ HAS_OPEN_AXES = frozenset({Phase.OPENING, Phase.OPEN, Phase.CLOSING})
 LISTENING = frozenset({Phase.OPENING, Phase.OPEN})
 
 
-class StartStep(IntEnum):
-    """Kind of a packet of the start."""
-
-    SYNC = auto()
-    INIT = auto()
-
-
-COLD_START = (*[StartStep.SYNC] * 9, StartStep.INIT, StartStep.SYNC, StartStep.SYNC)
-WARM_START = (StartStep.INIT,)
+_COLD_START = (False,) * 9 + (True, False, False)
+"""Whether each packet of a cold start is the init packet; a warm one has no other."""
 
 
 def _cycles(count: int) -> str:
@@ -146,7 +139,7 @@ class LoopProgram:
         if only is not None and only > n_axes:
             raise SettingError("only_axis", only, f"1..{n_axes}")
         self.wanted_axes = [only in (None, axis + 1) for axis in range(n_axes)]
-        self._start = COLD_START if settings.cold_start else WARM_START
+        self._start = _COLD_START if settings.cold_start else (True,)
         self._age = 0
         self._missed = 0
         self._missed_open = 0
@@ -165,8 +158,8 @@ class LoopProgram:
         self._enter(Phase.START)
 
     @property
-    def start_step(self) -> StartStep:
-        """Kind of the present packet in phase START."""
+    def at_init(self) -> bool:
+        """Whether the present packet in phase START is the init packet."""
         return self._start[self._age]
 
     def finish(self) -> None:
@@ -255,7 +248,7 @@ class LoopProgram:
 
     def _advance_start(self, answer: Answer) -> None:
         """Advance through the packets of the start; an init packet without answer ends it."""
-        if self._start[self._age - 1] is StartStep.INIT and not answer.valid:
+        if self._start[self._age - 1] and not answer.valid:
             self.reason = "the init packet was not answered"
             self._enter(Phase.ENDED)
         elif self._age == len(self._start):
@@ -827,14 +820,6 @@ class SimulatedController:
         self._number = 10 if warm else 1
         self._silent = 0 if warm else round(self.settings.boot_time / self.period)
 
-    def axis_leaves(self, axis: int) -> None:
-        """Close one axis (from 1) while the others stay open."""
-        self.program.axis_leaves(axis - 1)
-
-    def pause(self, mode: int, cycles: int) -> None:
-        """Report mode 500 or 502 for some cycles, then closed axes."""
-        self.program.pause(mode, cycles)
-
     def disturb(self, kind: DisturbanceKind, axis: int, size: float, cycles: int) -> None:
         """Disturb one axis (from 1), slip relative to its threshold; see `Disturbances.begin`."""
         if kind == "slip":
@@ -859,7 +844,7 @@ class SimulatedController:
             return b""
         if phase is not Phase.START:
             return self._cyclic_packet(phase)
-        if self.program.start_step is StartStep.INIT:
+        if self.program.at_init:
             return self._layout.init(self._stated, self.period)
         return CyclicPacket.zeros(self._number, MAX_AXES).encode()
 

@@ -64,13 +64,13 @@ class ControllerFault:
             case "e-stop":
                 controller.lose_drive("emergency stop")
             case "axis-leaves":
-                controller.axis_leaves(self.axis)
+                controller.program.axis_leaves(self.axis - 1)
             case "following-error":
                 controller.disturb(
                     "slip" if self.word == "slip" else "jam", self.axis, SLIP, self.count
                 )
             case "pause":
-                controller.pause(int(self.word), self.count)
+                controller.program.pause(int(self.word), self.count)
             case _:
                 size = LOAD if self.kind == "saturate" else PUSH
                 controller.disturb("load", self.axis, size, self.count)

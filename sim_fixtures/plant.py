@@ -58,13 +58,6 @@ class PlantTruth:
             object.__setattr__(self, name, values)
         object.__setattr__(self, "_has_third", bool(self.third.any()))
 
-    @classmethod
-    def frictionless(cls, rotor_inertia: ArrayLike) -> PlantTruth:
-        """Return a truth without friction."""
-        rotors = np.asarray(rotor_inertia, dtype=np.float64)
-        zero = np.zeros_like(rotors)
-        return cls(rotors, zero, zero, zero)
-
     @property
     def n_joints(self) -> int:
         """Number of joints."""

@@ -62,10 +62,10 @@ class UdpControllerLink:
         foreign: number of datagrams from other addresses.
 
     Raises:
-        TransportError: no such host, or the local port is in use.
+        TransportError: no such host.
     """
 
-    def __init__(self, host: str, port: int, *, source_port: int | None = None) -> None:
+    def __init__(self, host: str, port: int) -> None:
         self.foreign = 0
         try:
             self._pc = (socket.gethostbyname(host), port)
@@ -73,19 +73,8 @@ class UdpControllerLink:
             reason = f"there is no such IPv4 host ({error})"
             raise TransportError(f"UDP to {host}:{port}", reason, "check the address") from error
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            self._socket.setblocking(False)
-            self._socket.bind(("", source_port or 0))
-        except (OSError, OverflowError) as error:
-            self._socket.close()
-            place = f"local UDP port {source_port}"
-            raise TransportError(place, str(error), "use another port") from error
-
-    @property
-    def source_port(self) -> int:
-        """Local port of sent packets."""
-        port: int = self._socket.getsockname()[1]
-        return port
+        self._socket.setblocking(False)
+        self._socket.bind(("", 0))
 
     def send(self, packet: bytes) -> None:
         """Send one datagram; it is lost if the network is down or full."""

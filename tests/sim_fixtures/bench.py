@@ -49,7 +49,14 @@ def motor_matrix(drive: SimulatedDrive) -> Array:
 DRIVE = make_drive()
 _PLANTED = [CELL["simulation"][name] for name in ("rotor_inertia", "coulomb", "viscous", "third")]
 TRUTH = PlantTruth(*map(np.array, _PLANTED))
-FRICTIONLESS = PlantTruth.frictionless(TRUTH.rotor_inertia)
+
+
+def frictionless(rotor_inertia: Any) -> PlantTruth:
+    rotors = np.array(rotor_inertia)
+    return PlantTruth(rotors, *[np.zeros_like(rotors)] * 3)
+
+
+FRICTIONLESS = frictionless(TRUTH.rotor_inertia)
 
 
 def _smooth_motion() -> tuple[Array, Array]:

@@ -534,7 +534,7 @@ class TestLeaving:
 
     def test_an_axis_that_leaves_by_itself_stays_closed_until_all_open_again(self) -> None:
         controller = opened()
-        controller.axis_leaves(2)
+        controller.program.axis_leaves(1)
         for status in (0, 0, 0, STATUS_EXIT):
             assert step(controller, status=status).axes["mode"].tolist() == [4, 0]
         seen = [tuple(step(controller).axes["mode"].tolist()) for _ in range(30)]

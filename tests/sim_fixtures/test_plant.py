@@ -26,7 +26,7 @@ from sim_fixtures import (
 from sim_fixtures.arm import FrictionDrift, TorqueRipple
 from sim_fixtures.plant import TOLERANCE, resolve_dry_friction
 from sim_fixtures.servo import CurrentLoop, NominalModel, Servo
-from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, motor_matrix
+from tests.sim_fixtures.bench import CELL, DRIVE, FRICTIONLESS, TRUTH, frictionless, motor_matrix
 
 Array = NDArray[np.float64]
 START = np.array([0.2, -1.2, 2.5, 0.3, 1.0, 0.2])
@@ -336,15 +336,14 @@ def test_encoders_read_whole_counts() -> None:
     np.testing.assert_allclose((shifted - read) * DRIVE.encoder_counts, 2.0, atol=1e-6)
 
 
-SIMPLE = PlantTruth.frictionless(np.ones(6))
-NO_ROTORS = PlantTruth.frictionless(np.zeros(6))
+SIMPLE, NO_ROTORS = frictionless(np.ones(6)), frictionless(np.zeros(6))
 NO_WRIST = ((1.0, 1.0),) * 7
 
 
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: Plant(ns16.urdf_text(), PlantTruth.frictionless((1.0, 1.0))), "6 degrees of"),
+        (lambda: Plant(ns16.urdf_text(), frictionless((1.0, 1.0))), "6 degrees of"),
         (lambda: replace(SIMPLE, coulomb=-np.ones(6)), "coulomb"),
         (lambda: elastic(NO_ROTORS, (1e-6,) * 6), "rotor_inertia"),
         (lambda: elastic(SIMPLE, (0.0, 0.0, 0.0, 0.0, 0.0, 1e-8)), "resonances below"),
