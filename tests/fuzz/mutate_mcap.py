@@ -10,6 +10,7 @@ import contextlib
 import random
 import struct
 import zlib
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import lz4.frame
@@ -20,6 +21,7 @@ from hil.archive import container, header
 from hil.archive.container import Damage, encode
 from hil.archive.header import format_chunk_list
 from tests.fuzz.draw import mutate_bytes, mutate_text
+from tests.fuzz.targets import Mutation
 from tests.hil.mcap_bytes import Indexed
 from tests.hil.mcap_bytes import record as record_of
 
@@ -154,38 +156,36 @@ def _change(records: list[Record], rng: random.Random) -> None:
     if kind < 0.12:
         _shuffled(records, rng)
     elif one.inside:
-        if rng.random() < 0.15:
+        if kind < 0.25:
             one.times = (rng.choice((0, *one.times, 1 << 63)), rng.choice((*one.times, 0)))
-        elif rng.random() < 0.2:
+        elif kind < 0.4:
             one.compression = rng.choice(("", "zstd", "lz4", "gzip"))
-        elif rng.random() < 0.25:
+        elif kind < 0.55:
             _shuffled(one.inside, rng)
         else:
             for message in rng.sample(one.inside, min(len(one.inside), rng.choice((1, 1, 3, 50)))):
                 _of_a_message(message, rng)
-    elif one.opcode == container.METADATA:
-        _of_metadata(one, rng)
-    elif one.opcode == container.ATTACHMENT:
-        _of_an_attachment(one, rng)
-    elif one.opcode in (container.SCHEMA, container.CHANNEL) and rng.random() < 0.7:
-        words = mutate_text(one.body[4:], len(one.body) + 200, rng.getrandbits(32))
-        one.body = one.body[:4] + words
+    elif one.opcode in (container.METADATA, container.ATTACHMENT):
+        with contextlib.suppress(Damage):  # unreadable
+            one.body = body_of(_with_other_entry(one, rng))
+    elif one.opcode in (container.SCHEMA, container.CHANNEL) and kind < 0.7:
+        one.body = one.body[:4] + _mutated(one.body[4:], rng, mutate_text)
     else:
-        one.body = mutate_bytes(one.body, len(one.body) + 64, rng.getrandbits(32))
+        one.body = _mutated(one.body, rng)
+
+
+def _mutated(data: bytes, rng: random.Random, mutate: Mutation = mutate_bytes) -> bytes:
+    return mutate(data, len(data) + 500, rng.getrandbits(32))
 
 
 def _shuffled(records: list[Record], rng: random.Random) -> None:
-    if not records:
-        return
+    """Remove, repeat or exchange records, or change the kind of one."""
     at, other = rng.randrange(len(records)), rng.randrange(len(records))
     kind = rng.randrange(4)
     if kind == 0 and len(records) > 1:
         del records[at]
     elif kind == 1:
-        one = records[at]
-        copy = Record(one.opcode, one.body, None, one.compression, one.times)
-        copy.inside = None if one.inside is None else [Record(r.opcode, r.body) for r in one.inside]
-        records.insert(other, copy)
+        records.insert(other, deepcopy(records[at]))
     elif kind == 2:
         records[at], records[other] = records[other], records[at]
     else:
@@ -193,53 +193,39 @@ def _shuffled(records: list[Record], rng: random.Random) -> None:
 
 
 def _of_a_message(message: Record, rng: random.Random) -> None:
+    """Change its number, times or channel, a value in it, or any bytes."""
     if message.opcode != container.MESSAGE or len(message.body) < _MESSAGE.size:
-        message.body = mutate_bytes(message.body, len(message.body) + 64, rng.getrandbits(32))
+        message.body = _mutated(message.body, rng)
         return
-    head = list(_MESSAGE.unpack_from(message.body))
-    data = message.body[_MESSAGE.size :]
+    head, data = list(_MESSAGE.unpack_from(message.body)), message.body[_MESSAGE.size :]
     kind = rng.randrange(6)
     if kind < 4:
         strange = (0, 1, head[kind] + 1, head[kind] - 1, 2**63, 2**16 - 1, 2**32 - 1)
-        limit = (1 << 16, 1 << 32, 1 << 64, 1 << 64)[kind]
-        head[kind] = rng.choice(strange) % limit
+        head[kind] = rng.choice(strange) % (1 << 16, 1 << 32, 1 << 64, 1 << 64)[kind]
         if kind > 1 and rng.random() < 0.7:
             head[2] = head[3] = head[kind]
     elif kind == 4:
-        data = mutate_bytes(data, len(data) + 64, rng.getrandbits(32))
+        data = _mutated(data, rng)
     else:
-        changed = bytearray(data)
-        at = rng.randrange(max(1, len(changed) // 8)) * 8 + 4
+        at = rng.randrange(max(1, len(data) // 8)) * 8 + 4
         value = rng.choice((float("nan"), float("inf"), -1e308, 1e308, 0.0, 5e-324))
-        changed[at : at + 8] = struct.pack("<d", value)
-        data = bytes(changed)
+        data = data[:at] + struct.pack("<d", value) + data[at + 8 :]
     message.body = _MESSAGE.pack(*head) + data
 
 
-def _of_metadata(one: Record, rng: random.Random) -> None:
-    try:
+def _with_other_entry(one: Record, rng: random.Random) -> Attachment | Metadata:
+    """Metadata with an entry changed or removed, or an attachment with other data or name."""
+    if one.opcode == container.METADATA:
         name, entries = entries_of(one)
-    except Damage:
-        one.body = mutate_bytes(one.body, len(one.body) + 64, rng.getrandbits(32))
-        return
-    key = rng.choice([*entries, "period", "joint_names", "kind"])
-    if rng.random() < 0.2:
-        entries.pop(key, None)
-    else:
-        changed = mutate_text(entries.get(key, "").encode() or b"0", 6000, rng.getrandbits(32))
-        entries[key] = changed.decode("utf-8", "replace")
-    one.body = body_of(Metadata(name, entries))
-
-
-def _of_an_attachment(one: Record, rng: random.Random) -> None:
-    try:
-        found = container.parse(Attachment, container.Record(0, one.opcode, one.body))
-    except Damage:
-        return
+        key = rng.choice([*entries, "period", "joint_names", "kind"])
+        changed = _mutated(entries.pop(key, "").encode() or b"0", rng, mutate_text)
+        if rng.random() > 0.2:
+            entries[key] = changed.decode("utf-8", "replace")
+        return Metadata(name, entries)
+    found = container.parse(Attachment, container.Record(0, one.opcode, one.body))
     if rng.random() < 0.1:
-        names = ("../../x", "/dev/zero", "", "plan.json", "cell.toml", "init_packet.bin")
-        found.name = rng.choice(names)
+        found.name = rng.choice(("../../x", "/dev/zero", "", "plan.json", "init_packet.bin"))
     else:
-        change = mutate_bytes if found.name.endswith(".bin") else mutate_text
-        found.data = change(found.data, len(found.data) + 500, rng.getrandbits(32))
-    one.body = body_of(found)
+        binary = found.name.endswith(".bin")
+        found.data = _mutated(found.data, rng, mutate_bytes if binary else mutate_text)
+    return found
