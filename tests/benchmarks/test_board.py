@@ -175,19 +175,6 @@ class TestDegradations:
     def test_every_fault_has_an_expected_cause(self) -> None:
         assert DEGRADATIONS.keys() == EXPECTED.keys() >= FITTED_ONLY
 
-    def test_stamps_and_rows(self, logs: Logs) -> None:
-        log = logs["one"]
-        late = degradations.jittered_stamps(log).time - log.time
-        assert late.std() == pytest.approx(0.15 * 0.01, rel=0.1)
-        assert np.diff(log.time + late).min() > 0.0
-        fewer = degradations.lost_rows(log)
-        assert fewer.n_rows / log.n_rows == pytest.approx(0.98, abs=0.01)
-        assert np.isin(fewer.time, log.time).all()
-        slow = degradations.resampled(self.CLEAN)
-        assert np.diff(slow.time) == pytest.approx(1.0 / 94.0)
-        expected = np.interp(slow.time, self.CLEAN.time, self.CLEAN.position[:, 0])
-        assert slow.position[:, 0] == pytest.approx(expected)
-
     def test_filters_leave_what_is_slow(self) -> None:
         quick = np.sin(2.0 * np.pi * 30.0 * self.CLEAN.time)[:, None]
         torque, position = self.CLEAN.torque, self.CLEAN.position

@@ -7,16 +7,12 @@ are compared with the packets and answers, decoded here.
 
 from __future__ import annotations
 
-import io
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader
 from numpy.typing import NDArray
 
 from drivers.events import MotionEnded, MotionStarted
@@ -86,10 +82,10 @@ def archives(observed: Observed) -> Iterator[str]:
     all_placed = placed(observed)
     for number, one in enumerate(all_placed):
         name = one.archived.path.name
-        by_library = number == observed.seed % len(all_placed)
+        intact_too = number == observed.seed % len(all_placed)
         newest = any(one is p for p in _newest(all_placed, one.life))
         texts = [
-            *_readable(one, by_library=by_library, newest=newest),
+            *_readable(one, intact_too=intact_too, newest=newest),
             *_columns(one.archived, observed.cell.period),
             *_stated(one),
             *_made_of(one, gears, constants),
@@ -111,16 +107,14 @@ def _last_of(one: Placed) -> int:
     return int(one.talk.index[one.rows[-1]]) if one.talk is not None and len(one.rows) else -1
 
 
-def _readable(one: Placed, *, by_library: bool, newest: bool) -> Iterator[str]:
+def _readable(one: Placed, *, intact_too: bool, newest: bool) -> Iterator[str]:
     archived, life = one.archived, one.life
     name = archived.path.name
     being_written = newest and (life.died or bool(life.disk))  # at the fault
     if not archived.whole and not being_written and name not in life.torn:
         yield f"is incomplete ({archived.problem}) without a fault that truncated it"
-    if not archived.whole or by_library:
+    if not archived.whole or intact_too:
         yield from _as_the_product_reads(archived)
-    if by_library:
-        yield from _as_the_library_reads(archived)
 
 
 def _as_the_product_reads(archived: Archived) -> Iterator[str]:
@@ -138,22 +132,6 @@ def _as_the_product_reads(archived: Archived) -> Iterator[str]:
         same = np.array_equal(columns["cycle"], archived.cycles["cycle"])
         if not same or not np.array_equal(columns["position"], archived.cycles["position"]):
             yield f"{len(columns['cycle'])} records are read of {len(archived.cycles)}"
-
-
-def _as_the_library_reads(archived: Archived) -> Iterator[str]:
-    """The reader of the `mcap` library finds the same messages and times."""
-    stamps = []
-    try:
-        reader = NonSeekingReader(io.BytesIO(archived.path.read_bytes()), validate_crcs=True)
-        for _, channel, message in reader.iter_messages(log_time_order=False):
-            if channel.topic == "/hil/cycle":
-                stamps.append(message.log_time)
-    except (McapError, ValueError, struct.error) as error:  # the last: truncated within an index
-        if archived.whole:
-            yield f"the mcap library cannot read it: {type(error).__name__}: {error}"
-            return
-    if not np.array_equal(stamps, archived.stamps):
-        yield f"the mcap library finds {len(stamps)} cycles, {len(archived.stamps)} are there"
 
 
 def _columns(archived: Archived, period: float) -> Iterator[str]:
