@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Channel, Message
-from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
 from drivers.states import State
@@ -23,6 +19,7 @@ from hil.errors import ArchiveError
 from sim_fixtures import Phase
 from tests.process_death.controller import REST, at_rest
 from tests.process_death.rig import Seen
+from tests.simulate.laws.archived import read
 
 Records = NDArray[np.void]
 
@@ -174,35 +171,17 @@ def _is_newest(path: Path) -> bool:
 
 
 def _readable(one: Recorded, seen: Seen) -> Iterator[str]:
-    """An archive is a gap-free prefix, also for the `mcap` package."""
+    """An archive is a gap-free prefix, also for the second reader."""
     if one.cycles.size and (np.diff(one.cycles) != 1).any():
         yield f"{one.path.name} has gaps"
     if not one.archive.complete and not ("archive" in seen.killed and _is_newest(one.path)):
         yield f"{one.path.name} is not complete: {one.archive.missing}"
-    found = _cycles_by_mcap(one.path, whole=one.archive.complete)
+    found = len(read(one.path).cycles)
     if found != one.cycles.size:
-        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the mcap package"
+        yield f"{one.path.name}: {one.cycles.size} cycles, but {found} for the second reader"
     outcome = one.archive.outcome
     if outcome is not None and outcome.records_lost:
         yield f"{one.path.name} states that {outcome.records_lost} records were lost"
-
-
-def _cycles_by_mcap(path: Path, *, whole: bool) -> int:
-    """Return the number of cycles that the `mcap` package reads."""
-    with path.open("rb") as stream:
-        if whole:
-            reader = make_reader(stream, validate_crcs=True)
-            return sum(1 for _ in reader.iter_messages(topics=["/hil/cycle"]))
-        count, channels = 0, dict[int, str]()
-        try:
-            for record in StreamReader(stream, validate_crcs=True).records:
-                if isinstance(record, Channel):
-                    channels[record.id] = record.topic
-                elif isinstance(record, Message):
-                    count += channels[record.channel_id] == "/hil/cycle"
-        except (McapError, EOFError):
-            pass  # a truncated file ends somewhere
-        return count
 
 
 def _as_exchanged(one: Recorded, records: Records) -> Iterator[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 
 from tests.simulate import world
 from tests.simulate.__main__ import main
-from tests.simulate.many import recorded, stage_folder
+from tests.simulate.many import stage_folder
 from tests.simulate.scenes import NEIGHBOURS, scene_of
 from tests.simulate.script import DRAWS, Story, draw_script, kind_of, parse_script
 from tests.simulate.verdicts import Stage, Verdict, judged, shrunk, summary
@@ -49,17 +48,6 @@ class TestShrinking:
         both = {"kill@200", "kill@700"}
         assert set(shrunk(lines, lambda candidate: both <= set(candidate))) == both
 
-    def test_it_ends_after_some_tries(self) -> None:
-        tried: list[tuple[str, ...]] = []
-        lines = tuple(f"kill@{at}" for at in range(100, 900, 100))
-
-        def fails(candidate: tuple[str, ...]) -> bool:
-            tried.append(candidate)
-            return False
-
-        shrunk(lines, fails, tries=5)
-        assert len(tried) == 5
-
 
 def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
     met = ("the process died",)
@@ -67,11 +55,6 @@ def verdict(seed: int, *broken: tuple[str, str]) -> Verdict:
 
 
 class TestJournal:
-    def test_verdicts_are_restored_before_an_incomplete_line(self, tmp_path: Path) -> None:
-        path, found = tmp_path / "seeds.jsonl", verdict(3, ("guard", "too fast"))
-        path.write_text(json.dumps(asdict(found)) + '\n{"seed": 5, "scr')
-        assert recorded(path) == {3: found}
-
     def test_a_summary_counts_kinds_ends_and_failures(self) -> None:
         found = summary([verdict(1), verdict(2, ("guard", "a"), ("guard", "b"), ("rest", "c"))])
         assert (found["ran"], found["failed"], found["seeds_failed"]) == (2, 1, [2])
@@ -129,10 +112,6 @@ class TestCommand:
             printed = json.loads(capsys.readouterr().out.splitlines()[-1])
             assert (printed["ran"], printed["failed"], printed["seeds_failed"]) == (2, 0, [])
         assert len(Path(journal).read_text().splitlines()) == 2
-
-    def test_a_missing_script_is_named(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["--seed", "1", "--script", "/nowhere/script"]) == 2
-        assert "/nowhere/script" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
