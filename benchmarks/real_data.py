@@ -36,8 +36,7 @@ from benchmarks import parser_of, show
 from benchmarks.published import FITTED_SHARE, Published
 from hil.identify import Options
 from hil.identify.estimating import estimate_with
-from hil.identify.prepared import prepare_sources
-from hil.identify.settings import samples_of
+from hil.identify.prepared import prepare_sources, samples_of
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from hil.recordings import open_recording

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from os.path import commonpath
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -22,7 +22,7 @@ from scipy.stats import t as student
 from hil.batch import run
 from hil.batch.discovery import ArchiveRef, cell_in, open_ref
 from hil.batch.run import Arm, LevelEstimate
-from hil.batch.workers import Unused, Workers
+from hil.batch.workers import Workers
 from hil.errors import InputError
 from hil.identify.options import Options
 from hil.identify.sources import arm_differences
@@ -85,18 +85,6 @@ class Change:
 
 
 @dataclass(frozen=True, eq=False)
-class CampaignSet:
-    """Campaigns of one arm."""
-
-    arm: Arm
-    #: in chronological order if the times of all are known, else as given
-    campaigns: tuple[LevelEstimate, ...]
-    repetitions: tuple[tuple[LevelEstimate, ...], ...]  #: of each campaign
-    broken: tuple[Unused, ...] = ()  #: archives that could not be used
-    simulated: bool = False
-
-
-@dataclass(frozen=True, eq=False)
 class Comparison:
     """Changes of the campaigns of one arm from the first."""
 
@@ -136,8 +124,10 @@ class Comparison:
         }
 
 
-def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> CampaignSet:
+def compare(places: Sequence[str], workers: Workers, reporter: Reporter) -> Comparison:
     """Identify campaigns, given as folders or `results.json`, by unregularised least squares.
+
+    They are compared in chronological order if the times of all are known, else as given.
 
     Raises:
         InputError: there is only one campaign, or they are of different arms.
@@ -166,20 +156,18 @@ def gather(places: Sequence[str], workers: Workers, reporter: Reporter) -> Campa
 
     dated = all(one.when for one in campaigns)
     campaigns.sort(key=order)
-    return CampaignSet(
-        arm=result.arms[campaigns[0].arm],
-        campaigns=tuple(campaigns),
-        repetitions=tuple(
-            tuple(
-                each
-                for each in result.repetitions
-                if (each.campaign, each.setup) == (one.campaign, one.setup)
-            )
-            for one in campaigns
-        ),
-        broken=result.broken,
-        simulated=refs[0].simulated,  # as all of one arm
-    )
+    repetitions = [
+        [
+            each
+            for each in result.repetitions
+            if (each.campaign, each.setup) == (one.campaign, one.setup)
+        ]
+        for one in campaigns
+    ]
+    found = compare_campaigns(result.arms[campaigns[0].arm], campaigns, repetitions)
+    lost = [f"{path} could not be used: {reason}" for path, reason in result.broken]
+    # All archives of an arm are simulated, or none.
+    return replace(found, simulated=refs[0].simulated, warnings=(*lost, *found.warnings))
 
 
 def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
@@ -202,13 +190,13 @@ def _require_campaigns_of_one_arm(found: Sequence[ArchiveRef]) -> None:
         raise InputError(first.campaign, "is the only campaign given", remedy=_TWO)
 
 
-def compare_campaigns(gathered: CampaignSet) -> Comparison:
-    """Compare the parameters of the campaigns of one arm with those of the first."""
-    model, campaigns = gathered.arm.cell.model, gathered.campaigns
-    names, compared = _names(campaigns), quantities(model, campaigns[0])
-    figures = np.array(
-        [_figures(compared, *pair) for pair in zip(campaigns, gathered.repetitions, strict=True)]
-    )
+def compare_campaigns(
+    arm: Arm, campaigns: Sequence[LevelEstimate], repetitions: Sequence[Sequence[LevelEstimate]]
+) -> Comparison:
+    """Compare the parameters of campaigns of one arm, with their repetitions, with the first."""
+    names, compared = _names(campaigns), quantities(arm.cell.model, campaigns[0])
+    pairs = zip(campaigns, repetitions, strict=True)
+    figures = np.array([_figures(compared, *pair) for pair in pairs])
     value, variance, _ = np.moveaxis(figures, 2, 0)
     change, half, p_value = against_first(figures)
     std = np.sqrt(variance)
@@ -234,14 +222,14 @@ def compare_campaigns(gathered: CampaignSet) -> Comparison:
         for k, one in enumerate(compared)
     )
     return Comparison(
-        arm=gathered.arm.name,
-        simulated=gathered.simulated,
+        arm=arm.name,
+        simulated=False,
         dated=all(one.when for one in campaigns),
         verdict=_verdict([one for one in changes if one.changed]),
-        campaigns=campaigns,
+        campaigns=tuple(campaigns),
         names=tuple(names),
         changes=changes,
-        warnings=(*_warnings(names, gathered), _CAVEAT),
+        warnings=(*_warnings(names, campaigns, repetitions), _CAVEAT),
     )
 
 
@@ -309,19 +297,23 @@ def _names(campaigns: Sequence[LevelEstimate]) -> list[str]:
     return names
 
 
-def _warnings(names: Sequence[str], gathered: CampaignSet) -> list[str]:
-    found = [f"{path} could not be used: {reason}" for path, reason in gathered.broken]
-    setups = {name: one.setup for name, one in zip(names, gathered.campaigns, strict=True)}
+def _warnings(
+    names: Sequence[str],
+    campaigns: Sequence[LevelEstimate],
+    repetitions: Sequence[Sequence[LevelEstimate]],
+) -> list[str]:
+    found = []
+    setups = {name: one.setup for name, one in zip(names, campaigns, strict=True)}
     if len(set(setups.values())) > 1:
         stated = "; ".join(f"{name}: {setup or 'nothing'}" for name, setup in setups.items())
         found.append(f"the cells state different payloads or delays, compensated ({stated})")
-    for name, own in zip(names, gathered.repetitions, strict=True):
+    for name, own in zip(names, repetitions, strict=True):
         if len(own) < 2:
             found.append(
                 f"{name}: with one repetition, uncertainty includes noise only, not the scatter of"
                 " repetitions"
             )
-    each = zip(names, gathered.campaigns, strict=True)
+    each = zip(names, campaigns, strict=True)
     return found + [f"{name}: {warning}" for name, one in each for warning in one.warnings]
 
 

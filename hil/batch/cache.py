@@ -26,7 +26,7 @@ import hil
 import identification
 from hil.errors import InputError
 from hil.files import digest, json_digest, replace_file
-from hil.identify.settings import Settings
+from hil.identify.prepared import Settings
 from hil.reading import open_file
 from identification.estimators.consistent import Shrinkage
 from identification.factor.factor import Estimate, Factor

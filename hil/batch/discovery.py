@@ -20,7 +20,7 @@ from hil.campaign.folder import CampaignFolder, Entry
 from hil.cell import Cell
 from hil.errors import ArchiveError, InputError
 from hil.files import digest, file_digest, json_digest
-from hil.identify.settings import Settings, stated_delay
+from hil.identify.prepared import Settings, stated_delay
 from hil.progress import Reporter
 
 from .cache import BESIDE, CacheLocation, cacheable, code_digest

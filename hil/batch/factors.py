@@ -13,7 +13,7 @@ from hil.archive import Archive
 from hil.errors import ArchiveError
 from hil.files import json_digest
 from hil.identify.options import Options
-from hil.identify.settings import (
+from hil.identify.prepared import (
     MAX_RECORDINGS,
     Settings,
     carried_over,

@@ -17,7 +17,7 @@ from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.estimating import centre_of, fit_of
 from hil.identify.options import Options
-from hil.identify.settings import Settings
+from hil.identify.prepared import Settings
 from hil.progress import Reporter
 from identification import IdentificationError
 from identification.estimators.consistent import Shrinkage, fit_shrunk

@@ -7,9 +7,9 @@ from typing import Annotated, Final
 
 import typer
 
+from hil import compare as comparing
 from hil.batch.workers import LocalWorkers
 from hil.cli.arguments import JsonOption, QuietOption, print_json
-from hil.compare import compare_campaigns, gather
 from hil.files import make_folder, write_files
 from hil.progress import reporter as make_reporter
 from hil.terminal_text import printable
@@ -38,7 +38,7 @@ def compare(
     """
     reporter = make_reporter(quiet=quiet or json)
     with LocalWorkers() as workers:
-        found = compare_campaigns(gather(campaigns, workers, reporter))
+        found = comparing.compare(campaigns, workers, reporter)
     if output is not None:
         from hil.report.changes import comparison_page  # figures are slow to import
 

@@ -12,7 +12,6 @@ import typer
 from hil.cli.arguments import JsonOption, QuietOption, figures
 from hil.cli.identify_options import DelayOption, delay_from
 from hil.cli.verdict import NOT_GOOD
-from hil.files import write_output
 from hil.identify.options import Options
 from hil.identify.payload_run import PayloadFound, find_payload
 from hil.progress import reporter as make_reporter
@@ -23,7 +22,6 @@ def payload(
     loaded: list[Path] | None = None,
     frame: str | None = None,
     check: Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE")] = None,
-    urdf: Path | None = None,
     delay: DelayOption = None,
     quiet: QuietOption = False,
     json: JsonOption = False,
@@ -41,7 +39,6 @@ def payload(
             the last joint, else the link of that joint.
         check: Known value, such as mass=4.0 (kg): exit status 5 if it lies outside its 95 %
             interval (repeatable).
-        urdf: File for the payload as a link of a URDF.
     """
     wanted = figures(check or [], "--check", "mass=4.0", bare=False)
     reporter = make_reporter(quiet=quiet or json)
@@ -52,8 +49,6 @@ def payload(
         found.as_json() | {"checked": wanted, "outside": outside}, indent=1, ensure_ascii=False
     )
     lines = payload_lines(found, wanted, outside)
-    if urdf is not None:
-        write_output(urdf, found.urdf)
     typer.echo(text if json else "\n".join(lines))
     if outside:
         raise typer.Exit(NOT_GOOD)

@@ -55,8 +55,7 @@ from identification.signals.samples import Samples
 from identification.validation.finding import joined
 
 from .options import Estimator, Options
-from .prepared import Prepared
-from .settings import samples_of
+from .prepared import Prepared, samples_of
 
 # Hz. A narrower smoother removes part of the motion from the regressor, a bias that instruments
 # cannot correct. On simulated NS 16 logs with 100 to 1000 times the encoder noise, instrumental

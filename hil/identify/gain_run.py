@@ -20,8 +20,7 @@ from identification.model.payload import Payload
 from identification.signals.recording import RecordingError
 
 from .options import FIXED
-from .prepared import motor_from_joint
-from .settings import samples_of, stated_settings
+from .prepared import motor_from_joint, samples_of, stated_settings
 from .sources import cell_of, source_of
 
 

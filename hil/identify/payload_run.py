@@ -23,8 +23,7 @@ from identification.model.pseudo_inertia import Body
 from identification.model.robot import RobotModel
 
 from .options import Options
-from .prepared import prepare_sources
-from .settings import samples_of
+from .prepared import prepare_sources, samples_of
 from .sources import aligned, archives_in, arm_differences, gather_sources, refuse_duplicates
 
 Array = NDArray[np.float64]
@@ -120,31 +119,6 @@ class PayloadFound:
             "UR": f"set_target_payload({mass}, [{metres}], [{', '.join(six)}])",
             "Franka": f"robot.setLoad({mass}, {{{metres}}}, {{{', '.join(nine)}}});",
         }
-
-    @property
-    def urdf(self) -> str:
-        """URDF of the payload, fixed to the frame's link."""
-        xyz = " ".join(repr(float(part)) for part in self.body.centre)
-        names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
-        tensor = " ".join(
-            f'{name}="{float(part)!r}"' for name, part in zip(names, self.figures[4:], strict=True)
-        )
-        return f"""<?xml version="1.0"?>
-<robot name="payload">
-  <link name="{self.frame}"/>
-  <joint name="payload_mount" type="fixed">
-    <parent link="{self.frame}"/>
-    <child link="payload"/>
-  </joint>
-  <link name="payload">
-    <inertial>
-      <origin xyz="{xyz}" rpy="0 0 0"/>
-      <mass value="{float(self.body.mass)!r}"/>
-      <inertia {tensor}/>
-    </inertial>
-  </link>
-</robot>
-"""
 
     def as_json(self) -> dict[str, Any]:
         """Return all values as JSON data; infinite ends of intervals are null."""

@@ -1,27 +1,314 @@
-"""Preparation: from recordings to samples."""
+"""Preparation: settings, stated or chosen from the fitted data, and recordings to samples."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hil.cell import Cell
+from hil.cell.robot import ripples
 from hil.errors import ArchiveError
 from hil.progress import Reporter
-from identification.estimators.delay import DelayEstimate
+from identification.errors import IdentificationError
+from identification.estimators.consistent import Shrinkage
+from identification.estimators.delay import DelayEstimate, estimate_delay
+from identification.estimators.torque_channel import possible_low_passes
+from identification.model.elements import TorqueRipple
+from identification.model.robot import RobotModel
+from identification.selection.inner_prediction import Choice, Question, choose_settings
+from identification.selection.inner_prediction import Settings as Candidate
 from identification.signals.clock import time_base
 from identification.signals.recording import Recording
-from identification.signals.samples import Samples
+from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, Samples, prepare
+from identification.validation.finding import Thresholds
 from planner.arrays import numbers
 
 from .options import Options
-from .settings import Settings, decide, samples_of, validation_samples
-from .sources import Sources
+from .sources import Source, Sources
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the preprocessing and estimation of an arm's archives; serialisable."""
+
+    preprocessing: Preprocessing  #: with the delay of the torque
+    #: entries of `[robot.friction]` that replace the cell's
+    friction: Mapping[str, Any] = field(default_factory=dict)
+    #: of the positions (n,) [rad² or m²]; None estimates it in each recording
+    noise_variance: tuple[float, ...] | None = None
+    #: of the torques (n,) [N²·m² or N²]; None estimates it in each recording
+    torque_variance: tuple[float, ...] | None = None
+    stated_delay: float = 0.0  #: of the torque, by cell or options [s]
+    delay_variance: float = 0.0  #: of an estimated delay [s²]; zero for a stated one
+    shrinkage: Shrinkage = Shrinkage()  # noqa: RUF009 - frozen
+    choices: tuple[Choice, ...] = ()  #: made by inner prediction
+
+    def preprocessed(self, **changes: Any) -> Settings:
+        """Return these settings with changes of the preprocessing."""
+        return replace(self, preprocessing=replace(self.preprocessing, **changes))
+
+    def with_friction_law(self, cell: Cell) -> Cell:
+        """Return the cell with the friction law of these settings."""
+        return cell.with_friction(**self.friction) if self.friction else cell
+
+
+def stated_delay(cell: Cell) -> float:
+    """Return the delay of the torque that `[controller]` states [s]."""
+    controller = cell.file.controller
+    return controller.current_delay_cycles * cell.period if controller else 0.0
+
+
+def stated_settings(cell: Cell, options: Options) -> Settings:
+    """Return the settings that cell and options state, before any automatic choice."""
+    delay, bandwidth = options.delay, options.torque_bandwidth
+    delay = delay if isinstance(delay, float) else stated_delay(cell)
+    return Settings(
+        Preprocessing(
+            rigid_bandwidth=RIGID_BANDWIDTH if options.bandwidth == "auto" else options.bandwidth,
+            velocity="position" if options.velocity == "auto" else options.velocity,
+            left_out=None if options.standstill == "auto" else options.standstill,
+            smooth_torque=options.method == "paper",
+            torque_delay=delay,
+            torque_bandwidth=bandwidth if isinstance(bandwidth, float) else None,
+        ),
+        friction={} if options.friction == "auto" else dict(options.friction),
+        stated_delay=delay,
+    )
+
+
+def samples_of(
+    source: Source, cell: Cell, settings: Settings, model: RobotModel | None = None
+) -> Samples:
+    """Return the samples of a source, for a fit.
+
+    The friction law is that of the cell; `model` replaces the cell's.
+
+    Raises:
+        RecordingError: the recording cannot be prepared.
+    """
+    recording, start = source.context or (source.recording, 0)
+    driven = cell.file.drive_train is not None
+    samples = prepare(
+        recording,
+        model or cell.model,
+        noise_variance=_array(settings.noise_variance),
+        torque_variance=_array(settings.torque_variance),
+        options=settings.preprocessing,
+        origin=source.origin,
+        current_limit=np.array(cell.drive_table.current_limit) if driven else None,
+    )
+    if source.context is None:
+        return samples
+    return samples.between(start, start + source.recording.n_samples)
+
+
+def validation_samples(source: Source, cell: Cell, settings: Settings) -> Samples:
+    """Return the samples of a source for a verdict: rows in motion, torque as recorded.
+
+    Raises:
+        RecordingError: the recording cannot be prepared.
+    """
+    return samples_of(source, cell, settings.preprocessed(smooth_torque=False)).moving()
+
+
+def _array(figures: tuple[float, ...] | None) -> Array | None:
+    return None if figures is None else np.array(figures)
+
+
+MAX_RECORDINGS: Final = 32
+"""Recordings that settings are chosen from."""
+_DELAY_SAMPLES: Final = 8000  # A stated delay is checked on the first samples of a recording
+RIPPLE: Final = ((1,), (2,), (1, 2))
+"""Periods of a torque ripple per motor turn: rotor eccentricity, wave generator, both."""
+
+
+class Decided(NamedTuple):
+    """Chosen settings."""
+
+    settings: Settings
+    delays: DelayEstimate | None  #: in the longest recording; None if it cannot be determined
+    notes: tuple[str, ...]  #: about delays, one sentence each
+
+
+def decide(sources: Sources, options: Options, reporter: Reporter) -> Decided:
+    """Choose the settings that the options leave open, from sources with torques and noise.
+
+    Raises:
+        RecordingError: a recording cannot be prepared.
+        IdentificationError: a delay was requested and no row is usable.
+    """
+    sources = replace(sources, training=sources.training[:MAX_RECORDINGS])
+    stated = _with_noise_of(stated_settings(sources.cell, options), sources)
+    sources = replace(sources, cell=stated.with_friction_law(sources.cell))
+    notes: list[str] = []
+    settings, found = stated, _delays(sources, stated, options, reporter)
+    suggested: tuple[float, ...] = ()
+    if found is not None and options.delay == "auto":
+        notes = _described(found)
+        if found.significant:
+            settings = stated.preprocessed(torque_delay=found.delay)
+            notes.append(f"a delay of {found.delay * 1e3:.3g} ms of all axes was compensated")
+    elif found is not None and options.delay is None:
+        # A controller's delay is known; the estimate replaces it only if well determined and
+        # different by more than its bias in closed loop.
+        far = abs(found.delay - found.assumed) > Thresholds().delay * found.cycle
+        if sources.cell.file.controller is None or (far and found.determined):
+            notes = _described(found)
+            suggested = (found.delay,) if found.significant else ()
+    assumed = settings.preprocessing.torque_delay
+    chosen = _chosen(sources, settings, suggested, options, reporter)
+    how = chosen.preprocessing
+    lags = how.torque_bandwidth is not None and how.torque_shape.causal
+    compensated = f"a delay of {how.torque_delay * 1e3:.3g} ms of all axes was compensated"
+    unchanged = f"no other delay than the assumed {assumed * 1e3:.3g} ms was applied"
+    if found is not None and lags:
+        # It was estimated without the low-pass, and may be the lag of that.
+        found, notes = None, [f"{unchanged} beside the low-pass of the torque"]
+    elif how.torque_delay in suggested:
+        notes.append(compensated)
+    elif how.torque_delay != assumed:
+        found, notes = None, [compensated]
+    elif found is not None and suggested:
+        found, notes = None, [f"{notes[0]}; not applied, as it predicts worse"]
+    variance = found.variance if found is not None and notes else 0.0
+    return Decided(replace(chosen, delay_variance=variance), found, tuple(notes))
+
+
+def carried_over(settings: Settings, sources: Sources, options: Options) -> Settings:
+    """Return the settings for another campaign of the arm: with its noise and stated delay."""
+    settings = _with_noise_of(settings, sources)
+    if isinstance(options.delay, float):
+        return settings
+    stated = stated_delay(sources.cell)
+    delay = settings.preprocessing.torque_delay + (stated - settings.stated_delay)
+    return replace(settings, stated_delay=stated).preprocessed(torque_delay=delay)
+
+
+def _with_noise_of(settings: Settings, sources: Sources) -> Settings:
+    position, torque = (
+        None if values is None else tuple(values.tolist())
+        for values in (sources.noise_variance, sources.torque_variance)
+    )
+    return replace(settings, noise_variance=position, torque_variance=torque)
+
+
+def _questions(sources: Sources, options: Options, suggested: Sequence[float]) -> set[Question]:
+    """Return the questions that inner prediction has to answer."""
+    recorded = [source.recording for source in sources.training]
+    questions: dict[Question, bool] = {
+        "delay": bool(suggested),
+        "bandwidth": options.bandwidth == "auto",
+        "velocity": options.velocity == "auto"
+        and all(one.velocity is not None for one in recorded),
+        "presliding": options.friction == "auto",
+        "rows": options.standstill == "auto",
+        # A cell file with a drive train states the friction terms.
+        "friction": options.friction == "auto" and sources.cell.file.drive_train is None,
+        "ripple": options.friction == "auto" and bool(_ripples(sources.cell)),
+        # Currents of a controller are unfiltered.
+        "low-pass": options.torque_bandwidth == "auto"
+        and options.method == "default"
+        and recorded[0].motor_current is None,
+        "estimator": options.estimator == "auto",
+    }
+    return {question for question, wanted in questions.items() if wanted}
+
+
+def _chosen(
+    sources: Sources,
+    settings: Settings,
+    suggested: Sequence[float],
+    options: Options,
+    reporter: Reporter,
+) -> Settings:
+    """Choose the automatic settings by inner prediction; `suggested` delays [s] are candidates."""
+    cell, questions = sources.cell, _questions(sources, options, suggested)
+    if not questions:
+        return settings
+    # One repetition of a motion is enough.
+    read = sources.training[:1] if sources.same_motion else sources.training
+
+    def ready(model: RobotModel, how: Preprocessing) -> list[Samples]:
+        trial = replace(settings, preprocessing=how)
+        return [samples_of(source, cell, trial, model) for source in read]
+
+    def low_passes(model: RobotModel, how: Preprocessing) -> tuple[Preprocessing, ...]:
+        return possible_low_passes(
+            read[0].recording,
+            model,
+            noise_variance=sources.noise_variance,
+            options=how,
+            undelayed=settings.preprocessing.torque_delay,
+        )
+
+    start = Candidate(cell.model, settings.preprocessing)
+    with reporter.task("choosing settings by inner prediction", 1) as task:
+        best, choices = choose_settings(
+            ready, start, questions, low_passes, suggested, _ripples(cell)
+        )
+        task.advance(1)
+    law, friction = best.model.friction.laws[0], dict(settings.friction)
+    if "presliding" in questions:
+        friction |= {"presliding": law.presliding}
+    if "friction" in questions:
+        friction |= {"third": law.third or "none", "stribeck": law.stribeck or 0.0}
+    if "ripple" in questions and best.ripple:
+        friction |= {"ripple": [*best.ripple]}
+    return replace(
+        settings,
+        preprocessing=best.preprocessing,
+        friction=friction,
+        shrinkage=best.shrinkage,
+        choices=choices,
+    )
+
+
+def _ripples(cell: Cell) -> list[list[TorqueRipple]]:
+    """Candidates of torque ripple; none if the cell states some, or no gear ratios."""
+    if cell.file.drive_train is None or cell.file.robot.friction.ripple:
+        return []
+    motors = cell.drive_train.motor_from_joint
+    return [ripples(cell.joint_names, motors, orders) for orders in RIPPLE]
+
+
+def _delays(
+    sources: Sources, stated: Settings, options: Options, reporter: Reporter
+) -> DelayEstimate | None:
+    """Estimate the delays in the longest fitted recording, or in its beginning if not requested."""
+    if options.delay == "stated":
+        return None
+    recording = max((source.recording for source in sources.training), key=lambda r: r.n_samples)
+    wanted = options.delay == "auto"
+    if not wanted:
+        recording = recording.between(0, min(recording.n_samples, _DELAY_SAMPLES))
+    with reporter.task("estimating the delay", 1) as task:
+        try:
+            found = estimate_delay(
+                recording,
+                sources.cell.model,
+                noise_variance=sources.noise_variance,
+                options=replace(stated.preprocessing, smooth_torque=False),
+            )
+        except IdentificationError:
+            if wanted:
+                raise
+            return None
+        task.advance(1)
+    return found
+
+
+def _described(found: DelayEstimate) -> list[str]:
+    notes = [f"delay of the torque behind the position, {found.describe()}"]
+    if not found.significant:
+        notes.append(f"no other delay than the assumed {found.assumed * 1e3:.3g} ms was applied")
+    return notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,3 +415,21 @@ def _require_torques(sources: Sources) -> None:
             field="torque",
             remedy="give drive.torque_constant in the column map, or identify it by `hil gains`",
         )
+
+
+def executed_rows(source: Source, samples: Samples) -> slice:
+    """Return the samples from the first to the last changing set-point, or moving joint."""
+    commanded, time = source.recording.commanded_position, source.recording.time
+    if commanded is None:
+        return moving_rows(samples)
+    steps = np.flatnonzero((np.abs(np.diff(commanded, axis=0)) > 0.0).any(axis=1))
+    if not steps.size:
+        return slice(0, 0)
+    first, last = np.searchsorted(samples.motion.time, time[[steps[0], steps[-1] + 1]])
+    return slice(int(first), int(last) + 1)
+
+
+def moving_rows(samples: Samples) -> slice:
+    """Return the samples from the first to the last in which a joint moves."""
+    moving = np.flatnonzero(samples.usable.any(axis=1))
+    return slice(int(moving[0]), int(moving[-1]) + 1) if moving.size else slice(0, 0)

@@ -69,10 +69,6 @@ class Sources:
     tested_on: str  #: description of the held-out motion
     in_sample: bool = False  #: whether nothing is held out; `held_out` is `training` then
 
-    def with_warning(self, warning: str) -> Sources:
-        """Return the sources with one more warning."""
-        return replace(self, warnings=(*self.warnings, warning))
-
 
 def cell_of(archive: Archive) -> Cell:
     """Return the cell of an archive.

@@ -23,9 +23,8 @@ from hil.campaign import CampaignFolder
 from hil.cell import Cell
 from hil.errors import InputError
 from hil.identify.options import FIXED
-from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.prepared import Prepared, executed_rows, moving_rows, prepare_sources
 from hil.identify.sources import gather_sources
-from hil.identify.summary import executed_rows, moving_rows
 from hil.progress import Silent
 from hil.reading import read_text
 from hil.report.numbers import capitalised, fixed, significant

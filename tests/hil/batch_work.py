@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
@@ -24,14 +23,12 @@ NOTHING_OPEN: Final = (
 class Here(Workers):
     """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
 
-    def __init__(self, *deadly: str, local: bool = True) -> None:
+    def __init__(self, *deadly, local=True):
         super().__init__(ThreadPoolExecutor(1))
         self.deadly, self.local = deadly, local
         self.tasks: list[ArchiveTask[Any]] = []
 
-    def results(
-        self, tasks: Sequence[ArchiveTask[Any]], done: Callable[[int], None] | None = None
-    ) -> Iterator[Any]:
+    def results(self, tasks, done=None):
         for task in tasks:
             self.tasks.append(task)
             if done is not None:
@@ -40,7 +37,7 @@ class Here(Workers):
             yield Unused(task.path, "ended its process") if deadly else run_task(task)
 
 
-def _refs(argument: Any) -> Iterator[ArchiveRef]:
+def _refs(argument):
     if isinstance(argument, ArchiveRef):
         yield argument
     elif not isinstance(argument, str):
@@ -48,29 +45,29 @@ def _refs(argument: Any) -> Iterator[ArchiveRef]:
             yield from _refs(one)
 
 
-def number(k: int) -> int:
+def number(k):
     return k
 
 
-def marked(path: str) -> None:
+def marked(path):
     """Create a file when it begins."""
     Path(path).touch()
     time.sleep(0.1)
 
 
-def absent(k: int) -> None:
+def absent(k):
     raise ArchiveError(f"{k}.mcap", "cannot be read: No such file or directory")
 
 
-def faulty(_: int) -> None:
+def faulty(_):
     return [][0]
 
 
-def crash(_: int) -> None:
+def crash(_):
     os.kill(os.getpid(), signal.SIGSEGV)
 
 
-def once(path: str) -> str:
+def once(path):
     """End the process the first time."""
     if not Path(path).exists():
         Path(path).touch()
@@ -78,11 +75,11 @@ def once(path: str) -> str:
     return "again"
 
 
-def hang(_: int) -> None:
+def hang(_):
     time.sleep(600.0)
 
 
-def task(function, argument) -> ArchiveTask:
+def task(function, argument):
     return ArchiveTask(f"{function.__name__}-{argument}.mcap", function, (argument,))
 
 
@@ -100,7 +97,7 @@ def tasks_with_failures(count, **more):
     return tasks, {k: reasons.get(name, "took too long") for name, k in places.items()}
 
 
-def check_failures(tasks, found, failing, others=None) -> None:
+def check_failures(tasks, found, failing, others=None):
     for k, one in enumerate(found):
         if k in failing:
             assert isinstance(one, Unused)

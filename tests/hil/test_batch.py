@@ -31,8 +31,7 @@ from hil.errors import ArchiveError, InputError
 from hil.identify import Options, identify_campaign
 from hil.identify.estimating import estimate_with
 from hil.identify.options import FIXED
-from hil.identify.prepared import prepare_sources
-from hil.identify.settings import Settings, decide
+from hil.identify.prepared import Settings, decide, prepare_sources
 from hil.identify.sources import gather_sources
 from hil.progress import Silent
 from identification.estimators.consistent import Shrinkage

@@ -9,10 +9,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -23,10 +21,8 @@ from hil.batch.workers import (
     ClusterError,
     DaskWorkers,
     LocalWorkers,
-    Workers,
     WorkerSoftwareError,
 )
-from hil.campaign import Campaign
 from hil.errors import InputError
 from hil.identify.options import FIXED
 from hil.progress import Silent
@@ -41,7 +37,7 @@ PATIENCE = 60.0  # s; the machine may be busy
 class Cluster:
     """Processes of one cluster."""
 
-    def __init__(self, folder: Path, **environment: str) -> None:
+    def __init__(self, folder, **environment):
         self._folder, self._environment = folder, environment
         self.processes: list[subprocess.Popen[bytes]] = []
         self.start("scheduler", "--port", "0")
@@ -49,7 +45,7 @@ class Cluster:
         wait_for(lambda: description.exists() and description.read_text().endswith("}"))
         self.address: str = json.loads(description.read_text())["address"]
 
-    def start(self, kind: str, *arguments: str) -> None:
+    def start(self, kind, *arguments):
         with (self._folder / f"{kind}-{time.monotonic_ns()}.log").open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.dask_{kind}", *_LOCAL, *arguments],
@@ -68,7 +64,7 @@ class Cluster:
             )
         self.processes.append(process)
 
-    def close(self) -> None:
+    def close(self):
         for process in reversed(self.processes):
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)  # a nanny with its worker
@@ -76,7 +72,7 @@ class Cluster:
 
 
 @contextmanager
-def running(folder: Path, *, workers: int = 0, **environment: str) -> Iterator[Cluster]:
+def running(folder, *, workers=0, **environment):
     cluster = Cluster(folder, **environment)
     try:
         for _ in range(workers):
@@ -86,7 +82,7 @@ def running(folder: Path, *, workers: int = 0, **environment: str) -> Iterator[C
         cluster.close()
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
+def wait_for(condition):
     deadline = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < deadline
@@ -94,30 +90,30 @@ def wait_for(condition: Callable[[], bool]) -> None:
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+def cluster(tmp_path_factory):
     with running(tmp_path_factory.mktemp("dask"), workers=2) as cluster:
         yield cluster
 
 
 @pytest.fixture(scope="module")
-def workers(cluster: Cluster) -> Iterator[DaskWorkers]:
+def workers(cluster):
     with DaskWorkers(cluster.address, patience=PATIENCE) as workers:
         yield workers
 
 
-def tasks_of(function: Any, count: int) -> list[Any]:
+def tasks_of(function, count):
     return [work.task(function, k) for k in range(count)]
 
 
 class TestResults:
     @pytest.mark.parametrize("count", [0, 1, 65])
-    def test_come_in_order_and_are_reported_once(self, workers: DaskWorkers, count: int) -> None:
+    def test_come_in_order_and_are_reported_once(self, workers, count):
         finished: list[int] = []
         found = workers.results(tasks_of(work.number, count), finished.append)
         assert list(found) == list(range(count))
         assert sum(finished) == count
 
-    def test_are_cancelled_on_close(self, tmp_path: Path, workers: DaskWorkers) -> None:
+    def test_are_cancelled_on_close(self, tmp_path, workers):
         found = workers.results([work.task(work.marked, str(tmp_path / f"{k}")) for k in range(99)])
         next(found)
         found.close()
@@ -125,22 +121,18 @@ class TestResults:
         assert len([*tmp_path.iterdir()]) < 50
 
     @pytest.mark.slow
-    def test_of_failed_tasks_and_of_those_that_kill_their_worker(
-        self, workers: DaskWorkers
-    ) -> None:
+    def test_of_failed_tasks_and_of_those_that_kill_their_worker(self, workers):
         tasks, failing = work.tasks_with_failures(20)
         work.check_failures(tasks, workers.results(tasks), failing)
 
-    def test_with_other_code_are_refused(
-        self, workers: DaskWorkers, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_with_other_code_are_refused(self, workers, monkeypatch):
         """Whenever a worker joins: its software is checked with each task."""
         monkeypatch.setattr(workers, "software", "hil 0123")
         with pytest.raises(WorkerSoftwareError, match=r"other software .* instead of hil 0123"):
             list(workers.results(tasks_of(work.number, 1)))
 
     @pytest.mark.slow
-    def test_loss_of_the_scheduler_is_an_error(self, tmp_path: Path) -> None:
+    def test_loss_of_the_scheduler_is_an_error(self, tmp_path):
         with running(tmp_path, workers=1, DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT="2s") as own:
             workers = DaskWorkers(own.address, patience=10.0)
             found = workers.results(
@@ -153,15 +145,15 @@ class TestResults:
                 list(workers.results(tasks_of(work.number, 1)))
 
 
-def test_folders_must_exist_on_the_workers(workers: DaskWorkers, tmp_path: Path) -> None:
+def test_folders_must_exist_on_the_workers(workers, tmp_path):
     workers.require_folders([tmp_path])
     with pytest.raises(ClusterError, match=r"does not see .*absent"):
         workers.require_folders([tmp_path, tmp_path / "absent"])
 
 
 @pytest.mark.slow
-def test_estimates_equal_those_of_local_workers(campaign: Campaign, workers: DaskWorkers) -> None:
-    def figures(workers: Workers) -> list[bytes]:
+def test_estimates_equal_those_of_local_workers(campaign, workers):
+    def figures(workers):
         cache = CacheLocation(keep=False)
         found = run.reidentify([str(campaign.folder.root)], FIXED, workers, Silent(), cache=cache)
         assert not found.broken
@@ -184,7 +176,7 @@ def test_a_cluster_that_cannot_be_used_is_an_error(tmp_path, workers, message):
             DaskWorkers(address, patience=1.0 if own is None else 5.0)
 
 
-def test_without_dask_the_error_has_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_dask_the_error_has_the_install_command(monkeypatch):
     monkeypatch.setattr(batch_workers, "find_spec", lambda _: None)
     with pytest.raises(InputError, match=re.escape(install_command("cluster"))):
         DaskWorkers("tcp://127.0.0.1:9")

@@ -42,7 +42,7 @@ from hil.batch.table import COLUMNS, write_tables
 from hil.batch.workers import LocalWorkers, Unused
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
-from hil.identify.settings import Settings
+from hil.identify.prepared import Settings
 from identification.estimators.consistent import Shrinkage
 from identification.selection.inner_prediction import Choice
 from identification.signals.samples import Preprocessing

@@ -14,23 +14,18 @@ import typer
 from typer.testing import CliRunner
 
 from hil.archive import Samples, write_samples
-from hil.campaign import Campaign
 from hil.cli import app
 from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
-from hil.identify import Identification, Options, identify_archives, identify_campaign
-from hil.identify.estimating import (
-    Estimation,
-    estimate_with,
-)
-from hil.identify.options import ESTIMATORS, FIXED, Estimator
-from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify import Options, identify_archives, identify_campaign
+from hil.identify.estimating import estimate_with
+from hil.identify.options import ESTIMATORS, FIXED
+from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.importers import Robot
 from hil.outcome import write_outcome
 from hil.progress import Silent
-from hil.report import ReportSeries
-from hil.results import SCHEMA_VERSION, JudgementResult, Results
+from hil.results import SCHEMA_VERSION, Results
 from hil.simulation import planted_values
 from identification.errors import IdentificationError
 from identification.estimators.consistent import Shrinkage, SolverError
@@ -41,41 +36,51 @@ from .simulated_logs import archive_of, simulate
 PERIOD = 0.004
 
 
-def paths(campaign: Campaign) -> list[Path]:
+def identified(*archives, **options):
+    return identify_archives(archives, Silent(), Options(**options))
+
+
+def paths(campaign):
     kinds = ("excitation", "validation", "standstill")
     return [path for kind in kinds for path in campaign.folder.completed(kind)]
 
 
+def raiser(error):
+    """Return a function that raises an error."""
+
+    def function(*_, **__):
+        raise error
+
+    return function
+
+
 @pytest.fixture(scope="module")
-def found(campaign: Campaign) -> Identification:
+def found(campaign):
     return identify_campaign(campaign.folder.root, Silent())
 
 
 @pytest.fixture(scope="module")
-def judgement(found: Identification) -> JudgementResult:
+def judgement(found):
     return found.results.judgement
 
 
-def imported(
-    path: Path, names: tuple[str, ...] | None = None, *, torque: bool = True, **spoilt: object
-) -> Path:
+def imported(path, names=None, *, torque=True, noise=0.0, **spoilt):
     """Write an imported recording of sines on six joints, with faults by name."""
     robot = Robot.from_urdf(URDF_PATH)
     time = np.arange(2000) * PERIOD
     position = 0.3 * np.sin(np.outer(time, np.linspace(1.0, 2.0, 6)))
     torques = np.cos(np.outer(time, np.linspace(1.0, 2.0, 6)))
+    torques += noise * np.random.default_rng(1).standard_normal(torques.shape)
     stamp = np.rint(time * 1e9).astype(np.int64)
     for key, value in spoilt.items():
         if key == "nan":
             position[value] = np.nan
         elif key == "stuck":
-            position[:, value] = 0.25  # type: ignore[call-overload]
+            position[:, value] = 0.25
         elif key == "repeat":
-            stamp[value] = stamp[value - 1]  # type: ignore[index, operator]
+            stamp[value] = stamp[value - 1]
         elif key == "fall":
-            stamp[value] -= 10**9  # type: ignore[index]
-        elif key == "noise":
-            torques += value * np.random.default_rng(1).standard_normal(torques.shape)
+            stamp[value] -= 10**9
     write_samples(
         path,
         Samples(stamp, position, None, torques if torque else None, None),
@@ -86,7 +91,7 @@ def imported(
     return path
 
 
-def imported_ur5(folder: Path, time: np.ndarray, late: np.ndarray | float, still: int = 0) -> Path:
+def imported_ur5(folder, time, late, still=0):
     """Import a UR5 at rest for `still` samples, then moving, with torques `late` by a time [s]."""
     made = simulate("ur5_robot.urdf", time, noise=0.3)
     lags = zip(np.broadcast_to(late, 6), made.torque.T, strict=True)
@@ -103,20 +108,15 @@ def imported_ur5(folder: Path, time: np.ndarray, late: np.ndarray | float, still
 class TestCampaign:
     """Results of a campaign."""
 
-    def test_has_58_parameters_near_the_planted_ones(self, found: Identification) -> None:
+    def test_has_58_parameters_near_the_planted_ones(self, found):
         """More than 3 of 58 normal deviates beyond 3 sigma have a probability of 1e-5."""
-        ids = sorted(p.table2_id or 0 for p in found.results.parameters)
-        assert ids == list(range(1, 59))
-        coverage = found.results.coverage
-        assert coverage.within_3 >= 55
+        results = found.results
+        assert sorted(p.table2_id or 0 for p in results.parameters) == list(range(1, 59))
+        assert results.coverage.within_3 >= 55
+        assert results.calibration.inside >= 0.93  # held-out torque inside its intervals
+        assert None not in results.calibration.joint_inside
 
-    def test_held_out_torque_lies_inside_its_intervals(self, found: Identification) -> None:
-        calibration = found.results.calibration
-        assert calibration is not None
-        assert calibration.inside >= 0.93
-        assert None not in calibration.joint_inside
-
-    def test_planned_criteria_are_those_that_were_executed(self, found: Identification) -> None:
+    def test_planned_criteria_are_those_that_were_executed(self, found):
         """At equal times; stiction and noise change the columns by per mille."""
         planned, executed = found.results.excitation.planned, found.results.excitation.executed
         assert executed.n_samples == pytest.approx(3 * planned.n_samples, abs=6)
@@ -124,9 +124,7 @@ class TestCampaign:
         assert executed.coupling_index == pytest.approx(planned.coupling_index, rel=0.02)
         assert executed.scaled_condition == pytest.approx(planned.scaled_condition, rel=0.02)
 
-    def test_needs_the_archives_only(
-        self, campaign: Campaign, found: Identification, tmp_path: Path
-    ) -> None:
+    def test_needs_the_archives_only(self, campaign, found, tmp_path):
         """Copied without their folder, they give the same numbers."""
         moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
         again = identify_archives(moved, Silent(), name=found.results.name)
@@ -135,23 +133,17 @@ class TestCampaign:
         assert again.results == found.results.model_copy(update={"conduct": None})
 
     @pytest.mark.slow
-    def test_has_the_same_parameters_by_the_papers_filters(
-        self, campaign: Campaign, found: Identification
-    ) -> None:
+    def test_has_the_same_parameters_by_the_papers_filters(self, campaign, found):
         paper = identify_campaign(campaign.folder.root, Silent(), Options(method="paper"))
         assert paper.verdict.good, paper.verdict.line
         for ours, theirs in zip(found.results.parameters, paper.results.parameters, strict=True):
             both = np.hypot(ours.std, theirs.std)
             assert abs(ours.estimate - theirs.estimate) < 5.0 * both, ours.name
 
-    def test_reports_a_failed_consistent_solution(
-        self, campaign: Campaign, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def none(*_: object, **__: object) -> None:
-            raise IdentificationError("the solver failed")
-
+    def test_reports_a_failed_consistent_solution(self, campaign, monkeypatch):
         for name in ("check_consistency", "choose_essential"):
-            monkeypatch.setattr(f"hil.identify.run.{name}", none)
+            failing = raiser(IdentificationError("the solver failed"))
+            monkeypatch.setattr(f"hil.identify.run.{name}", failing)
         without = identify_campaign(campaign.folder.root, Silent(), FIXED)
         warnings = without.results.verdict.warnings
         assert sum("the solver failed" in one for one in warnings) == 2
@@ -161,9 +153,7 @@ class TestCampaign:
 class TestOutcome:
     """Files of a result."""
 
-    def test_is_replaced_completely_or_not_at_all(
-        self, found: Identification, tmp_path: Path
-    ) -> None:
+    def test_is_replaced_completely_or_not_at_all(self, found, tmp_path):
         write_outcome(tmp_path, found, Silent())
         first = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
         assert {"results.json", "report.html", "parameters.csv", "identified.urdf"} <= set(first)
@@ -189,7 +179,7 @@ class TestOutcome:
             ),
         ],
     )
-    def test_of_another_version_is_refused(self, text: str, sentence: str, tmp_path: Path) -> None:
+    def test_of_another_version_is_refused(self, text, sentence, tmp_path):
         path = tmp_path / "results.json"
         path.write_text(text)
         with pytest.raises(InputError, match=sentence):
@@ -199,38 +189,30 @@ class TestOutcome:
 class TestSources:
     """Archives that are fitted, predicted, or refused."""
 
-    def test_truncated_are_used_to_the_last_complete_chunk(
-        self, campaign: Campaign, tmp_path: Path
-    ) -> None:
+    def test_truncated_are_used_to_the_last_complete_chunk(self, campaign, tmp_path):
         moved = [Path(shutil.copy(path, tmp_path)) for path in paths(campaign)]
         moved[2].write_bytes(moved[2].read_bytes()[: moved[2].stat().st_size // 2])
         warnings = " ".join(identify_archives(moved, Silent()).results.verdict.warnings)
         assert moved[2].name in warnings
         assert "could be read" in warnings
 
-    def test_without_an_excitation_are_refused(self, campaign: Campaign, tmp_path: Path) -> None:
-        with pytest.raises(InputError, match="no excitation"):
-            identify_archives(campaign.folder.completed("validation"), Silent())
-        with pytest.raises(InputError, match="has no completed excitation"):
-            identify_campaign(tmp_path, Silent())
-
-    def test_are_not_fitted_and_predicted(self, campaign: Campaign, tmp_path: Path) -> None:
+    def test_that_do_not_belong_together_are_refused(self, campaign, tmp_path):
         first = campaign.folder.completed("excitation")[0]
         copy = Path(shutil.copy(first, tmp_path / "another_name.mcap"))
+        with pytest.raises(InputError, match="no excitation"):
+            identified(*campaign.folder.completed("validation"))
+        with pytest.raises(InputError, match="has no completed excitation"):
+            identify_campaign(tmp_path, Silent())
         with pytest.raises(InputError, match="is a copy of"):
-            identify_archives([first, copy], Silent())
+            identified(first, copy)
         with pytest.raises(InputError, match="in-sample"):
             gather_sources([first], 0.7, [first], in_sample=True)
-
-    def test_of_different_robots_are_not_mixed(self, campaign: Campaign, tmp_path: Path) -> None:
-        other = imported(tmp_path / "other.mcap")
-        first = campaign.folder.completed("excitation")[0]
         with pytest.raises(ArchiveError, match=r"other\.mcap.*has another"):
-            identify_archives([first, other], Silent())
+            identified(first, imported(tmp_path / "other.mcap"))
 
-    def test_at_rest_are_no_test(self, campaign: Campaign) -> None:
+    def test_at_rest_are_no_test(self, campaign):
         """At the end of a recording the arm rests for 0.2 s."""
-        found = identify_archives([paths(campaign)[0]], Silent(), Options(split=0.985))
+        found = identified(paths(campaign)[0], split=0.985)
         assert not found.verdict.good
         assert "moved in fewer than" in found.verdict.line
 
@@ -247,28 +229,26 @@ class TestSources:
             ),
         ],
     )
-    def test_that_are_invalid_are_refused_by_name(
-        self, tmp_path: Path, spoilt: dict[str, object], sentence: str
-    ) -> None:
+    def test_that_are_invalid_are_refused_by_name(self, tmp_path, spoilt, sentence):
         with pytest.raises(ArchiveError, match=r"bad\.mcap.*" + sentence):
-            identify_archives([imported(tmp_path / "bad.mcap", **spoilt)], Silent())  # type: ignore[arg-type]
+            identified(imported(tmp_path / "bad.mcap", **spoilt))
 
-    def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path: Path) -> None:
-        found = identify_archives([imported(tmp_path / "one.mcap", repeat=300)], Silent())
+    def test_alone_are_split_and_repeated_stamps_averaged(self, tmp_path):
+        found = identified(imported(tmp_path / "one.mcap", repeat=300))
         assert any("1 samples had the time stamp" in note for note in found.results.notes)
         assert any("the rest was predicted" in one for one in found.results.verdict.warnings)
         assert [run.archive for run in found.results.validation] == ["one.mcap (last part)"]
         assert "unseen" not in found.verdict.line.split(":")[0]
 
-    def test_that_repeat_the_fitted_motion_are_not_unseen(self, campaign: Campaign) -> None:
-        found = identify_archives(campaign.folder.completed("excitation"), Silent())
+    def test_that_repeat_the_fitted_motion_are_not_unseen(self, campaign):
+        found = identified(*campaign.folder.completed("excitation"))
         line = "The model predicts a repetition of the fitted motion"
         assert found.verdict.line.startswith(line)
 
     @pytest.mark.parametrize("noise", [0.0, 0.01])
-    def test_with_a_noiseless_torque_are_named(self, tmp_path: Path, noise: float) -> None:
+    def test_with_a_noiseless_torque_are_named(self, tmp_path, noise):
         """It was filtered by a low-pass, or computed."""
-        found = identify_archives([imported(tmp_path / "smooth.mcap", noise=noise)], Silent())
+        found = identified(imported(tmp_path / "smooth.mcap", noise=noise))
         named = [one.check for one in found.results.judgement.findings]
         assert ("torque bandwidth" in named) == (noise == 0.0)
 
@@ -276,25 +256,18 @@ class TestSources:
 class TestJudgement:
     """Numbers behind a verdict: in `results.json`, on the terminal and in the report."""
 
-    def test_compares_joints_with_limit_and_other_models(
-        self, judgement: JudgementResult, found: Identification
-    ) -> None:
+    def test_compares_joints_with_limit_and_other_models(self, judgement, found):
         assert [joint.joint for joint in judgement.joints] == found.results.joint_names
         for joint in judgement.joints:
-            assert joint.limit is not None and joint.share_of_limit is not None
             assert joint.share_of_limit == pytest.approx(joint.rms / joint.limit)
-            assert joint.relative is not None and joint.explained is not None
             # An error of r of the torque leaves at most 1 - r² unexplained of what varies in it.
             assert joint.explained <= 1.0 - joint.relative**2 + 1e-12
             # Nominal links, rotors and friction are wrong by 10 to 20 %, those of the simulated
             # controller's model by 5 to 10 %; what was found is not.
-            assert joint.nominal_relative is not None and joint.controller_relative is not None
             assert joint.nominal_relative > 2.0 * joint.relative
             assert 0.01 < joint.controller_relative < 0.15
 
-    def test_is_a_table_and_a_sentence_for_each_finding(
-        self, found: Identification, judgement: JudgementResult
-    ) -> None:
+    def test_is_a_table_and_a_sentence_for_each_finding(self, found, judgement):
         rows, lines = table(found.results), sentences(found.results)
         assert len(rows) == 1 + len(found.results.joint_names)
         heading = "joint RMS error relative fitted of limit R² nominal controller"
@@ -305,7 +278,7 @@ class TestJudgement:
         for finding in judgement.findings:
             assert sum(finding.words in line for line in lines) == 1
 
-    def test_is_json_for_scripts(self, found: Identification) -> None:
+    def test_is_json_for_scripts(self, found):
         read = json.loads(as_json(found.results))
         assert read["good"] is found.results.verdict.good
         assert read["line"] == found.results.verdict.line
@@ -314,9 +287,7 @@ class TestJudgement:
         assert read["in_sample"] is False and read["undetermined"] == []
 
     @pytest.mark.parametrize("good", [True, False])
-    def test_ends_with_its_line_and_a_status(
-        self, found: Identification, good: bool, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_ends_with_its_line_and_a_status(self, found, good, capsys):
         verdict = found.results.verdict.model_copy(update={"good": good})
         with nullcontext() if good else pytest.raises(typer.Exit) as left:
             finish(found.results.model_copy(update={"verdict": verdict}), json=False)
@@ -324,18 +295,15 @@ class TestJudgement:
         assert capsys.readouterr().out == verdict.line + "\n"
 
 
-# Estimators
-
-
 @pytest.fixture(scope="module")
-def prepared(campaign: Campaign) -> Prepared:
+def prepared(campaign):
     """Rows in sliding motion only, without velocity reversals."""
     sources = gather_sources(paths(campaign), 0.7)
     return prepare_sources(sources, Options(standstill="slow"), Silent())
 
 
 @pytest.fixture(scope="module")
-def estimations(prepared: Prepared) -> dict[Estimator, Estimation]:
+def estimations(prepared):
     return {name: estimate_with(prepared, Options(estimator=name), Silent()) for name in ESTIMATORS}
 
 
@@ -343,9 +311,7 @@ class TestEstimators:
     """Every estimator on one campaign, with its warnings."""
 
     @pytest.mark.parametrize("name", ESTIMATORS)
-    def test_find_the_planted_arm(
-        self, name: Estimator, estimations: dict[Estimator, Estimation], prepared: Prepared
-    ) -> None:
+    def test_find_the_planted_arm(self, name, estimations, prepared):
         """Compared by torque on the fitted motion."""
         found = estimations[name]
         pooled = found.result.pooled
@@ -358,7 +324,7 @@ class TestEstimators:
         assert found.estimator == name
         assert len(found.result.repetitions) == len(prepared.fitted)
 
-    def test_need_commands_as_instruments(self, prepared: Prepared) -> None:
+    def test_need_commands_as_instruments(self, prepared):
         sources = prepared.sources
         training = tuple(
             replace(source, recording=replace(source.recording, commanded_position=None))
@@ -369,17 +335,11 @@ class TestEstimators:
             estimate_with(without, Options(estimator="iv"), Silent())
 
     def test_without_a_consistent_solution_are_least_squares(
-        self,
-        prepared: Prepared,
-        estimations: dict[Estimator, Estimation],
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
+        self, prepared, estimations, monkeypatch
+    ):
         """The reason is a warning."""
-
-        def none(*_: object, **__: object) -> None:
-            raise SolverError("no solution was found")
-
-        monkeypatch.setattr("hil.identify.estimating.consistent_estimate", none)
+        failing = raiser(SolverError("no solution was found"))
+        monkeypatch.setattr("hil.identify.estimating.consistent_estimate", failing)
         settings = replace(prepared.settings, shrinkage=Shrinkage(0.1))
         found = estimate_with(replace(prepared, settings=settings), Options(), Silent())
         expected = estimations["wls"].result.pooled.values
@@ -387,24 +347,22 @@ class TestEstimators:
         assert any("least squares is reported" in one for one in found.warnings)
 
 
-class TestCommand:
-    def test_writes_results_of_the_estimator(self, campaign: Campaign, tmp_path: Path) -> None:
-        command = ["identify", str(campaign.folder.root), "--estimator", "huber", "--json"]
-        ran = CliRunner().invoke(app, [*command, "--output", str(tmp_path)])
-        assert ran.exit_code == 0, ran.output
-        assert json.loads(ran.stdout)["good"] is True
-        assert "Condition number" in (tmp_path / "report.html").read_text()
-        written = Results.load(tmp_path / "results.json")
-        assert written.estimator.name == "huber"
-        assert "Huber" in written.uncertainty.method
-        assert written.exports is not None and written.exports.written
-        assert all((tmp_path / name).exists() for name in written.exports.written)
-        for parameter in written.parameters:
-            assert parameter.prior_std is not None and parameter.prior_ratio is not None
-            assert parameter.learned == (parameter.prior_ratio < 0.5)
-            assert not parameter.undetermined
-        assert written.estimator.prior is not None
-        assert "20 %" in written.estimator.prior
+def test_the_command_writes_results_of_the_estimator(campaign, tmp_path):
+    command = ["identify", str(campaign.folder.root), "--estimator", "huber", "--json"]
+    ran = CliRunner().invoke(app, [*command, "--output", str(tmp_path)])
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["good"] is True
+    assert "Condition number" in (tmp_path / "report.html").read_text()
+    written = Results.load(tmp_path / "results.json")
+    assert written.estimator.name == "huber"
+    assert "Huber" in written.uncertainty.method
+    assert written.exports.written
+    assert all((tmp_path / name).exists() for name in written.exports.written)
+    for parameter in written.parameters:
+        assert parameter.prior_std is not None
+        assert parameter.learned == (parameter.prior_ratio < 0.5)
+        assert not parameter.undetermined
+    assert "20 %" in written.estimator.prior
 
 
 # One imported recording: split, or all of it fitted
@@ -414,53 +372,25 @@ UNFILTERED = Options(torque_bandwidth=None, delay="auto")
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     """An imported UR5 whose torques lag."""
     return imported_ur5(tmp_path_factory.mktemp("log"), np.arange(0.0, 16.0, 4e-3), LATE)
 
 
 @pytest.fixture(scope="module")
-def split(log: Path) -> Identification:
+def split(log):
     return identify_archives([log], Silent(), UNFILTERED)
 
 
-@pytest.fixture(scope="module")
-def whole(log: Path) -> Identification:
-    return identify_archives([log], Silent(), replace(UNFILTERED, in_sample=True))
-
-
-class TestInSample:
-    """Errors of the fit, with and without a prediction."""
-
-    def test_nothing_is_called_good(self, whole: Identification, split: Identification) -> None:
-        results = whole.results
-        assert results.judgement.in_sample
-        assert results.validation == [] and results.essential is results.calibration is None
-        assert not results.verdict.good
-        assert (
-            "in-sample" in results.verdict.line and "no motion was held out" in results.verdict.line
-        )
-        assert "unseen motion well" not in results.verdict.line
-        more, fewer = results.excitation.executed, split.results.excitation.executed
-        assert more.n_samples > fewer.n_samples
-        pairs = zip(results.judgement.joints, results.fitted.relative_error, strict=True)
-        for joint, fitted in pairs:
-            assert joint.relative == pytest.approx(fitted)
-        assert "in-sample" in table(results)[0] and "relative" not in table(results)[0]
-
-
-class TestCellContext:
-    """Delays, nominal masses, position jumps."""
-
-    def test_a_delay_is_compensated(self, split: Identification) -> None:
-        delays = split.results.delays
-        np.testing.assert_allclose(delays.applied, LATE, atol=1e-3)
+class TestDelays:
+    def test_of_the_torque_are_compensated(self, split):
+        np.testing.assert_allclose(split.results.delays.applied, LATE, atol=1e-3)
         applied = json.loads(as_json(split.results))["delays"]["applied"]
         np.testing.assert_allclose(applied, LATE, atol=1e-3)
         found = [one for one in split.verdict.findings if one.check == "delay"]
         assert [one.level for one in found] == ["doubtful"]
 
-    def test_a_stated_delay_is_applied_and_another_reported(self, log: Path) -> None:
+    def test_that_are_stated_are_applied_and_others_reported(self, log):
         options = replace(UNFILTERED, delay=0.0)
         prepared = prepare_sources(gather_sources([log], 0.7), options, Silent())
         assert prepared.assumed_delay == 0.0
@@ -468,43 +398,37 @@ class TestCellContext:
         assert prepared.delays.delay > 0.01
 
 
+def test_nothing_is_called_good_in_sample(log, split):
+    results = identify_archives([log], Silent(), replace(UNFILTERED, in_sample=True)).results
+    assert results.judgement.in_sample
+    assert results.validation == [] and results.essential is results.calibration is None
+    assert not results.verdict.good
+    line = results.verdict.line
+    assert "in-sample" in line and "no motion was held out" in line
+    assert "unseen motion well" not in line
+    more, fewer = results.excitation.executed, split.results.excitation.executed
+    assert more.n_samples > fewer.n_samples
+    relative = [joint.relative for joint in results.judgement.joints]
+    assert relative == pytest.approx(results.fitted.relative_error)
+    assert "in-sample" in table(results)[0] and "relative" not in table(results)[0]
+
+
 # The arm of the log starts without acceleration, which no rigid body does: slow rows are left out.
 SLOW = replace(FIXED, friction={"presliding": 1e-4, "third": "none"}, delay=0.0, standstill="slow")
 
 
-@pytest.fixture(scope="module")
-def rest_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An imported UR5, which rests for two seconds before it moves."""
-    return imported_ur5(tmp_path_factory.mktemp("rest"), np.arange(0.0, 10.0, 8e-3), 0.0, 250)
-
-
-@pytest.fixture(scope="module")
-def rested(rest_log: Path) -> Identification:
-    return identify_archives([rest_log], Silent(), SLOW)
-
-
-@pytest.fixture(scope="module")
-def series(rested: Identification) -> ReportSeries:
-    return rested.series
-
-
-class TestSeries:
-    """Data of the figures."""
-
-    def test_marks_the_fitted_rows(self, series: ReportSeries) -> None:
-        """A second of rest is displayed and not fitted."""
-        first = np.argmax(series.excitation_fitted.any(axis=1))
-        rest = series.excitation_time[first] - series.excitation_time[0]
-        assert 0.9 < rest < 1.1
-        assert 0.3 < series.excitation_fitted.mean() < 1.0
-        assert set(np.unique(series.example_used)) <= {0.0, 1.0}
-
-    def test_friction_data_lie_around_the_law(
-        self, series: ReportSeries, rested: Identification
-    ) -> None:
-        for j, noise in enumerate(rested.results.noise_std):
-            known = np.isfinite(series.friction_speed[:, j])
-            assert known.sum() > 100
-            speed, torque = series.friction_speed[known, j], series.friction_torque[known, j]
-            law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
-            assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise
+def test_series_of_figures_have_fitted_rows_and_friction(tmp_path):
+    """A second of rest is displayed and not fitted; friction data lie around the law."""
+    log = imported_ur5(tmp_path, np.arange(0.0, 10.0, 8e-3), 0.0, 250)
+    rested = identify_archives([log], Silent(), SLOW)
+    series = rested.series
+    first = np.argmax(series.excitation_fitted.any(axis=1))
+    assert 0.9 < series.excitation_time[first] - series.excitation_time[0] < 1.1
+    assert 0.3 < series.excitation_fitted.mean() < 1.0
+    assert set(np.unique(series.example_used)) <= {0.0, 1.0}
+    for j, noise in enumerate(rested.results.noise_std):
+        known = np.isfinite(series.friction_speed[:, j])
+        assert known.sum() > 100
+        speed, torque = series.friction_speed[known, j], series.friction_torque[known, j]
+        law = np.interp(speed, series.law_speed[:, j], series.law_torque[:, j])
+        assert np.std((torque - law)[np.abs(speed) > 0.05]) < 2.0 * noise

@@ -21,7 +21,6 @@ from hil.identify.payload_run import find_payload
 from hil.importers.column_map import Drive
 from hil.progress import Silent
 from identification import FrictionLaw
-from identification.model.kinematics import pinocchio_model
 from tests.docs.test_commands import QUICK
 from tests.docs.typed import ROOT, commands
 from tests.hil.simulated_logs import Simulated, archive_of, simulate
@@ -90,8 +89,6 @@ class TestPage:
             words += SHORTER.get(words[0], ())
             result = CliRunner().invoke(app, words)
             assert result.exit_code == 0, (shlex.join(words), result.output, result.exception)
-        model = pinocchio_model((folder / "gripper.urdf").read_text())
-        assert model.inertias[0].mass == pytest.approx(MASS, rel=0.01)
 
 
 class TestFigures:

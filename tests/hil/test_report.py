@@ -49,7 +49,7 @@ HOSTILE = '$\\frac$\x07"><script>alert(1)</script><img src=x onerror=alert(2)>--
 
 
 # fmt: off
-def make_results(**changes: Any) -> Results:
+def make_results(**changes):
     """The NS 16 as a campaign on the simulated cell would leave it; `changes` replace fields."""
     rng = np.random.default_rng(16)
     truth, size = np.array([row.pi_c or 0.0 for row in TABLE2]), len(TABLE2)
@@ -97,7 +97,7 @@ def make_results(**changes: Any) -> Results:
     return Results.model_validate_json(text)
 
 
-def real_recording() -> Results:
+def real_recording():
     """One imported recording: no truth, no plan, one way to a standard deviation, one run."""
     whole = make_results()
     unknown = {"truth": None, "table2_id": None, "repetition_std": None}
@@ -111,24 +111,24 @@ def real_recording() -> Results:
     )
 
 
-def _unit(name: str) -> str:
+def _unit(name):
     units = {"m": "kg m", "I": "kg m²", "f0": "N·m", "f1": "N·m·s/rad", "f2": "N·m·s²/rad²"}
     return next(unit for start, unit in units.items() if name.startswith(start))
 
 
-def _correlation(rng: np.random.Generator, size: int) -> np.ndarray:
+def _correlation(rng, size):
     """Neighbours in the chain share what a motion shows of them."""
     shared = rng.uniform(0.0, 1.0, (size, 1)) * rng.standard_normal((15, 90))[np.arange(size) // 4]
     return np.corrcoef(rng.standard_normal((size, 90)) + 3.0 * shared)
 
 
-def _criteria(log10_det: float, coupling: float) -> dict[str, float]:
+def _criteria(log10_det, coupling):
     return {"log10_det": log10_det, "coupling_index": coupling,
             "fitness": 0.7 * log10_det + 0.3 * 1653.0 / coupling, "n_samples": 7425,
             "condition": 48210.0, "scaled_condition": 96.4}
 
 
-def _judgement() -> dict[str, Any]:
+def _judgement():
     profile = {"centre": [-1.0, 0.0, 1.0], "mean": [0.5, None, -0.5], "std": [0.1, None, 0.1]}
     joint = {"unit": "N·m", "rms": 2.0, "relative": 0.02, "explained": 0.99, "limit": None,
              "share_of_limit": None, "nominal_relative": 0.3, "controller_relative": None}
@@ -139,7 +139,7 @@ def _judgement() -> dict[str, Any]:
             "speed": [profile] * N, "position": [profile] * N}
 
 
-def _validation(rng: np.random.Generator, k: int) -> dict[str, Any]:
+def _validation(rng, k):
     rms = 0.016 * TORQUE * rng.lognormal(0.0, 0.2, 6)
     return {"archive": f"validation_{k:03d}_a1.mcap", "duration": 8.0 + k / 3.0,
             "mean_abs_error": 0.78 * rms, "rms_error": rms,
@@ -149,7 +149,7 @@ def _validation(rng: np.random.Generator, k: int) -> dict[str, Any]:
             "overall_relative_error": float(np.linalg.norm(rms) / np.linalg.norm(TORQUE))}
 
 
-def make_series(samples: int = 2000, joints: int = 6, name: str = "v.mcap") -> ReportSeries:
+def make_series(samples = 2000, joints = 6, name = "v.mcap"):
     """Smooth motion with the amplitudes of a real one, and a torque that is nearly right."""
     rng = np.random.default_rng(4)
     time, half = 0.002 * np.arange(samples), samples // 2
@@ -177,7 +177,7 @@ def make_series(samples: int = 2000, joints: int = 6, name: str = "v.mcap") -> R
 class Page(HTMLParser):
     """What a browser would make of a page, as far as these tests care."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.tables: list[list[list[str]]] = []
@@ -185,7 +185,7 @@ class Page(HTMLParser):
         self._in_cell = False
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
         if tag == "table":
             self.tables.append([])
@@ -195,26 +195,26 @@ class Page(HTMLParser):
             self.tables[-1][-1].append("")
             self._in_cell = True
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self._in_cell = self._in_cell and tag not in {"td", "th"}
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         if not self.tags or self.tags[-1][0] not in {"style", "script"}:
             self.words.append(data)
         if self._in_cell:
             self.tables[-1][-1][-1] += data
 
     @property
-    def text(self) -> str:
+    def text(self):
         return " ".join(" ".join(self.words).split())
 
-    def table(self, heading: str) -> list[dict[str, str]]:
+    def table(self, heading):
         """Rows of the table that has a column `heading`, by column heading."""
         rows = next(rows for rows in self.tables if heading in rows[0])
         return [dict(zip(rows[0], row, strict=True)) for row in rows[1:] if len(row) > 1]
 
 
-def assert_stands_alone(html: str) -> None:
+def assert_stands_alone(html):
     """The law of every page: nothing from outside, one script, ids and references that fit.
 
     The script is the one that the policy of the page names by its digest.
@@ -238,13 +238,13 @@ def assert_stands_alone(html: str) -> None:
     assert set(re.findall(r'(?:href="|url\()#([^")]*)', html)) <= set(ids)
 
 
-def assert_inert(page: Page) -> None:
+def assert_inert(page):
     """Names from archives start nothing: the page's own script is the only one."""
     assert [tag for tag, _ in page.tags if tag in {"script", "img"}] == ["script"]
     assert not [name for _, a in page.tags for name in a if name.startswith("on")]
 
 
-def many_choices() -> list[dict[str, object]]:
+def many_choices():
     errors = [0.5, *(0.2 + 0.01 * k for k in range(9)), math.inf]
     return [
         {"name": "bandwidth of the motion", "candidates": ["10 Hz", "5 Hz"],
@@ -264,262 +264,27 @@ STEPS = [
 
 
 @pytest.fixture(scope="module")
-def results() -> Results:
+def results():
     """Of a campaign, with everything that a page can show."""
     return make_results(choices=many_choices(), conduct={"steps": STEPS})
 
 
 @pytest.fixture(scope="module")
-def html(results: Results) -> str:
+def html(results):
     return render(results)
 
 
 @pytest.fixture(scope="module")
-def whole(html: str) -> Page:
+def whole(html):
     return Page(html)
 
 
-@pytest.fixture(scope="module")
-def recording() -> Page:
-    return Page(render(real_recording()))
-
-
-def render(results: Results, series: ReportSeries | None = None) -> str:
+def render(results, series=None):
     return report_bytes(results, series or make_series(samples=200)).decode()
 
 
-def rendered(results: Results) -> Page:
+def rendered(results):
     return Page(render(results))
-
-
-class TestPage:
-    def test_has_the_verdict_first_and_details_folded(self, html: str) -> None:
-        order = ["predicts unseen motion to 1.5 % of the torque", "SIMULATED",
-                 "Torque error over all joints", 'id="friction"', 'id="parameters"', 'id="trust"',
-                 '<details id="appendix">', 'id="run"', 'id="excitation"', 'id="estimation"',
-                 'id="correlation"', 'id="validation"']  # fmt: skip
-        places = [html.index(mark) for mark in order]
-        assert places == sorted(places)
-        assert places[0] < html.index("Figure 1")
-        assert html.rindex("</details>") > places[-1]
-
-    @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
-    def test_has_word_and_symbol_of_the_verdict(self, good: bool, word: str) -> None:
-        verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
-        text = render(make_results(verdict=verdict))
-        card = text[text.index('<section class="verdict') :].split("</section>")[0]
-        assert Page(card).text == f"{word} So it is. because"
-        assert 'class="badge"' in card
-
-    def test_names_what_was_simulated(self, whole: Page, recording: Page) -> None:
-        assert "SIMULATED. No robot moved" in whole.text
-        assert all(effect in whole.text for effect in make_results().effects)
-        assert "lower bound" not in whole.text
-        assert "lower bound" in rendered(make_results(effects=[])).text
-        assert not {"simulated", "truth:", "planned"} & set(recording.text.lower().split())
-        assert not any("Truth" in rows[0] for rows in recording.tables)
-        assert len(recording.table("Estimate")) == 58
-
-    def test_stands_alone(self, html: str) -> None:
-        assert_stands_alone(html)
-        assert len(set(re.findall(r'(?:href="|url\()#([^")]*)', html))) > 50
-        assert len(html.encode()) < 2_000_000
-
-    def test_bytes_do_not_depend_on_thread_or_settings(self) -> None:
-        settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
-        series = make_series(samples=200)
-        with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
-            pages = list(pool.map(lambda _: report_bytes(make_results(), series), range(2)))
-            assert {key: mpl.rcParams[key] for key in settings} == settings
-        assert set(pages) == {report_bytes(make_results(), series)}
-
-    def test_names_from_archives_are_escaped(self, results: Results) -> None:
-        def spoil(value: Any) -> Any:
-            if isinstance(value, list):
-                return [spoil(v) for v in value]
-            if isinstance(value, dict):
-                end = HOSTILE if "hil" in value else ""  # the keys of `software` are names too
-                return {k + end: spoil(v) for k, v in value.items()}
-            hostile = isinstance(value, str) and value not in FIXED_WORDS
-            return value + HOSTILE if hostile else value
-
-        spoilt = Results.model_validate(spoil(results.model_dump()))
-        found = Page(render(spoilt, make_series(samples=200, name="v" + HOSTILE)))
-        assert_inert(found)
-        assert "{{7*7}}" in found.text
-        assert "<script>alert(1)</script>" in found.text
-
-    def test_describes_and_numbers_each_figure(self, whole: Page, html: str) -> None:
-        drawings = [a for tag, a in whole.tags if tag == "svg" and a.get("role") == "img"]
-        assert all(len(a["aria-label"] or "") > 30 for a in drawings)
-        assert sum(tag == "h1" for tag, _ in whole.tags) == 1
-        assert sum(tag == "caption" for tag, _ in whole.tags) == len(whole.tables)
-        for kind, count in (("Figure", 6), ("Table", len(whole.tables))):
-            found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
-            assert found == [str(k) for k in range(1, count + 1)]
-
-    def test_of_one_joint_without_friction_or_validation(self) -> None:
-        whole = real_recording()
-        executed = _criteria(1.0, 1.0) | {"condition": math.inf}
-        # fmt: off
-        alone = whole.model_dump() | {
-            "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
-            "correlation": [[1.0]], "noise_std": [0.1], "validation": [],
-            "judgement": {key: value if isinstance(value, bool | None) else value[:1]
-                          for key, value in whole.judgement.model_dump().items()},
-            "fitted": {key: value[:1] if isinstance(value, list) else value
-                       for key, value in whole.fitted.model_dump().items()},
-            "repetition_values": [[1.0] for _ in whole.repetitions],
-            "excitation": whole.excitation.model_dump() | {"executed": executed},
-        }
-        # fmt: on
-        found = Page(render(Results.model_validate(alone), make_series(joints=1)))
-        assert "Nothing was held out" in found.text
-
-    def test_bidirectional_characters_are_escaped(self) -> None:
-        text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
-        name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
-        shown = text.render(name=name, same=same, number=3)
-        assert shown == r"a\u202eb\x1b[31m\u2066c\x7f" + f"|{same}|3"
-
-
-class TestEstimation:
-    """How the estimate was made."""
-
-    def test_shows_the_chosen_candidate_and_the_best(self, results: Results, whole: Page) -> None:
-        estimator = results.choices[1]
-        words = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
-        assert words == ["least squares", *(f"ridge {k}" for k in range(5))]
-        worst = Choice(name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7)
-        assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
-        assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
-        assert "✓ ridge 0 20.00" in whole.text and "least squares 50.00" in whole.text
-        assert whole.text.count("Inner prediction (cross-validation):") == 1
-        assert "Inner prediction" not in rendered(make_results()).text
-
-
-class TestParameters:
-    def test_are_in_a_table(self, whole: Page, results: Results) -> None:
-        rows, parameters = whole.table("Estimate"), results.parameters
-        assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
-        for row, p in zip(rows, parameters, strict=True):
-            half = 0.06 * p.std  # numbers are rounded at the second digit of std
-            assert float(row["Estimate"]) == pytest.approx(p.estimate, abs=half)
-            assert float(row["Truth"]) == pytest.approx(p.truth, abs=half)
-            assert float(row["± std"]) == pytest.approx(p.std, rel=0.06)
-            assert float(row["95 % from"]) == pytest.approx(p.estimate - 2.05 * p.std, abs=half)
-            assert float(row["95 % to"]) == pytest.approx(p.estimate + 2.05 * p.std, abs=half)
-            z = (p.estimate - p.truth) / p.std
-            assert float(row["(est. − truth) / std"]) == pytest.approx(z, abs=0.0051)
-            assert float(row["Std over rep."]) == pytest.approx(p.repetition_std, rel=0.06)
-
-    def test_that_are_off_or_not_significant_are_marked(self) -> None:
-        cases = [
-            (10.0, 8.1, ""), (10.0, 7.9, "▲ outside 2σ"), (10.0, 13.1, "■ outside 3σ"),
-            (1.9, 1.0, "○ not significant"), (1.9, 5.0, "■ outside 3σ, ○ not significant"),
-        ]  # fmt: skip
-        parameters = [p.model_dump() for p in make_results().parameters]
-        for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
-            parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
-        rows = rendered(make_results(parameters=parameters)).table("Estimate")
-        remarks = [row["Remark"].replace("\xa0", " ") for row in rows]
-        assert remarks[: len(cases)] == [remark for *_, remark in cases]
-
-    def test_have_a_matrix_of_correlation_from_white_to_black(self, results: Results) -> None:
-        svg = figures.correlation_matrix(results).svg
-        image = re.findall(r"data:image/png;base64,\s*([^\"]*)", svg)[0]
-        pixels = imread(io.BytesIO(base64.b64decode(image)))[..., :3]
-        assert pixels.shape == (40, 40, 3)
-        expected = np.abs(np.array(results.correlation)[:40, :40])
-        np.testing.assert_allclose(1.0 - pixels.mean(axis=2), expected, atol=0.02)
-
-
-class TestErrors:
-    """Of the torque: of every run, over all runs, and over every row beside that of the verdict."""
-
-    def test_are_of_unseen_and_fitted_motion(self, results: Results, html: str) -> None:
-        head = Page(html[: html.index("<main>")])
-        median, worst, fitted = (list(row.values()) for row in head.table("All rows [%]"))
-        assert fitted == ["fitted", "2.10", "4.30"]
-        assert median[2] == "5.00" == worst[2]
-        assert float(worst[1]) >= float(median[1]) > 0.0
-        assert "median of 12 runs" in median[0]
-        assert Page(html).text.count("includes standstill and reversals") == 1
-
-
-class TestFigures:
-    """A panel for each joint; rows that do not count are shaded."""
-
-    def test_show_every_joint_that_moved(self, results: Results) -> None:
-        series, joints = make_series(), figures.joints_of(results)
-        series.law_speed[:, 2] = 0.0
-        for panels, expected in (
-            (figures.excitation_panels(series, joints), JOINTS),
-            (figures.torque_panels(series, joints), JOINTS),
-            (figures.friction_panels(series, joints), [*JOINTS[:2], *JOINTS[3:]]),
-        ):
-            assert [one.title for one in panels] == expected
-            assert all(one.svg.count("<path") > 4 for one in panels)
-
-    def test_shade_rows_to_midway_to_the_next(self) -> None:
-        used = np.array([[0.0], [1.0], [1.0], [0.0], [1.0]])
-        assert figures._left_out(np.arange(5.0), used, 0) == ((0.0, 0.5), (2.5, 3.5))
-
-    @pytest.mark.parametrize(
-        ("field", "values"),
-        [
-            ("excitation_velocity", np.zeros((3, 6))),
-            ("example_used", np.ones((3, 6))),
-            ("friction_torque", np.ones((7, 6))),
-            ("law_torque", np.full((40, 6), np.inf)),
-        ],
-    )
-    def test_refuse_series_that_do_not_fit_by_name(self, field: str, values: np.ndarray) -> None:
-        with pytest.raises(SeriesError, match=field.partition("_")[0]):
-            replace(make_series(), **{field: values})
-        with pytest.raises(SeriesError):
-            render(make_results(), make_series(joints=5))
-
-    @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
-    def test_thinning_leaves_order_ends_and_every_peak(
-        self, values: list[float], bins: int
-    ) -> None:
-        time, signal = np.arange(float(len(values))), np.array(values)
-        thin_time, thin = thinned(time, signal, bins)
-        assert thin.size <= 2 * bins + 2
-        assert np.all(np.diff(thin_time) > 0)
-        assert (thin_time[0], thin_time[-1]) == (time[0], time[-1])
-        assert (thin.min(), thin.max()) == (signal.min(), signal.max())
-
-
-class TestConduct:
-    """How the campaign was run."""
-
-    def test_shows_steps_and_may_be_missing(self, whole: Page) -> None:
-        for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
-            assert words in whole.text
-        assert "▲ Not warm" in whole.text and "still 1.3%" in whole.text
-        assert "Execution" not in rendered(make_results()).text
-
-
-class TestNumbers:
-    @given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e9))
-    def test_read_back_unchanged(self, value: float, std: float) -> None:
-        assert float(numbers.significant(value)) == pytest.approx(value, rel=0.0051)
-        assert abs(float(numbers.beside(value, std)) - value) <= 0.06 * std + 1e-9 * abs(value)
-
-    @pytest.mark.parametrize(
-        ("value", "std", "text"),
-        [
-            *[(71.6987, 0.4512, "71.70"), (71.6987, 31.0, "72"), (9.996, 0.0996, "10.00")],
-            *[(-0.00004, 0.02, "0.000"), (1.23456e-9, 2.2e-11, "1.235e-9")],
-            (5.0, math.nan, "5.000"),
-        ],
-    )
-    def test_are_rounded_where_uncertainty_begins(
-        self, value: float, std: float, text: str
-    ) -> None:
-        assert numbers.beside(value, std) == text
 
 
 ESSENTIAL = {
@@ -538,18 +303,167 @@ CONSISTENCY = {
 }  # fmt: skip
 
 
-class TestTrust:
-    """Grades, essential parameters and the nearest consistent model."""
+class TestPage:
+    def test_has_the_verdict_first_and_details_folded(self, html):
+        order = ["predicts unseen motion to 1.5 % of the torque", "SIMULATED",
+                 "Torque error over all joints", 'id="friction"', 'id="parameters"', 'id="trust"',
+                 '<details id="appendix">', 'id="run"', 'id="excitation"', 'id="estimation"',
+                 'id="correlation"', 'id="validation"']  # fmt: skip
+        places = [html.index(mark) for mark in order]
+        assert places == sorted(places)
+        assert places[0] < html.index("Figure 1")
+        assert html.rindex("</details>") > places[-1]
+
+    @pytest.mark.parametrize(("good", "word"), [(True, "GOOD"), (False, "NOT GOOD")])
+    def test_has_word_and_symbol_of_the_verdict(self, good, word):
+        verdict = {"good": good, "line": "So it is.", "reasons": ["because"], "warnings": []}
+        text = render(make_results(verdict=verdict))
+        card = text[text.index('<section class="verdict') :].split("</section>")[0]
+        assert Page(card).text == f"{word} So it is. because"
+        assert 'class="badge"' in card
+
+    def test_names_what_was_simulated(self, whole):
+        assert "SIMULATED. No robot moved" in whole.text
+        assert all(effect in whole.text for effect in make_results().effects)
+        assert "lower bound" not in whole.text
+        assert "lower bound" in rendered(make_results(effects=[])).text
+        recording = rendered(real_recording())
+        assert not {"simulated", "truth:", "planned"} & set(recording.text.lower().split())
+        assert not any("Truth" in rows[0] for rows in recording.tables)
+        assert len(recording.table("Estimate")) == 58
+
+    def test_stands_alone_with_figures_and_tables_in_order(self, html, whole):
+        assert_stands_alone(html)
+        assert len(set(re.findall(r'(?:href="|url\()#([^")]*)', html))) > 50
+        assert len(html.encode()) < 2_000_000
+        drawings = [a for tag, a in whole.tags if tag == "svg" and a.get("role") == "img"]
+        assert all(len(a["aria-label"] or "") > 30 for a in drawings)
+        assert sum(tag == "h1" for tag, _ in whole.tags) == 1
+        assert sum(tag == "caption" for tag, _ in whole.tags) == len(whole.tables)
+        for kind, count in (("Figure", 6), ("Table", len(whole.tables))):
+            found = re.findall(rf"<b>{kind} (\d+)\.</b>", html)
+            assert found == [str(k) for k in range(1, count + 1)]
+
+    def test_bytes_do_not_depend_on_thread_or_settings(self):
+        settings = {"lines.linestyle": ":", "svg.fonttype": "path", "text.usetex": True}
+        series = make_series(samples=200)
+        with mpl.rc_context(settings), ThreadPoolExecutor(2) as pool:
+            pages = list(pool.map(lambda _: report_bytes(make_results(), series), range(2)))
+            assert {key: mpl.rcParams[key] for key in settings} == settings
+        assert set(pages) == {report_bytes(make_results(), series)}
+
+    def test_names_from_archives_are_escaped(self, results):
+        def spoil(value):
+            if isinstance(value, list):
+                return [spoil(v) for v in value]
+            if isinstance(value, dict):
+                end = HOSTILE if "hil" in value else ""  # the keys of `software` are names too
+                return {k + end: spoil(v) for k, v in value.items()}
+            hostile = isinstance(value, str) and value not in FIXED_WORDS
+            return value + HOSTILE if hostile else value
+
+        spoilt = Results.model_validate(spoil(results.model_dump()))
+        found = Page(render(spoilt, make_series(samples=200, name="v" + HOSTILE)))
+        assert_inert(found)
+        assert "{{7*7}}" in found.text
+        assert "<script>alert(1)</script>" in found.text
+        # Also characters that change the direction of text.
+        text = environment().from_string("{{ name }}|{{ same }}|{{ number }}")
+        name, same = "a\u202eb\x1b[31m\u2066c\x7f", "1\u2009234\u00a0N\n\té"
+        shown = text.render(name=name, same=same, number=3)
+        assert shown == r"a\u202eb\x1b[31m\u2066c\x7f" + f"|{same}|3"
+
+    def test_of_one_joint_without_friction_or_validation(self):
+        whole = real_recording()
+
+        def first(section):
+            found = section.model_dump().items()
+            return {key: value[:1] if isinstance(value, list) else value for key, value in found}
+
+        alone = whole.model_dump() | {
+            "joint_names": ["q"], "parameters": [whole.parameters[5].model_dump()], "n_base": 1,
+            "correlation": [[1.0]], "noise_std": [0.1], "validation": [],
+            "judgement": first(whole.judgement), "fitted": first(whole.fitted),
+            "repetition_values": [[1.0] for _ in whole.repetitions],
+            "excitation": whole.excitation.model_dump()
+            | {"executed": _criteria(1.0, 1.0) | {"condition": math.inf}},
+        }  # fmt: skip
+        found = Page(render(Results.model_validate(alone), make_series(joints=1)))
+        assert "Nothing was held out" in found.text
+
+    def test_shows_the_chosen_candidate_and_the_best(self, results, whole):
+        estimator = results.choices[1]
+        words = [estimator.candidates[k] for k in page.shown_candidates(estimator)]
+        assert words == ["least squares", *(f"ridge {k}" for k in range(5))]
+        worst = Choice(name="x", candidates=list("abcdefgh"), errors=[0.1] * 7 + [0.9], chosen=7)
+        assert 7 in page.shown_candidates(worst) and len(page.shown_candidates(worst)) == 6
+        assert "✓ 10 Hz 6.12" in whole.text and "5 Hz 6.55" in whole.text
+        assert "✓ ridge 0 20.00" in whole.text and "least squares 50.00" in whole.text
+        assert whole.text.count("Inner prediction (cross-validation):") == 1
+        assert "Inner prediction" not in rendered(make_results()).text
+
+    def test_has_errors_of_unseen_and_fitted_motion(self, html):
+        head = Page(html[: html.index("<main>")])
+        median, worst, fitted = (list(row.values()) for row in head.table("All rows [%]"))
+        assert fitted == ["fitted", "2.10", "4.30"]
+        assert median[2] == "5.00" == worst[2]
+        assert float(worst[1]) >= float(median[1]) > 0.0
+        assert "median of 12 runs" in median[0]
+        assert Page(html).text.count("includes standstill and reversals") == 1
+
+    def test_shows_steps_of_the_campaign_if_known(self, whole):
+        for words in ("Execution", "6 of 6 criteria passed", "Accepted by ada", "2 late"):
+            assert words in whole.text
+        assert "▲ Not warm" in whole.text and "still 1.3%" in whole.text
+        assert "Execution" not in rendered(make_results()).text
+
+
+class TestParameters:
+    def test_are_in_a_table(self, whole, results):
+        rows, parameters = whole.table("Estimate"), results.parameters
+        assert [row["Id"] for row in rows] == [str(p.table2_id) for p in parameters]
+        for row, p in zip(rows, parameters, strict=True):
+            half = 0.06 * p.std  # numbers are rounded at the second digit of std
+            for column, value, error in (
+                ("Estimate", p.estimate, half),
+                ("Truth", p.truth, half),
+                ("± std", p.std, half),
+                ("95 % from", p.estimate - 2.05 * p.std, half),
+                ("95 % to", p.estimate + 2.05 * p.std, half),
+                ("(est. − truth) / std", (p.estimate - p.truth) / p.std, 0.0051),
+                ("Std over rep.", p.repetition_std, 0.06 * p.repetition_std),
+            ):
+                assert float(row[column]) == pytest.approx(value, abs=error), column
+
+    def test_that_are_off_or_not_significant_are_marked(self):
+        cases = [
+            (10.0, 8.1, ""), (10.0, 7.9, "▲ outside 2σ"), (10.0, 13.1, "■ outside 3σ"),
+            (1.9, 1.0, "○ not significant"), (1.9, 5.0, "■ outside 3σ, ○ not significant"),
+        ]  # fmt: skip
+        parameters = [p.model_dump() for p in make_results().parameters]
+        for parameter, (estimate, truth, _) in zip(parameters, cases, strict=False):
+            parameter |= {"estimate": estimate, "truth": truth, "std": 1.0}
+        rows = rendered(make_results(parameters=parameters)).table("Estimate")
+        remarks = [row["Remark"].replace("\xa0", " ") for row in rows]
+        assert remarks[: len(cases)] == [remark for *_, remark in cases]
+
+    def test_have_a_matrix_of_correlation_from_white_to_black(self, results):
+        svg = figures.correlation_matrix(results).svg
+        image = re.findall(r"data:image/png;base64,\s*([^\"]*)", svg)[0]
+        pixels = imread(io.BytesIO(base64.b64decode(image)))[..., :3]
+        assert pixels.shape == (40, 40, 3)
+        expected = np.abs(np.array(results.correlation)[:40, :40])
+        np.testing.assert_allclose(1.0 - pixels.mean(axis=2), expected, atol=0.02)
 
     @pytest.mark.parametrize(
         ("std", "grade"),
         [(0.1, "well"), (0.5, "roughly"), (0.6, "hardly"), (math.inf, "undetermined")],
     )
-    def test_a_grade_is_by_relative_standard_deviation(self, std: float, grade: str) -> None:
+    def test_are_graded_by_relative_standard_deviation(self, std, grade):
         parameter = make_results().parameters[0].model_copy(update={"estimate": 1.0, "std": std})
         assert parameter.grade == grade
 
-    def test_essential_and_consistent_parameters_are_explained(self) -> None:
+    def test_essential_and_consistent_ones_are_explained(self):
         page = rendered(make_results(essential=ESSENTIAL, consistency=CONSISTENCY))
         for words in (
             "2 of 58 are essential",
@@ -564,3 +478,64 @@ class TestTrust:
         assert link["Mass [kg]"] == "12.3" and link["Link of"] == "<script>alert(1)"
         without = rendered(make_results()).text
         assert "Essential parameters" not in without and "Physical consistency" not in without
+
+
+class TestFigures:
+    """A panel for each joint; rows that do not count are shaded."""
+
+    def test_show_every_joint_that_moved(self, results):
+        series, joints = make_series(), figures.joints_of(results)
+        series.law_speed[:, 2] = 0.0
+        for panels, expected in (
+            (figures.excitation_panels(series, joints), JOINTS),
+            (figures.torque_panels(series, joints), JOINTS),
+            (figures.friction_panels(series, joints), [*JOINTS[:2], *JOINTS[3:]]),
+        ):
+            assert [one.title for one in panels] == expected
+            assert all(one.svg.count("<path") > 4 for one in panels)
+
+    def test_shade_rows_to_midway_to_the_next(self):
+        used = np.array([[0.0], [1.0], [1.0], [0.0], [1.0]])
+        assert figures._left_out(np.arange(5.0), used, 0) == ((0.0, 0.5), (2.5, 3.5))
+
+    @pytest.mark.parametrize(
+        ("field", "values"),
+        [
+            ("excitation_velocity", np.zeros((3, 6))),
+            ("example_used", np.ones((3, 6))),
+            ("friction_torque", np.ones((7, 6))),
+            ("law_torque", np.full((40, 6), np.inf)),
+        ],
+    )
+    def test_refuse_series_that_do_not_fit_by_name(self, field, values):
+        with pytest.raises(SeriesError, match=field.partition("_")[0]):
+            replace(make_series(), **{field: values})
+        with pytest.raises(SeriesError):
+            render(make_results(), make_series(joints=5))
+
+    @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=3000), st.integers(1, 200))
+    def test_thinning_leaves_order_ends_and_every_peak(self, values, bins):
+        time, signal = np.arange(float(len(values))), np.array(values)
+        thin_time, thin = thinned(time, signal, bins)
+        assert thin.size <= 2 * bins + 2
+        assert np.all(np.diff(thin_time) > 0)
+        assert (thin_time[0], thin_time[-1]) == (time[0], time[-1])
+        assert (thin.min(), thin.max()) == (signal.min(), signal.max())
+
+
+class TestNumbers:
+    @given(st.floats(-1e12, 1e12), st.floats(1e-12, 1e9))
+    def test_read_back_unchanged(self, value, std):
+        assert float(numbers.significant(value)) == pytest.approx(value, rel=0.0051)
+        assert abs(float(numbers.beside(value, std)) - value) <= 0.06 * std + 1e-9 * abs(value)
+
+    @pytest.mark.parametrize(
+        ("value", "std", "text"),
+        [
+            *[(71.6987, 0.4512, "71.70"), (71.6987, 31.0, "72"), (9.996, 0.0996, "10.00")],
+            *[(-0.00004, 0.02, "0.000"), (1.23456e-9, 2.2e-11, "1.235e-9")],
+            (5.0, math.nan, "5.000"),
+        ],
+    )
+    def test_are_rounded_where_uncertainty_begins(self, value, std, text):
+        assert numbers.beside(value, std) == text
