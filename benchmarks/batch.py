@@ -21,8 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -32,7 +31,7 @@ from benchmarks import parser_of, show
 from benchmarks.archive_files import PERIOD, repetitions
 from hil.batch.cache import CacheLocation
 from hil.batch.run import BatchResult, reidentify
-from hil.batch.workers import LocalWorkers, Workers
+from hil.batch.workers import ArchiveTask, Workers, run_task
 from hil.identify.options import FIXED
 from hil.progress import Silent
 
@@ -42,8 +41,14 @@ _CAMPAIGN = 25  # repetitions
 class InThisProcess(Workers):
     """One core and no child: what the work itself takes."""
 
-    def __init__(self) -> None:
-        super().__init__(ThreadPoolExecutor(1))
+    def results(
+        self, tasks: Sequence[ArchiveTask[Any]], done: Callable[[int], None] | None = None
+    ) -> Iterator[Any]:
+        """Run tasks one after the other."""
+        for task in tasks:
+            yield run_task(task)
+            if done is not None:
+                done(1)
 
 
 def archives_to_estimate(paths: Sequence[Path]) -> float:
@@ -65,10 +70,10 @@ def archives_to_estimate(paths: Sequence[Path]) -> float:
 def measure(places: Sequence[str], workers: int | None) -> dict[str, Any]:
     """A first and a second run on some folders."""
     with tempfile.TemporaryDirectory() as cache:
-        with LocalWorkers(workers) as hands:
+        with Workers(workers) as hands:
             first, first_wall, first_own = _timed(places, Path(cache), "wls", hands)
         first_cpu = first_own + _children()
-        with LocalWorkers(workers) as hands:
+        with Workers(workers) as hands:
             second, second_wall, second_own = _timed(places, Path(cache), "wls", hands)
         second_cpu = first_own + second_own + _children() - first_cpu
         cached = sum(path.stat().st_size for path in Path(cache).rglob("*") if path.is_file())

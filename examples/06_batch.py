@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 
 from hil import Campaign, Cell
 from hil.batch.run import reidentify
-from hil.batch.workers import LocalWorkers
+from hil.batch.workers import Workers
 from hil.campaign import design
 from hil.identify.options import Options
 from hil.progress import Silent
@@ -33,7 +33,7 @@ def record(root: Path) -> None:
 
 def main() -> None:
     """Record, re-identify, draw."""
-    with TemporaryDirectory() as folder, LocalWorkers(2) as workers:
+    with TemporaryDirectory() as folder, Workers(2) as workers:
         record(Path(folder))
         result = reidentify([folder], Options(), workers, Silent())
     figure, axes = plt.subplots(figsize=(8, 3.5), layout="constrained")

@@ -27,7 +27,6 @@ settings.load_profile("hil")
 
 _LONGEST = (
     "test_fault_matrix.py",
-    "test_batch_dask.py",
     "test_cli.py",
     "test_rounds.py",
     "test_one_sided_errors.py",

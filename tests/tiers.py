@@ -37,7 +37,6 @@ LONG: Final = (
     "hil/test_any_robot.py",
     "hil/test_archive_process.py",
     "hil/test_batch.py",
-    "hil/test_batch_dask.py",
     "hil/test_changes.py",
     "hil/test_campaign_day.py",
     "hil/test_campaign_plan.py",

@@ -137,7 +137,7 @@ def discover(
         raise InputError(", ".join(roots), "; ".join(reasons), remedy="name others")
     known: dict[str, ArchiveRef | Unused] = {}
     with reporter.task("reading the metadata of archives", len(places)) as task:
-        for place in places if workers.local else ():  # else the cache is on the workers
+        for place in places:
             with suppress(ArchiveError):  # it has disappeared: the worker reports it
                 if (ref := _known(place, cache)) is not None:
                     known[place] = ref

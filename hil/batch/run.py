@@ -266,11 +266,11 @@ class _Batch:
     # Estimates
 
     def result(self, campaigns: Sequence[_Campaign], skipped: tuple[Unused, ...]) -> BatchResult:
-        """Reduce and estimate everything; local cache entries are read in this process."""
+        """Reduce and estimate everything; cache entries are read in this process."""
         tasks = []
         for one in campaigns:
             for refs in factors.split_bundles([ref for ref in one.refs if ref.use != "standstill"]):
-                known = self.workers.local and factors.is_cached(refs, one.ready, self.cache)
+                known = factors.is_cached(refs, one.ready, self.cache)
                 one.bundles.append((refs, known))
                 tasks += [] if known else [self._reducing(one, refs)]
         self.stream = self.workers.results(tasks)

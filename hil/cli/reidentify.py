@@ -14,7 +14,7 @@ from hil.batch import run
 from hil.batch.cache import CacheLocation
 from hil.batch.run import BatchEstimator, BatchResult, LevelEstimate, relative_error
 from hil.batch.table import write_tables
-from hil.batch.workers import DaskWorkers, LocalWorkers
+from hil.batch.workers import Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
 from hil.files import convert_write_errors, make_folder
@@ -34,7 +34,6 @@ def reidentify(
     estimator: BatchEstimator = "auto",
     workers: Annotated[int | None, typer.Option(min=1)] = None,
     cache: Annotated[str | None, typer.Option(metavar="FOLDER|none")] = None,
-    dask: Annotated[str | None, typer.Option(metavar="ADDRESS")] = None,
     *,
     how: Identifying,
     quiet: QuietOption = False,
@@ -56,15 +55,13 @@ def reidentify(
         workers: Number of processes. Default: one per core.
         cache: Folder of cached factors, or none. Default: .hil-cache next to the archives, or in
             the user's cache folder if those are read-only.
-        dask: Address of a Dask scheduler that does the work, such as tcp://host:8786.
     """
     reporter = make_reporter(quiet=quiet or json)
     if output is not None:
         make_folder(output)
     options, keep = how.options(estimator=estimator), cache != "none"
     location = CacheLocation(str(Path(cache).resolve()) if keep and cache else None, keep)
-    with LocalWorkers(workers) if dask is None else DaskWorkers(dask) as hands:
-        hands.require_folders([Path(place) for place in places])
+    with Workers(workers) as hands:
         result = run.reidentify(places, options, hands, reporter, cache=location)
     written: list[Path] = []
     if output is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from hil.batch.workers import ArchiveTask, LocalWorkers, Unused
+from hil.batch.workers import ArchiveTask, Unused, Workers
 from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
 from hil.campaign.errors import RepetitionsRejectedError
 from hil.campaign.plan import plan_around
@@ -219,7 +219,7 @@ def in_children(
     calls: Sequence[tuple[Path, tuple[Any, ...]]],
     title: str,
     reporter: Reporter,
-    workers: LocalWorkers,
+    workers: Workers,
 ) -> list[T]:
     """Call a function in child processes with the arguments of each place; results in order.
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from hil.batch.workers import LocalWorkers
+from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.design import preset
 from hil.files import digest, write_files
@@ -55,7 +55,7 @@ def run_study(
         simulated_link(cell)  # raises for real hardware
         settings = settings.model_copy(update={"cell": digest(cell.text + cell.urdf)})
     truth = planted_values(cell)
-    with folder.locked(), LocalWorkers(workers, timeout=campaigns.LONGEST) as processes:
+    with folder.locked(), Workers(workers, timeout=campaigns.LONGEST) as processes:
         folder.begin(settings)
         wanted = campaigns.searches(settings, len(cell.joint_names))
         found = campaigns.run_searches(folder, cell, wanted, reporter, workers)

@@ -35,7 +35,6 @@ OTHER_PROGRAMS = {
     "printf": "changes the computer",
     "echo": "changes the computer",
     "candump": "needs a CAN bus",
-    "dask": "needs other machines; tests/hil/test_batch_dask.py starts a cluster",
     "ssh": "needs another machine",
     "make": "is how tests are run: its targets are looked up",
     "pip": "network",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,9 +22,9 @@ NOTHING_OPEN: Final = (
 class Here(Workers):
     """Workers in this process; `deadly` archives, by name, are as if they ended theirs."""
 
-    def __init__(self, *deadly, local=True):
-        super().__init__(ThreadPoolExecutor(1))
-        self.deadly, self.local = deadly, local
+    def __init__(self, *deadly):
+        super().__init__(1)
+        self.deadly = deadly
         self.tasks: list[ArchiveTask[Any]] = []
 
     def results(self, tasks, done=None):

@@ -24,7 +24,7 @@ from hil.batch.cache import CacheLocation
 from hil.batch.discovery import discover, open_ref
 from hil.batch.factors import cached_bundle, reduce_bundle
 from hil.batch.run import BatchEstimator, reidentify
-from hil.batch.workers import LocalWorkers
+from hil.batch.workers import Workers
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ArchiveError, InputError
@@ -211,11 +211,10 @@ class TestNumbers:
     @pytest.mark.slow
     def test_do_not_depend_on_workers_order_or_cache(self, folder, tmp_path, monkeypatch):
         monkeypatch.setattr(factors, "BUNDLE", 1)
-        with LocalWorkers(2) as workers:
+        with Workers(2) as workers:
             alone = batch(folder, workers=workers)
         files = sorted((folder / "archives").glob("*.mcap"), reverse=True)
         assert bits(batch(*files)) == bits(alone)
-        assert bits(batch(folder, workers=Here(local=False))) == bits(alone)
         place = CacheLocation(str(tmp_path / "cache"))
         for _ in range(2):
             assert bits(batch(folder, cache=place)) == bits(alone)
@@ -588,16 +587,12 @@ class TestMetadata:
         assert ref.arm == "another digest"
         assert len(opened) == 2
 
-    def test_on_other_machines_are_left_to_their_workers(self, tmp_path, arm):
+    def test_are_read_by_child_processes(self, tmp_path, arm):
         for name in ("a", "b", "c"):
             recording(tmp_path / f"{name}.mcap", arm)
-        cache = CacheLocation(str(tmp_path / "cache"))
-        with LocalWorkers(2) as workers:
-            found = discover([str(tmp_path)], cache, workers, Silent())
+        with Workers(2) as workers:
+            found = discover([str(tmp_path)], UNCACHED, workers, Silent())
         assert [ref.name for ref in found.refs] == ["a.mcap", "b.mcap", "c.mcap"]
-        far = Here(local=False)
-        assert discover([str(tmp_path)], cache, far, Silent()) == found
-        assert [task.path for task in far.tasks] == [ref.location for ref in found.refs]
 
     def test_of_an_archive_that_changes_while_it_is_read(self, tmp_path, arm, monkeypatch):
         """It is not cached."""

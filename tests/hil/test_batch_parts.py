@@ -39,7 +39,7 @@ from hil.batch.factors import (
 )
 from hil.batch.run import Arm, BatchResult
 from hil.batch.table import COLUMNS, write_tables
-from hil.batch.workers import LocalWorkers, Unused
+from hil.batch.workers import Unused, Workers
 from hil.cell import Cell
 from hil.cell.schema import PayloadTable, TorsionSpringTable
 from hil.identify.prepared import Settings
@@ -206,14 +206,14 @@ class TestWorkers:
         tasks, failing = work.tasks_with_failures(12, hang=5)
         tasks[9] = work.task(work.once, str(tmp_path / "ran"))
         finished = []
-        with LocalWorkers(2, timeout=4.0) as workers:
+        with Workers(2, timeout=4.0) as workers:
             found = list(workers.results(tasks, finished.append))
         assert sum(finished) == 12
         work.check_failures(tasks, found, failing, {9: "again"})
 
     def test_closing_ends_tasks_at_work(self):
         begin = time.monotonic()
-        with LocalWorkers(2) as workers:
+        with Workers(2) as workers:
             found = workers.results([work.task(work.number, 0), *[work.task(work.hang, 1)] * 20])
             assert next(found) == 0
         assert time.monotonic() - begin < 60.0

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from hil.batch.run import Arm
-from hil.batch.workers import LocalWorkers
+from hil.batch.workers import Workers
 from hil.campaign import Campaign
 from hil.campaign.plan import design
 from hil.cell import Cell
@@ -66,7 +66,7 @@ def ran(folder, cell, plan):
 
 
 def compared(*places):
-    with LocalWorkers(1) as workers:
+    with Workers(1) as workers:
         return compare([str(place) for place in places], workers, Silent())
 
 

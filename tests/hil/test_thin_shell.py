@@ -13,7 +13,7 @@ SHELL = sorted((ROOT / "hil" / "cli").glob("*.py"))
 OURS = ("hil", "drivers", "planner", "identification", "sim_fixtures")
 ALGEBRA = ("numpy", "scipy", "pinocchio", "coal", "ruckig", "pymoo", "cma", "cvxpy", "clarabel",
            "matplotlib", "mcap", "zstandard", "lz4", "isal", "rosbags", "can", "serial", "pydantic",
-           "jinja2", "foxglove", "distributed")  # fmt: skip
+           "jinja2", "foxglove")  # fmt: skip
 WIRE = ("socket", "struct", "multiprocessing", "ctypes", "mmap")
 OF_NUMPY = {"array", "asarray", "isfinite", "degrees", "max", "abs", "argmax", "float64"}
 """Functions of numpy for output: no estimation, solution, sampling or integration."""
