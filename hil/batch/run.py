@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import groupby
 from typing import Any, Final, Literal, TypeVar, cast, get_args
 
@@ -82,9 +82,6 @@ class LevelEstimate:
     level: Level
     arm: str  #: digest of the arm, a key of `BatchResult.arms`
     campaign: str  #: folder; "" if pooled
-    #: location and digest of the archive of a repetition; "" otherwise
-    archive: str
-    sha256: str
     when: str  #: time of the (first) recording, ISO 8601, "" if unknown
     repetitions: int  #: archives that were fitted
     names: tuple[str, ...]
@@ -106,6 +103,15 @@ class LevelEstimate:
     #: payload and delay that the cell states, as text; "" if neither, or if campaigns with
     #: different ones are pooled
     setup: str = ""
+    #: location and digest of the archive of a repetition; "" otherwise
+    archive: str = ""
+    sha256: str = ""
+
+    @classmethod
+    def of(cls, found: Estimate, **others: Any) -> LevelEstimate:
+        """Return an estimate with `others`, which replace its fields."""
+        names = [one.name for one in fields(cls) if hasattr(found, one.name)]
+        return cls(**({name: getattr(found, name) for name in names} | others))
 
 
 @dataclass(frozen=True, eq=False)
@@ -503,7 +509,9 @@ def repetition_level(
     found = estimator.of_archive(summary, centre)
     own = {name: getattr(found, name).copy() for name in ("values", "noise_std", "samples")}
     nothing = np.full(model.n_joints, np.nan)
-    return LevelEstimate(
+    return LevelEstimate.of(
+        found,
+        **own,
         level="repetition",
         arm=ref.arm,
         campaign=ref.campaign,
@@ -511,7 +519,8 @@ def repetition_level(
         sha256=ref.sha256,
         when=ref.when,
         repetitions=1,
-        **(_figures(found) | own | {"names": model.parameter_names, "units": model.units}),
+        names=model.parameter_names,
+        units=model.units,
         covariance=None,
         torque_rms=_rms(replace(summary.total)),
         unseen_rms=nothing,
@@ -545,16 +554,13 @@ def sum_level(
             " archives uses QR"
         )
         warnings = (conditioning, *warnings)
-    return LevelEstimate(
+    return LevelEstimate.of(
+        found,
         level=level,
         arm=refs[0].arm,
         campaign=refs[0].campaign if level == "campaign" else "",
-        archive="",
-        sha256="",
         when=min((ref.when for ref in refs if ref.when), default=""),
         repetitions=len(refs),
-        **_figures(found),
-        covariance=found.covariance,
         torque_rms=_rms(group.total),
         unseen_rms=_rms(unseen, unseen.squared_errors(found.values)),
         unseen_torque_rms=_rms(unseen),
@@ -579,11 +585,3 @@ def relative_error(error: Array, torque: Array, rows: NDArray[np.intp] | None = 
     known = (count > 0.0) & np.isfinite(error) & np.isfinite(torque)
     whole = float(count[known] @ torque[known] ** 2)
     return math.sqrt(float(count[known] @ error[known] ** 2) / whole) if whole > 0.0 else math.nan
-
-
-def _figures(found: Estimate) -> dict[str, Any]:
-    names = (
-        *("names", "units", "values", "std", "interval_factor", "samples", "noise_std"),
-        *("condition", "undetermined", "method"),
-    )
-    return {name: getattr(found, name) for name in names}

@@ -15,12 +15,12 @@ from hil.cell import Cell
 from hil.files import write_files
 from hil.identify.run import consistency_of
 from hil.outcome import Exports, exports_of
-from identification import Estimate, Motion
+from identification import Estimate
 from identification.estimators.covariance import with_block_covariance
 from identification.factor.factor import Factor, estimate, joint_weights
 from identification.selection.essential import Elimination, choose_essential
-from identification.signals.samples import Samples
 from identification.validation.plausibility import ConsistencyCheck
+from tests.identification.two_link import simulated, sine_motion, values_of
 
 Array = NDArray[np.float64]
 
@@ -79,11 +79,11 @@ def identified_arm(
     """
     cell = Cell.from_texts(CELL.format(robot=robot), urdf, Path("cell.toml"))
     model = cell.model
-    if standard is None:
-        standard = model.nominal.copy()
-        standard[model.layout.rotors] = 0.2
     friction = [{"f0": 2.0, "f1": 1.5, "fo": 0.1}.get(t.symbol, 0.3) for t in model.friction.terms]
-    truth = np.concatenate([model.base.grouping @ standard, friction])
+    if standard is None:
+        truth = values_of(model, friction, 0.2)
+    else:
+        truth = np.concatenate([model.base.grouping @ standard, friction])
     runs = [_run(cell, truth, seed, still, noise) for seed in (1, 2, 3)]
     training, *held_out = (Factor.by_time(model, run) for run in runs)
     weights = joint_weights(training)
@@ -95,34 +95,17 @@ def identified_arm(
     return IdentifiedArm(cell, truth, free, consistency, essential)
 
 
-def _run(cell: Cell, truth: Array, seed: int, still: tuple[int, ...], noise: float) -> Samples:
+def _run(cell, truth, seed, still, noise):
     model = cell.model
     motion = a_motion(model.n_joints, seed, still)
-    torque = model.torque(truth, *motion[1:])
-    size = np.sqrt(np.mean(torque**2, axis=0))
-    torque += noise * size * np.random.default_rng(seed).standard_normal(torque.shape)
-    return Samples(
-        motion=motion,
-        torque=torque,
-        usable=model.moving(motion.velocity),
-        segments=(slice(0, len(motion.time)),),
-        origin=0.0,
-        position_bandwidth=np.full(model.n_joints, np.inf),
-    )
+    size = np.sqrt(np.mean(model.torque(truth, *motion[1:]) ** 2, axis=0))
+    return simulated(model, truth, motion, noise * size, seed)
 
 
-def a_motion(n: int, seed: int, still: tuple[int, ...] = ()) -> Motion:
+def a_motion(n, seed, still=()):
     """Eight seconds of three sines per joint."""
-    time = np.arange(0.0, 8.0, 0.01)
     rng = np.random.default_rng(seed)
-    size, pulse, phase = (
-        rng.uniform(low, high, (3, n)) for low, high in ((0.2, 0.5), (1, 5), (0, 6))
-    )
+    ranges = ((0.2, 0.5), (1, 5), (0, 6))
+    size, pulse, phase = (rng.uniform(low, high, (3, n)) for low, high in ranges)
     size[:, list(still)] = 0.0
-    angle = pulse * time[:, None, None] + phase
-    return Motion(
-        time,
-        (size * np.sin(angle)).sum(axis=1),
-        (size * pulse * np.cos(angle)).sum(axis=1),
-        (-size * pulse**2 * np.sin(angle)).sum(axis=1),
-    )
+    return sine_motion(np.arange(0.0, 8.0, 0.01), size, pulse, phase)

@@ -33,7 +33,7 @@ from hil.progress import Silent
 from hil.report.changes import comparison_page
 
 from . import arm_histories
-from .arm_histories import FRICTION, Condition, Load
+from .arm_histories import FRICTION, Condition
 from .fast_cell import fast_cell
 from .test_report import HOSTILE, Page, assert_inert, assert_stands_alone
 
@@ -138,7 +138,7 @@ def judged(levels, repetitions=equal):
 
 def in_memory(friction=1.0, *, load=0.0, repetitions=equal):
     """Compare a usual campaign with one of other friction or load."""
-    other = Condition(friction=friction * FRICTION, load=Load(load))
+    other = Condition(friction=friction * FRICTION, load=load)
     return judged(levels_of(Condition(), other), repetitions)
 
 
