@@ -11,7 +11,7 @@ import math
 import os
 import struct
 from dataclasses import dataclass, fields, is_dataclass
-from functools import cache, lru_cache
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from sys import intern
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 BESIDE: Final = ".hil-cache"  # folder beside the archives
 
-_MAGIC: Final = b"HILCACH3"
+_MAGIC: Final = b"HILCACH4"
 _HEAD: Final = struct.Struct("<8sII")  # magic, length of the JSON text, checksum of what follows
 _KINDS: Final[dict[str, type[np.generic]]] = {"f": np.float64, "i": np.intp}
 _TYPES: Final[dict[str, type[Any]]] = {
@@ -121,10 +121,7 @@ class CacheLocation:
 
 
 def encoded(key: str, content: Any) -> bytes:
-    """Return the file of an entry: JSON, then the arrays.
-
-    Of symmetric matrices (..., k, k) the lower triangles (..., k (k + 1) / 2) are written.
-    """
+    """Return the file of an entry: JSON, then the arrays."""
     arrays: list[NDArray[Any]] = []
     size = 0
 
@@ -133,14 +130,9 @@ def encoded(key: str, content: Any) -> bytes:
         if is_dataclass(value) and not isinstance(value, type):
             own = {one.name: getattr(value, one.name) for one in fields(value)}
             return own | {"type": type(value).__name__}
-        width = value.shape[-1] if value.ndim > 1 and value.shape[-1] == value.shape[-2] else 0
-        if width and np.array_equal(value, value.swapaxes(-1, -2)):
-            value = value[(..., *_triangle(width))]
-        else:
-            width = 0
         arrays.append(np.ascontiguousarray(value))
         at, size = size, size + value.nbytes
-        return {"array": value.dtype.kind, "shape": value.shape, "at": at, "square": width}
+        return {"array": value.dtype.kind, "shape": value.shape, "at": at}
 
     text = json.dumps({"key": key, "content": content}, default=place).encode()
     text += b" " * (-(len(text) + _HEAD.size) % 8)
@@ -163,13 +155,7 @@ def decoded(data: bytes, key: str) -> Any:
         if "array" not in found:
             return found
         kind, count = _KINDS[found["array"]], math.prod(found["shape"])
-        values = np.frombuffer(body, kind, count, size + found["at"]).reshape(found["shape"])
-        if not found["square"]:
-            return values
-        row, column = _triangle(found["square"])
-        square = np.empty((*values.shape[:-1], found["square"], found["square"]), kind)
-        square[..., row, column] = square[..., column, row] = values
-        return square
+        return np.frombuffer(body, kind, count, size + found["at"]).reshape(found["shape"])
 
     try:
         entry = json.loads(bytes(body[:size]), object_hook=restored)
@@ -183,13 +169,6 @@ def _fixed(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(map(_fixed, value))
     return intern(value) if isinstance(value, str) else value
-
-
-@lru_cache(maxsize=64)
-def _triangle(width: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of the lower triangle of a square."""
-    row, column = np.tril_indices(width)
-    return row, column
 
 
 @cache

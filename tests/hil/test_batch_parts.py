@@ -70,11 +70,11 @@ def test_bundles_do_not_depend_on_the_order_of_archives(order):
 class TestCache:
     @given(st.data())
     def test_entries_with_one_wrong_bit_are_ignored(self, data):
-        content = {"a": [1.5, "x"], "values": np.arange(7.0), "none": [np.zeros((0, 3))]}
+        content = {"a": [1.5, "x"], "values": np.eye(7), "none": [np.zeros((0, 3))]}
         intact = encoded(KEY, content)
         found = decoded(intact, KEY)
         assert found["a"] == [1.5, "x"]
-        assert found["values"].tobytes() == np.arange(7.0).tobytes()
+        assert found["values"].tobytes() == np.eye(7).tobytes()
         assert found["none"][0].shape == (0, 3)
         bit = data.draw(st.integers(0, 8 * len(intact) - 1))
         damaged = bytearray(intact)
@@ -114,14 +114,6 @@ class TestCache:
         assert all(one.exception() is None for one in writing)
         assert {float(np.ptp(one)) for one in found if one is not None} <= {0.0}
         assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [KEY]
-
-    @given(st.integers(1, 6), st.booleans())
-    def test_square_matrices_are_restored_exactly(self, size, symmetric):
-        square = np.random.default_rng(size).normal(size=(3, size, size))
-        square = square + square.swapaxes(1, 2) if symmetric else square
-        data = encoded(KEY, [square])
-        assert decoded(data, KEY)[0].tobytes() == square.tobytes()
-        assert not symmetric or len(data) < 300 + 8 * 3 * size * (size + 1) / 2
 
     def test_unwritable_folders_are_refused_with_a_remedy(self, tmp_path):
         (tmp_path / "file").write_text("")
@@ -182,6 +174,7 @@ class TestDigests:
         assert changed(elements=[TorsionSpringTable(**spring)]) != own
         assert arm_digest(replace(cell, urdf=cell.urdf + "\n"), b"drives") != own
         assert arm_digest(cell, b"other drives") != own
+        assert arm_digest(cell, b"drives", simulated=True) != own
 
     def test_that_of_settings_ignores_those_of_the_estimate(self):
         stated = Settings(Preprocessing(torque_delay=0.002), noise_variance=(1e-9,) * 6)
