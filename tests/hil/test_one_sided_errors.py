@@ -8,7 +8,6 @@ of the URDF.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ import pinocchio as pin
 import pytest
 
 import hil.identify.sources
-from hil.campaign import Campaign, CampaignPlan
+from hil.campaign import CampaignPlan
 from hil.cell import Cell, CellError
 from hil.identify import identify_campaign
 from hil.progress import Silent
@@ -31,44 +30,48 @@ from sim_fixtures.ns16 import (
     urdf_text,
 )
 
-Run = Callable[..., Campaign]
+slow = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def short(cell):
-    return cell.with_link(cycle_ms=2).with_campaign(repetitions=2, validation_runs=1)
+def ran(tmp_path_factory, cell, plan, run):
+    """Return a function that runs a short campaign, one motion of each kind."""
+    short = cell.with_link(cycle_ms=2).with_campaign(repetitions=2, validation_runs=1)
+    motions = CampaignPlan(plan.excitation, plan.validation[:1])
+
+    def campaign(error=None, **changes):
+        if error is not None:
+            changes["drive"] = error(simulated_drive(short))
+        return run(tmp_path_factory.mktemp("ran") / "campaign", short, motions, **changes)
+
+    return campaign
 
 
 @pytest.fixture(scope="module")
-def motions(plan):
-    """Return one motion of each kind."""
-    return CampaignPlan(plan.excitation, plan.validation[:1])
-
-
-@pytest.fixture(scope="module")
-def correct_campaign(tmp_path_factory, short, motions, run):
+def correct_campaign(ran):
     """Return a campaign of the robot that the cell describes; read only."""
-    return run(tmp_path_factory.mktemp("correct_campaign") / "campaign", short, motions)
+    return ran()
 
 
 def verdict(campaign):
     return identify_campaign(campaign.folder.root, Silent()).results.verdict
 
 
-def gear_4_negated(drive):
-    ratios = list(drive.gear_ratio)
-    ratios[3] = -ratios[3]
-    return replace(drive, gear_ratio=tuple(ratios))
+def swapped(values, i, j):
+    found = list(values)
+    found[i], found[j] = found[j], found[i]
+    return tuple(found)
 
 
-def coupling_of_5_into_6_turned(drive):
-    return replace(drive, k65=-drive.k65)
-
-
-def torque_constants_of_2_and_3_swapped(drive):
-    constants = list(drive.torque_constant)
-    constants[1], constants[2] = constants[2], constants[1]
-    return replace(drive, torque_constant=tuple(constants))
+ERRORS = {
+    "gear 4 negated": lambda drive: replace(
+        drive, gear_ratio=tuple(np.multiply(drive.gear_ratio, [1, 1, 1, -1, 1, 1]).tolist())
+    ),
+    "coupling of 5 into 6 turned": lambda drive: replace(drive, k65=-drive.k65),
+    "torque constants of 2 and 3 swapped": lambda drive: replace(
+        drive, torque_constant=swapped(drive.torque_constant, 1, 2)
+    ),
+}
 
 
 def test_a_correct_cell_is_good(correct_campaign):
@@ -76,30 +79,25 @@ def test_a_correct_cell_is_good(correct_campaign):
     assert found.good, found.line
 
 
-@pytest.mark.slow
-def test_usual_unmodelled_effects_stay_good(tmp_path, short, motions, run):
-    found = verdict(run(tmp_path / "effects", short, motions, effects=True))
+@slow
+def test_usual_unmodelled_effects_stay_good(ran):
+    found = verdict(ran(effects=True))
     assert found.good, found.line
 
 
 @pytest.mark.parametrize(
     "error",
     [
-        pytest.param(gear_4_negated, marks=pytest.mark.slow),
-        pytest.param(coupling_of_5_into_6_turned, marks=pytest.mark.slow),
-        torque_constants_of_2_and_3_swapped,
+        *(pytest.param(name, marks=slow) for name in [*ERRORS][:2]),
+        "torque constants of 2 and 3 swapped",
     ],
-    ids=lambda error: error.__name__,
 )
-def test_a_robot_other_than_the_cell_is_wrong(tmp_path, short, motions, run, error):
-    physical = error(simulated_drive(short))
-    found = verdict(run(tmp_path / "tampered", short, motions, drive=physical))
+def test_a_robot_other_than_the_cell_is_wrong(ran, error):
+    found = verdict(ran(ERRORS[error]))
     assert not found.good, found.line
 
 
-@pytest.mark.parametrize(
-    "joint", [0, *(pytest.param(joint, marks=pytest.mark.slow) for joint in range(1, 6))]
-)
+@pytest.mark.parametrize("joint", [0, *(pytest.param(joint, marks=slow) for joint in range(1, 6))])
 def test_a_negative_torque_constant_is_wrong(correct_campaign, monkeypatch, joint):
     def turned(archive):
         recording = recording_of(archive)
@@ -170,14 +168,10 @@ class TestInertiaScale:
 
     def test_without_it_the_urdf_is_true(self):
         cell = Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": []})
-        b = cell.model.base.rank
+        b, standard = cell.model.base.rank, cell.model.nominal
         np.testing.assert_array_equal(planted_truth(cell).inertia_scale, np.ones(6))
-        rotors = np.array(cell.simulation.rotor_inertia)
-        standard = cell.model.nominal
-        standard[cell.model.layout.rotors] = rotors
+        standard[cell.model.layout.rotors] = cell.simulation.rotor_inertia
         np.testing.assert_allclose(planted_values(cell)[:b], cell.model.base.grouping @ standard)
-
-    @pytest.mark.parametrize("scale", [[1.1], [1.0, 1.0, 1.0, 1.0, 1.0, 0.0]])
-    def test_one_positive_factor_per_joint_is_needed(self, scale):
-        with pytest.raises(CellError, match=r"simulation\.inertia_scale"):
-            Cell.load(CELL_PATH).with_values({"simulation.inertia_scale": scale})
+        for scale in ([1.1], [1.0, 1.0, 1.0, 1.0, 1.0, 0.0]):
+            with pytest.raises(CellError, match=r"simulation\.inertia_scale"):
+                cell.with_values({"simulation.inertia_scale": scale})

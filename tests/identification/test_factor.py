@@ -3,7 +3,6 @@
 import tracemalloc
 from dataclasses import replace
 from fractions import Fraction
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -45,15 +44,11 @@ from tests.identification.two_link import (
 both = pytest.mark.parametrize("storage", ["gram", "qr"])
 
 
-@cache
-def ns16():
-    return RobotModel.from_urdf(urdf_text())
-
-
-def some_samples(m, seed=0):
-    random = np.random.default_rng(seed)
-    q, qd, qdd, torque = random.uniform(-3.0, 3.0, (4, m, 6))
-    return Motion(np.arange(m) * 1e-3, q, qd, qdd), 100.0 * torque
+def some_samples(m):
+    """Return the NS 16, random motion of it, and random torque."""
+    q, qd, qdd, torque = np.random.default_rng(0).uniform(-3.0, 3.0, (4, m, 6))
+    motion = Motion(np.arange(m) * 1e-3, q, qd, qdd)
+    return RobotModel.from_urdf(urdf_text()), motion, 100.0 * torque
 
 
 def a_motion(samples=3000, *, step=0.002, held_elbow=False):
@@ -73,10 +68,6 @@ def ill():
 def noisy(motion, noise=0.0, seed=0):
     error = noise * np.random.default_rng(seed).standard_normal((len(motion.time), 2))
     return recording(error, motion)
-
-
-def parts_of(samples, edges):
-    return [samples.between(a, b) for a, b in pairwise(np.unique(edges).tolist())]
 
 
 def summed(storage, parts):
@@ -104,7 +95,7 @@ def exact_solution(samples):
 class TestFactor:
     def test_the_gram_is_that_of_the_usable_rows(self):
         """Masked rows may hold any values; input arrays are unchanged."""
-        model, (motion, torque) = ns16(), some_samples(200)
+        model, motion, torque = some_samples(200)
         mask = np.ones((200, 6), dtype=bool)
         mask[40:80, 2] = False
         torque[40:80, 2] = np.nan
@@ -126,8 +117,9 @@ class TestFactor:
         """Gram matrices and triangles agree to nine digits, with any weights of joints."""
         samples = noisy(a_motion(1500), NOISE, seed)
         random = np.random.default_rng(seed)
-        inner, weights = random.integers(0, 1501, pieces - 1), random.uniform(0.1, 20.0, 2)
-        many = summed(storage, parts_of(samples, np.concatenate([[0], inner, [1500]])))
+        edges, weights = random.integers(0, 1501, pieces - 1), random.uniform(0.1, 20.0, 2)
+        edges = np.unique([0, *edges, 1500]).tolist()
+        many = summed(storage, [samples.between(*part) for part in pairwise(edges)])
         whole = Factor.of(MODEL, samples, "qr")
         size = np.abs(whole.gram).max(axis=(1, 2), keepdims=True)
         assert np.abs((many.gram - whole.gram) / size).max() < 1e-13
@@ -142,7 +134,7 @@ class TestFactor:
             assert ("QR" in one.method) == (storage == "qr")
 
     def test_the_dense_regressor_is_not_allocated(self):
-        model, (motion, torque) = ns16(), some_samples(30_000)
+        model, motion, torque = some_samples(30_000)
         tracemalloc.start()
         Factor.from_samples(model, motion, torque)
         _, peak = tracemalloc.get_traced_memory()
