@@ -273,19 +273,17 @@ class TestTables:
             assert (*found, float(row["value"]), float(row["std"])) == expected
         row, undetermined = rows[0], rows[3]
         half = levels()[0].interval_factor * float(row["std"])
-        assert float(row["low"]) == pytest.approx(float(row["value"]) - half)
-        assert float(row["high"]) == pytest.approx(float(row["value"]) + half)
-        found = (undetermined["determined"], undetermined["std"], undetermined["high"])
-        assert found == ("false", "inf", "inf")
-        assert row["archive"] == 'line "3", spring/?.mcap'
-        assert row["archive_sha256"] == "ab" * 32
-        assert (row["settings"], row["code"], row["estimator"]) == ("settings", "c0de", "wls")
+        for end, sign in (("low", -1.0), ("high", 1.0)):
+            assert float(row[end]) == pytest.approx(float(row["value"]) + sign * half)
+        expected = {
+            "archive": 'line "3", spring/?.mcap', "archive_sha256": "ab" * 32, "when": "",
+            "settings": "settings", "code": "c0de", "estimator": "wls",
+            "warnings": "stood still at first; two gaps",
+        }  # fmt: skip
+        assert expected.items() <= row.items()
+        assert {"determined": "false", "std": "inf", "high": "inf"}.items() <= undetermined.items()
         assert re.search(r"\bhil \d", row["software"])
-        assert row["warnings"] == "stood still at first; two gaps"
         assert row["arm"].endswith("-digest")
-        dated = next(row for row in rows if row["level"] == "campaign")
-        assert datetime.fromisoformat(dated["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)
-        assert row["when"] == ""
 
     def test_have_kinds_of_parameters_and_errors_of_all_joints(self, tables):
         rows = tables["parameters"]
@@ -296,15 +294,14 @@ class TestTables:
         weight = one.samples.astype(float)
         expected = math.sqrt((weight @ one.noise_std**2) / (weight @ one.torque_rms**2))
         campaign = next(row for row in rows if row["level"] == "campaign")
+        assert datetime.fromisoformat(campaign["when"]) == datetime(2026, 1, 1, 8, tzinfo=UTC)
         assert float(campaign["relative_error"]) == pytest.approx(expected)
         assert math.isnan(float(campaign["unseen_relative_error"]))
         assert float(rows[-1]["unseen_relative_error"]) == pytest.approx(0.1)
-
-    def test_have_axes_and_what_was_not_used(self, tables):
-        rows = tables["axes"]
-        assert len(rows) == len(levels()) * model().n_joints
-        assert float(rows[1]["error_std"]) == levels()[0].noise_std[1]
-        assert [row["axis"] for row in rows[:6]] == list(model().joint_names)
+        axes = tables["axes"]
+        assert len(axes) == len(levels()) * model().n_joints
+        assert float(axes[1]["error_std"]) == levels()[0].noise_std[1]
+        assert [row["axis"] for row in axes[:6]] == list(model().joint_names)
         assert [tuple(row.values()) for row in tables["not_used"]] == [
             ("a/truncated.mcap", "broken", "its footer is missing"),
             ("a/slow.mcap", "skipped", "holds a validation run"),

@@ -267,9 +267,8 @@ class TestJudgement:
             assert joint.nominal_relative > 2.0 * joint.relative
             assert 0.01 < joint.controller_relative < 0.15
 
-    def test_is_a_table_and_a_sentence_for_each_finding(self, found, judgement):
+    def test_is_a_table_sentences_and_json(self, found, judgement):
         rows, lines = table(found.results), sentences(found.results)
-        assert len(rows) == 1 + len(found.results.joint_names)
         heading = "joint RMS error relative fitted of limit R² nominal controller"
         assert rows[0].split() == heading.split()
         for row, name in zip(rows[1:], found.results.joint_names, strict=True):
@@ -277,11 +276,8 @@ class TestJudgement:
         assert len({len(row) for row in rows}) == 1
         for finding in judgement.findings:
             assert sum(finding.words in line for line in lines) == 1
-
-    def test_is_json_for_scripts(self, found):
-        read = json.loads(as_json(found.results))
-        assert read["good"] is found.results.verdict.good
-        assert read["line"] == found.results.verdict.line
+        read, verdict = json.loads(as_json(found.results)), found.results.verdict
+        assert (read["good"], read["line"]) == (verdict.good, verdict.line)
         assert {finding["check"] for finding in read["findings"]} >= {"excitation", "delay"}
         assert len(read["joints"]) == 6
         assert read["in_sample"] is False and read["undetermined"] == []
@@ -382,20 +378,18 @@ def split(log):
     return identify_archives([log], Silent(), UNFILTERED)
 
 
-class TestDelays:
-    def test_of_the_torque_are_compensated(self, split):
-        np.testing.assert_allclose(split.results.delays.applied, LATE, atol=1e-3)
-        applied = json.loads(as_json(split.results))["delays"]["applied"]
-        np.testing.assert_allclose(applied, LATE, atol=1e-3)
-        found = [one for one in split.verdict.findings if one.check == "delay"]
-        assert [one.level for one in found] == ["doubtful"]
-
-    def test_that_are_stated_are_applied_and_others_reported(self, log):
-        options = replace(UNFILTERED, delay=0.0)
-        prepared = prepare_sources(gather_sources([log], 0.7), options, Silent())
-        assert prepared.assumed_delay == 0.0
-        assert not any("delay" in note for note in prepared.notes)
-        assert prepared.delays.delay > 0.01
+def test_delays_of_the_torque_are_compensated(log, split):
+    """A stated one is applied, and another reported."""
+    np.testing.assert_allclose(split.results.delays.applied, LATE, atol=1e-3)
+    applied = json.loads(as_json(split.results))["delays"]["applied"]
+    np.testing.assert_allclose(applied, LATE, atol=1e-3)
+    found = [one for one in split.verdict.findings if one.check == "delay"]
+    assert [one.level for one in found] == ["doubtful"]
+    options = replace(UNFILTERED, delay=0.0)
+    prepared = prepare_sources(gather_sources([log], 0.7), options, Silent())
+    assert prepared.assumed_delay == 0.0
+    assert not any("delay" in note for note in prepared.notes)
+    assert prepared.delays.delay > 0.01
 
 
 def test_nothing_is_called_good_in_sample(log, split):
