@@ -383,7 +383,7 @@ class Group:
     total: Factor | None = None  #: sum of their factors; None if there are none
     repetitions: list[LevelEstimate] = field(default_factory=list)  #: estimates of each
     unseen: Factor | None = None  #: sum of the totals of validation runs; None if none
-    #: sum of those of the archives, see :attr:`hil.batch.types.Summary.products`
+    #: sum of those of the archives, see :attr:`hil.batch.factors.Summary.products`
     products: Array | None = None
     #: every archive, with the warnings about it
     warned: list[tuple[ArchiveRef, tuple[str, ...]]] = field(default_factory=list)
