@@ -4,22 +4,35 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .campaign import Campaign as Campaign
-    from .errors import CampaignFolderError as CampaignFolderError
-    from .errors import MotionFailedError as MotionFailedError
-    from .errors import MotionRefusedError as MotionRefusedError
-    from .errors import NotRehearsedError as NotRehearsedError
-    from .folder import CampaignFolder as CampaignFolder
-    from .link import Link as Link
-    from .link import MotionLink as MotionLink
-    from .link import Progress as Progress
-    from .operator import Stop as Stop
-    from .operator import stop_on_interrupt as stop_on_interrupt
-    from .plan import CampaignPlan as CampaignPlan
-    from .plan import PlannedMotion as PlannedMotion
-    from .plan import design as design
-    from .plan import plan_around as plan_around
+    from .campaign import Campaign
+    from .errors import (
+        CampaignFolderError,
+        MotionFailedError,
+        MotionRefusedError,
+        NotRehearsedError,
+    )
+    from .folder import CampaignFolder
+    from .link import Link, MotionLink, Progress
+    from .operator import Stop, stop_on_interrupt
+    from .plan import CampaignPlan, PlannedMotion, design, plan_around
 
+__all__ = [
+    "Campaign",
+    "CampaignFolder",
+    "CampaignFolderError",
+    "CampaignPlan",
+    "Link",
+    "MotionFailedError",
+    "MotionLink",
+    "MotionRefusedError",
+    "NotRehearsedError",
+    "PlannedMotion",
+    "Progress",
+    "Stop",
+    "design",
+    "plan_around",
+    "stop_on_interrupt",
+]
 _HOME = {
     "Campaign": "campaign",
     "CampaignFolder": "folder",
@@ -31,7 +44,6 @@ _HOME = {
 if not TYPE_CHECKING:  # which would accept any name
 
     def __getattr__(name: str) -> Any:
-        module = _HOME.get(name, "errors" if name.endswith("Error") else None)
-        if module is None:
+        if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{module}"), name)
+        return getattr(import_module(f"{__name__}.{_HOME.get(name, 'errors')}"), name)
