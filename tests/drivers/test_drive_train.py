@@ -91,17 +91,6 @@ def test_power_is_the_same_on_both_sides(train, current, qd):
     assert abs(electrical - mechanical) <= 1e-12 * scale
 
 
-def test_coupling_acts_transposed_on_torques():
-    """A current in motor 5 alone loads joint 4 through k54; a per-axis factor would not."""
-    train = build()
-    current = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
-    torque = train.joint_torque(current)
-    direct = train.gear_ratio[4] * train.torque_constant[4]
-    assert torque[4] == pytest.approx(direct * train.joint_sign[4])
-    assert torque[3] == pytest.approx(-train.k54 * direct * train.joint_sign[3])
-    assert torque[5] == 0.0
-
-
 def test_many_samples_at_once_equal_one_at_a_time():
     train = build()
     rng = np.random.default_rng(1)

@@ -161,14 +161,6 @@ class TestHold:
         run(execution, 2 * STOP, 9)
         assert (execution.outcome, execution.held) == ("completed", True)
 
-    def test_rest_before_the_hold_does_not_count(self):
-        execution = begun(source := Motion(step=0.0, speed=0.0))
-        execution.advance(1)
-        source.step = 0.01
-        execution.hold(1)
-        run(execution, STOP + 1, 2)
-        assert execution.outcome == "stopped"
-
     def test_hold_before_the_begin(self):
         execution = requested(source := Motion())
         assert execution.hold(0) is None

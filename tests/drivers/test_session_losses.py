@@ -22,7 +22,6 @@ from tests.drivers.rig import (
     Rig,
     all_drive_off,
     assert_refused,
-    closed,
     exiting,
     kind_of,
     limits,
@@ -30,7 +29,6 @@ from tests.drivers.rig import (
     opened,
     refused,
     running,
-    smooth_move,
     still,
 )
 
@@ -79,30 +77,6 @@ class TestLostMotion:
             assert rig.state is State.OPEN
         rig.cycle(5)
         assert source.advances == advances
-
-    @pytest.mark.parametrize(
-        ("waits", "change", "reason"),
-        [
-            (Mode.CLOSED, {"status": 0}, OFF),
-            (Mode.DRIVING_ON, {"status": 0}, OFF),
-            (Mode.CLOSED, {"mode": Mode.DRIVING_ON}, "the drive was switched on again"),
-            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_PC}, PAUSED),
-            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_CONTROLLER}, PAUSED),
-        ],
-    )
-    def test_a_waiting_motion_is_lost_and_another_may_follow(self, waits, change, reason):
-        rig = Rig()
-        rig.session.request(source := Cruise())
-        rig.start()
-        rig.cycle(mode=waits)
-        assert rig.session.requested
-        rig.cycle(**change)
-        assert rig.ended == MotionEnded("lost", reason, -1, rig.ended.cycle)
-        rig.cycle(3, status=5)
-        rig.session.request(still(3))
-        rig.open()
-        rig.run_to("completed")
-        assert source.begun_at is None
 
     def test_axis_that_closes_is_refused_during_a_motion(self):
         rig, _ = moving()
@@ -269,33 +243,6 @@ class TestGaps:
             rig.miss(2)
             rig.cycle(2)
         assert (source.stops, rig.session.counters.missed) == (0, 40)
-
-    def test_motion_survives_the_wrap_of_the_numbers(self):
-        """And a cyclic packet with number 10 is no init packet."""
-        rig = closed(ring_capacity=64)
-        rig.cycle(0x7FFF - rig.number - 20)
-        rig.session.request(smooth_move(MOVE, 300))
-        rig.open()
-        rig.run_to("completed")
-        assert rig.session.counters.missed == 0
-        assert len(rig.seen(InitReceived)) == 1
-
-    @pytest.mark.parametrize("missed", [1, 2])
-    def test_extrapolated_motion_at_full_speed(self, missed):
-        """At 50 motor revolutions per second, 0.1 per cycle, and a threshold of one."""
-        one = np.full(N, 1.0)
-        rates = {"velocity": 2.8 * one, "acceleration": 30.0 * one, "jerk": 900.0 * one}
-        source = type("Faster", (Cruise,), {"SPEED": 2.618, "RAMP": 1.0})()
-        wide = limits(**FAR, **rates, following_error=one)
-        rig = running(source, 600, guard_limits=wide)
-        step = rig.axes["d"][0, 1]
-        assert abs(step) == pytest.approx(0.1, rel=1e-3)
-        rig.miss(missed)
-        rig.axes["d"][0, [0, 2]] += missed * step
-        rig.cycle(10)
-        assert (rig.state, rig.session.counters.not_accepted) == (State.OPEN, 0)
-        rig.session.stop()
-        rig.run_to("stopped")
 
     @pytest.mark.parametrize("leaving", [False, True])
     @pytest.mark.parametrize(

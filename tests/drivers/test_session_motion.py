@@ -50,25 +50,6 @@ class TestMotion:
         assert ended == [("completed", 0), ("completed", 1)]
         assert set(rig.records["interval"]) == {-1, 0, 1}
 
-    def test_a_source_may_reuse_its_arrays(self):
-        class Reusing(Cruise):
-            def advance(self):
-                position, velocity = super().advance()
-                self.q[:], self.qd[:] = position, velocity
-                return self.q, self.qd
-
-        def replies_of(source):
-            rig = Rig()
-            source.q, source.qd = np.zeros(N), np.zeros(N)
-            rig.session.request(source)
-            rig.open()
-            rig.cycle(100)
-            return [reply for _, reply in rig.transcript], rig.records["commanded_velocity"]
-
-        (replies, velocities), (expected, theirs) = replies_of(Reusing()), replies_of(Cruise())
-        assert replies == expected
-        np.testing.assert_array_equal(velocities, theirs)
-
     def test_set_points_on_the_wire_are_those_of_the_source(self):
         rig = running(source := smooth_move(MOVE, 300))
         before = rig.train.motor_revolutions(source.positions[0])
@@ -96,46 +77,7 @@ class TestMotion:
         assert rig.ended.outcome == "completed"  # although the drive went off
 
 
-@pytest.mark.parametrize("period", [0.001, 0.002])
-@pytest.mark.parametrize("mode", [1, 4, 5])
-def test_motion_in_each_position_mode_and_cycle(period, mode):
-    rig = Rig(mode=mode, period=period)
-    source = smooth_move(MOVE, round(0.6 / period))
-    source.velocities = np.diff(source.positions, axis=0, prepend=source.positions[:1]) / period
-    rig.session.request(source)
-    rig.open()
-    rig.cycle(200)
-    np.testing.assert_allclose(
-        rig.records[-1]["commanded_velocity"], source.velocities[200], rtol=1e-6, atol=1e-9
-    )
-    d = rig.axes["d"].astype(np.float64)
-    np.testing.assert_allclose(
-        rig.train.joint_velocity(d[:, 1], period), source.velocities[200], rtol=1e-5, atol=1e-7
-    )
-    rig.run_to("completed")
-    assert rig.session.period == period
-
-
 class TestStaggeredOpening:
-    def test_no_motion_before_the_last_axis_is_open(self):
-        rig = Rig()
-        source = Cruise()
-        rig.session.request(source)
-        rig.close()
-        target = rig.axes["d"][:, 0].copy()
-        for joint in range(N - 1):
-            rig.axes["mode"][joint] = Mode.POSITION
-            for _ in range(3):
-                answer = rig.cycle()
-                assert rig.state is State.OPENING
-                np.testing.assert_array_equal(answer.axes["mode"], rig.axes["mode"])
-                np.testing.assert_array_equal(answer.axes["d"][:, 0], target)
-                assert not answer.axes["d"][:, 1:].any()
-        assert source.begun_at is None
-        rig.cycle(mode=Mode.POSITION)
-        assert rig.state is State.OPEN
-        assert source.begun_at is not None
-
     def test_records_of_open_axes(self):
         rig = closed()
         rig.axes["mode"][[1, 4]] = Mode.POSITION
@@ -240,22 +182,6 @@ class TestRecords:
         np.testing.assert_array_equal(record["extra3"], [2, 5, 8, 11, 14, 17])
         assert np.isnan(record["commanded_position"]).all()
         assert np.isnan(record["commanded_velocity"]).all()
-
-    def test_commanded_values_in_the_interval_only(self):
-        source = smooth_move(MOVE, 300)
-        rig = running(source)
-        rig.run()
-        rig.cycle(5)
-        inside = rig.records[rig.records["interval"] == 0]
-        outside = rig.records[rig.records["interval"] == -1]
-        # first set-point, 300 more, 5 of settling of which the last asks for exit
-        assert len(inside) == 306
-        np.testing.assert_allclose(inside["commanded_position"][:301], source.positions, atol=1e-7)
-        np.testing.assert_allclose(
-            inside["commanded_velocity"][1:301], source.velocities[1:], atol=1e-4
-        )
-        assert set(inside["state"]) == {State.OPEN, State.EXITING}
-        assert np.isnan(outside["commanded_position"]).all()
 
 
 D1, D2, D3, D4, D5 = range(5)

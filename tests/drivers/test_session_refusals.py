@@ -227,6 +227,18 @@ class TestFeedback:
             if not begins:
                 assert assert_refused(rig, answer, kind).joint == 4
 
+    @pytest.mark.parametrize(("off", "begins"), [(0.09, True), (0.15, False)])
+    def test_arm_is_near_the_set_point_that_was_held(self, off, begins):
+        """Not only near a target that is itself off it."""
+        rig = opened(20)
+        rig.session.request(source := Cruise())
+        rig.axes["d"][4, 0] += off
+        rig.axes["d"][4, 2] += 2.0 * off
+        answer = rig.cycle()
+        assert (source.begun_at is not None) == begins
+        if not begins:
+            assert assert_refused(rig, answer, Check.FIRST_SET_POINT).joint == 4
+
 
 class TestFollowingError:
     def test_it_is_reported_while_the_axes_stay_open(self):

@@ -20,7 +20,6 @@ from drivers import (
 )
 from drivers.init_check import is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
-from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
     START,
     N,
@@ -53,16 +52,6 @@ class TestHandShake:
         assert rig.sync(1, INIT_LENGTH) is None
         assert (rig.session.counters.malformed, rig.state) == (1, State.SYNC)
         assert len(rig.sync(1, length)) == length
-
-    def test_warm_start_begins_with_the_init_packet(self):
-        rig = started()
-        packet, reply = rig.transcript[0]
-        assert len(reply) == INIT_LENGTH
-        assert reply == struct.pack("<i", 11) + packet[4:]
-        assert (rig.session.init.n_axes, rig.session.period) == (N, 0.002)
-        rig.cycle(status=0)
-        assert rig.number == 11
-        assert rig.path == [State.INIT, State.DRIVE_OFF]
 
     def test_duplicates_get_the_same_reply(self):
         rig = started()
@@ -295,27 +284,6 @@ def test_drive_off_has_zeros_for_values_not_finite():
     expected[2] = 0.0
     np.testing.assert_allclose(answer.axes["d"][:, 0], expected, rtol=1e-6)
     np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
-
-
-@pytest.mark.parametrize(
-    ("arms", "status", "powered", "back"),
-    [
-        (None, [3, 4, 7, 9], False, [3, 0, 0, 0]),
-        (None, [3, 7, DRIVE_ON, 9], True, [0, 0, 0, 0]),
-        ((1, 1), [3, 7, DRIVE_ON, 9], False, [3, 0, 0, 0]),
-        ((1, 1), [DRIVE_ON, 7, 0, 9], True, [0, 0, 0, 0]),
-        ((1, 4), [3, 7, DRIVE_ON, 9], False, [3, 0, 0, 9]),
-    ],
-)
-def test_unknown_arms_are_on_if_any_drive_is(arms, status, powered, back):
-    """Then nothing is echoed; four status bytes go back, none of which is drive on."""
-    modes = np.full(2, Mode.CLOSED, np.int32)
-    answer = safe_reply(bytes(status), modes, arms)
-    assert answer.status == bytes(back)
-    assert answer.mask[:, D1:].all() == (not powered)
-    opened = np.full(2, Mode.POSITION, np.int32)
-    reading = Reader(np.arange(2), arms, 1, Mode.POSITION).read(bytes(status), opened)
-    assert reading.powered == powered
 
 
 def described(*changes, **build) -> InitPacket:
