@@ -166,8 +166,8 @@ def plan_around(
     validation = _validation_motions(cell, checks)
     return CampaignPlan(
         excitation,
-        tuple(PlannedMotion(motion.trajectory, _moves_of(cell, motion)) for motion in validation),
-        _moves_of(cell, excitation),
+        tuple(PlannedMotion(motion.trajectory, moves_of(cell, motion)) for motion in validation),
+        moves_of(cell, excitation),
     )
 
 
@@ -189,7 +189,7 @@ def _validation_motions(cell: Cell, checks: MotionChecks) -> tuple[ViaPointMotio
         raise NoExcitationError(f"no motion to test the result with: {reason}") from error
 
 
-def _moves_of(cell: Cell, motion: Excitation | ViaPointMotion) -> PlanFile | None:
+def moves_of(cell: Cell, motion: Excitation | ViaPointMotion) -> PlanFile | None:
     """Return the moves of a motion through via points; None for Fourier series."""
     moves, via_points = motion.moves, motion.via_points
     if moves is None or via_points is None:

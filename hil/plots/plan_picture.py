@@ -81,31 +81,10 @@ def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:
     axes.yaxis.set_major_formatter("{x:.4g}")
 
 
-def _number(axes: Axes, number: int, at: float) -> None:
-    """Write a number above the axes."""
-    axes.annotate(
-        str(number), (at, 1.0), xycoords=("data", "axes fraction"), xytext=(0.0, 2.0),
-        textcoords="offset points", ha="center", fontsize=style.SMALL, color=style.INK,
-    )  # fmt: skip
-
-
-def corner_times(plan: MotionPlan) -> list[tuple[float, float]]:
-    """Return start and end of the corner at each target but the last [s]; equal for a stop."""
-    times = []
-    end = 0.0
-    entered = 0.0
-    for duration, corner in zip(plan.durations, plan.corners, strict=False):
-        begin = end + max(duration - entered - corner.leave, 0.0)
-        end = begin + (0.0 if corner.join is None else corner.join.duration)
-        times.append((begin, end))
-        entered = corner.enter
-    return times
-
-
 def draw_plan(
     plan: MotionPlan, joint_names: Sequence[str], frame: AngleFrame, *, title: str = ""
 ) -> Figure:
-    """Draw a plan in angles of a frame, with targets and corners, one row per joint."""
+    """Draw a plan in angles of a frame, with its targets, one row per joint."""
     n = len(joint_names)
     height = _TOP + n * _ROW + _BOTTOM
     targets = np.array([frame.shown(move.target) for move in plan.moves])
@@ -120,8 +99,7 @@ def draw_plan(
         draw_motion(rows, plan.trajectory, plan.limits, joint_names, frame)
         for joint, row in enumerate(rows):
             for axes in row:
-                for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
-                    axes.axvspan(begin, end, color=style.SHADE, linewidth=0.0, zorder=0.5)
+                for target in plan.targets[:-1]:
                     line = _LINES[target.how]
                     axes.axvline(target.time, color=style.MUTED, linewidth=0.7, linestyle=line)
             row[0].plot(
@@ -131,7 +109,11 @@ def draw_plan(
             )  # fmt: skip
         for axes in rows[0]:
             for number, time in enumerate(times, 1):
-                _number(axes, number, time)
+                axes.annotate(
+                    str(number), (time, 1.0), xycoords=("data", "axes fraction"),
+                    xytext=(0.0, 2.0), textcoords="offset points", ha="center",
+                    fontsize=style.SMALL, color=style.INK,
+                )  # fmt: skip
         figure.align_ylabels([row[0] for row in rows])
         duration, stopping = plan.duration, plan.duration_with_stops
         share = f" ({duration / stopping:.1%} of the time with stops)" if stopping > 0.0 else ""
@@ -139,8 +121,8 @@ def draw_plan(
         passed = ", ".join(f"{number} {how}" for how, number in zip(*count, strict=True))
         headline = " · ".join(filter(None, (title, f"{duration:.3f} s{share}", passed)))
         legend = (
-            "red dashes: limits; shaded: corners; line at each numbered target: solid fly-by as "
-            "requested, dashed reduced, dotted stop; circles: targets"
+            "red dashes: limits; line at each numbered target: solid fly-by as requested, dashed "
+            "reduced, dotted stop; circles: targets"
         )
         for text, at, size, colour in (
             (headline, 0.3, style.TITLE, style.INK),

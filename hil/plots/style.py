@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 
 from hil.report.drawing import drawing
 
-INK, MUTED, RULE, SHADE = "#1a1a1a", "#666666", "#dddddd", "#f0e8d2"
+INK, MUTED, RULE = "#1a1a1a", "#666666", "#dddddd"
 LIMIT = "#b3261e"
 POSITION, VELOCITY, ACCELERATION = "#0072b2", "#00795a", "#b0530b"
 SMALL, TEXT, TITLE = 7.5, 9.0, 12.0

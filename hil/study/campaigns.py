@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from hil.batch.workers import ArchiveTask, Unused, Workers
-from hil.campaign import Campaign, CampaignFolder, CampaignPlan, PlannedMotion, Stop
+from hil.campaign import Campaign, CampaignFolder, CampaignPlan, Stop
 from hil.campaign.errors import RepetitionsRejectedError
-from hil.campaign.plan import plan_around
+from hil.campaign.plan import moves_of, plan_around
 from hil.cell import Cell
 from hil.design import DesignResult, DesignSettings, preset
 from hil.design.advice import NoExcitationError
@@ -21,7 +21,6 @@ from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from hil.simulation import simulated_link, simulated_provenance
 from identification.excitation import Excitation
-from planner import PlanFile
 
 from .settings import StudyFolder, StudySettings
 
@@ -165,7 +164,7 @@ def plan_study(
             key: Execution(
                 folder.campaign(condition, key),
                 main,
-                _plan(cell, one, held_out.get(key, ())),
+                CampaignPlan(one, tuple(held_out.get(key, ())), moves_of(cell, one)),
                 condition == EFFECTS,
             )
             for key, one in excitations.items()
@@ -173,14 +172,6 @@ def plan_study(
         }
         for condition in ((NO_EFFECTS, EFFECTS) if settings.effects else (NO_EFFECTS,))
     }
-
-
-def _plan(cell: Cell, excitation: Excitation, held_out: Sequence[PlannedMotion]) -> CampaignPlan:
-    moves, points = excitation.moves, excitation.via_points
-    file = None
-    if moves is not None and points is not None:
-        file = PlanFile(cell.joint_names, points[0], moves, limits=cell.joint_limits)
-    return CampaignPlan(excitation, tuple(held_out), file)
 
 
 def execute(execution: Execution) -> None:

@@ -283,12 +283,6 @@ def processors(count: int, **files: str) -> dict[str, str]:
     }
 
 
-def deep(disable: str) -> dict[str, str]:
-    state = {"cpuidle__state1__name": "C1", "cpuidle__state1__latency": "2"}
-    state |= {"cpuidle__state3__name": "C6", "cpuidle__state3__latency": "133"}
-    return processors(2, **state, cpuidle__state3__disable=disable)
-
-
 def ip(*entries: object) -> dict[str, str]:
     return {"ip": json.dumps(entries)}
 
@@ -321,10 +315,9 @@ JUDGED = [
         (FULL_SPEED | processors(1, cpufreq__scaling_governor="powersave"), WARN, "powersave"),
         ({}, OK, "no frequency scaling"),
     ),
-    *of(lambda s: system_checks.idle_states(s, cpu_awake=False),
-        (deep("0"), WARN, "C6, 133 µs"), (deep("0"), WARN, "/etc/udev/rules.d/90-hil.rules"),
-        (deep("1"), OK, "C1"), ({}, OK, "none listed")),
-    *of(lambda s: system_checks.idle_states(s, cpu_awake=True), (deep("0"), OK, "not entered")),
+    *of(lambda _: system_checks.idle_states(cpu_awake=False),
+        ({}, WARN, "/etc/udev/rules.d/90-hil.rules")),
+    *of(lambda _: system_checks.idle_states(cpu_awake=True), ({}, OK, "not entered")),
     # What was given applies, not the limit.
     *of(lambda s: system_checks.scheduling(ALL, 0), ({}, OK, "SCHED_FIFO 50")),
     *of(lambda s: system_checks.scheduling(NOTHING, 0),

@@ -16,7 +16,6 @@ from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.errors import InputError
 from hil.plots import draw_plan
-from hil.plots.plan_picture import corner_times
 from planner.moves import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 
@@ -141,25 +140,6 @@ def planned(cell: Cell, count: int, fly: float = 50.0):
     random = np.random.default_rng(4)
     points = limits.lower + random.random((count, 6)) * (limits.upper - limits.lower)
     return plan_moves(points[0], [Move(p, fly_percent=fly) for p in points[1:]], limits)
-
-
-def test_shaded_corners_are_where_the_motion_is_curved(cell):
-    plan = planned(cell, 6)
-    points = np.array([plan.start, *(move.target for move in plan.moves)])
-    time = np.linspace(0.0, plan.trajectory.duration, 20_001)
-    q = plan.trajectory.sample(time)[0]
-    moves = np.diff(points, axis=0)
-    off = np.full(len(time), np.inf)
-    for start, move in zip(points, moves, strict=False):
-        along = np.clip((q - start) @ move / (move @ move), 0.0, 1.0)
-        off = np.minimum(off, np.linalg.norm(q - start - along[:, None] * move, axis=1))
-    straight = off < 1e-7
-    inside = np.zeros(len(time), dtype=bool)
-    for (begin, end), target in zip(corner_times(plan), plan.targets, strict=False):
-        assert begin <= target.time <= end
-        inside |= (time >= begin) & (time <= end)
-    assert np.all(straight[~inside])
-    assert np.mean(straight[inside]) < 0.2
 
 
 def test_a_plan_without_corners_has_a_picture(cell):
