@@ -20,7 +20,7 @@ import pytest
 from drivers.errors import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
-from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
+from drivers.transports.simulated import Corrupt, SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.recorder import Recorded
 from hil.campaign import Link, Progress, Stop
@@ -37,7 +37,7 @@ from sim_fixtures.ns16 import CELL_PATH
 NAME = "excitation_000_a1.mcap"
 
 
-def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = None) -> Link:
+def own_motion_link(cell: Cell, *faults: Corrupt, stated: Cell | None = None) -> Link:
     """A link in virtual time to a controller whose own program moves the arm.
 
     `stated` is the cell that the PC has, by default the controller's.
@@ -49,7 +49,7 @@ def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = N
 
 
 def recording_of(
-    cell: Cell, path: Path, *faults: Lose | Corrupt, kind: str = "excitation", **how: Any
+    cell: Cell, path: Path, *faults: Corrupt, kind: str = "excitation", **how: Any
 ) -> Recorded:
     """A recording of the controller's own motion."""
     how = {"stop": Stop(), **how}
@@ -122,14 +122,6 @@ def test_the_operator_ends_a_recording_properly_or_early(
     done = recording_of(cell, tmp_path / NAME, **how, **after(500))
     assert (done.outcome, done.reason) == (outcome, "ended by the operator")
     assert done.records == open_archive(tmp_path / NAME).n_samples >= 500
-
-
-def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> None:
-    recording_of(cell, tmp_path / NAME, Lose(600, "to_pc"), duration=1.0)
-    archive = open_archive(tmp_path / NAME)
-    assert {*np.diff(archive.columns["cycle"]).tolist()} == {1, 2}
-    assert archive.columns["gap"].sum() == 1
-    assert archive.outcome.entries["lost_packets"] == "1"
 
 
 def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: Cell) -> None:
