@@ -58,12 +58,6 @@ def archives(logs: Logs, tmp_path_factory: pytest.TempPathFactory) -> Archives:
 
 
 class TestSplit:
-    def test_a_log_comes_back_from_its_archive(self, logs: Logs, archives: Archives) -> None:
-        written, read = logs["one"], JointLog.read(archives["one"], 5.0)
-        assert read.time == pytest.approx(written.time, abs=1e-9)
-        for name in ("position", "velocity", "torque"):
-            assert np.array_equal(getattr(read, name), getattr(written, name))
-
     @pytest.mark.parametrize(("part", "fitted"), [("first", (0, 700)), ("last", (300, 1000))])
     def test_a_part_is_fitted_and_the_rest_predicted(
         self, logs: Logs, part: str, fitted: tuple[int, int]
@@ -155,12 +149,6 @@ class TestConfiguration:
         for split in published.splits:
             assert {split.fitted, split.predicted or split.fitted} <= published.logs.keys()
         assert any(not split.in_sample for split in published.splits)
-
-    def test_published_recordings_are_there(self, shared_data: Path) -> None:
-        for name in known():
-            published = Published.named(name)
-            for file in published.logs.values():
-                assert (shared_data / (published.folder or name) / file).is_file()
 
     def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(SystemExit, match="name the folder of all with --data"):

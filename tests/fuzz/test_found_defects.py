@@ -99,8 +99,10 @@ def test_cell_whose_link_cannot_be_changed_is_refused(
         Cell.load(path).with_link(transport="udp")
 
 
-def log(path: Path, position: np.ndarray, time: np.ndarray) -> None:
-    """Import a log of these arrays; check that no archive is left."""
+def log(path: Path, value: float = 0.0, kind: str = "f8", last: float = 6e-3) -> None:
+    """Import a log with this position in its third row; check that no archive is left."""
+    position, time = np.zeros((4, 2), kind), np.array([0.0, 2e-3, 4e-3, last])
+    position[2, 1] = value
     np.savez(path.with_name("log.npz"), q=position, t=time)
     output = path.with_name("o.mcap")
     try:
@@ -109,18 +111,6 @@ def log(path: Path, position: np.ndarray, time: np.ndarray) -> None:
         )
     finally:
         assert not output.exists()
-
-
-def log_with(path: Path, value: float) -> None:
-    position = np.zeros((4, 2))
-    position[2, 1] = value
-    log(path, position, 0.002 * np.arange(4.0))
-
-
-def log_with_signalling_nan(path: Path) -> None:
-    position = np.zeros((4, 2), np.float32)
-    position.view(np.uint32)[1] = 0x7F800001
-    log(path, position, 0.002 * np.arange(4.0))
 
 
 def bag_whose_names_are_no_text(path: Path) -> None:
@@ -153,17 +143,17 @@ def of_robot(was: str, put: str) -> Callable[[Path], object]:
     return lambda _: chain_from_urdf(URDF.replace(was, put))
 
 
+SIGNALLING = np.array([0x7F800001], np.uint32).view(np.float32)[0]
 NESTED = "a = " + "[" * 9999
 NO_NUMBER = r"position of joint ankle is \S+ in sample 2"
 REFUSED: list[tuple[str, Callable[[Path], object], type[Exception], str]] = [
     ("map.toml", of_text(ColumnMap.load, NESTED), SourceError, r"map\.toml: cannot be read"),
     ("map.toml", of_text(ColumnMap.load, f"sample_rate = {'9' * 5000}"), SourceError,
      r"map\.toml: cannot be read"),
-    ("log", lambda path: log(path, np.zeros((3, 2)), np.array([0.0, 1.0, 1e308])), SourceError,
-     r"spans 1.00e\+308 s; give the unit"),
-    *(("log", partial(log_with, value=value), SourceError, NO_NUMBER)
+    ("log", partial(log, last=1e308), SourceError, r"spans 1.00e\+308 s; give the unit"),
+    *(("log", partial(log, value=value), SourceError, NO_NUMBER)
       for value in (2.2e203, -1e13, np.inf, np.nan)),
-    ("log", log_with_signalling_nan, SourceError, "is nan in sample 1"),
+    ("log", partial(log, value=SIGNALLING, kind="f4"), SourceError, NO_NUMBER),
     ("bag.db3", bag_whose_names_are_no_text, SourceError, r"bag\.db3: is not a rosbag2"),
     ("excitation.toml", design_without_positions, InputError,
      r"is not a designed excitation \('positions'\)"),

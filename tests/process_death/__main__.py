@@ -142,7 +142,6 @@ def summary(results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "archives_torn": len(lost),
         "lost_at_most": lost[-1] if lost else 0,
         "lost_within_promise": sum(count <= PROMISED for count in lost),
-        "estimates_apart_at_most": max((one.get("apart", 0.0) for one in results), default=0.0),
         "seconds": sum(one["seconds"] for one in results),
         "processor_seconds": sum(one["processor"] for one in results),
     }

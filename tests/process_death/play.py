@@ -12,10 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import chi2
-
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveName, open_archive
 from hil.campaign import Campaign, CampaignPlan, Link, Stop
@@ -25,10 +21,12 @@ from hil.identify import identify_campaign
 from hil.identify.options import FIXED
 from hil.progress import Silent
 from hil.simulation import simulated_controller
+from identification import Estimate
 from tests.hil.fast_cell import fast_cell
 from tests.process_death.laws import broken_by
 from tests.process_death.rig import ARCHIVE, EXCHANGE, Seen, made, run
 from tests.process_death.rounds import Round, round_of
+from tests.simulate.laws.estimated import alike
 
 
 @dataclass(frozen=True)
@@ -86,24 +84,6 @@ NOISE: Final = 0.004
 """A, of the simulated currents. With the cell's own the arm trembles at rest about as fast as what
 still counts as standstill, and some runs are refused for it without anybody having died."""
 ESTIMATED: Final = 3  # In every so many rounds the campaign is estimated from when it is complete
-UNLIKELY: Final = 1e-9  # Chance that two estimates of one arm differ by more than is let pass
-
-
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    values: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-    def apart(self, other: Estimated) -> float:
-        """The squared distance of two independent estimates in their own measure."""
-        difference = self.values - other.values
-        both = self.covariance + other.covariance
-        return float(difference @ np.linalg.solve(both, difference))
-
-    @property
-    def bound(self) -> float:
-        """What that distance exceeds by chance `UNLIKELY`."""
-        return float(chi2.isf(UNLIKELY, len(self.values)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +91,7 @@ class Stage:
     folder: Path  # of the rounds
     cell: Cell  # of the small arm
     plan: CampaignPlan  # of its campaign
-    undisturbed: Estimated  # of an undisturbed run
+    undisturbed: Estimate  # of an undisturbed run
     planted: Path | None = None  # folder of a planted defect, None for none
 
     @classmethod
@@ -138,10 +118,9 @@ def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
     )
 
 
-def estimate_of(campaign: Campaign) -> Estimated:
+def estimate_of(campaign: Campaign) -> Estimate:
     """Return the estimate from the archives of a campaign, with fixed settings."""
-    pooled = identify_campaign(campaign.folder.root, Silent(), FIXED).estimate.pooled
-    return Estimated(np.asarray(pooled.values), np.asarray(pooled.covariance))
+    return identify_campaign(campaign.folder.root, Silent(), FIXED).estimate.pooled
 
 
 def play(stage: Stage, number: int) -> dict[str, Any]:
@@ -166,10 +145,7 @@ def play(stage: Stage, number: int) -> dict[str, Any]:
         }
         broken += finished(campaign, played, seen, folder)
         if not broken and number % ESTIMATED == 0:
-            apart = estimate_of(campaign).apart(stage.undisturbed)
-            result["apart"] = apart
-            if apart > stage.undisturbed.bound:
-                broken.append(f"the estimate is another one (squared distance {apart:.1f})")
+            broken += alike(estimate_of(campaign), stage.undisturbed)
     except Exception as error:
         # Of any kind: this round is reported, and the others continue.
         broken = [f"{type(error).__name__}: {error}"]

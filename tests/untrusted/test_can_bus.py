@@ -133,21 +133,3 @@ def test_replayed_session_moves_nothing(at: int, first: int, outcome: str) -> No
     np.testing.assert_allclose(gone, np.outer(share, MOVE), atol=1e-6, err_msg="off the path")
     assert not run.controller.plant.velocity.any()
     assert run.controller.phase in (Phase.CLOSED, Phase.DRIVE_OFF, Phase.ENDED)
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-def test_repeated_frames_get_no_reply(profile: str) -> None:
-    repeated = []
-
-    def again(bus: SharedBus, cycle: int) -> None:
-        if cycle > 200 and cycle % 40 == 0:
-            repeated.append(cycle)
-            bus.send_frames(bus.frames[-25])
-
-    run, _ = run_with(profile, again)
-    (ended,) = run.seen(MotionEnded)
-    assert ended.outcome == "completed", ended.reason
-    assert None not in run.link.replies
-    rejected = {(one.kind, one.count) for one in run.seen(PacketRejected)}
-    assert rejected == {("stale", 1)}
-    assert run.session.counters.stale == len(repeated)

@@ -44,7 +44,7 @@ def estimate(observed: Observed) -> Iterator[str]:
         yield from _pooled(observed)
     if found is not None and twin is not None:
         disturbed = any(kind_of(line) in DISTURBS_THE_ARM for line in observed.struck)
-        yield from _alike(found.result.pooled, twin.result.pooled)
+        yield from alike(found.result.pooled, twin.result.pooled)
         if not disturbed:
             yield from _predicted_alike(found, twin)
 
@@ -64,7 +64,8 @@ def _pooled(observed: Observed) -> Iterator[str]:
         yield f"{', '.join(sorted(left_out))} are valid and were not pooled"
 
 
-def _alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
+def alike(ours: Estimate, theirs: Estimate) -> Iterator[str]:
+    """Yield the parameters of two estimates that differ, of those that both determine."""
     if ours.names != theirs.names:
         yield "other parameters than in the undisturbed run"
         return
