@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
-from planner.corners import STOP, Corner, How, passing, round_corners
+from planner.corners import STOP, Corner, How, StraightMoves, passing, round_corners
 from planner.errors import InvalidSetting, InvalidViaPoints, PlannerError, PlanningError
 from planner.limits import Allowance, JointLimits
 from planner.piecewise_cubic import Block, PiecewiseCubic, Rows, check_limits, check_smooth
-from planner.straight import StraightMoves
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,8 @@ from hil.archive.header import REJECTED
 from hil.archive.repair import amend_outcome
 from hil.cell import Cell
 from hil.errors import ArchiveError
-from identification.signals.noise import STANDSTILL_WINDOW
 from identification.signals.recording import stuck
+from identification.signals.smoothing import STANDSTILL_WINDOW
 from planner import FourierSeries, PiecewiseCubic
 
 from .folder import CampaignFolder

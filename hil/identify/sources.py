@@ -23,13 +23,13 @@ from hil.files import file_digest
 from hil.reading import path_exists
 from hil.recordings import recording_of
 from identification.signals.clock import true_times
-from identification.signals.noise import standstill_variance
 from identification.signals.recording import (
     Recording,
     RecordingError,
     offsets_of_repetitions,
     without_repeats,
 )
+from identification.signals.smoothing import standstill_variance
 
 Array = NDArray[np.float64]
 

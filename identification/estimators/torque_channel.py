@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from identification.factor.factor import Factor, count_by_block, estimate
 from identification.model.robot import RobotModel
 from identification.signals.masks import LONGEST_END, edge_rows
-from identification.signals.noise import noiseless_above
 from identification.signals.recording import Recording
 from identification.signals.samples import RIGID_BANDWIDTH, Preprocessing, prepare
 from identification.signals.smoothing import (
@@ -23,6 +22,7 @@ from identification.signals.smoothing import (
     WITHOUT_PHASE,
     LowPassShape,
     low_passed,
+    noiseless_above,
 )
 
 Array = NDArray[np.float64]

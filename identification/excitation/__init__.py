@@ -35,9 +35,12 @@ from identification.excitation.excitation import Excitation, ViaPointMotion
 from identification.excitation.genomes import Genome, SineGenome, ViaPointGenome
 from identification.excitation.searches.journal import Journal
 from identification.excitation.searches.population import (
+    Front,
     Method,
     Population,
     Problem,
+    Scale,
+    Scores,
     SearchSettings,
 )
 from identification.excitation.searches.run import (
@@ -47,7 +50,6 @@ from identification.excitation.searches.run import (
     most_evaluations,
     search,
 )
-from identification.excitation.searches.scores import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.violation import KINDS, NoFeasibleMotionError, Violation
 

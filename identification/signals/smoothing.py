@@ -1,4 +1,4 @@
-"""Smoothing splines with a given mean squared residual (SPAPS of the paper), and low-passes.
+"""Noise of a recording, smoothing of positions, and the low-pass of torques.
 
 Quintic splines f on uniform knots minimise, per channel on any increasing times,
 
@@ -12,6 +12,7 @@ off-diagonals; knots are refined to the tolerance.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import comb, factorial
@@ -21,7 +22,113 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from identification.signals.recording import RecordingError
+
 Array = NDArray[np.float64]
+
+
+STANDSTILL_WINDOW: Final = 0.1  # s
+_SHORTEST_WINDOW: Final = 20  # samples
+_HIGHEST_DIFFERENCE: Final = 8
+
+
+def standstill_variance(time: Array, values: Array) -> Array:
+    """Return the noise variance per channel (c,) of a recording at standstill (m, c).
+
+    Median over windows of 0.1 s of the variance about a straight line, so that creep and single
+    stick-slip moves do not count. Zero for a constant reading.
+
+    Raises:
+        RecordingError: fewer samples than one window.
+    """
+    if len(time) < _SHORTEST_WINDOW:
+        raise RecordingError(
+            f"a variance at standstill requires {_SHORTEST_WINDOW} samples, got {len(time)}"
+        )
+    width = max(_SHORTEST_WINDOW, round(STANDSTILL_WINDOW / float(np.median(np.diff(time)))))
+    width = min(width, len(time))
+    count = len(time) // width
+    line = np.linspace(-1.0, 1.0, width)
+    basis = np.column_stack([np.ones(width), line])
+    basis /= np.linalg.norm(basis, axis=0)
+    windows = values[: count * width].reshape(count, width, -1)
+    windows = windows - windows.mean(axis=1, keepdims=True)
+    residual = windows - np.einsum("wk,vk,nvc->nwc", basis, basis, windows)
+    freedom = width - 2
+    variance = (residual**2).sum(axis=1) / freedom
+    # Median over mean of a chi-squared variable (Wilson and Hilferty).
+    return np.asarray(np.median(variance, axis=0) / (1.0 - 2.0 / (9.0 * freedom)) ** 3)
+
+
+def difference_variance(time: Array, values: Array) -> Array:
+    """Return the white noise variance (c,) of smooth channels (m, c).
+
+    By divided differences of rising order, scaled to unit noise gain (Gasser, Sroka and
+    Jennen-Steinmetz 1986), up to the order at which the next changes the estimate by less than 5 %.
+
+    Raises:
+        RecordingError: fewer samples than the highest order needs.
+    """
+    if len(time) < 2 * _HIGHEST_DIFFERENCE:
+        raise RecordingError(
+            f"a noise variance requires {2 * _HIGHEST_DIFFERENCE} samples, got {len(time)}"
+        )
+    found = [_difference_variance(time, values, 1)]
+    settled = np.zeros((0, values.shape[1]), dtype=np.bool_)
+    for order in range(2, _HIGHEST_DIFFERENCE + 1):
+        found.append(_difference_variance(time, values, order))
+        settled = np.array(found[1:]) > 0.95 * np.array(found[:-1])
+        if settled.any(axis=0).all():  # higher orders are not needed
+            break
+    estimates = np.array(found)
+    first = np.where(settled.any(axis=0), settled.argmax(axis=0), _HIGHEST_DIFFERENCE - 1)
+    return np.asarray(np.take_along_axis(estimates, first[None, :], axis=0)[0])
+
+
+def _difference_variance(time: Array, values: Array, order: int) -> Array:
+    windows = np.lib.stride_tricks.sliding_window_view(time, order + 1)
+    scale = windows[:, -1:] - windows[:, :1]
+    apart = (windows[:, :, None] - windows[:, None, :]) / scale[:, :, None]
+    apart[:, np.arange(order + 1), np.arange(order + 1)] = 1.0
+    weights = 1.0 / apart.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1, keepdims=True)
+    stacked = np.lib.stride_tricks.sliding_window_view(values, order + 1, axis=0)
+    return np.asarray(np.mean(np.einsum("mck,mk->mc", stacked, weights) ** 2, axis=0))
+
+
+_STRETCH: Final = 4.0  # s; resolution 0.25 Hz
+_FEWEST: Final = 32  # samples
+_NO_POWER: Final = 1e-6  # share of a signal's power; noise of 0.1 % of the amplitude
+_LOW_PASSED: Final = 0.75  # share of half the sampling rate; anti-alias filters cut at about 0.8
+
+
+def noiseless_above(time: Array, signals: Array, segments: Sequence[slice]) -> float | None:
+    """Return the frequency [Hz] above which signals (m, c) have no power; None with noise."""
+    frequency, power = _power(time, signals, segments)
+    power = power[:, power.sum(axis=0) > 0.0]
+    if not power.size:
+        return None
+    above = np.cumsum(power[::-1], axis=0)[::-1]
+    silent = np.all(above < _NO_POWER * above[0], axis=1)
+    found = float(frequency[np.argmax(silent)])
+    return found if silent.any() and found < _LOW_PASSED * frequency[-1] else None
+
+
+def _power(time: Array, signals: Array, segments: Sequence[slice]) -> tuple[Array, Array]:
+    """Return frequencies (f,) above zero and power spectral densities (f, c)."""
+    longest = max(segments, key=lambda one: int(one.stop - one.start), default=slice(0, 0))
+    time, signals = time[longest], signals[longest]
+    if time.size < _FEWEST:
+        return np.empty(0), np.empty((0, signals.shape[1]))
+    interval = float(np.median(np.diff(time)))
+    even = np.arange(time[0], time[-1], interval)
+    resampled = np.column_stack([np.interp(even, time, column) for column in signals.T])
+    length = min(len(even), max(_FEWEST, round(_STRETCH / interval)))
+    frequency, power = scipy.signal.welch(
+        resampled, fs=1.0 / interval, window="blackmanharris", nperseg=length, axis=0
+    )
+    # Without the mean, and the line changed by detrending.
+    return frequency[1:], power[1:]
 
 
 DEGREE: Final = 5

@@ -18,8 +18,8 @@ from identification.factor.columns import standard_factor, under_gravity
 from identification.factor.factor import Estimate, Factor, solve
 from identification.model.regressor import LINK_SYMBOLS
 from identification.model.robot import RobotModel
-from identification.signals.noise import noiseless_above
 from identification.signals.samples import Samples
+from identification.signals.smoothing import noiseless_above
 from identification.validation.causes import Cause, find_causes
 from identification.validation.finding import Finding, Thresholds
 from identification.validation.plausibility import (

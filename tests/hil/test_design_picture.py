@@ -17,7 +17,7 @@ from hil.plots.design_picture import draw_design
 from identification.excitation import Design, Objective, information
 from identification.excitation.constraints import sampled
 from identification.excitation.excitation import Excitation
-from identification.excitation.searches.scores import Front
+from identification.excitation.searches.population import Front
 from identification.factor.factor import Factor
 from planner import FourierSeries, Trajectory, plan
 from sim_fixtures.ns16 import CELL_PATH

@@ -35,7 +35,7 @@ from identification.excitation.criteria import (
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
-from identification.excitation.searches.scores import Front, Scale, Scores
+from identification.excitation.searches.population import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 from identification.model.friction import FrictionLaw

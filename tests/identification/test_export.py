@@ -38,8 +38,7 @@ from identification.model.motion import Motion
 from identification.model.payload import Payload
 from identification.model.robot import RobotModel
 from identification.model.urdf_text import LONGEST, MOST_LINKS, refusal, urdf_tree
-from identification.signals.noise import noiseless_above
-from identification.signals.smoothing import LowPassShape, low_passed
+from identification.signals.smoothing import LowPassShape, low_passed, noiseless_above
 from sim_fixtures.ns16 import urdf_text
 from tests.identification.robots import random_urdf, robot_text, some_bodies
 from tests.identification.two_link import URDF

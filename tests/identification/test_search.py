@@ -21,9 +21,16 @@ from identification.excitation.errors import JournalError
 from identification.excitation.genomes import SineGenome
 from identification.excitation.searches import journal
 from identification.excitation.searches.journal import Journal
-from identification.excitation.searches.population import Population, SearchSettings
+from identification.excitation.searches.population import (
+    ROW,
+    Front,
+    Population,
+    Scale,
+    Scores,
+    SearchSettings,
+    unplanned,
+)
 from identification.excitation.searches.run import polish, search
-from identification.excitation.searches.scores import ROW, Front, Scale, Scores, unplanned
 from identification.excitation.violation import NoFeasibleMotionError, excess_by_kind
 from planner import FourierSeries, JointLimits, check_limits
 from planner.errors import LimitExceeded

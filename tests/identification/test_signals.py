@@ -22,7 +22,6 @@ from identification.signals.masks import (
     flat_topped,
     mask_rows,
 )
-from identification.signals.noise import difference_variance, standstill_variance
 from identification.signals.recording import (
     Recording,
     RecordingError,
@@ -30,7 +29,12 @@ from identification.signals.recording import (
     without_repeats,
 )
 from identification.signals.samples import Preprocessing, prepare
-from identification.signals.smoothing import fit_smoothing_spline, low_pass
+from identification.signals.smoothing import (
+    difference_variance,
+    fit_smoothing_spline,
+    low_pass,
+    standstill_variance,
+)
 from tests.identification.two_link import MODEL, URDF, one_sine, sine_motion, truth
 
 NAMES = ("shoulder", "elbow", "wrist")

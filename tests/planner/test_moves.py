@@ -21,9 +21,9 @@ from planner import (
     plan,
     plan_chunk,
 )
+from planner.corners import StraightMoves
 from planner.moves import Move, Overrides, plan_moves
 from planner.piecewise_cubic import Block, check_smooth
-from planner.straight import StraightMoves
 from tests.planner.six_axes import SIX_AXES, random_points, rows_of
 
 
@@ -66,7 +66,7 @@ def routes(draw, limits: JointLimits):
         elif kind == "back" and len(rows) > 1:
             row = rows[-2].copy()
         elif kind == "tiny":
-            row = row + draw(st.sampled_from([1e-15, 1e-12, 1e-9, 1e-6, 1e-4])) * span
+            row = row + draw(st.sampled_from([1e-320, 1e-15, 1e-12, 1e-9, 1e-6, 1e-4])) * span
         elif kind == "one joint":
             joint = draw(st.integers(0, n - 1))
             row[joint] = draw(st.sampled_from([limits.lower[joint], limits.upper[joint]]))

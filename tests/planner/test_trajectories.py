@@ -24,12 +24,19 @@ from planner import (
     check_limits,
     plan,
 )
-from planner.corners import FIRST_SHARES, LAST_SHARES, STOP, passing, solve_many
+from planner.corners import (
+    FIRST_SHARES,
+    LAST_SHARES,
+    STOP,
+    StraightMoves,
+    passing,
+    rest_to_rest,
+    solve_many,
+)
 from planner.errors import UnsupportedSolver
 from planner.fourier import FourierSeries, harmonic_bounds
 from planner.interpolator import corner
 from planner.piecewise_cubic import Block, check_rest
-from planner.straight import StraightMoves, rest_to_rest
 from planner.time_law import RateBounds, TimeLaw, admits, ramp, slowing_bounds
 from tests.planner.six_axes import SIX_AXES, join, legs_between, random_points, rows_of
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from identification.excitation.errors import JournalError
-from identification.excitation.searches.scores import Scores
+from identification.excitation.searches.population import Scores
 
 Array = NDArray[np.float64]
 

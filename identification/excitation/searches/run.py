@@ -15,8 +15,15 @@ from identification.excitation.criteria import SENSE, Criteria, fitness_eq7
 from identification.excitation.errors import DesignError
 from identification.excitation.excitation import Excitation
 from identification.excitation.searches.journal import Journal
-from identification.excitation.searches.population import CHUNK, Population, SearchSettings
-from identification.excitation.searches.scores import SAMPLE_COUNT, Front, Scale, Scores
+from identification.excitation.searches.population import (
+    CHUNK,
+    SAMPLE_COUNT,
+    Front,
+    Population,
+    Scale,
+    Scores,
+    SearchSettings,
+)
 from identification.excitation.violation import KINDS, NoFeasibleMotionError
 
 Array = NDArray[np.float64]
