@@ -267,6 +267,7 @@ class Factor:
 
     def by_block(self, weights: Array) -> Array:
         """Return the Gram matrices of the blocks (B, p + 1, p + 1) with joint weights (n,)."""
+        assert self.storage == "gram"
         width = self.n_parameters + 1
         whole = np.zeros((len(self), width * width))
         for joint, (weight, gram) in enumerate(zip(weights, self.matrices, strict=True)):
@@ -277,6 +278,7 @@ class Factor:
 
     def scores(self, weights: Array, values: Array) -> Array:
         """Return the scores ``W' w (y - W values)`` of each block (B, p)."""
+        assert self.storage == "gram"
         pull = np.zeros((len(self), self.n_parameters))
         for weight, gram, used in zip(weights, self.matrices, self.columns, strict=True):
             pull[:, used] += weight * (gram[:, :-1] @ np.append(-values[used], 1.0))
@@ -294,6 +296,7 @@ class Factor:
 
     def merged(self, length: int) -> Self:
         """Merge runs of `length` blocks; the last one may be shorter."""
+        assert self.storage == "gram"
         matrices = tuple(merged(own, length) for own in self.matrices)
         return replace(self, matrices=matrices, counts=merged(self.counts, length))
 

@@ -576,13 +576,6 @@ class TestMetadata:
         assert ref.arm == "another digest"
         assert len(opened) == 2
 
-    def test_are_read_by_child_processes(self, tmp_path, arm):
-        for name in ("a", "b", "c"):
-            recording(tmp_path / f"{name}.mcap", arm)
-        with Workers(2) as workers:
-            found = discover([str(tmp_path)], UNCACHED, workers, Silent())
-        assert [ref.name for ref in found.refs] == ["a.mcap", "b.mcap", "c.mcap"]
-
     def test_of_an_archive_that_changes_while_it_is_read(self, tmp_path, arm, monkeypatch):
         """It is not cached."""
         path = recording(tmp_path / "a.mcap", arm)

@@ -7,7 +7,6 @@ of the URDF.
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -117,28 +116,23 @@ def test_negated_friction_columns_are_wrong(correct_campaign, monkeypatch):
     assert any("Coulomb friction of" in reason for reason in found.reasons)
 
 
-def cell_with(third, overrides, planted):
-    """Return the NS 16 with these third laws and true coefficients."""
-    base = Cell.load(CELL_PATH).with_values({"simulation.third": json.loads(planted)})
-    lines = [f'[robot.friction.joints.{name}]\nthird = "{law}"' for name, law in overrides.items()]
-    text = base.text.replace('third = "quadratic"', f'third = "{third}"', 1)
-    return Cell.from_texts("\n".join([text, *lines]), base.urdf, base.path)
+LAWS = {"joint_1": "quadratic", "joint_2": "cubic"}
 
 
-@pytest.mark.parametrize(
-    ("laws", "found"),
-    [
-        ({"joint_2": "quadratic"}, "quadratic"),
-        ({"joint_2": "cubic"}, "cubic"),
-        ({"joint_1": "quadratic", "joint_2": "cubic"}, "cubic"),
-    ],
-)
-def test_the_law_follows_the_simulated_third_term(laws, found):
+def truth_with(laws, planted):
+    """Return the truth of the NS 16 with third terms of some joints and these coefficients."""
+    base = Cell.load(CELL_PATH).with_values({"simulation.third": planted})
+    lines = [f'[robot.friction.joints.{name}]\nthird = "{law}"' for name, law in laws.items()]
+    text = base.text.replace('third = "quadratic"', 'third = "none"', 1)
+    return planted_truth(Cell.from_texts("\n".join([text, *lines]), base.urdf, base.path))
+
+
+def test_the_law_follows_the_simulated_third_term():
     """Joints without a third term do not count; two laws in one arm raise."""
-    assert planted_truth(cell_with("none", laws, "[0, 1.5, 0, 0, 0, 0]")).third_law == found
-    cell = cell_with("none", {"joint_1": "quadratic", "joint_2": "cubic"}, "[1, 1.5, 0, 0, 0, 0]")
+    for laws in ({"joint_2": "quadratic"}, {"joint_2": "cubic"}, LAWS):
+        assert truth_with(laws, [0, 1.5, 0, 0, 0, 0]).third_law == laws["joint_2"]
     with pytest.raises(CellError, match=r"robot\.friction\.joints.*joint_1, joint_2.*same third"):
-        planted_truth(cell)
+        truth_with(LAWS, [1, 1.5, 0, 0, 0, 0])
 
 
 class TestInertiaScale:
