@@ -17,6 +17,7 @@ from operator import index
 from typing import Any, Concatenate, Final, NamedTuple, ParamSpec
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from planner.arrays import Array, read_only
@@ -44,6 +45,7 @@ class Status(IntEnum):
     NEED_MORE_DATA = 1
     FINAL_STEP = 2
     OUTPUT_FORMAT = -13
+    TIME_TOO_SHORT = -25
     NO_TARGET = -42
     FATAL = -68
     INCONSISTENT = -76
@@ -62,6 +64,16 @@ class OutputFormat(IntEnum):
 
     JOINT = 0
     CARTESIAN = 1
+
+
+class PointAccuracy(IntEnum):
+    """When a target at which the arm stops counts as reached (ORL's termination kinds)."""
+
+    FINE = 0
+    COARSE = 1
+    NOSETTLE = 2
+    JNT_FINE = 3
+    JNT_COARSE = 4
 
 
 class FlybyCriterion(IntEnum):
@@ -196,14 +208,18 @@ class MotionQueue:
         begin, _, path = stretches[self._reading]
         return path.read(time - begin)[0]
 
+    def leg_to(self, move: Move, overrides: Overrides) -> Legs:
+        """Return the leg to a further target, from rest to rest."""
+        points = np.stack((self._point, move.target))
+        return legs_through(points, [move], self._limits, overrides)
+
     def append(self, target_id: int, move: Move, overrides: Overrides, now: float) -> None:
         """Add a target; `now` is the present motion time [s].
 
         Raises:
             PlannerError: no motion to it was found; the motion planned before is unchanged.
         """
-        points = np.stack((self._point, move.target))
-        new = legs = legs_through(points, [move], self._limits, overrides)
+        new = legs = self.leg_to(move, overrides)
         turn, turns = STOP, list[Corner]()
         if self._last is not None:
             both = self._last[0].followed_by(new)
@@ -235,8 +251,9 @@ class MotionQueue:
 class MoveSettings:
     """Settings of the next targets.
 
-    `speed`, `acceleration` and `jerk` are shares of the limits of each joint (n,); `advance` is the
-    number of targets that should be known beyond the next one.
+    `speed`, `acceleration` and `jerk` are shares of the limits of each joint (n,); `motion_time` is
+    that of the next move [s], 0 for the shortest; `advance` is the number of targets that should be
+    known beyond the next one.
     """
 
     speed: Array
@@ -245,12 +262,14 @@ class MoveSettings:
     flying: bool = False
     fly_percent: float = _FLY_PERCENT
     overrides: Overrides = field(default_factory=Overrides)
+    motion_time: float = 0.0
     advance: int = 1
 
-    def move_to(self, target: Array) -> Move:
-        """Return a move to a target (n,) [rad]."""
+    def move_to(self, target: Array, speed: float = 1.0) -> Move:
+        """Return a move to a target (n,) [rad] without `motion_time`."""
         return Move(
             target,
+            speed=speed,
             joint_speed=self.speed,
             joint_acceleration=self.acceleration,
             fly_percent=self.fly_percent if self.flying else 0.0,
@@ -455,9 +474,28 @@ class Interpolator:
     @_service
     def set_flyby_criteria_parameter(self, criterion: int, value: float) -> None:
         """Set the size of corners: FLY_PER in 0..100 %."""
-        self._require_percent(criterion)
-        self._require(0.0 <= value <= 100.0, f"fly-by of {value} %")
-        self._set(fly_percent=float(value))
+        self._set_flyby(criterion, value)
+
+    @_service
+    def set_point_accuracy_parameter(self, criterion: int, value: float) -> None:
+        """Set the size of corners, as COMAU maps this service."""
+        self._set_flyby(criterion, value)
+
+    @_service
+    def cancel_flyby_criteria(self, criterion: int) -> None:
+        """Reset the value of a criterion."""
+        self._set_flyby(criterion, _FLY_PERCENT)
+
+    @_service
+    def select_point_accuracy(self, accuracy: int) -> None:
+        """Select the `PointAccuracy` of later targets; it does not change set-points."""
+        PointAccuracy(accuracy)
+
+    @_service
+    def set_motion_time(self, seconds: float) -> None:
+        """Set the duration of the next move, from rest to rest [s]; 0 for the shortest."""
+        self._require(0.0 <= seconds < inf, f"motion time of {seconds} s")
+        self._set(motion_time=float(seconds))
 
     # -- targets ---------------------------------------------------------------------------
 
@@ -465,15 +503,16 @@ class Interpolator:
     def set_next_target(self, target_id: int, position: ArrayLike) -> Status:
         """Add a target (n,) [rad] with the present settings; OK or NEED_MORE_DATA.
 
-        Refusals are INCONSISTENT, and FATAL where no motion was found; the motion to the targets
-        before it continues.
+        Refusals are INCONSISTENT, TIME_TOO_SHORT (see `set_motion_time`), and FATAL where no motion
+        was found; the motion to the targets before it continues.
         """
         queue = self._queue
         if queue is None:
             raise _RefusedError("no initial position is set")
         self._require(not self._cancelling, "the cancelled motion still comes to rest")
-        move = self._settings.move_to(self._position_of(position))
+        move = _timed(queue, self._settings, self._position_of(position))
         queue.append(index(target_id), move, self._settings.overrides, self._law.motion_time)
+        self._set(motion_time=0.0)
         return self._wanted(queue)
 
     def get_current_target_id(self) -> int | None:
@@ -611,6 +650,11 @@ class Interpolator:
         percent = FlybyCriterion(criterion) is FlybyCriterion.PERCENT
         self._require(percent, "only percentages of the deceleration are implemented")
 
+    def _set_flyby(self, criterion: int, value: float) -> None:
+        self._require_percent(criterion)
+        self._require(0.0 <= value <= 100.0, f"fly-by of {value} %")
+        self._set(fly_percent=float(value))
+
     def _set_shares(self, name: str, percent: ArrayLike, joints: Sequence[int] | None) -> None:
         shares = np.array(getattr(self._settings, name))
         chosen = [index(joint) for joint in (range(len(shares)) if joints is None else joints)]
@@ -667,3 +711,31 @@ class Interpolator:
         step = self._step(Status.FINAL_STEP, events)
         self._rest_at(self._position)
         return step
+
+
+def _timed(queue: MotionQueue, settings: MoveSettings, target: Array) -> Move:
+    """Return the move to a target with its motion time.
+
+    Raises:
+        InvalidSetting: a motion time for a target that is the point before.
+    """
+    seconds = settings.motion_time
+    if seconds == 0.0:
+        return settings.move_to(target)
+
+    def excess(speed: float) -> float:
+        leg = queue.leg_to(settings.move_to(target, speed), settings.overrides)
+        return float(leg.moves.durations[0]) - seconds
+
+    least = excess(1.0)
+    if least == -seconds:
+        raise InvalidSetting("motion time", seconds, "0 s where the target is the point before")
+    if least > _ROUNDING:
+        reason = f"the move takes longer than its motion time of {seconds} s"
+        raise _RefusedError(reason, Status.TIME_TOO_SHORT)
+    slow = 1.0
+    while excess(slow) < 0.0:
+        slow /= 2.0
+    if slow < 1.0:
+        slow = float(scipy.optimize.brentq(excess, slow, 1.0, xtol=1e-300, rtol=1e-15))
+    return settings.move_to(target, slow)

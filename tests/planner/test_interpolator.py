@@ -106,7 +106,7 @@ def test_every_setting_reaches_the_plan():
     interpolator.set_override_acceleration(70.0, AccelerationKind.ACCELERATION)
     interpolator.set_override_acceleration(60.0, AccelerationKind.DECELERATION)
     interpolator.select_flyby_mode(True)
-    interpolator.set_flyby_criteria_parameter(FlybyCriterion.PERCENT, 60.0)
+    interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, 60.0)
     queue(interpolator, points[1:])
     shares = {
         "joint_speed": np.array([0.8, 0.8, 0.35, 0.8, 0.8, 0.8]),
@@ -186,6 +186,35 @@ def test_data_are_requested_while_few_targets_are_ahead(advance):
     for step in steps_to_rest(interpolator)[:-1]:
         ahead -= len(step.events)
         assert (step.status == Status.NEED_MORE_DATA) == (ahead <= advance)
+
+
+# -- time ---------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10**6), st.floats(1.0, 6.0))
+@settings(max_examples=15, deadline=None)
+def test_a_motion_time_is_met(seed, factor):
+    a, b, c = random_points(seed, 3)
+    shortest = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
+    interpolator = ready(SIX_AXES, a)
+    assert interpolator.set_motion_time(factor * shortest) == Status.OK
+    queue(interpolator, [b, c])  # the time is that of one move
+    first = plan_moves(b, [Move(c)], SIX_AXES).trajectory.duration
+    last = steps_to_rest(interpolator)[-1].elapsed_time
+    assert last == pytest.approx(factor * shortest + first, rel=1e-9)
+
+
+def test_a_motion_time_too_short_is_refused():
+    a, b = random_points(40, 2)
+    shortest = plan_moves(a, [Move(b)], SIX_AXES).trajectory.duration
+    interpolator = ready(SIX_AXES, a)
+    interpolator.set_motion_time(0.999 * shortest)
+    assert interpolator.set_next_target(1, b) == Status.TIME_TOO_SHORT == -25
+    assert interpolator.get_next_step().status == Status.NO_TARGET
+    assert interpolator.set_next_target(1, a) == Status.INCONSISTENT  # nowhere, in some time
+    interpolator.set_motion_time(0.0)
+    queue(interpolator, [b])
+    assert steps_to_rest(interpolator)[-1].elapsed_time == pytest.approx(shortest)
 
 
 def test_the_interpolation_time_changes_the_steps_not_the_motion():
@@ -326,6 +355,10 @@ REFUSED = {
     "select_flyby_criteria": [([],), (7,), (FlybyCriterion.DISTANCE,)],
     "set_flyby_criteria_parameter": [(3, 10.0), (FlybyCriterion.PERCENT, "x"),
                                      (FlybyCriterion.PERCENT, 100.5)],
+    "cancel_flyby_criteria": [(3,)],
+    "select_point_accuracy": [("fine",)],
+    "set_point_accuracy_parameter": [(3, 10.0)],
+    "set_motion_time": [(-1.0,), (np.inf,)],
     "set_interpolation_time": [(np.nan,), (0.0,)],
     "set_initial_position": [(None,), ([[0.0], [0.0, 1.0]],)],
     "set_next_target": [("two", [0.0] * 6), (2, [0.0] * 5), (2, [0.0] * 5 + [99.0])],
@@ -476,10 +509,17 @@ class AnyServices(RuleBasedStateMachine):
         status = self.interpolator.set_next_target(self.next_id, target)
         if self.cancelled:
             assert status == Status.INCONSISTENT
-        else:
+        elif status != Status.TIME_TOO_SHORT and status != Status.INCONSISTENT:
             assert status in (Status.OK, Status.NEED_MORE_DATA), self.interpolator.refusal
             self.queued.append((self.next_id, target))
             self.next_id += 1
+        else:
+            assert "motion time" in self.interpolator.refusal
+            assert self.interpolator.set_motion_time(0.0) == Status.OK
+
+    @rule(seconds=st.floats(0.0, 2.0))
+    def take_time(self, seconds):
+        assert self.interpolator.set_motion_time(seconds) == Status.OK
 
     @rule(count=st.sampled_from([1, 3, 20, 100]))
     def step(self, count):
@@ -548,7 +588,7 @@ class AnyServices(RuleBasedStateMachine):
     def fly(self, on, percent):
         interpolator = self.interpolator
         assert interpolator.select_flyby_mode(on) == Status.OK
-        status = interpolator.set_flyby_criteria_parameter(FlybyCriterion.PERCENT, percent)
+        status = interpolator.set_point_accuracy_parameter(FlybyCriterion.PERCENT, percent)
         assert status == Status.OK
 
     @rule(a=PERCENT, b=PERCENT, c=PERCENT, joint=st.integers(0, 2))
