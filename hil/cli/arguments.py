@@ -23,6 +23,21 @@ ArchivesArgument = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", "-q", help="Print only the result.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+DhOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="TABLE",
+        help="CSV table of DH parameters in place of --urdf: joint, type, a, alpha, d, "
+        "theta_offset (m, rad; or a_mm, alpha_deg, …), one row per joint. Needs --convention.",
+    ),
+]
+ConventionOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Convention of --dh: standard (Rz(q + theta_offset) Tz(d) Tx(a) Rx(alpha)) or "
+        "modified (Craig: Rx(alpha) Tx(a) Rz(q + theta_offset) Tz(d)).",
+    ),
+]
 
 
 Command = Callable[..., None]

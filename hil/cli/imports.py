@@ -11,6 +11,8 @@ import typer
 
 from hil.archive import open_archive
 from hil.cli.arguments import (
+    ConventionOption,
+    DhOption,
     JsonOption,
     exactly_one,
     figures,
@@ -25,6 +27,7 @@ from hil.importers import (
     Effort,
     Robot,
     Use,
+    convention_of,
     import_log,
     import_rosbag2,
     recorded_joints,
@@ -61,6 +64,8 @@ class Described:
     cell: Annotated[
         Path | None, typer.Option(help="Cell file, in place of --urdf and --friction.")
     ] = None
+    dh: DhOption = None
+    convention: ConventionOption = None
     gravity: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
@@ -94,8 +99,8 @@ class Described:
     ] = False
 
     def robot(self, recorded: Callable[[], tuple[str, ...] | None]) -> Robot:
-        """Return the robot of a cell file or URDF; `recorded` reads the joint names."""
-        exactly_one(urdf=self.urdf, cell=self.cell)
+        """Return the robot of a cell file, URDF or DH table; `recorded` reads the joint names."""
+        exactly_one(urdf=self.urdf, cell=self.cell, dh=self.dh)
         law = FrictionLaw.from_table(
             {**friction_from(self.friction), "standstill": self.standstill}
         )
@@ -103,9 +108,11 @@ class Described:
         joints = recorded() if self.lock_others else None
         if self.cell is not None:
             return Robot.from_cell(self.cell, gravity=self.gravity, locked=at, recorded=joints)
-        assert self.urdf is not None
+        path = self.urdf or self.dh
+        assert path is not None
         return Robot.from_urdf(
-            self.urdf,
+            path,
+            convention=None if self.dh is None else convention_of(self.convention),
             friction=law,
             gravity=self.gravity or STANDARD_GRAVITY,
             locked=at,

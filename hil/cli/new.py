@@ -10,15 +10,20 @@ import typer
 
 from hil.campaign import stop_on_interrupt
 from hil.cli.arguments import (
+    ConventionOption,
+    DhOption,
     JsonOption,
     at_most_one,
+    exactly_one,
     figures,
     print_json,
 )
 from hil.errors import InputError
 from hil.files import convert_write_errors, write_atomically
+from hil.importers import convention_of
 from hil.new import (
     Known,
+    cell_of_dh,
     cell_of_urdf,
     from_archive,
     from_init,
@@ -32,8 +37,9 @@ PORT = 1000
 
 
 def new(
-    urdf: Annotated[Path, typer.Option()],
-    *,
+    urdf: Path | None = None,
+    dh: DhOption = None,
+    convention: ConventionOption = None,
     output: Annotated[Path, typer.Option("--output", "-o")] = Path("cell.toml"),
     from_controller: Annotated[str | None, typer.Option(metavar="HOST[:PORT]")] = None,
     from_archive_file: Annotated[
@@ -52,10 +58,12 @@ def new(
     Limits come from the URDF if it states them. With --from-controller this PC waits for the Open
     program of the controller, replies without moving anything and reads the init packet: start this
     command first, then that program. With --from-archive the values come from an archive. A file
-    with a "?" is refused with a list of all unknown values and where to find each of them.
+    with a "?" is refused with a list of all unknown values and where to find each of them. For an
+    arm with known Denavit-Hartenberg parameters and no URDF use --dh.
 
     **Examples:** `hil new --urdf robot.urdf --from-controller 10.2.12.150 -o cell.toml`, `hil new
-    --design-only --urdf robot.urdf -o cell.toml`
+    --dh table.csv --convention modified -o cell.toml`, `hil new --design-only --urdf robot.urdf -o
+    cell.toml`
 
     Options:
         urdf: URDF of the arm.
@@ -72,12 +80,17 @@ def new(
             a design needs beyond the URDF are assumed and listed.
         force: Replace an earlier file.
     """
+    exactly_one(urdf=urdf, dh=dh)
     at_most_one(
         design_only=design_only, from_controller=from_controller, from_archive=from_archive_file
     )
     _require_free(output, force=force)
     fixed = figures(fix or [], "--fix", "--fix finger=0.02 (rad or m)")
-    made = cell_of_urdf(urdf, fixed)
+    if urdf is not None:
+        made = cell_of_urdf(urdf, fixed)
+    else:
+        assert dh is not None
+        made = cell_of_dh(dh, convention_of(convention), fixed)
     if made.urdf is not None:
         _require_free(made.urdf_beside(output), force=force, own=made.urdf_path)
     known = made.known

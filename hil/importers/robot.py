@@ -17,6 +17,7 @@ from hil.cell import Cell
 from hil.cell.text import replaced_value
 from hil.errors import SourceError
 from hil.files import file_digest
+from hil.importers.dh import Convention, urdf_of_dh
 from hil.importers.findings import check_clock, examine, limits_of
 from hil.reading import read_input
 from identification import FrictionLaw
@@ -50,6 +51,7 @@ class Robot:
         cls,
         path: str | PathLike[str],
         *,
+        convention: Convention | None = None,
         friction: FrictionLaw | None = None,
         gravity: Sequence[float] = STANDARD_GRAVITY,
         locked: Mapping[str, float] | None = None,
@@ -58,7 +60,8 @@ class Robot:
         """Return a robot by its URDF and the settings of its model.
 
         Args:
-            path: the URDF file.
+            path: the URDF file, or a table of Denavit-Hartenberg parameters, which has no masses.
+            convention: of such a table, see :func:`hil.importers.dh.urdf_of_dh`; None for a URDF.
             friction: friction law of every joint, None for `IMPORTED_LAW`.
             gravity: in the base frame [m/s²].
             locked: position [rad or m] of joints that are not in the model, such as a gripper's.
@@ -70,7 +73,7 @@ class Robot:
         """
         path = Path(path)
         otherwise = "name a URDF file"
-        urdf = read_input(path, otherwise)
+        urdf = read_input(path, otherwise) if convention is None else urdf_of_dh(path, convention)
         try:
             pinocchio_model(urdf)
         except ModelError as error:  # an error of this file, not of a cell file

@@ -23,6 +23,7 @@ from hil.cell.errors import UNKNOWN, WHERE, models_of
 from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
 from hil.errors import InputError
+from hil.importers import Convention, urdf_of_dh
 from hil.reading import read_input
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
@@ -138,7 +139,7 @@ class NewCell:
     name: str
     joint_names: tuple[str, ...]
     urdf: str | None  #: changed URDF text, None if the given file is used
-    urdf_path: Path  #: URDF that was read
+    urdf_path: Path  #: URDF or table of DH parameters that was read
     meshes: tuple[str, ...]  #: `package://` mesh paths of the collision shapes
     known: Known
     design_only: bool = False
@@ -246,13 +247,25 @@ def _comment(text: str, mark: str) -> list[str]:
     return textwrap.wrap(text, 98, initial_indent=mark, subsequent_indent=rest)
 
 
+def cell_of_dh(path: Path, convention: Convention, fixed: Mapping[str, float]) -> NewCell:
+    """Return the cell of a table of DH parameters, with a URDF to write, or raise InputError."""
+    text = urdf_of_dh(path, convention)
+    note = "the URDF contains the geometry of the DH parameters only: no masses, no limits"
+    made = _cell_of(path, text, fixed)
+    return replace(made, urdf=made.urdf or text, known=Known(notes=(note,)) | made.known)
+
+
 def cell_of_urdf(path: Path, fixed: Mapping[str, float]) -> NewCell:
     """Return the cell of the URDF of an open chain (else InputError).
 
     Joints in `fixed` are fixed at these positions [rad or m], prismatic joints at zero (or the
     nearest position in their range), mimic joints at their offset; notes report this.
     """
-    text = read_input(path, "name a URDF")
+    return _cell_of(path, read_input(path, "name a URDF"), fixed)
+
+
+def _cell_of(path: Path, text: str, fixed: Mapping[str, float]) -> NewCell:
+    """Return the cell of the URDF text read from `path`."""
     chain = _chain(path, text)
     names = chain.joint_names
     if unknown := sorted(set(fixed) - set(names)):

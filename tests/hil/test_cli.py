@@ -135,7 +135,7 @@ def test_the_demo_writes_results_and_ends_with_the_verdict(
     [
         (["identify", "nothing.mcap"], "nothing.mcap"),
         (["identify", str(CELL_PATH)], "cell.toml"),
-        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell"),
+        (["import", "rosbag2", "x.db3", "-o", "y.mcap"], "give --urdf or --cell or --dh"),
         (["import", "rosbag2", "x.db3", "-o", "y.mcap", "--urdf", str(URDF_PATH)], "x.db3"),
         (
             ["import", "log", "x", "-o", "y", "--map", "m.toml", "--urdf", str(URDF_PATH)],

@@ -1,4 +1,4 @@
-"""Import of logs of text and arrays, warnings about column maps."""
+"""Import of logs of text and arrays, robots by DH parameters, warnings about column maps."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from click.testing import Result
 from hypothesis import assume, given
@@ -26,10 +27,12 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 from hil.archive import ArchiveHeader, Findings, Samples, open_archive
+from hil.cell import Cell
 from hil.cli import app
 from hil.errors import InputError, SourceError
+from hil.identify.cell_context import nominal_of
 from hil.identify.sources import cell_of
-from hil.importers import ColumnMap, Robot
+from hil.importers import ColumnMap, Convention, Robot, urdf_of_dh
 from hil.importers import arrays as array_files
 from hil.importers.arrays import ArrayFile
 from hil.importers.column_map import UNITS, Format
@@ -38,11 +41,13 @@ from hil.importers.robot import _cell_text
 from hil.importers.table import Table
 from hil.recordings import open_recording
 from identification import FrictionLaw
+from identification.model.kinematics import chain_from_urdf
 from tests.hil.simulated_logs import (
     JOINTS,
     Simulated,
     simulate,
     three_joint_robot,
+    urdf_path,
 )
 from tests.hil.simulated_logs import imported as read
 from tests.hil.test_importers_rosbag2 import STATE, bag, state
@@ -591,6 +596,188 @@ def test_child_process_has_limited_memory_also_after_a_restart() -> None:
     assert array_files._readers[0].connection.poll(5.0)
     assert array_files._in_child(resource.getrlimit, resource.RLIMIT_AS) == (2**33, 2**33)
     assert array_files._in_child(os.getpid) != pid
+
+
+# Robots by Denavit-Hartenberg parameters
+
+
+DH_HEADER = "joint,type,a,alpha,d,theta_offset"
+MIXED = (
+    ("turn", "revolute", 0.2, 0.7, 0.4, 0.3),
+    ("slide", "prismatic", -0.1, -1.2, 0.15, 1.1),
+    ("elbow", "revolute", 0.05, 3.0, 0.0, -2.0),
+    ("wrist", "revolute", 0.0, -0.4, -0.3, 0.0),
+)
+UR5 = """joint,type,a,alpha_deg,d,theta_offset
+shoulder_pan_joint,revolute,0,90,0.089159,0
+shoulder_lift_joint,revolute,-0.425,0,0,0
+elbow_joint,revolute,-0.39225,0,0,0
+wrist_1_joint,revolute,0,90,0.10915,0
+wrist_2_joint,revolute,0,-90,0.09465,0
+wrist_3_joint,revolute,0,0,0.0823,0
+"""
+PANDA = """# manufacturer's table, convention of Craig
+joint;type;a_mm;alpha_deg;d_mm;theta_offset_deg
+panda_joint1;revolute;0;0;333;0
+panda_joint2;revolute;0;-90;0;0
+panda_joint3;revolute;0;90;316;0
+panda_joint4;revolute;82.5;90;0;0
+panda_joint5;revolute;-82.5;-90;384;0
+panda_joint6;revolute;0;90;0;0
+panda_joint7;revolute;88;90;0;0
+"""
+
+
+def dh_table(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def dh_text(rows: tuple[tuple[object, ...], ...]) -> str:
+    return "\n".join([DH_HEADER, *(",".join(map(str, row)) for row in rows)]) + "\n"
+
+
+def about_z(angle: float, along: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, along], [0, 0, 0, 1.0]])
+
+
+def about_x(angle: float, along: float) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0, along], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]])
+
+
+def flange(convention: Convention, q: Floats) -> Floats:
+    """Forward kinematics of MIXED, row by row."""
+    place = np.eye(4)
+    for (_, kind, a, alpha, d, offset), value in zip(MIXED, q, strict=True):
+        turns = kind == "revolute"
+        z = about_z(offset + value * turns, d + value * (not turns))
+        x = about_x(alpha, a)
+        place = place @ (z @ x if convention == "standard" else x @ z)
+    return place
+
+
+def placement(model: pin.Model, q: Floats, frame: str) -> Floats:
+    """Return a frame of a URDF in its base; joints without limits have cosine and sine."""
+    joints = zip(model.joints[1:], q, strict=True)
+    full = np.concatenate(
+        [[np.cos(one), np.sin(one)] if joint.nq == 2 else [one] for joint, one in joints]
+    )
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, full)
+    return np.array(data.oMf[model.getFrameId(frame)].homogeneous)
+
+
+class TestDhKinematics:
+    @pytest.mark.parametrize("convention", ["standard", "modified"])
+    def test_equals_product_of_row_transforms(self, tmp_path: Path, convention: Convention) -> None:
+        path = dh_table(tmp_path / "dh.csv", dh_text(MIXED))
+        model = pin.buildModelFromXML(urdf_of_dh(path, convention))
+        for q in np.random.default_rng(2).uniform(-3.0, 3.0, (20, 4)):
+            assert placement(model, q, "flange") == pytest.approx(flange(convention, q), abs=1e-12)
+
+    def test_ur5_equals_its_urdf(self, tmp_path: Path) -> None:
+        """Standard convention; base and tool frames differ by constant transforms."""
+        ours = pin.buildModelFromXML(urdf_of_dh(dh_table(tmp_path / "ur5.csv", UR5), "standard"))
+        theirs = pin.buildModelFromUrdf(str(urdf_path("ur5_robot.urdf")))
+        base, tools = about_z(np.pi, 0.0), []
+        for q in np.random.default_rng(3).uniform(-3.0, 3.0, (10, 6)):
+            there = base @ placement(theirs, q, "tool0")
+            tools.append(np.linalg.solve(there, placement(ours, q, "flange")))
+        assert np.ptp(tools, axis=0).max() < 1e-3  # m; the URDF rounds its lengths
+
+    def test_panda_equals_its_urdf(self, tmp_path: Path) -> None:
+        """Modified convention, with lengths in mm and angles in degrees."""
+        path = dh_table(tmp_path / "panda.csv", PANDA)
+        ours = pin.buildModelFromXML(urdf_of_dh(path, "modified"))
+        theirs = pin.buildModelFromUrdf(str(urdf_path("panda.urdf")))
+        for q in np.random.default_rng(4).uniform(-1.0, 1.0, (10, 7)):
+            expected = placement(theirs, np.append(q, [0.0, 0.0]), "panda_link7")
+            assert placement(ours, q, "link_7") == pytest.approx(expected, abs=1e-9)
+
+    def test_gives_no_nominal_model(self, tmp_path: Path) -> None:
+        """The table has no masses."""
+        path = dh_table(tmp_path / "dh.csv", dh_text(MIXED))
+        robot = Robot.from_urdf(path, convention="standard")
+        cell = Cell.from_texts(robot.cell, robot.urdf, Path("cell.toml"))
+        assert robot.joint_names == ("turn", "slide", "elbow", "wrist")
+        assert not cell.model.nominal.any()
+        assert nominal_of(cell) is None
+
+
+class TestDhErrors:
+    @pytest.mark.parametrize(
+        ("text", "sentence"),
+        [
+            ("", r"has no row of a joint; write joint,type,a,alpha,d,theta_offset"),
+            ("joint,type,a,alpha,d\nj,revolute,0,0,0\n", "header: has no column theta_offset"),
+            (
+                f"{DH_HEADER},alpha_deg\nj,revolute,0,0,0,0,9\n",
+                "header: has columns alpha and alpha_",
+            ),
+            (f"{DH_HEADER}\nj,spherical,0,0,0,0\n", "type: line 2 has 'spherical'; write rev"),
+            (f"{DH_HEADER}\nj,revolute,0,90,0,0\n", "alpha: line 2 has '90'.*column alpha_deg"),
+            (f"{DH_HEADER}\nj,revolute,400,0,0,0\n", "a: line 2 has '400'.*call the column a_mm"),
+            (f"{DH_HEADER}\nj,revolute,0,nan,0,\n", "alpha: line 2 has 'nan'"),
+            (
+                f"{DH_HEADER}\nj,revolute,0,0,0,0\nj,revolute,0,0,0,0\n",
+                "joint: line 3 has 'j'; give each",
+            ),
+        ],
+    )
+    def test_name_line_field_and_remedy(self, tmp_path: Path, text: str, sentence: str) -> None:
+        with pytest.raises(InputError, match=r"dh\.csv: cannot be read"):
+            urdf_of_dh(tmp_path / "dh.csv", "standard")
+        with pytest.raises(InputError, match=rf"dh\.csv: {sentence}"):
+            urdf_of_dh(dh_table(tmp_path / "dh.csv", text), "standard")
+
+    @pytest.mark.parametrize(
+        ("options", "sentence"),
+        [
+            (["--dh", "dh.csv"], "--convention: is not given; --dh needs standard"),
+            (["--dh", "dh.csv", "--urdf", "r.urdf"], "--urdf and --dh: exclude each other"),
+        ],
+    )
+    def test_options_that_do_not_fit(self, options: list[str], sentence: str) -> None:
+        result = CliRunner().invoke(app, ["new", *options])
+        assert isinstance(result.exception, InputError)
+        assert sentence in str(result.exception)
+
+
+class TestDhCommands:
+    def test_new_writes_a_cell_and_its_urdf(self, tmp_path: Path) -> None:
+        path = dh_table(tmp_path / "panda.csv", PANDA)
+        arguments = ["new", "--dh", str(path), "--convention", "modified", "--json"]
+        result = CliRunner().invoke(app, [*arguments, "-o", str(tmp_path / "cell.toml")])
+        assert result.exit_code == 0, result.output
+        summary = json.loads(result.output)
+        assert summary["joints"] == [f"panda_joint{j}" for j in range(1, 8)]
+        assert "limits.lower_deg" in summary["unknown"]
+        assert any("no masses" in note for note in summary["notes"])
+        cell = tomllib.loads((tmp_path / "cell.toml").read_text())
+        assert cell["cell"]["urdf"] == "cell.urdf"
+        chain = chain_from_urdf((tmp_path / "cell.urdf").read_text())
+        assert list(chain.joint_names) == summary["joints"]
+        assert path.read_text() == PANDA
+
+    def test_a_log_is_imported_with_it(self, tmp_path: Path) -> None:
+        """As with a URDF; joints that were not recorded can be locked."""
+        time = np.arange(200) / 100.0
+        q = np.sin(time[:, None] * [1.0, 2.0, 3.0])
+        np.savez(tmp_path / "log.npz", t=time, q=q)
+        (tmp_path / "map.toml").write_text(
+            'joints = ["turn", "elbow", "wrist"]\n[time]\ncolumn = "t"\n[position]\ncolumns = "q"\n'
+        )
+        path = dh_table(tmp_path / "dh.csv", dh_text(MIXED))
+        arguments = ["import", "log", str(tmp_path / "log.npz"), "-o", str(tmp_path / "log.mcap")]
+        arguments += ["--map", str(tmp_path / "map.toml"), "--dh", str(path), "--lock-others"]
+        result = CliRunner().invoke(app, [*arguments, "--convention", "modified"])
+        assert result.exit_code == 0, result.exception
+        assert "locked, rad or m: slide at 0" in result.output
+        archive = open_archive(tmp_path / "log.mcap")
+        assert archive.joint_names == ("turn", "elbow", "wrist")
+        assert np.array_equal(archive.columns["position"], q)
 
 
 # Warnings about the column map and the robot
