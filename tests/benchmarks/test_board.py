@@ -163,16 +163,6 @@ class TestDegradations:
     def test_every_fault_has_an_expected_cause(self) -> None:
         assert DEGRADATIONS.keys() == EXPECTED.keys() >= FITTED_ONLY
 
-    def test_filters_leave_what_is_slow(self) -> None:
-        quick = np.sin(2.0 * np.pi * 30.0 * self.CLEAN.time)[:, None]
-        torque, position = self.CLEAN.torque, self.CLEAN.position
-        noisy = replace(self.CLEAN, torque=torque + quick, position=position + quick)
-        inner = slice(100, -100)
-        filtered = degradations.filtered_positions(noisy).position
-        assert np.abs((filtered - position)[inner]).max() < 0.05
-        filtered = degradations.filtered_torque(noisy).torque
-        assert np.abs((filtered - torque)[inner]).mean() < 0.5  # Coulomb friction is not slow
-
     def test_torques(self, logs: Logs) -> None:
         torque = logs["one"].torque
         three = replace(logs["one"], torque=np.column_stack([torque, torque[:, 0]]))
@@ -220,12 +210,6 @@ class TestPlainFit:
         for measured in (one, other):
             predicted = fitted.predicted_torque(measured)
             assert plain_fit.relative_error(measured.torque, predicted) < 1e-8
-
-    def test_another_motion_of_the_simulated_arm_is_predicted(self) -> None:
-        """Torques of recursive Newton-Euler, with what filter and differences leave of it."""
-        one, other = (two_joint_log(seed, noise=0.0).measured for seed in (1, 2))
-        predicted = plain_fit.fit(ROBOT, one).predicted_torque(other)
-        assert plain_fit.relative_error(other.torque, predicted) < 0.01
 
     def test_gravity_and_locked_joints_are_those_that_are_named(self) -> None:
         locked = plain_fit.robot_from_urdf(URDF.read_text(), (0.0, 9.81, 0.0), {"elbow": 0.5})

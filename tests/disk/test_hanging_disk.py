@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import subprocess
 import sys
@@ -17,7 +16,7 @@ import pytest
 from hil.archive import ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, free_port, loopback_link
+from hil.demo_link import LOOPBACK, SimulatorProcess, free_port, loopback_link
 from hil.errors import ControllerFault
 from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
@@ -25,7 +24,6 @@ from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
 
 PATIENCE = 120.0  # s for a process on a loaded computer
 RUN = (sys.executable, "-m", "hil", "run")
-SIMULATE = (sys.executable, "-m", "hil", "simulate")
 
 
 @pytest.fixture(scope="module")
@@ -54,11 +52,9 @@ def made(disk: Disk, name: str, folder: Path) -> Campaign:
 def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
     """Run a campaign; the rule applies once the file `after` has some content."""
     port = campaign.cell.controller.port
-    simulator = subprocess.Popen(
-        [*SIMULATE, str(campaign.folder.cell), "--udp", f"{LOOPBACK}:{port}", "--json",
-         "--patience", "0.5"],
-        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+    simulator = SimulatorProcess.start(
+        campaign.folder.cell, "--udp", f"{LOOPBACK}:{port}", "--patience", "0.5"
+    )
     process = subprocess.Popen(
         [*RUN, str(campaign.folder.root), "--no-identify", "--accept-dry-run", "--quiet"],
         stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -75,10 +71,9 @@ def run(campaign: Campaign, disk: Disk, rule: Rule | None, after: str) -> Ended:
         output = process.communicate(timeout=PATIENCE)[0].decode()
     finally:
         process.kill()
-        simulator.terminate()
-        out, errors = simulator.communicate(timeout=PATIENCE)
-    assert out, errors.decode()
-    return Ended(process.returncode, output, json.loads(out.decode().splitlines()[-1]))
+        simulator.finish()
+        arm = simulator.end()
+    return Ended(process.returncode, output, arm)
 
 
 def lost(campaign: Campaign) -> dict[str, str]:
