@@ -360,6 +360,27 @@ class TestLongGaps:
         np.testing.assert_allclose(np.diff(targets[-5:], axis=0), [step] * 4, rtol=0.02, atol=1e-5)
         assert rig.state is State.OPEN
 
+    @pytest.mark.parametrize(
+        ("column", "factor", "off", "kind"),
+        [
+            (0, 1.0, 0.0, None),
+            (0, 1.0, 0.25, Check.ACCEPTED),
+            (1, 0.4, 0.0, Check.GAP_VELOCITY),
+            (1, 1.6, 0.0, Check.GAP_VELOCITY),
+        ],
+    )
+    def test_motion_that_can_be_resumed_is_compared_as_well(self, column, factor, off, kind):
+        rig = running(planned(), 200)
+        d = rig.axes["d"]
+        rig.miss(5)
+        d[:, [0, 2]] += 5.0 * d[:, [1]]
+        d[0, column] = factor * d[0, column] + off
+        answer = rig.cycle()
+        if kind is None:
+            assert rig.state is State.OPEN
+        else:
+            assert assert_refused(rig, answer, kind).joint == 0
+
     def test_motion_held_at_its_begin_stays(self):
         """Slower than what counts as standstill, only its target shows that it was held."""
         rig = running(planned())
@@ -386,6 +407,15 @@ class TestPauses:
         rig.axes["d"][:, 3] = 0.0
         error = assert_refused(rig, rig.cycle(), Check.PAUSE_VELOCITY)
         assert error.bound == pytest.approx(LAG * limits().acceleration[0])
+
+    def test_old_velocity_is_refused(self):
+        rig = at_speed(1200, speed=2.0)
+        rig.ages = np.zeros((N, 8), np.uint16)
+        rig.ages[3, 3] = 1
+        rig.cycle()
+        assert rig.state is State.OPEN
+        rig.now += 0.9
+        assert assert_refused(rig, rig.cycle(), Check.GAP_AGE).joint == 3
 
     def test_arm_that_lags_behind_or_rests_without_a_motion_continues(self):
         """As on a busy computer, whose cycle was longer."""
