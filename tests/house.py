@@ -29,15 +29,15 @@ TARGETS: Final[Mapping[str, int | None]] = {
     "functions over 60 lines": None,
 }
 CEILINGS: Final[Mapping[str, int]] = {
-    "product lines": 64_200,
-    "product files": 300,
-    "test lines": 62_000,
-    "test files": 240,
+    "product lines": 62_000,
+    "product files": 290,
+    "test lines": 55_000,
+    "test files": 220,
     "import circles": 0,
-    "imports inside functions": 30,
+    "imports inside functions": 22,
     "files with one importer": 10,
     "banned names": 0,
-    "functions over 60 lines": 19,
+    "functions over 60 lines": 18,
 }
 """Figures that no change may exceed: targets that are met, else those of today, to be lowered."""
 BANNED: Final = {
