@@ -222,7 +222,7 @@ def test_an_earlier_campaign_is_not_removed_for_a_bad_motion(
     wild = FourierSeries(cell.home, np.full((6, 1), 2.0), np.full((6, 1), 3.0), 5.0, 1.0)
     for name in ("manifest.json", "results.json", "report.html", *FILES):
         (tmp_path / name).write_text("{}")
-    monkeypatch.setattr(demo_module, "_designed", lambda *arguments: designed(wild))
+    monkeypatch.setattr(demo_module, "load_design", lambda *_: designed(wild))
     with pytest.raises(MotionRefusedError, match=r"the excitation .*design another motion\."):
         demo_module.demo(output=tmp_path, excitation=tmp_path / "x.toml", force=True, quiet=True)
     assert (tmp_path / "manifest.json").read_text() == "{}"
