@@ -99,9 +99,6 @@ class Rehearsal(Frozen):
     repetitions: int
     motion_seconds: float
     software: dict[str, str]
-    failed_seeds: tuple[int, ...] = ()
-    motion_hash: str = ""
-    """Of earlier versions, not used."""
 
     @model_validator(mode="after")
     def _judged_by_its_criteria(self) -> Self:

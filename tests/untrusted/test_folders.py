@@ -472,7 +472,7 @@ def test_saved_documents_are_read_back(folder: Path) -> None:
     found = Criterion(name="excitation", value=float("inf"), bound=1.0, passed=False, sentence="")
     rehearsal = Rehearsal(
         plan_hash="", seed=1, passed=False, criteria=[found], assumed=[], not_seen=[],
-        repetitions=2, motion_seconds=4.0, software={}, failed_seeds=(2, 3),
+        repetitions=2, motion_seconds=4.0, software={},
     )  # fmt: skip
     rehearsal.save(folder / "rehearsal.json")
     assert Rehearsal.load(campaign) == rehearsal
