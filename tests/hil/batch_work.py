@@ -48,12 +48,6 @@ def number(k):
     return k
 
 
-def marked(path):
-    """Create a file when it begins."""
-    Path(path).touch()
-    time.sleep(0.1)
-
-
 def absent(k):
     raise ArchiveError(f"{k}.mcap", "cannot be read: No such file or directory")
 
