@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ import pytest
 from drivers.errors import ModeRefused
 from drivers.packets import DRIVE_ON, INIT_LENGTH
 from drivers.states import State
-from drivers.transports.simulated import Corrupt, SimulatedTransport
+from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.recorder import Recorded
 from hil.campaign import Link, Progress, Stop
@@ -37,7 +38,7 @@ from sim_fixtures.ns16 import CELL_PATH
 NAME = "excitation_000_a1.mcap"
 
 
-def own_motion_link(cell: Cell, *faults: Corrupt, stated: Cell | None = None) -> Link:
+def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = None) -> Link:
     """A link in virtual time to a controller whose own program moves the arm.
 
     `stated` is the cell that the PC has, by default the controller's.
@@ -49,7 +50,7 @@ def own_motion_link(cell: Cell, *faults: Corrupt, stated: Cell | None = None) ->
 
 
 def recording_of(
-    cell: Cell, path: Path, *faults: Corrupt, kind: str = "excitation", **how: Any
+    cell: Cell, path: Path, *faults: Lose | Corrupt, kind: str = "excitation", **how: Any
 ) -> Recorded:
     """A recording of the controller's own motion."""
     how = {"stop": Stop(), **how}
@@ -122,6 +123,14 @@ def test_the_operator_ends_a_recording_properly_or_early(
     done = recording_of(cell, tmp_path / NAME, **how, **after(500))
     assert (done.outcome, done.reason) == (outcome, "ended by the operator")
     assert done.records == open_archive(tmp_path / NAME).n_samples >= 500
+
+
+def test_a_lost_packet_is_a_gap_and_not_a_shift(tmp_path: Path, cell: Cell) -> None:
+    recording_of(cell, tmp_path / NAME, Lose(600, "to_pc"), duration=1.0)
+    archive = open_archive(tmp_path / NAME)
+    assert {*np.diff(archive.columns["cycle"]).tolist()} == {1, 2}
+    assert archive.columns["gap"].sum() == 1
+    assert archive.outcome.entries["lost_packets"] == "1"
 
 
 def test_a_refusal_is_shown_at_once_and_ends_a_recording(tmp_path: Path, cell: Cell) -> None:
@@ -251,6 +260,69 @@ def test_an_arm_at_rest_is_left_after_a_second(on_udp: tuple[Path, int]) -> None
         output, errors = recorder.communicate(timeout=60)
     assert recorder.returncode == 0, errors
     assert json.loads(output)["outcome"] == "completed"
+
+
+@pytest.mark.slow
+def test_a_session_that_ends_early_is_reported(on_udp: tuple[Path, int]) -> None:
+    path, port = on_udp
+    with (
+        running(*own_motion(path, port, "--duration", "3")),
+        recorder_of(path, "--duration", "60", "--json") as recorder,
+    ):
+        output, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    result = json.loads(output)  # one object: what was recorded, and why that is not all
+    stated = (result["outcome"], result["kind"], result["exit_code"])
+    assert stated == ("completed", "ControllerFault", 4)
+    assert result["cycles"] > 0
+    assert re.search("the controller ended the session after .* of 60 s.*a.mcap", flat(errors))
+    assert open_archive(path.parent / "a.mcap").outcome.outcome == "completed"
+
+
+def signal_child(recorder: subprocess.Popen[str], module: str, number: int) -> None:
+    """Send a signal to the child that runs a module."""
+    for task in Path(f"/proc/{recorder.pid}/task/{recorder.pid}/children").read_text().split():
+        if module in Path(f"/proc/{task}/cmdline").read_text():
+            return os.kill(int(task), number)
+    raise AssertionError(f"no {module}")
+
+
+def flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+@pytest.mark.slow
+def test_a_killed_exchange_ends_a_recording_as_lost(on_udp: tuple[Path, int]) -> None:
+    path, port = on_udp
+    archive = path.parent / "a.mcap"
+    with running(*own_motion(path, port)), recorder_of(path) as recorder:
+        wait_until_recorded(archive, recorder)
+        signal_child(recorder, "drivers.exchange", signal.SIGKILL)
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "the exchange process ended" in errors
+    assert "a.mcap" in errors
+    outcome = open_archive(archive).outcome
+    assert (outcome.outcome, outcome.reason) == ("lost", "the exchange process ended")
+
+
+@pytest.mark.slow
+def test_a_hanging_archive_process_is_ended(on_udp: tuple[Path, int]) -> None:
+    """And the moving arm is replied to until the controller ends the session."""
+    path, port = on_udp
+    archive = path.parent / "a.mcap"
+    with running(*own_motion(path, port)) as controller, recorder_of(path) as recorder:
+        wait_until_recorded(archive, recorder)
+        signal_child(recorder, "hil.archive.process", signal.SIGSTOP)
+        result = next(line for line in recorder.stdout if "replying until" in line)
+        assert "sent no heartbeat for 5 s and was ended" in result
+        controller.send_signal(signal.SIGTERM)
+        counts, _ = controller.communicate(timeout=60)
+        _, errors = recorder.communicate(timeout=60)
+    assert recorder.returncode == 4
+    assert "a.mcap is readable up to its last part" in flat(errors)
+    assert json.loads(counts)["missed"] <= 1  # the last packet, 504, needs no answer
+    assert open_archive(archive).n_samples > 500
 
 
 def test_a_missing_controller_is_waited_for_as_stated(on_udp: tuple[Path, int]) -> None:
