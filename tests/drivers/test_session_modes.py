@@ -325,11 +325,22 @@ class TestCorrections:
         rig.cycle()
         assert rig.state is state
 
-    @pytest.mark.parametrize("mode", [2, 8, 9])
-    def test_target_of_the_controller_outside_the_range(self, mode):
-        rig = begun(mode, correction(mode), guard_limits=limits(upper=START + 0.005))
-        rig.put_arm_at(START + np.array([0, 0, 0, 0, 0.006, 0]))
-        assert assert_refused(rig, rig.cycle(), Check.POSITION).joint == 4
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES))
+    @pytest.mark.parametrize("corrected", [False, True])
+    @pytest.mark.parametrize(
+        ("column", "off", "kind"),
+        [(None, 0.006, Check.POSITION), (2, 2.1, Check.FOLLOWING_ERROR), (4, 20.1, Check.CURRENT)],
+    )
+    def test_arm_is_checked_beside_its_correction(self, mode, corrected, column, off, kind):
+        """Its range begins 0.005 rad from where it stands."""
+        options = {"mode": mode, "guard_limits": limits(upper=START + 0.005)}
+        rig = running(correction(mode), **options) if corrected else opened(**options)
+        if column is None:
+            rig.put_arm_at(START + off * (np.arange(N) == 4))
+        else:
+            rig.axes["d"][4, column] += off
+        rig.cycle()
+        assert (kind_of(rig.refusal), rig.refusal.joint) == (kind, 4)
 
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_sum_with_the_servo_current_is_limited(self, sign):
