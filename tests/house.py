@@ -34,7 +34,7 @@ CEILINGS: Final[Mapping[str, int]] = {
     "test lines": 55_000,
     "test files": 220,
     "import circles": 0,
-    "imports inside functions": 22,
+    "imports inside functions": 25,
     "files with one importer": 10,
     "banned names": 0,
     "functions over 60 lines": 18,

@@ -23,10 +23,6 @@ from hil.archive import open_archive
 from hil.cell import Cell
 from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
 from hil.files import make_folder, write_output
-from hil.identify.estimating import estimate_with
-from hil.identify.options import FIXED
-from hil.identify.prepared import prepare_sources
-from hil.identify.sources import gather_sources
 from hil.motion_checks import PLANNED_CURRENT
 from hil.progress import Reporter
 from hil.results import Frozen
@@ -357,6 +353,12 @@ def of_currents(cell: Cell, folder: CampaignFolder, name: str, bound: float) -> 
 
 def of_estimate(twin: Twin, folder: CampaignFolder, reporter: Reporter) -> list[Criterion]:
     """Judge an identification from the archives: determined, correct, predictive."""
+    # Slow to import, and not needed by those who read a rehearsal.
+    from hil.identify.estimating import estimate_with
+    from hil.identify.options import FIXED
+    from hil.identify.prepared import prepare_sources
+    from hil.identify.sources import gather_sources
+
     bounds = {"excitation": 0.0, "parameters": MOST_SIGMA, "unseen motion": MOST_ERROR}
     kinds = ("excitation", "validation", "standstill")
     paths = [path for kind in kinds for path in folder.completed(kind)]
