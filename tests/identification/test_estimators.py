@@ -1,6 +1,7 @@
 """Robust, consistent and prior estimates, their covariance, and the delay of the torque."""
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 from identification import (
     Coupling,
@@ -37,13 +39,21 @@ from identification import (
     write_urdf,
 )
 from identification.estimators.consistent import Shrinkage, fit_shrunk, shrunk_values
-from identification.estimators.covariance import spread
+from identification.estimators.covariance import block_length, cluster_covariance, spread
 from identification.estimators.delay import LONGEST_DELAY
 from identification.estimators.losses import Loss
 from identification.export.urdf import NotConsistentError
-from identification.factor.factor import joint_weights, rows_of, solve, total_factor
+from identification.factor.factor import (
+    NormalEquations,
+    joint_weights,
+    rows_of,
+    solve,
+    total_factor,
+)
 from identification.model.pseudo_inertia import pseudo_inertia
 from identification.signals.smoothing import low_pass
+from sim_fixtures.ns16 import urdf_text
+from tests.identification.robots import robot_text
 from tests.identification.two_link import (
     MODEL,
     NOISE,
@@ -110,6 +120,41 @@ class TestBlocks:
         moved = values - without
         rows = spread(a_blocks, scores, solve(phase.weighted(weights)).root)
         np.testing.assert_allclose(rows.T @ rows, moved.T @ moved, rtol=1e-9)
+
+    @pytest.mark.parametrize("shared", [0.0, 0.09])
+    def test_correlation_of_neighbouring_blocks_counts(self, shared):
+        """Mean of blocks that are correlated with the next one."""
+        rng = np.random.default_rng(3)
+        blocks, k = 300, 40
+        weight = (1.0 - np.sqrt(1.0 - 4.0 * shared**2)) / (2.0 * shared) if shared else 0.0
+        white = rng.standard_normal((blocks + 1, k)) / np.sqrt(blocks * (1.0 + weight**2))
+        scores = white[1:] + weight * white[:-1]
+        information = np.tile(np.eye(k) / blocks, (blocks, 1, 1))
+        solution = solve(NormalEquations(np.eye(k), scores.sum(axis=0)))
+        found = cluster_covariance(information, scores, solution)
+        assert found.blocks == blocks // 2
+        assert np.trace(found.covariance) / k == pytest.approx(1.0 + 2.0 * shared, rel=0.05)
+
+    def test_blocks_grow_with_the_correlation_of_the_scores(self):
+        white = np.random.default_rng(5).standard_normal((400, 30))
+        slow = lfilter([1.0], [1.0, -0.8], white, axis=0)
+        assert block_length(white) == 2
+        assert 4 <= block_length(slow) <= 20
+        assert block_length(white[:25]) == 1  # enough blocks remain
+
+    def test_the_interval_factor_is_students_t_of_the_number_of_blocks(self):
+        motion = a_motion()
+        noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
+        result = estimate_repetitions(MODEL, [recording(noise, motion)]).pooled
+        assert "40 blocks of 0.25 s" in result.method
+        assert result.interval_factor == pytest.approx(2.02, abs=0.01)
+
+    def test_independent_repetitions_are_averaged(self):
+        motion, rng = a_motion(), np.random.default_rng(4)
+        runs = [recording(coloured(rng, len(motion.time), 5e-3, 0.02), motion) for _ in range(16)]
+        result = estimate_repetitions(MODEL, runs)
+        assert np.median(result.std / 4.0 / result.pooled.std) == pytest.approx(1.0, abs=0.35)
+        assert np.median(result.classical_std / result.pooled.std) < 0.75
 
     def test_variance_determined_by_few_blocks_is_correct(self):
         """The elbow moves for 0.2 s only, in two blocks with almost no residual."""
@@ -253,6 +298,13 @@ class TestRobustEstimate:
             inside.append(np.abs(result.values - truth()) < result.interval_factor * result.std)
         assert 0.90 <= np.mean(inside) <= 0.99
 
+    def test_exact_data_with_gross_outliers_give_the_true_values(self):
+        motion = a_motion(3.0)
+        samples = recording(np.zeros((len(motion.time), 2)), motion)
+        samples.torque[::40] += 500.0
+        result = robust_estimate(MODEL, [samples], Tukey())
+        np.testing.assert_allclose(result.estimate.values, truth(), rtol=1e-6)
+
     def test_a_resting_joint_has_no_scale(self):
         motion = a_motion(4.0)
         samples = recording(gaussian(np.random.default_rng(6), motion), motion)
@@ -383,6 +435,26 @@ class TestPosterior:
         # No parameter is less certain than before.
         assert (found.ratio <= 1.0 + 1e-9).all()
 
+    def test_parameters_without_data_and_prior_stay_at_its_mean(self):
+        factor = Factor.of(MODEL, noisy(held_elbow=True))
+        found = with_prior(MODEL, factor, nominal_prior(MODEL, known=ROTORS))
+        assert set(found.estimate.undetermined) == {"f0_2", "f1_2"}
+        unknown = np.array([name in found.estimate.undetermined for name in found.estimate.names])
+        assert np.isinf(found.estimate.std[unknown]).all()
+        np.testing.assert_array_equal(found.ratio[unknown], 1.0)
+        np.testing.assert_array_equal(found.estimate.values[unknown], 0.0)
+
+    def test_few_rows_require_weights(self):
+        kept = np.arange(len(noisy().torque)) % 200 == 7
+        few = Factor.of(MODEL, replace(noisy(), usable=noisy().usable & kept[:, None]))
+        prior = nominal_prior(MODEL, known=KNOWN)
+        with pytest.raises(IdentificationError, match="too few"):
+            with_prior(MODEL, few, prior)
+        assert np.isfinite(with_prior(MODEL, few, prior, 1.0 / NOISE**2).estimate.values).all()
+        empty = replace(noisy(), usable=np.zeros_like(noisy().usable))
+        with pytest.raises(IdentificationError, match="not one usable sample"):
+            fit_with_prior(MODEL, [empty], nominal_prior(MODEL))
+
     @pytest.mark.parametrize("correlation", [0.0, 0.05])
     def test_95_percent_intervals_cover_90_to_99_percent(self, correlation):
         prior = nominal_prior(MODEL, known=KNOWN)
@@ -444,6 +516,15 @@ class TestNominalPrior:
         scale = np.outer(prior.std[:rank], prior.std[:rank])
         assert np.abs((np.cov(base.T) - covariance) / scale).max() < 0.04
         np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
+
+    def test_rotors_and_friction_have_none_and_flatten_only_their_groups(self):
+        model = RobotModel.from_urdf(urdf_text())
+        std = dict(zip(model.parameter_names, nominal_prior(model).std, strict=True))
+        rotors = model.base.grouping[:, model.layout.rotors].any(axis=1)
+        groups = {name for name, own in zip(model.base.names, rotors, strict=True) if own}
+        flat = {name for name, value in std.items() if np.isinf(value)}
+        assert flat == groups | set(model.parameter_names[model.base.rank :])
+        assert all(value > 0.0 for value in std.values())
 
     def test_a_urdf_without_inertia_has_none(self):
         bare = replace(MODEL, chain=replace(MODEL.chain, inertial=np.zeros((2, 10))))
@@ -597,6 +678,25 @@ class TestConsistentEstimate:
         assert found.relative_error == pytest.approx(relative, rel=1e-6)
         assert "covariance of the unconstrained estimate" in found.estimate.method
         np.testing.assert_array_equal(found.estimate.covariance, found.unconstrained.covariance)
+
+    @pytest.mark.parametrize(
+        "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
+    )
+    def test_other_robots_with_partly_inconsistent_nominal_parameters(self, path):
+        model = RobotModel.from_urdf(robot_text(path))
+        values = values_of(model, np.repeat([2.0, 1.0, 0.0], model.n_joints), 0.5)
+        found = fit_of(values, 0.1, 1, model=model)
+        assert_consistent(model, found)
+        assert error_rise(found) < 1e-3
+
+    def test_missing_nominal_bodies_are_assumed(self):
+        bare = re.sub(r"<inertial>.*?</inertial>", "", URDF, flags=re.DOTALL)
+        empty = RobotModel.from_urdf(bare, friction=FrictionLaw(third=None))
+        motion = five_sines(MODEL, 12)
+        found = fitted(empty, motion, measured(MODEL, motion, truth(), 0.02, 12))
+        assert all(words.startswith("assumed") for words in found.reference)
+        assert_consistent(empty, found)
+        assert error_rise(found) < 1e-3
 
     def test_a_resting_joint_keeps_its_nominal_link(self):
         law = FrictionLaw(third=None)
@@ -779,6 +879,17 @@ class TestDelay:
         assert not right.significant
         assert right.applied == 0.004
 
+    def test_a_resting_axis_does_not_matter(self):
+        late = [part * [1.0, 0.0] for part in four_sines_at(np.arange(6000) * STEP - 7e-4)]
+        noise = np.random.default_rng(1).standard_normal((2, 6000, 2))
+        still = delayed(0.0)
+        still = replace(
+            still,
+            position=four_sines_at(still.time)[0] * [1.0, 0.0] + 1e-6 * noise[0],
+            torque=MODEL.torque(TRUTH, *late) + 0.1 * noise[1],
+        )
+        assert estimate_delay(still, MODEL).applied == pytest.approx(7e-4, abs=1e-4)
+
     def test_presliding_friction_is_read_at_the_same_time(self):
         law = FrictionLaw(third=None, presliding=1e-3)
         model = RobotModel.from_urdf(URDF, friction=law)
@@ -835,3 +946,11 @@ class TestDelayUncertainty:
         added = wider.covariance - fitted.covariance
         np.testing.assert_allclose(added, 0.25 * np.outer(slope, slope), rtol=0.06, atol=1e-6)
         np.testing.assert_array_equal(wider.values, fitted.values)
+        # An undetermined parameter stays undetermined.
+        covariance = fitted.covariance.copy()
+        covariance[0, :] = covariance[:, 0] = 0.0
+        covariance[0, 0] = np.inf
+        unknown = replace(fitted, covariance=covariance)
+        wider = with_uncertain_delay(unknown, Factor.of(MODEL, middle), products, 1.0)
+        assert np.isinf(wider.covariance[0, 0])
+        np.testing.assert_array_equal(wider.covariance[0, 1:], 0.0)

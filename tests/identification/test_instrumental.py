@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from identification import (
     FrictionLaw,
+    IdentificationError,
     Motion,
     RobotModel,
     estimate,
@@ -162,6 +163,16 @@ class TestPlannedMotion:
         )
         assert not instruments.usable[TIME - min(shoulder, elbow) < -STEP].any()
         assert instruments.usable[inside].all()
+
+    def test_missing_commands_are_not_used(self):
+        samples, command = executed(0), PLAN.position.copy()
+        command[300:340, 1] = np.nan
+        instruments = planned_motion(samples, command)
+        assert not instruments.usable[300:340].any()
+        assert instruments.usable[400:-400].all()
+        for value, words in ((np.nan, "no commanded positions"), (1.0, "no joint is commanded")):
+            with pytest.raises(IdentificationError, match=words):
+                planned_motion(samples, np.full_like(command, value))
 
     def test_repetitions_share_a_plan_for_any_clock(self):
         plan = TIME, PLAN.position

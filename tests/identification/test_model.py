@@ -402,6 +402,30 @@ class TestBaseParameters:
         # Their traces are not printed as groups either.
         assert np.array_equal(rounded.grouping != 0.0, ns16.base.grouping != 0.0)
 
+    def test_expressions_read_like_the_table_and_units_fit(self, ns16):
+        expression = dict(zip(ns16.base.names, ns16.base.expressions(3), strict=True))
+        assert expression["I1yy"] == (
+            "I1yy + I1m + I2yy + 0.09 m2 + I3zz + 0.58 m3 + 0.614 m4 + 0.614 m5 + 0.614 m6"
+        )
+        assert expression["mc4z"] == "mc4z - mc5y"
+        unit = dict(zip(ns16.parameter_names, ns16.units, strict=True))
+        names = ("I1yy", "I3m", "mc2x", "f0_1", "f1_6")
+        expected = ["kg m²", "kg m²", "kg m", "N·m", "N·m·s/rad"]
+        assert [unit[name] for name in names] == expected
+        sliding = RobotModel.from_urdf(slider("1 0 0"))
+        assert sliding.parameter_names == ("m1", "f0_1", "f1_1", "f2_1")
+        assert sliding.units == ("kg", "N", "N·s/m", "N·s²/m²")
+        assert sliding.base.expressions() == ("m1 + I1m",)
+
+    def test_an_unclear_rank_is_reported(self, ns16):
+        """The first axis a ten-thousandth of a radian off gravity: more is felt, but hardly."""
+        assert ns16.base.explanation().startswith("40 of 66 standard parameters are independent")
+        base = RobotModel.from_urdf(urdf_text().replace("1.5707963267948966", "1.5709")).base
+        assert base.rank > ns16.base.rank
+        assert base.smallest_pivot < 1e-4
+        weakest = base.names[int(np.argmin(base.shares[base.pivots]))]
+        assert f"{base.smallest_pivot:.1e} ({weakest})" in base.explanation()
+
     @pytest.mark.parametrize("arm", ARMS)
     def test_the_rank_is_that_of_pinocchios_regressor(self, arm):
         urdf = robot_text(ARMS[arm])
@@ -461,6 +485,17 @@ class TestLawsOfJoints:
         expected = [[torque_of(laws[j], own[j], v) for j, v in enumerate(row)] for row in qd]
         np.testing.assert_allclose(torque, expected, atol=1e-11)
 
+    def test_parameters_are_ordered_by_term(self):
+        model = RobotModel.from_urdf(
+            TWO_LINK,
+            friction=FrictionLaw(third=None),
+            joint_friction={"elbow": FrictionLaw(viscous=False, third="cubic", stribeck=0.1)},
+        )
+        assert model.friction.names == ("f0_1", "f0_2", "f1_1", "f2_2", "fs_2")
+        assert model.friction.units == ("N·m", "N·m", "N·m·s/rad", "N·m·s³/rad³", "N·m")
+        table = model.friction.table(np.arange(5.0))
+        assert table == ({"f0": 0.0, "f1": 2.0}, {"f0": 1.0, "f2": 3.0, "fs": 4.0})
+
     def test_rows_at_rest_are_excluded_only_with_that_zone(self):
         model = RobotModel.from_urdf(
             TWO_LINK,
@@ -494,6 +529,16 @@ class TestDissipation:
             for v in (-3.0, -0.01, 0.01, 3.0):
                 assert torque_of(law, own, v) * v >= -1e-12
 
+    def test_all_dissipative_friction_is_allowed_and_no_other(self):
+        law = FrictionLaw(third=None, asymmetric=True, stribeck=0.2)
+        friction = JointFriction((law,), (True,))
+        combine, not_negative = dissipation(friction)
+        possible = {"f0": 2.0, "f1": 1.0, "fd": -0.9, "fs": -1.8, "fo": -5.0}
+        for change in ({}, {"fd": -1.1}, {"fs": -2.1}, {"f0": -0.1}, {"fd": 1.1}):
+            values = possible | change
+            g = np.linalg.solve(combine, [values[term.symbol] for term in friction.terms])
+            assert np.all(g[not_negative] >= 0.0) == (change == {}), change
+
 
 steps = st.lists(st.sampled_from([-3e-4, -1e-5, 0.0, 1e-5, 2e-3]), min_size=2, max_size=60)
 distances = st.sampled_from([1e-5, 1e-4, 1e-3])
@@ -514,6 +559,11 @@ class TestPreslidingState:
 
 
 class TestDirectionOfFriction:
+    def test_without_presliding_it_is_the_sign(self):
+        motion = a_motion()
+        direction = MODEL.friction.direction(*motion[:3])
+        np.testing.assert_array_equal(direction, np.sign(motion.velocity))
+
     def test_the_torque_uses_the_direction_of_a_motion(self):
         motion = a_motion()
         half = motion._replace(direction=0.5 * np.sign(motion.velocity))

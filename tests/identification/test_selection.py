@@ -375,6 +375,16 @@ class TestLowPassShape:
         gain = inner.std() / sine[1000:3000].std()
         assert gain == pytest.approx(np.sqrt(0.5) if shape.causal else 0.5, rel=0.01)
 
+    def test_uneven_times_are_interpolated(self):
+        time = np.arange(4000) / RATE
+        uneven = time + 0.3 / RATE * np.random.default_rng(3).uniform(-1.0, 1.0, len(time))
+        smooth, found = (
+            low_passed(t, np.sin(4.0 * t)[:, None], BANDWIDTH, LowPassShape(2, causal=True))[:, 0]
+            for t in (time, uneven)
+        )
+        expected = np.interp(uneven, time, smooth)
+        assert found[500:-10] == pytest.approx(expected[500:-10], abs=2e-3)
+
     def test_samples_filter_their_regressor_by_it(self):
         shape = LowPassShape(order=1, causal=True)
         how = Preprocessing(torque_bandwidth=BANDWIDTH, torque_shape=shape)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.interpolate import BSpline
 from scipy.signal import butter, sosfiltfilt
 
+from identification.errors import ShapeError
 from identification.model.coupling import Coupling
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
@@ -134,6 +137,12 @@ class TestChecks:
 
 
 class TestRecording:
+    def test_arrays_of_other_shapes_are_refused_by_name(self):
+        recording = a_recording()
+        for name, values in (("torque", recording.torque[:-1]), ("gap_before", np.zeros(3, bool))):
+            with pytest.raises(ShapeError, match=name):
+                replace(recording, **{name: values})
+
     def test_gaps_split_it_but_jitter_does_not(self):
         recording = a_recording()
         gap = np.zeros(200, dtype=bool)
@@ -196,6 +205,17 @@ class TestRepetitions:
 
 
 class TestTimeBase:
+    @pytest.mark.parametrize("rate", [100.0, 125.0, 1000.0, 5000.0])
+    def test_an_even_clock_since_1970_is_uniform_and_jitter_is_not(self, rate):
+        base = time_base(1.7e9 + np.arange(2000) / rate)
+        assert base.uniform
+        assert base.rate == pytest.approx(rate, rel=1e-4)
+        assert (base.repeated, base.backward, base.dropped, base.gaps) == (0, 0, 0, 0)
+        steps = (1.0 + 0.2 * np.random.default_rng(1).uniform(-1.0, 1.0, 20_000)) / rate
+        uneven = time_base(np.cumsum(steps))
+        assert not uneven.uniform
+        assert uneven.jitter == pytest.approx(0.2 / np.sqrt(3.0), rel=0.02)
+
     @pytest.mark.parametrize("seed", range(5))
     def test_late_stamps_are_not_missing_samples(self, seed):
         random = np.random.default_rng(seed)
@@ -289,6 +309,49 @@ class TestSmoothingSpline:
         if jitter:
             error = (spline(time, 2) - sines(time, 2))[200:-200]
             assert np.std(error) < 0.01 * np.std(sines(time, 2))
+
+    def test_it_minimises_squares_plus_roughness(self):
+        """Small enough for a dense solution by splines and quadrature of SciPy."""
+        rng = np.random.default_rng(5)
+        time = np.sort(rng.uniform(0.0, 1.0, 40))
+        values = np.sin(5.0 * time) + 0.05 * rng.standard_normal(40)
+        spline = fit_smoothing_spline(time, values[:, None], np.array([0.05**2]))
+        k = len(spline.coefficients)
+        knots = spline.start + spline.spacing * np.arange(-5, k + 1)
+        basis = BSpline(knots, np.eye(k), 5)
+        third = basis.derivative(3)
+        roughness = np.zeros((k, k))
+        for i in range(k):
+            for j in range(max(0, i - 5), i + 1):
+                roughness[i, j] = roughness[j, i] = sum(
+                    quad(lambda t, i=i, j=j: third(t)[i] * third(t)[j], *knots[p : p + 2])[0]
+                    for p in range(max(i, 5), min(j + 6, k))
+                )
+        density = len(time) / (time[-1] - time[0])
+        penalty = density / (2.0 * np.pi * spline.bandwidth[0]) ** 6
+        rows = basis(time)
+        dense = np.linalg.solve(rows.T @ rows + penalty * roughness, rows.T @ values)
+        np.testing.assert_allclose(spline(time)[:, 0], rows @ dense, atol=1e-9)
+
+    def test_derivatives_are_far_better_than_differences(self):
+        sigma = 1e-5
+        time, values = noisy_sines(sigma)
+        spline = fit_smoothing_spline(time, values, np.full(2, sigma**2))
+        inner = slice(200, -200)
+        error = [np.std((spline(time, d) - sines(time, d))[inner]) for d in range(3)]
+        assert error[0] < 0.4 * sigma
+        assert error[1] < 2e-3 * np.std(sines(time, 1))
+        assert error[2] < 5e-3 * np.std(sines(time, 2))
+        differences = np.gradient(np.gradient(values, time, axis=0), time, axis=0)
+        assert np.std((differences - sines(time, 2))[inner]) > 50 * error[2]
+
+    def test_knots_are_refined_to_the_tolerance(self):
+        """120 Hz at 1 kHz: one knot per four samples cannot follow, one per sample can."""
+        time = np.arange(2000) * 1e-3
+        values = np.sin(2.0 * np.pi * 120.0 * time)[:, None]
+        spline = fit_smoothing_spline(time, values, np.array([1e-8]))
+        assert spline.spacing < 3e-3
+        assert np.mean((values - spline(time)) ** 2) <= 1.001e-8
 
 
 TRUTH = truth()

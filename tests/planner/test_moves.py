@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -155,6 +156,43 @@ class TestMotion:
                 assert 0.0 < passage.fly <= asked
                 assert (passage.how == "flown") == (passage.fly == asked)
         assert motion.targets[-1].how == "stopped"
+
+    @given(problems(), st.floats(0.02, 1.0))
+    @settings(max_examples=60)
+    def test_stops_take_longer_than_fly_by_and_less_with_more_speed(self, problem, share):
+        points, moves, limits, overrides = problem
+        motion = plan_moves(points[0], moves, limits, overrides)
+        stopping = [replace(move, fly_percent=0.0) for move in moves]
+        stops = plan_moves(points[0], stopping, limits, overrides)
+        assert stops.duration == pytest.approx(motion.duration_with_stops, rel=1e-14)
+        # Equal but for the rounding of a sum in which a corner replaces times by themselves.
+        assert motion.duration <= stops.duration * (1 + 1e-13)
+        slower = replace(overrides, speed=share * overrides.speed)
+        slow = plan_moves(points[0], stopping, limits, slower)
+        assert stops.duration <= slow.duration * (1 + 1e-13)
+
+    def test_moves_of_another_arm_are_refused(self):
+        a, b = random_points(8, 2)
+        for start, moves in ((a, [Move(b[:5])]), (a[:5], [Move(b[:5])]), (a, [])):
+            with pytest.raises(InvalidViaPoints):
+                plan_moves(start, moves, SIX_AXES)
+        with pytest.raises(InvalidSetting, match="joint override"):
+            plan_moves(a, [Move(b)], SIX_AXES, Overrides(joint=[1.0] * 5))
+
+    def test_corners_not_rounded_as_requested_are_reported(self):
+        a, b, c = random_points(7, 3)
+        repeated = plan_moves(a, [Move(p, fly_percent=50) for p in (b, b, c)], SIX_AXES)
+        assert (repeated.reduced_corners, repeated.stopped_corners) == (0, 0)  # nothing to round
+        reduced = 0
+        for seed in range(100, 200):
+            a, b, c = random_points(seed, 3)
+            # Joint 5 reverses exactly on its limit while joint 0 determines the time.
+            moves = [Move(p, fly_percent=100) for p in (SIX_AXES.upper, c)]
+            motion = plan_moves(a, moves, SIX_AXES)
+            assert motion.reduced_corners == (motion.targets[0].how == "reduced")
+            assert motion.stopped_corners == (motion.targets[0].how == "stopped")
+            reduced += motion.reduced_corners
+        assert reduced > 0
 
 
 def ramps(motion):

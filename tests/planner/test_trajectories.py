@@ -461,6 +461,17 @@ class TestRestToRest:
         assert np.all(gap <= 1e-12 * np.array(scale) + [0.0, law.duration * tick, tick])
         assert ends[-1, 0] == pytest.approx(distance, rel=1e-12)
 
+    @given(problems())
+    def test_it_is_as_fast_as_an_independent_planner(self, problem):
+        distance, velocity, acceleration, deceleration, jerk = problem
+        asked = ruckig.InputParameter(1)
+        asked.target_position = [distance]
+        asked.max_velocity, asked.max_acceleration = [velocity], [acceleration]
+        asked.min_acceleration, asked.max_jerk = [-deceleration], [jerk]
+        solution = ruckig.Trajectory(1)
+        ruckig.Ruckig(1).calculate(asked, solution)
+        assert scalar(*problem)[0].duration == pytest.approx(solution.duration, rel=1e-6)
+
 
 def flown(points, limits, share=0.5):
     """The corner at the middle one of three points."""
@@ -572,6 +583,18 @@ class TestPassing:
         assert passed.time == pytest.approx(1.37 / 2.0, abs=1e-12)
         assert passed.distance == pytest.approx(0.5, abs=1e-12)
 
+    @given(tables(), st.data())
+    def test_no_sample_is_nearer(self, motion, data):
+        point = np.array(data.draw(st.tuples(*[numbers] * motion.n_joints)))
+        passed = passing(motion, point)
+        q = motion.sample(np.linspace(0.0, motion.duration, 2001))[0]
+        sampled = np.linalg.norm(q - point, axis=1).min()
+        # Two dips of like depth between the looks at a path may be mistaken for one another.
+        between = 0.5 * motion.duration / 64 * np.linalg.norm(motion.extrema().velocity)
+        assert passed.distance <= sampled + between
+        reached = motion.sample_one(passed.time)[0]
+        assert passed.distance == pytest.approx(np.linalg.norm(reached - point), abs=1e-12)
+
 
 fractions = st.one_of(st.sampled_from([0.0, 0.2, 1.0]), st.floats(0.0, 1.0))
 rate_bounds = st.builds(RateBounds, st.floats(0.01, 100.0), st.floats(0.01, 1000.0))
@@ -616,6 +639,22 @@ def test_a_ramp_is_smooth_within_its_bounds_to_the_target(state, target):
         )
     assert way.sample(way.duration) == (way.motion_time, target, 0.0)
     assert way.sample(way.duration + 2.0)[0] == pytest.approx(way.motion_time + 2.0 * target)
+
+
+@given(states(), fractions)
+def test_no_ramp_is_faster(state, target):
+    bounds, rate, slope = state
+    # The reference is known to crash at states on their limit, and is exact to 1e-8.
+    slope = float(np.clip(slope, -0.9 * bounds.slope, 0.9 * bounds.slope))
+    problem = ruckig.InputParameter(1)
+    problem.control_interface = ruckig.ControlInterface.Velocity
+    problem.current_velocity, problem.current_acceleration = [rate], [slope]
+    problem.target_velocity = [target]
+    problem.max_acceleration, problem.max_jerk = [bounds.slope], [bounds.change]
+    reference = ruckig.Trajectory(1)
+    ruckig.Ruckig(1).calculate(problem, reference)
+    duration = ramp(rate, slope, target, bounds).duration
+    assert duration == pytest.approx(reference.duration, rel=1e-6, abs=1e-7)
 
 
 moments = st.one_of(st.just(0.0), st.floats(0.0, 3.0))
