@@ -40,7 +40,10 @@ from hil.terminal_text import plural, printable
 STEP: Final = 0.1
 """Step of the override per key, and its least value."""
 _LONGEST_TYPED: Final = 3
-"""Most keys at once from an operator; of more, which are pasted, only stop and hold count."""
+"""Most keys at once from an operator; of more, which are pasted, only stop and hold count.
+
+So of keys together with Esc, as a terminal sends those pressed with Alt.
+"""
 HELP: Final = "h hold   space resume   s stop   + - override   1…9: 10…90 %   0: 100 %"
 _ACTIONS: Final[dict[str, Literal["hold", "resume", "stop"]]] = {
     **dict.fromkeys("hH\x1b", "hold"),
@@ -59,7 +62,7 @@ _LOCAL, _CONTROL, _INPUT = 3, 6, 0
 def typed(chunk: str) -> str:
     """Return the keys in what a terminal sent, without sequences of arrow and function keys."""
     keys = _SEQUENCES.sub("", chunk)
-    if len(keys) > _LONGEST_TYPED:
+    if len(keys) > _LONGEST_TYPED or "\x1b" in keys:
         keys = "".join(key for key in keys if _ACTIONS.get(key) in ("stop", "hold"))
     return keys
 

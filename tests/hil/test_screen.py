@@ -155,6 +155,8 @@ def test_keys_change_the_request(keys: str, override: float, held: bool) -> None
         ("ssh host 1", "sshhs"),
         # Esc is a key, also before another
         ("\x1b", "\x1b"), ("\x1bs", "\x1bs"), ("\x1b\x1b[A", "\x1b"), ("\x1b[A\x1bs", "\x1bs"),
+        # where no other key moves the arm on
+        ("\x1b ", "\x1b"), ("\x1br", "\x1b"), ("\x1b3", "\x1b"), ("\x1bh", "\x1bh"),
     ],
 )  # fmt: skip
 def test_sequences_and_pasted_text_are_no_keys(sent: str, keys: str) -> None:
