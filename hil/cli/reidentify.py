@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from hil.batch import run
 from hil.batch.cache import CacheLocation
 from hil.batch.run import BatchEstimator, BatchResult, LevelEstimate, relative_error
 from hil.batch.table import write_tables
-from hil.batch.workers import Workers
+from hil.batch.workers import Unused, Workers
 from hil.cli.arguments import JsonOption, QuietOption, print_json, with_options
 from hil.cli.identify_options import Identifying
 from hil.files import convert_write_errors, make_folder
@@ -77,6 +78,8 @@ def reidentify(
             reporter.say(f"written to {written[0].parent}: {names}")
         for line in _last([f"{path} could not be used: {why}" for path, why in result.broken]):
             typer.echo(printable(line), err=True)
+        if result.skipped and not quiet:
+            typer.echo(printable(skipped_line(result.skipped)))
         typer.echo(
             f"{plural(len(result.repetitions), 'repetition')} in "
             f"{plural(len(result.campaigns), 'campaign')} of {plural(len(result.arms), 'arm')}; "
@@ -112,6 +115,13 @@ def _last(lines: Sequence[str]) -> Iterator[str]:
     if (more := len(lines) - _MOST_LINES) > 0:
         yield f"  {more} more: see --output and --json"
     yield from lines[-_MOST_LINES:]
+
+
+def skipped_line(skipped: Sequence[Unused]) -> str:
+    """Count the skipped archives by reason, without the name of another archive in it."""
+    counts = Counter(re.sub(r"\S*(/|\.mcap)\S*", "another", one.reason) for one in skipped)
+    reasons = "; ".join(f"{count} {reason}" for reason, count in counts.most_common())
+    return f"skipped, not for fitting: {reasons}"
 
 
 def as_dict(result: BatchResult, written: Sequence[Path]) -> dict[str, Any]:
