@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from typer.testing import CliRunner
 
 from hil.archive import Samples, open_archive, write_samples
@@ -22,6 +24,8 @@ from hil.plots.archive_view import (
     draw_archive,
     view_of,
 )
+
+VIEWERS = Path(__file__).parents[2] / "examples" / "viewers"
 
 
 @pytest.fixture
@@ -51,6 +55,26 @@ def test_every_quantity_of_every_joint_is_shown_with_its_peaks(
     traces = view_of(excitation).quantities[4].traces
     for joint, trace in enumerate(traces):
         assert np.nanmax(np.abs(trace.value)) == pytest.approx(np.abs(error[:, joint]).max())
+
+
+def test_layouts_of_viewers_name_topics_and_fields_of_an_archive(excitation: Path) -> None:
+    with excitation.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    fields = {
+        channel.topic: summary.schemas[channel.schema_id].data.decode()
+        for channel in summary.channels.values()
+    }
+    texts = {path.name: path.read_text("utf-8") for path in VIEWERS.iterdir()}
+    drawn = re.findall(r'"(/\w+)\.(\w+)\[\d\]"', texts["foxglove.json"])
+    drawn += re.findall(r'name="(/\w+)/\w+/(\w+)"', texts["plotjuggler.xml"])
+    assert len(drawn) == 2 * 30
+    assert all(re.search(rf"^\S+ {field}$", fields[topic], re.MULTILINE) for topic, field in drawn)
+    panels = json.loads(texts["foxglove.json"])["configById"]
+    named = {*panels["3D!arm"]["topics"], panels["RosOut!events"]["topicToRender"]}
+    assert named <= set(fields)
+    shown = re.findall(r"\"(/\w+(?:/\w+)*)\"", texts["rerun_blueprint.py"])
+    assert set(shown) == set(fields) - {"/hil/cycle"}
 
 
 def test_torque_has_the_sign_of_its_angle(excitation: Path, campaign: Campaign) -> None:
