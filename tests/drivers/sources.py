@@ -87,7 +87,7 @@ class Scripted:
 
 
 class ScriptedMotion(Scripted):
-    """A `MotionSource`; with `feed` also a `FeedForwardSource`, see `fed`."""
+    """A `MotionSource`."""
 
     def __init__(
         self, motion: np.ndarray, beside: np.ndarray, breaks: Breaks, bounds: str = "plan"
