@@ -150,10 +150,6 @@ class TestConfiguration:
             assert {split.fitted, split.predicted or split.fitted} <= published.logs.keys()
         assert any(not split.in_sample for split in published.splits)
 
-    def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
-        with pytest.raises(SystemExit, match="name the folder of all with --data"):
-            board.main(["--data", str(tmp_path), "--only", "kr300"])
-
 
 class TestDegradations:
     """Each copy of a log has the one fault that it is named after."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks import excitation_study
 from benchmarks.identification_study import Covered, coverage, recorded, study
 from benchmarks.payload import coverage as payload_coverage
 from benchmarks.real_data import ESTIMATORS, Case, error, load_case, splits_of
@@ -87,20 +85,6 @@ def test_the_fit_of_a_simulated_recording_is_pinocchios() -> None:
     samples = prepare(one.recording, model, noise_variance=sources.noise_variance)
     weights = 1.0 / sources.torque_variance
     require_same_fit(model, urdf, samples, weights)
-
-
-def test_an_unknown_case_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        excitation_study.main(["--only", "C"])
-    assert "front" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_a_quick_study_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    excitation_study.main(["--quick", "--seeds", "1", "--only", "B (eq. 7)", "front", "--json"])
-    rows = json.loads(capsys.readouterr().out)["rows"]
-    assert [each["case"] for each in rows] == ["B (eq. 7)", "front"]
-    assert all(each["evaluated"] >= 144 for each in rows)
 
 
 class TestPayload:
