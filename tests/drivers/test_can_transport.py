@@ -158,6 +158,26 @@ class TestSocketCan(CanContract):
         (ended,) = run.seen(MotionEnded)
         assert ended.outcome == "completed", ended.reason
 
+    def test_overflow_of_the_receive_queue_is_a_gap(self, profile):
+        """The kernel stores some hundred frames and drops the others without an error."""
+        near, far = self.ends(profile)
+        far.send(init_packet())
+        assert near.receive(5.0) is not None
+        for number in range(11, 3011):
+            far.send(CyclicPacket.zeros(number, 6).encode())
+        numbers = []
+        while (received := near.receive(0.1)) is not None:
+            numbers.append(CyclicPacket.decode(received, 6).number)
+        assert numbers == sorted(set(numbers))
+        assert len(numbers) < 3000
+        for number in range(3011, 3031):
+            far.send(CyclicPacket.zeros(number, 6).encode())
+            if (received := near.receive(0.5)) is not None:
+                break
+        assert CyclicPacket.decode(received, 6).number == number
+        near.close()
+        far.close()
+
 
 def cyclic_link(profile: str):
     near, far = virtual_ends(profile)

@@ -259,6 +259,19 @@ def test_motion_is_run_and_recorded():
         assert exchange.log == ""
 
 
+def test_motion_of_many_megabytes_is_handed_over():
+    with running() as (exchange, controller):
+        controller.cycle(5)
+        exchange.submit(still(100_000))
+        status = exchange.status()
+        assert status.program_accepted == 1
+        assert status.pickup_us > 0.0
+        controller.open = True
+        controller.cycle(20)
+        assert the(MotionStarted, exchange.events()).interval == 0
+        assert controller.unanswered == 0
+
+
 def test_packets_are_answered_while_the_controller_moves_the_arm():
     with running() as (exchange, controller):
         exchange._channel.shutdown(socket.SHUT_RDWR)  # as by its death: noticed at once
@@ -423,6 +436,41 @@ def test_backlog_after_a_stall_is_dropped():
         status = exchange.status()
         assert status.late - status.answered_late == 90
         assert status.missed == 90
+
+
+class Slow(Cruise):
+    """Takes five cycles for each step: the next packet overtakes every reply, even where a busy
+    computer makes the controller of the test late."""
+
+    COST = 5 * PERIOD
+
+    def advance(self):
+        end = time.monotonic() + self.COST
+        while time.monotonic() < end:
+            pass
+        return super().advance()
+
+
+def test_consecutive_late_replies_stop_the_motion():
+    """The controller does not wait for them."""
+    with running(session={"max_gap": 100}, max_late=2, preload=(__name__,)) as (
+        exchange,
+        controller,
+    ):
+        exchange.submit(Slow())
+        controller.open = True
+        controller.cycle(20)
+        ended, begin = [], time.monotonic()
+        while not ended:
+            assert time.monotonic() < begin + 30.0
+            controller.post()
+            time.sleep(PERIOD)
+            while not controller.silent(0.0):
+                controller._follow(controller.socket.recv(2048))
+            ended = [event for event in exchange.events() if isinstance(event, MotionEnded)]
+        assert ended[0].outcome == "stopped", ended[0].reason
+        assert "consecutive replies left too late" in ended[0].reason
+        assert exchange.status().worst_turnaround_us > 1e6 * Slow.COST
 
 
 class TestStops:

@@ -250,6 +250,9 @@ class TestRates:
         last = rows[len(bounds) - 1]
         error = refused(Check.JERK, guard.check_set_point, last, REST, bounds[-1], 5)
         assert error.bound == pytest.approx(50.0 * FACTORS[bounds[-1]][1], rel=1e-5)
+        guard = only(jerk=50.0)
+        for cycle, row in enumerate(rows[:3]):
+            guard.check_set_point(row, REST, "stop", cycle)
         guard.begin(START, 9)  # forgets the way, and the bounds granted there
         step = START + at(2, 60.0 * T**3)
         refused(Check.JERK, guard.check_set_point, step, REST, "plan", 10)

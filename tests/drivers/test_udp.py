@@ -310,6 +310,28 @@ class TestSession:
         assert another.received_nothing()
         assert session.state is State.INIT
 
+    def test_duplicated_reordered_and_short_datagrams(self, transport, controller, session):
+        first, second, third, fourth = (CyclicPacket.zeros(k, N).encode() for k in range(11, 15))
+        counters = session.counters
+        for count, packet in enumerate(
+            [init_packet().encode(), first, first, third, second, third[:100], fourth], 1
+        ):
+            controller.send(packet)
+
+            def handled(count=count):
+                lost = counters.stale + counters.malformed
+                return counters.answered + counters.duplicates + lost == count
+
+            exchange(transport, session, until=handled)
+        for _ in range(5):
+            controller.wait()
+        assert controller.received_nothing()
+        numbers = [int.from_bytes(reply[:4], "little") for reply in controller.replies]
+        assert numbers == [11, 12, 12, 14, 15]
+        assert controller.replies[1] == controller.replies[2]
+        assert (counters.duplicates, counters.stale, counters.malformed) == (1, 1, 1)
+        assert counters.missed == 1
+
     def test_lost_session_is_resumed_from_another_port(
         self, transport, controller, another, session
     ):
