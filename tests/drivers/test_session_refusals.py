@@ -76,6 +76,21 @@ class TestRefusedSetPoints:
         else:
             assert rig.state is State.OPEN
 
+    @pytest.mark.parametrize("settle", [0, 5])
+    def test_source_that_ends_while_moving(self, settle):
+        """Rest would be a jump, also where the end is not held before open mode is left."""
+
+        class Ending(Cruise):
+            def advance(self):
+                step = super().advance()
+                self.finished = self.advances > 300
+                return step
+
+        rig = running(Ending(), 300, settle_cycles=settle)
+        rig.cycle()
+        assert (rig.state, rig.exits_asked) == (State.OPEN if settle else State.EXITING, not settle)
+        assert assert_refused(rig, rig.cycle(), Check.ACCELERATION).joint == 0
+
     def test_source_that_ignores_a_stop(self):
         source = type("Unstoppable", (Cruise,), {"SPEED": 0.1, "stop": lambda self: None})()
         rig = running(source, 300)
