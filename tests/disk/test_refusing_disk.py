@@ -159,6 +159,15 @@ def test_failing_disk_costs_one_motion_only(disk: Disk, designed: Designed) -> N
     assert rounds(disk, designed, range(2)) >= 1
 
 
+@pytest.mark.parametrize("operation", [CREATE, WRITE])
+def test_manifest_that_cannot_be_written_is_reported(
+    disk: Disk, designed: Designed, operation: str
+) -> None:
+    campaign = rehearsed(disk, f"manifest_{operation}", designed)
+    rule = Rule((operation,), "manifest.json*", after=2, times=1, error="EIO")
+    assert refused_run(disk, campaign, rule) == [f"{operation} manifest.json.tmp"]
+
+
 def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) -> None:
     """Without a manifest it would look like one whose cell file was edited."""
     root = disk.root / "half"

@@ -22,6 +22,7 @@ from tests.drivers.rig import (
     Rig,
     all_drive_off,
     assert_refused,
+    closed,
     exiting,
     kind_of,
     limits,
@@ -29,6 +30,7 @@ from tests.drivers.rig import (
     opened,
     refused,
     running,
+    smooth_move,
     still,
 )
 
@@ -77,6 +79,30 @@ class TestLostMotion:
             assert rig.state is State.OPEN
         rig.cycle(5)
         assert source.advances == advances
+
+    @pytest.mark.parametrize(
+        ("waits", "change", "reason"),
+        [
+            (Mode.CLOSED, {"status": 0}, OFF),
+            (Mode.DRIVING_ON, {"status": 0}, OFF),
+            (Mode.CLOSED, {"mode": Mode.DRIVING_ON}, "the drive was switched on again"),
+            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_PC}, PAUSED),
+            (Mode.CLOSED, {"mode": Mode.PAUSE_BY_CONTROLLER}, PAUSED),
+        ],
+    )
+    def test_a_waiting_motion_is_lost_and_another_may_follow(self, waits, change, reason):
+        rig = Rig()
+        rig.session.request(source := Cruise())
+        rig.start()
+        rig.cycle(mode=waits)
+        assert rig.session.requested
+        rig.cycle(**change)
+        assert rig.ended == MotionEnded("lost", reason, -1, rig.ended.cycle)
+        rig.cycle(3, status=5)
+        rig.session.request(still(3))
+        rig.open()
+        rig.run_to("completed")
+        assert source.begun_at is None
 
     def test_axis_that_closes_is_refused_during_a_motion(self):
         rig, _ = moving()
@@ -236,6 +262,18 @@ class TestGaps:
         if missed == 3:
             rig.run_to("stopped")
             assert "3 packets" in rig.ended.reason
+
+    def test_motion_survives_the_wrap_of_the_numbers(self):
+        """And a cyclic packet with number 10 is no init packet."""
+        rig = closed()
+        rig.now += 2.0  # after a silence any number is new
+        rig.number = LAST_NUMBER - 100
+        rig.cycle()
+        rig.session.request(smooth_move(MOVE, 300))
+        rig.open()
+        rig.run_to("completed")
+        assert 10 < rig.number < 1000
+        assert (rig.session.counters.missed, len(rig.seen(InitReceived))) == (0, 1)
 
     def test_short_gaps_do_not_add_up(self):
         rig, source = moving(0)

@@ -342,6 +342,14 @@ class TestCorrections:
         rig.cycle()
         assert (kind_of(rig.refusal), rig.refusal.joint) == (kind, 4)
 
+    def test_offset_out_of_the_range_is_refused(self):
+        """Of an arm that is within it, 5e-4 rad from its end."""
+        rig = running(correction(7), mode=7, guard_limits=limits(upper=START + 5e-4))
+        rig.cycle(50)
+        assert rig.state is State.OPEN
+        rig.cycle(150)
+        assert (kind_of(rig.refusal), rig.refusal.joint) == (Check.POSITION, 2)
+
     @pytest.mark.parametrize("sign", [-1, 1])
     def test_sum_with_the_servo_current_is_limited(self, sign):
         rows = np.full((400, N), sign * 5.0)

@@ -63,6 +63,20 @@ class TestMotion:
             assert not answer.axes["d"][:, 2:].any()
             before = motor
 
+    @pytest.mark.parametrize("mode", [1, 4, 5])
+    def test_motion_in_cycles_of_1_ms(self, mode):
+        rig, source = Rig(mode=mode, period=0.001), smooth_move(MOVE, 600)
+        source.velocities = np.diff(source.positions, axis=0, prepend=source.positions[:1]) / 0.001
+        rig.session.request(source)
+        rig.open()
+        rig.cycle(200)
+        speed = source.velocities[200]
+        np.testing.assert_allclose(rig.records[-1]["commanded_velocity"], speed, 1e-6, 1e-9)
+        step = rig.axes["d"][:, 1].astype(np.float64)
+        np.testing.assert_allclose(rig.train.joint_velocity(step, 0.001), speed, 1e-5, 1e-7)
+        rig.run_to("completed")
+        assert rig.session.period == 0.001
+
     def test_end_is_held_then_exit_is_requested_once(self):
         rig = running(smooth_move(MOVE, 300), 300, settle_cycles=30)
         end = rig.axes["d"][:, 0].copy()

@@ -20,6 +20,7 @@ from drivers import (
 )
 from drivers.init_check import is_narrower
 from drivers.packets import DRIVE_ON, INIT_LENGTH, NO_SLOT
+from drivers.replies import D1, Reader, safe_reply
 from tests.drivers.rig import (
     START,
     N,
@@ -284,6 +285,26 @@ def test_drive_off_has_zeros_for_values_not_finite():
     expected[2] = 0.0
     np.testing.assert_allclose(answer.axes["d"][:, 0], expected, rtol=1e-6)
     np.testing.assert_array_equal(answer.axes["d"][:, 1:], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("arms", "status", "powered", "back"),
+    [
+        (None, [3, 4, 7, 9], False, [3, 0, 0, 0]),
+        (None, [3, 7, DRIVE_ON, 9], True, [0, 0, 0, 0]),
+        ((1, 1), [3, 7, DRIVE_ON, 9], False, [3, 0, 0, 0]),
+        ((1, 1), [DRIVE_ON, 7, 0, 9], True, [0, 0, 0, 0]),
+        ((1, 4), [3, 7, DRIVE_ON, 9], False, [3, 0, 0, 9]),
+    ],
+)
+def test_unknown_arms_are_on_if_any_drive_is(arms, status, powered, back):
+    """Then nothing is echoed; four status bytes go back, none of which is drive on."""
+    answer = safe_reply(bytes(status), np.full(2, Mode.CLOSED, np.int32), arms)
+    assert answer.status == bytes(back)
+    assert answer.mask[:, D1:].all() == (not powered)
+    opened = np.full(2, Mode.POSITION, np.int32)
+    reading = Reader(np.arange(2), arms, 1, Mode.POSITION).read(bytes(status), opened)
+    assert reading.powered == powered
 
 
 def described(*changes, **build) -> InitPacket:

@@ -106,6 +106,22 @@ def test_frames_of_another_node_are_ignored(profile: str) -> None:
     assert sum(foreign) == 3 * (len(bus.frames) - 1), "frames behind the last packet are not read"
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+def test_repeated_frames_get_no_reply(profile: str) -> None:
+    repeated = []
+
+    def again(bus: SharedBus, cycle: int) -> None:
+        if cycle > 200 and cycle % 40 == 0:
+            repeated.append(cycle)
+            bus.send_frames(bus.frames[-25])
+
+    run, _ = run_with(profile, again)
+    (ended,) = run.seen(MotionEnded)
+    assert ended.outcome == "completed", ended.reason
+    assert {(one.kind, one.count) for one in run.seen(PacketRejected)} == {("stale", 1)}
+    assert run.session.counters.stale == len(repeated)
+
+
 @pytest.mark.parametrize(
     ("at", "first", "outcome"),
     [
