@@ -29,7 +29,7 @@ from drivers import (
 from drivers.errors import Check
 from drivers.packets import INIT_LENGTH, MAX_AXES, cyclic_length, is_init
 from tests.drivers import oracle
-from tests.drivers.rig import Table
+from tests.drivers.rig import Rig, Table
 
 CAPTURES = (
     "a_505",
@@ -282,6 +282,38 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
     refused = [(event.error.kind, event.error.joint) for event in replay.seen(Refused)]
     assert refused == ([(Check.VELOCITY, 0)] if name == "a_508" else [])
+
+
+def test_controller_with_an_invalid_axis_map_is_not_moved(shared_data: Path):
+    """Five axes that all claim slot 1, a cycle of 1500: the foreign driver moved one of them."""
+    rig, n, moved_by_them = Rig(), 5, 0
+    for packet, reply in conversation(shared_data, IMPOSSIBLE_MAP):
+        ours_raw = rig.send(packet)
+        if len(packet) == INIT_LENGTH:
+            assert ours_raw == oracle.echo(packet) == reply
+            continue
+        received, ours = oracle.parse(packet, n), oracle.parse(ours_raw, n)
+        expected = oracle.safe_answer(received, (1,) * n)
+        if situation(received, None) == "open":
+            axes = tuple(axis._replace(mode=oracle.DRIVE_OFF_REQUEST) for axis in expected.axes)
+            expected = expected._replace(axes=axes)
+        assert oracle.differences(ours, expected) == []
+        if reply is not None:
+            theirs = oracle.parse(reply, n)
+            # It fills the one slot that the map names and leaves -1 as the mode of the others.
+            assert [axis.mode for axis in theirs.axes] == [-1, received.axes[1].mode, -1, -1, -1]
+            moved_by_them += theirs.axes[1].floats[1] != 0.0
+    assert (moved_by_them, rig.state) == (1, State.ENDED)
+    assert np.isnan(rig.records["commanded_position"]).all()
+
+
+def test_session_that_begins_at_speed_gets_no_reply(shared_data: Path):
+    """Before an init packet, with a drive on: an echo would be set-points."""
+    rig, pairs = Rig(), conversation(shared_data, SEVEN_AXES)
+    for packet, _ in pairs:
+        assert rig.send(packet) == (None if packet[4] == oracle.DRIVE_ON else oracle.echo(packet))
+    assert rig.session.counters.malformed == sum(packet[4] == 5 for packet, _ in pairs) > 50
+    assert rig.state is State.SYNC
 
 
 def open_axes(pairs: list[tuple[bytes, bytes | None]], name: str) -> int:

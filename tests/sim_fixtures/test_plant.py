@@ -184,6 +184,12 @@ def elastic(
 
 
 class TestElasticGears:
+    def test_springs_carry_gravity_from_the_start(self) -> None:
+        plant = elastic()
+        gravity = pin.computeGeneralizedGravity(plant.model, plant.model.createData(), START)
+        np.testing.assert_allclose(plant.motor_position - START, gravity * SOFT, atol=1e-15)
+        np.testing.assert_allclose(steps(plant, 200, gravity).position, START, atol=1e-9)
+
     def test_a_stiff_gear_is_a_rigid_one(self) -> None:
         stiff, rigid = elastic(compliance=(5e-8, 5e-8, 0.0, 0.0, 0.0, 0.0)), rigid_plant()
         for k in range(1000):

@@ -162,6 +162,30 @@ def test_an_answer_after_its_cycle_is_late_and_not_accepted():
     assert packet_number(cabinet.accepted[21]) == 23
 
 
+def test_only_the_first_of_several_answers_is_accepted():
+    def answer(index, packet):
+        second = bytearray(echo(packet))
+        second[4] = 1
+        return [*prompt(index, packet), (0.2 * T, bytes(second))]
+
+    summary, cabinet, _ = served(answer)
+    # That of the last cycle is never read.
+    assert (summary.replies, summary.surplus) == (50, 49)
+    assert all(reply[4] == 0 for reply in cabinet.accepted)
+
+
+def test_an_answer_the_controller_finds_wrong_counts_as_missing(monkeypatch):
+    accept = Cabinet.accept
+
+    def picky(self, reply: bytes | None) -> None:
+        accept(self, reply)
+        self.rejected_replies += len(self.accepted) % 10 == 0
+
+    monkeypatch.setattr(Cabinet, "accept", picky)
+    summary, _, _ = served()
+    assert (summary.replies, summary.missed, summary.rejected) == (45, 5, 5)
+
+
 @pytest.mark.parametrize("junk", [b"", b"\0" * 5, struct.pack("<i", 0) * 12, b"\xff" * 48])
 def test_junk_before_the_answer_is_rejected(junk: bytes):
     summary, _, _ = served(lambda k, packet: [(0.05 * T, junk), *prompt(k, packet)])
@@ -226,6 +250,14 @@ class TestRequest:
         assert (summary.ended, cabinet.finished, cabinet.stopped) == (True, True, False)
         summary, _, _ = served(request=after(6, Request.ABORT), cycles=10_000)
         assert (summary.cycles, summary.ended) == (7, False)
+
+    def test_at_the_end_a_silent_pc_is_waited_for_once(self):
+        summary, cabinet, _ = served(
+            only(lambda k: k < 10), request=after(5, Request.END), stretch=0.5, patience=1.0,
+            options={"at_rest": False}, cycles=10_000,
+        )  # fmt: skip
+        assert (summary.stretched, summary.missed) == (1, len(cabinet.accepted) - 10)
+        assert len(cabinet.accepted) > 400
 
     def test_an_arm_not_at_rest_after_the_patience_loses_its_drive(self):
         summary, cabinet, _ = served(
