@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,12 +12,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt, sosfiltfilt
+from typer.testing import CliRunner
 
+from hil.cli import app
+from hil.cli.verdict import NOT_GOOD
+from hil.errors import ArchiveError
 from hil.identify.options import FIXED, Options
-from hil.identify.prepared import Prepared, prepare_sources
+from hil.identify.prepared import Prepared, prepare_sources, stated_settings
 from hil.identify.sources import gather_sources
 from hil.importers import ColumnMap, Quantity, Robot, TimeColumn, Use, import_log
 from hil.progress import Silent
+from hil.results import FittedResult, Results
 from identification import Estimate, FrictionLaw, estimate, prediction_error
 from identification.factor.factor import Factor
 from tests.hil.simulated_logs import (
@@ -24,6 +31,7 @@ from tests.hil.simulated_logs import (
     Simulated,
     planted,
     simulate,
+    urdf_path,
 )
 
 Array = NDArray[np.float64]
@@ -120,6 +128,14 @@ def test_seven_axes_in_degrees_at_an_uneven_100_hz(tmp_path: Path) -> None:
     assert "1 gaps" in notes
 
 
+def test_currents_without_torque_constants_are_refused(tmp_path: Path) -> None:
+    simulated = simulate(UR5, np.arange(0.0, 5.0, 4e-3))
+    np.savez(tmp_path / "log.npz", q=simulated.position, i=simulated.torque)
+    columns = 'sample_rate = 250.0\n[position]\ncolumns = "q"\n[motor_current]\ncolumns = "i"\n'
+    with pytest.raises(ArchiveError, match=r"no torques; give drive\.torque_constant"):
+        identify(tmp_path, simulated, "log.npz", columns)
+
+
 def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
     """Three files of one robot: to be fitted, to be predicted, at rest (positions alone)."""
     time = np.arange(0.0, 12.0, 4e-3)
@@ -154,6 +170,46 @@ def test_a_standstill_gives_the_noise(tmp_path: Path) -> None:
 
     unread = gather_sources(paths[:1], 0.7, predict=paths[1:2])
     assert [one.name for one in unread.held_out] == ["b.mcap"]
+
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = ROOT.parent / "shared" / "data"
+TEXT = (ROOT / "docs" / "bring-your-own-robot.md").read_text(encoding="utf-8")
+SECTION = TEXT.split("## Two published recordings")[1].split("\n## ")[0]
+COMMANDS = re.findall(r"^\$ hil (.*)$", SECTION, re.MULTILINE)
+
+
+def fitted_by(commands: list[str], output: Path) -> FittedResult:
+    """Run an import and an identification, and read the errors of the fit."""
+    for command in commands:
+        arguments = shlex.split(command)
+        status = 0
+        if arguments[0] == "identify":
+            arguments, status = [*arguments, "--output", str(output)], NOT_GOOD
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == status, (command, result.output, result.exception)
+    return Results.load(output / "results.json").fitted
+
+
+@pytest.mark.slow
+def test_the_commands_of_the_page_fit_two_published_recordings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """UR10: every row of all joints; TX40, with its coupling and without: torque through 40 Hz."""
+    assert [command.split()[0] for command in COMMANDS] == ["import", "identify"] * 3
+    if not (DATA / "tx40").is_dir() or not (DATA / "ur10_unisa").is_dir():
+        pytest.skip(f"there are no recordings below {DATA}")
+    files = [*(DATA / "tx40").iterdir(), *(DATA / "ur10_unisa").iterdir()]
+    for file in [*files, urdf_path("ur10_robot.urdf")]:
+        (tmp_path / file.name).symlink_to(file)
+    (block,) = re.findall(r"```toml\n(.*?)```", SECTION, re.DOTALL)
+    (tmp_path / "tx40.toml").write_text(block)
+    monkeypatch.chdir(tmp_path)
+    assert fitted_by(COMMANDS[:2], tmp_path / "ur10").all_rows_relative_error <= 0.0515
+    coupled = fitted_by(COMMANDS[2:4], tmp_path / "coupled").smoothed_overall_relative_error
+    alone = fitted_by(COMMANDS[4:6], tmp_path / "alone").smoothed_overall_relative_error
+    assert coupled <= 0.109
+    assert coupled < alone <= 0.143
 
 
 RATE = 125.0  # Hz
@@ -210,3 +266,10 @@ class TestFilteredTorque:
             assert preprocessing.torque_shape.causal
             assert preprocessing.torque_delay == 0.0
             assert found.delays is None
+
+
+def test_fixed_options_decide_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("choose_settings", "estimate_delay", "possible_low_passes"):
+        monkeypatch.setattr(f"hil.identify.prepared.{name}", pytest.fail)
+    found = prepared(tmp_path, 2, causal=True, options=FIXED)
+    assert found.settings == stated_settings(found.sources.cell, FIXED)

@@ -20,9 +20,11 @@ from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.errors import models_of
 from hil.cell.schema import CanTable, CellFile
 from hil.cell.text import replaced_value, urdf_limits
+from hil.design import preset, problem_of
 from sim_fixtures.ns16 import CELL_PATH, URDF_PATH
 from sim_fixtures.plant import build_model
 from tests.hil.new_cells import TWO_JOINTS
+from tests.hil.simulated_logs import urdf_path
 
 
 @pytest.fixture
@@ -371,6 +373,19 @@ def test_the_document_and_the_schema_name_the_same_fields_and_defaults() -> None
     # Of one joint, only what is written counts.
     schema["robot.friction.joints"] = dict.fromkeys(schema["robot.friction.joints"], "not set")
     assert documented() == schema
+
+
+def test_the_worked_example_can_be_designed_for_with_all_checks(tmp_path: Path) -> None:
+    urdf = urdf_path("ur10_robot.urdf")
+    (tmp_path / "ur10_robot.urdf").write_bytes(urdf.read_bytes())
+    (tmp_path / "share").symlink_to(urdf.parents[4])  # with the meshes
+    (example,) = re.findall(
+        r"```toml\n(\[cell\]\nname = \"UR10\".*?)```", DOCUMENT.read_text("utf-8"), re.DOTALL
+    )
+    (tmp_path / "cell.toml").write_text(example, "utf-8")
+    problem = problem_of(Cell.load(tmp_path / "cell.toml"), preset("b"))
+    assert problem.constraints.currents is not None
+    assert ("base_link", "upper_arm_link") in problem.constraints.checker.pairs
 
 
 DRAKES = TWO_JOINTS.replace('"1.0"', '"1.0" encoding="GB2312"').replace(

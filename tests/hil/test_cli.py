@@ -187,6 +187,13 @@ def test_force_removes_only_a_campaign(campaign: Campaign, tmp_path: Path) -> No
     assert (folder / "my_notes.txt").exists()
 
 
+@pytest.mark.slow
+def test_an_archive_that_went_missing_is_named(campaign: Campaign, tmp_path: Path) -> None:
+    folder = shutil.copytree(campaign.folder.root, tmp_path / "copy")
+    (folder / "archives" / "excitation_001_a1.mcap").unlink()
+    assert "excitation_001_a1.mcap is missing" in hil("identify", folder, "--quiet").stderr
+
+
 def test_ctrl_c_stops_on_the_path_with_complete_archives(tmp_path: Path) -> None:
     folder = tmp_path / "demo"
     command = [sys.executable, "-m", "hil", "demo", "--output", str(folder)]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tomllib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +26,8 @@ from hil.cell.text import urdf_limits
 from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
-from hil.new import from_archive
+from hil.importers import Robot
+from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.known import _nothing_moves
 from hil.progress import Silent
@@ -266,6 +269,33 @@ def test_an_archive_without_a_valid_arm_is_of_arm_1(arm: str, tmp_path: Path) ->
     )
     known = from_archive(path, ("shoulder", "elbow"))
     assert list(known.values["drive_train.gear_ratio"]) == [100.0, -80.0]
+
+
+def test_prismatic_joints_are_fixed_with_a_note(tmp_path: Path) -> None:
+    urdf = described_robot(PANDA)
+    summary = new(urdf, tmp_path / "panda.toml", "--fix", "panda_finger_joint1=0.02")
+    assert len(summary["joints"]) == 7
+    (note,) = summary["notes"]
+    assert "panda_finger_joint2 is prismatic, and fixed at 0 m" in note
+    assert (tmp_path / "panda.urdf").exists()
+
+
+def test_pipes_and_other_encodings_are_refused(tmp_path: Path, two_joints: Path) -> None:
+    """As `hil new --urdf <(xacro robot.xacro)` does."""
+    reading, writing = os.pipe()
+    os.write(writing, TWO_JOINTS.encode())
+    os.close(writing)
+    try:
+        for read in (partial(cell_of_urdf, fixed={}), Robot.from_urdf):
+            with pytest.raises(InputError, match="write it to a file first"):
+                read(Path(f"/dev/fd/{reading}"))
+    finally:
+        os.close(reading)
+    with pytest.raises(InputError, match="name a URDF"):
+        cell_of_urdf(tmp_path, {})
+    two_joints.write_bytes(TWO_JOINTS.replace("hip", "h\xfc").encode("latin-1"))
+    with pytest.raises(InputError, match="save it as UTF-8"):
+        cell_of_urdf(two_joints, {})
 
 
 def test_a_file_that_is_not_a_urdf_gives_one_line(tmp_path: Path) -> None:

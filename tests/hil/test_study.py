@@ -246,6 +246,20 @@ class TestWhole:
             distance = np.abs(np.array(method.pooled) - truth)
             assert np.mean(distance <= 4.0 * np.array(method.pooled_std)) >= 0.8, method.key
 
+    @pytest.mark.slow
+    def test_one_seed_is_one_study_with_any_number_of_processes(
+        self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
+    ) -> None:
+        """Of searches that is tested where they are."""
+        root, found = whole
+        again = tmp_path / "study"
+        shutil.copytree(root / "designs", again / "designs")
+        shutil.copy(root / "study.json", again)
+        straight = run_study(again, small, Silent(), workers=2, cell=arm)
+        not_the_same: dict[str, object] = {"software": {}}
+        texts = [one.model_copy(update=not_the_same).to_json() for one in (found, straight)]
+        assert texts[0] == texts[1]
+
     def test_a_restart_repeats_nothing_complete(
         self, whole: Whole, small: StudySettings, arm: Cell, tmp_path: Path
     ) -> None:

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import pickle
 from dataclasses import asdict
 from functools import cache, partial
 from itertools import pairwise
@@ -37,7 +38,7 @@ from identification.excitation.excitation import Excitation
 from identification.excitation.genomes import SineGenome, ViaPointGenome
 from identification.excitation.searches.population import Front, Scale, Scores
 from identification.excitation.validation_motions import random_validation_motions
-from identification.excitation.violation import KINDS, NoFeasibleMotionError
+from identification.excitation.violation import KINDS, NoFeasibleMotionError, excess_by_kind
 from identification.model.friction import FrictionLaw
 from identification.model.robot import RobotModel
 from planner import (
@@ -400,6 +401,34 @@ class TestJointLimits:
 
 
 class TestViolations:
+    @pytest.mark.parametrize(
+        ("shortest", "longest", "side"), [(5.0, 9.0, "least"), (0.0, 1.0, "most")]
+    )
+    def test_a_motion_too_short_or_too_long_is_named(self, swing, shortest, longest, side):
+        constraints = Constraints(ROD_LIMITS, min_duration=shortest, max_duration=longest)
+        (violation,) = constraints.violations(swing, sampled(swing))
+        bound = shortest or longest
+        found = (violation.kind, violation.value, violation.bound)
+        assert found == ("duration", swing.duration, bound)
+        assert violation.excess == pytest.approx(abs(swing.duration / bound - 1.0))
+        assert f"at {side} {bound:g} s" in str(violation)
+
+    def test_excess_by_kind_is_the_largest(self, swing):
+        constraints = Constraints(
+            ROD_LIMITS.scaled(velocity=0.5),
+            max_duration=1.0,
+            checker=CollisionChecker(ROD_URDF, Workspace(floor=0.01, margin=0.06)),
+            currents=make_currents([0.1, 0.1], torque_limit=np.ones(2)),
+        )
+        motion = sampled(swing)
+        violations = constraints.violations(swing, motion)
+        assert pickle.loads(pickle.dumps(constraints)).violations(swing, motion) == violations
+        excess = excess_by_kind(violations)
+        assert [kind for kind, e in zip(KINDS, excess, strict=True) if e > 0] == list(KINDS[1:])
+        for kind, worst in zip(KINDS, excess, strict=True):
+            assert worst == max((v.excess for v in violations if v.kind == kind), default=0.0)
+        assert not excess_by_kind(()).any()
+
     def test_the_deepest_contact_is_reported_with_pair_and_instant(self):
         checker = CollisionChecker(ROD_URDF, Workspace(floor=-0.5, margin=0.1))
         down = plan([[0.0, 0.0], [-0.6, 0.0], [0.3, 0.0]], ROD_LIMITS, fly=0.0)

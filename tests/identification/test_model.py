@@ -4,6 +4,7 @@ import gc
 import math
 import weakref
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -43,6 +44,9 @@ from identification.model.pseudo_inertia import (
 from identification.model.regressor import CHUNK
 from identification.model.robot import RobotModel, StandardLayout
 from identification.selection.essential import eliminate
+from identification.signals.recording import Recording
+from identification.signals.samples import Preprocessing, prepare
+from identification.validation.prediction import prediction_error
 from sim_fixtures.ns16 import N_ESSENTIAL, TABLE2, urdf_text
 from tests.identification import two_link
 from tests.identification.robots import NS16_TURNS, one_joint, random_urdf, robot_text, some_bodies
@@ -708,6 +712,54 @@ class TestElementTorque:
         whole = EXTENSION.known(POSITIONS)
         np.testing.assert_allclose(both.columns(POSITIONS) @ [900.0, 60.0], whole)
         np.testing.assert_allclose(one.columns(POSITIONS)[:, 0] * 900 + one.known(POSITIONS), whole)
+
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"there are no recordings in {DATA}")
+class TestPublishedRecordings:
+    TURNS = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    TURNS[5, 4] = TURNS[5, 5]  # joint 5 turns motor 6 along
+
+    def test_a_balancer_is_reproduced(self):
+        """A recording with and one without its balancer differ by the computed torque."""
+        raw, off = (
+            np.genfromtxt(DATA / "kr300" / name, delimiter=",", names=True)
+            for name in ("A.csv", "Abal.csv")
+        )
+        np.testing.assert_allclose(BALANCER.known(raw["q2"]), raw["tau2"] - off["tau2"], atol=1e-6)
+
+    def fitted(self, coupling):
+        """Return the least-squares estimate of the TX40, and its error."""
+        motor, torque = (
+            np.loadtxt(DATA / "tx40" / name, delimiter=",", skiprows=1)
+            for name in ("pos_read_data.csv", "curr_data.csv")
+        )
+        recorded = Recording(
+            time=np.arange(len(motor)) * 2e-4,
+            position=motor @ np.linalg.inv(self.TURNS).T
+            + np.pi / 2 * np.array([0, -1, 1, 0, 0, 0]),
+            joint_names=tuple(f"joint_{j}" for j in range(1, 7)),
+            torque=torque @ self.TURNS,
+        )
+        urdf = (DATA / "tx40" / "tx40_mdh_modified.urdf").read_text(encoding="utf-8")
+        model = RobotModel.from_urdf(urdf, friction=FrictionLaw(offset=True), coupling=coupling)
+        options = Preprocessing(smooth_torque=True, torque_bandwidth=40.0)
+        samples = prepare(recorded, model, options=options)
+        found = estimate(model, Factor.of(model, samples), np.ones(6))
+        (error,) = prediction_error(model, found.values, [samples], all_rows=True)
+        return found, error
+
+    @pytest.mark.slow
+    def test_a_coupled_wrist_is_explained_with_the_published_parameters(self):
+        """Comparators: 10.9 % with, 14.3 % without; joint 5 19 and 53 %; Iam6, fsm6, fvm6."""
+        _, without = self.fitted(None)
+        found, coupled = self.fitted(Coupling(self.TURNS))
+        assert coupled.overall <= 0.109 < 0.12 < without.overall
+        assert coupled.relative[4] <= 0.19 < 0.45 < without.relative[4]
+        values = [found.value(name) for name in ("I56", "f0_m6", "f1_m6")]
+        assert values == pytest.approx([0.00964, 1.95, 0.616], rel=0.05)
 
 
 class TestElementFigures:

@@ -18,10 +18,18 @@ from identification.validation.evidence import CellContext, Evidence, gather
 from identification.validation.finding import Thresholds
 from identification.validation.plausibility import Implausible
 from identification.validation.prediction import PredictionError
+from identification.validation.residuals import (
+    HARMONICS,
+    BlockMean,
+    FrictionDrift,
+    Ripple,
+    check_residuals,
+)
 from identification.validation.verdict import judge
 from sim_fixtures.ns16 import load_truth, urdf_text
+from tests.identification import two_link
 from tests.identification.robots import ns16_values
-from tests.identification.two_link import as_samples, sine_motion
+from tests.identification.two_link import as_samples, four_sines, sine_motion
 
 COULOMB, VISCOUS = map(np.array, (load_truth().coulomb, load_truth().viscous))
 CURRENT_NOISE = 0.02  # A
@@ -339,6 +347,69 @@ class TestJudgement:
         verdict = judged(("{one}", "<two>"), held_out=an_error(0.4), training=an_error(0.4))
         assert "{one} 40%, <two> 40%" in " ".join(verdict.reasons)
         assert any("torque constant of {one}, <two>," in one for one in verdict.next_steps)
+
+
+def ripple(size):
+    """Return a ripple of the second joint, four per motor turn, of this rms."""
+    mean = np.zeros((2, len(HARMONICS), 2))
+    mean[1, HARMONICS.index(4), 0] = np.sqrt(2.0) * size
+    std = np.full_like(mean, 1e-6)
+    return Ripple(BlockMean(mean, std, np.full(2, 1000.0), np.full(2, 50)))
+
+
+def drift(*change):
+    """Return a drift over ten parts with small scatter."""
+    total = np.array(change)
+    return FrictionDrift(np.linspace(0.0, 1.0, 10)[:, None] * total, total, np.full(2, 1e-4), 8)
+
+
+@pytest.fixture(scope="module")
+def clean():
+    """Checks of the residual of two links with white noise, without ripple and drift."""
+    model, values, time = two_link.MODEL, two_link.truth(), np.arange(3000) * 4e-3
+    runs = [
+        two_link.simulated(model, values, four_sines(time, seed=seed), two_link.NOISE, seed)
+        for seed in range(6)
+    ]
+    found = check_residuals(model, values, runs[:5], runs[5:])
+    return replace(found, ripple=None, drift=None, rms=np.full(2, 0.01))
+
+
+class TestPatternsOfTheResidual:
+    """Those that were found by chance alone are no finding, small ones no doubt."""
+
+    def test_untested_ones_have_no_finding(self, clean):
+        checks = {one.check for one in judged(residuals=clean).findings}
+        assert "whiteness" in checks
+        assert not {"torque ripple", "friction over time"} & checks
+
+    @pytest.mark.parametrize(
+        ("share", "level"), [(0.0, "good"), (0.9, "information"), (1.1, "doubtful")]
+    )
+    def test_large_ripple_is_doubtful(self, clean, share, level):
+        size = share * Thresholds().ripple
+        changed = replace(clean, ripple=ripple(size * clean.torque_rms[1]))
+        found = finding_of("torque ripple", residuals=changed)
+        assert found.level == level
+        assert "one" not in found.words
+        expected = f"two (4 per motor turn, {size:.1%} of its torque)"
+        assert (expected in found.words) == (level != "good")
+
+    @pytest.mark.parametrize(
+        ("change", "share", "level", "words"),
+        [
+            ((1e-5, -1e-5), 1.0, "good", "did not change"),
+            ((0.02, 0.0), 1.0, "information", "one by +2.0%, at most 2.0% of an axis"),
+            ((0.1, 0.0), 0.2, "information", "at most 2.0%"),
+            ((0.02, -0.2), 1.0, "doubtful", "during the recordings: two by -20.0%"),
+        ],
+    )
+    def test_drift_is_judged_by_its_torque(self, clean, change, share, level, words):
+        changed = replace(clean, drift=drift(*change), friction_share=np.array([share, 1.0]))
+        found = finding_of("friction over time", residuals=changed)
+        assert found.level == level
+        assert words in found.words
+        assert (found.role == "cause") == (level == "doubtful")
 
 
 # Causes
