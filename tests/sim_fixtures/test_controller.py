@@ -26,6 +26,7 @@ from sim_fixtures import (
     Phase,
     SettingError,
     SimulatedController,
+    UnmodelledEffects,
     ns16,
 )
 from sim_fixtures.controller import MISSING, RUN_UP, Answer, LoopProgram, OwnMotion
@@ -249,6 +250,15 @@ class TestOpenMode:
         assert np.all(d[:, :, 4].std(axis=0) < 0.01 * np.array([16.5, 22.0, 9.5, 3.5, 7.0, 10.0]))
 
 
+def test_one_seed_is_one_run_bit_for_bit() -> None:
+    settings, effects = ControllerSettings(**NOISY), UnmodelledEffects.default_sizes(6)
+    logs = [play(DRIVE, settings, seed=seed, effects=effects)[1] for seed in (3, 3, 4)]
+    first, again, other = (log.raw for log in logs)
+    assert len(first) > 3000
+    assert first == again
+    assert first[500:] != other[500:]
+
+
 class TestSmoothMotion:
     def test_it_is_followed_within_a_fifth_of_the_threshold(self) -> None:
         controller, log = play(DRIVE, ControllerSettings(**NOISY))
@@ -314,6 +324,21 @@ class TestCurrentsAreTorques:
         a, b, _ = np.polyfit(delays, [np.sum(residuals(delay=d) ** 2) for d in delays], 2)
         assert a > 0.0
         assert -b / (2.0 * a) == pytest.approx(documented, abs=0.01)
+
+    @pytest.mark.parametrize(
+        "flip",
+        [
+            {"gear_ratio": [116.0, 116.0, -106.0, -50.0, 51.5, -33.0]},
+            {"k54": -0.03},
+            {"k64": 0.02},
+            {"k65": -0.035},
+            {"torque_constant": [1.1, 1.1, 0.75, 0.36, 0.46, 0.42]},
+        ],
+    )
+    def test_one_wrong_figure_in_the_conversion_shows(
+        self, residuals: Callable[..., Array], flip: dict[str, Any]
+    ) -> None:
+        assert (residuals(make_drive(**flip)) / residuals()).max() > 50.0
 
 
 class TestArms:
@@ -594,6 +619,21 @@ class TestProgram:
         assert loop.gave_up
         self.phases_to(loop, Phase.ENDED)
         assert loop.reason == f"open mode was lost 3 times in a row: {reason}"
+
+    def test_a_trip_in_open_mode_drops_the_drive_before_the_modes(self) -> None:
+        loop = self.program(Phase.OPEN)
+        loop.trip("test")
+        assert (loop.powered, loop.braked, loop.open_axes) == (False, True, [True] * 3)
+        for _ in range(2):
+            loop.advance(FINE, at_rest=True)
+        assert loop.phase is Phase.DRIVE_OFF
+        assert not any(loop.open_axes)
+
+    def test_the_init_packet_of_a_warm_start_has_to_be_answered(self) -> None:
+        loop = self.program(cold_start=False)
+        loop.advance(MISSING, at_rest=True)
+        assert loop.phase is Phase.ENDED
+        assert "init" in loop.reason
 
     def test_phases_last_as_long_as_set_and_the_end_waits_until_the_arm_is_at_rest(self) -> None:
         loop = self.program(Phase.DRIVE_OFF)
