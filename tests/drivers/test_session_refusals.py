@@ -207,8 +207,11 @@ class TestFeedback:
         ],
     )
     def test_narrower_limit_of_cell_and_controller(self, name, column, kind, cell, stated, bound):
+        """The drives of the cell carry 20 A, less than its guard allows."""
+        wide = limits(current=np.full(N, 30.0))
         for sign in (-1, 1):
-            rig, _ = moving(init=init_packet(arm_1={name: [*[cell] * 5, stated]}))
+            init = init_packet(arm_1={name: [*[cell] * 5, stated]})
+            rig, _ = moving(init=init, guard_limits=wide)
             rig.axes["d"][5, column] += sign * 0.999 * bound
             rig.cycle()
             assert rig.state is State.OPEN
@@ -499,6 +502,15 @@ class TestLongGap:
         rig.miss(10)
         rig.cycle()
         assert rig.state is State.EXITING
+        assert not rig.seen(Refused)
+
+    def test_axes_that_open_are_not_compared(self):
+        rig = opened(20)
+        rig.cycle(mode=Mode.CLOSED)
+        rig.axes["d"][:, [0, 2]] += 0.5
+        rig.miss(10)
+        rig.cycle(mode=Mode.POSITION)
+        assert rig.state is State.OPEN
         assert not rig.seen(Refused)
 
 
