@@ -83,13 +83,13 @@ def broken(truth: Undamaged, harmed: Sequence[Path], number: int) -> Iterator[st
         try:
             yield from reader()
         except HilError as error:
-            if not _blames(str(error), truth, harmed):
+            if not blamed(str(error), truth, harmed):
                 yield f"an error that names nothing that was damaged: {error}"
         except Exception as error:
             yield f"an undocumented {type(error).__name__}: {error}"
 
 
-def _blames(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
+def blamed(text: str, truth: Undamaged, harmed: Sequence[Path]) -> bool:
     """Return whether a sentence names a damaged archive, or the folder and no other archive."""
     if any(path.name in text for path in harmed):
         return True

@@ -12,8 +12,10 @@ from hil.archive import open_archive
 from hil.errors import ArchiveError
 from hil.identify import identify_archives
 from hil.progress import Silent
-from tests.disk.damage import KINDS, SWAPPED, Undamaged, broken, campaign, play
+from tests.disk.damage import KINDS, SWAPPED, Undamaged, blamed, broken, campaign, play
 from tests.hil.mcap_bytes import chunks
+
+HARMED = "archives/excitation_000_a1.mcap"
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +27,19 @@ def test_each_kind_of_damage_is_named_or_harmless(truth: Undamaged) -> None:
     for number, kind in enumerate([SWAPPED, *KINDS]):
         words, laws = play(truth, number, kind)
         assert not laws, f"round {number}, {words}"
+
+
+@pytest.mark.parametrize(
+    ("text", "blames"),
+    [
+        (f"/elsewhere/{HARMED}: the chunk at 3 is damaged", True),
+        ("{root}: an archive has another checksum", True),
+        ("an .mcap file is invalid", False),
+        ("{root}/archives/excitation_001_a1.mcap: the chunk at 3 is damaged", False),
+    ],
+)
+def test_error_must_name_what_was_damaged(truth: Undamaged, text: str, blames: bool) -> None:
+    assert blamed(text.format(root=truth.root), truth, [truth.root / HARMED]) is blames
 
 
 @pytest.mark.slow

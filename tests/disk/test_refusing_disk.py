@@ -180,6 +180,18 @@ def test_campaign_without_manifest_is_removed(disk: Disk, designed: Designed) ->
 
 
 @pytest.mark.slow
+def test_rehearsal_passes_after_a_disk_error(disk: Disk, designed: Designed) -> None:
+    for number, (operation, after) in enumerate(((WRITE, 40), (RENAME, 12), (SYNC, 8))):
+        campaign = Campaign.create(disk.root / f"rehearsed_{number}", *designed)
+        disk.do_wrong(Rule((operation,), after=after, error="EIO"))
+        with pytest.raises(HilError) as raised:
+            campaign.rehearse()
+        assert disk.do_wrong()
+        require_error(raised.value, campaign.folder.root)
+        assert Campaign.open(campaign.folder.root).rehearse().passed
+
+
+@pytest.mark.slow
 def test_many_failures_cost_one_motion_only(disk: Disk, designed: Designed) -> None:
     assert rounds(disk, designed, range(100, 140)) > 20
 

@@ -446,6 +446,16 @@ class TestPauses:
         error = assert_refused(rig, rig.cycle(), Check.PAUSE_VELOCITY)
         assert error.bound == pytest.approx(LAG * limits().acceleration[0])
 
+    @pytest.mark.parametrize("missed", [0, 2])
+    def test_pause_is_longer_than_an_allowed_gap_by_two_cycles(self, missed):
+        for cycles, state in ((3.9, State.OPEN), (4.1, State.FAULTED)):
+            rig = at_speed(1200, speed=2.0)
+            rig.miss(missed)
+            rig.now = rig.session._arrived_at + (cycles - 1.0) * PERIOD
+            rig.axes["d"][:, 3] = 0.0
+            rig.cycle()
+            assert rig.state is state
+
     def test_old_velocity_is_refused(self):
         rig = at_speed(1200, speed=2.0)
         rig.ages = np.zeros((N, 8), np.uint16)
