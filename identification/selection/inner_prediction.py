@@ -61,7 +61,8 @@ LEFT_OUT: Final[tuple[LeftOut, ...]] = ("slow", "rests")
 NEARBY: Final = (1.0, 0.9, 0.95, 1.05, 1.1)  # factors of the bandwidth of a low-pass
 STRENGTHS: Final = (0.0, 1e-3, 1e-2, 0.1, 1.0, math.inf)
 PRIOR_WEIGHTS: Final = (0.01, 0.1, 1.0, 10.0)
-# Terms beside Coulomb and viscous friction; they correlate, so one at most.
+# Terms beside Coulomb and viscous friction; they correlate, so one at most. A stated Stribeck speed
+# is a candidate too.
 FRICTION_TERMS: Final[tuple[Mapping[str, Any], ...]] = (
     {"third": None, "stribeck": None},
     {"third": "quadratic", "stribeck": None},
@@ -239,8 +240,11 @@ def choose_settings(
     # The following models have other columns and need their own centres.
     trial.clear_centres()
     if "friction" in questions:
+        law = now.model.friction.laws[0]
+        stated = {"third": law.third, "stribeck": law.stribeck}
+        terms = FRICTION_TERMS if stated in FRICTION_TERMS else (stated, *FRICTION_TERMS)
         found = trial.decide(
-            "friction at speed", [_friction(now, **one) for one in FRICTION_TERMS], TERM_WORTHWHILE
+            "friction at speed", [_friction(now, **one) for one in terms], TERM_WORTHWHILE
         )
         now, choices = found.settings, [*choices, found.choice]
     if "ripple" in questions:

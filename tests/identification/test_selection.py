@@ -210,9 +210,11 @@ RATE = 200.0  # Hz
 BANDWIDTH = 3.0  # Hz
 
 
-def a_recording(model=MODEL, values=None, *, noise=0.05, duration=10.0, shape=None, seed=5):
+def a_recording(
+    model=MODEL, values=None, *, noise=0.05, duration=10.0, shape=None, seed=5, motion=None
+):
     """Simulate a motion with noise on torque and position, through a Butterworth low-pass."""
-    motion = a_motion(duration)
+    motion = a_motion(duration) if motion is None else motion
     direction = model.friction.direction(*motion[:3])
     rng = np.random.default_rng(seed)
     torque = model.torque(truth() if values is None else values, *motion[1:4], direction)
@@ -229,7 +231,7 @@ def cut(recording):
     return round(0.7 * recording.n_samples)
 
 
-def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=None):
+def chosen(recording, questions, *, model=MODEL, leaks=False, ripple=(), low_passes=None):
     """Choose settings on the fitted rows, or on all of them with a leak."""
     fitted = recording if leaks else recording.between(0, cut(recording))
 
@@ -239,7 +241,7 @@ def chosen(recording, questions, *, leaks=False, ripple=(), low_passes=None):
     def possible(model, how):
         return possible_low_passes(fitted, model, options=how) if low_passes is None else low_passes
 
-    start = Settings(MODEL, Preprocessing())
+    start = Settings(model, Preprocessing())
     return choose_settings(ready, start, questions, possible, ripples=[ripple])
 
 
@@ -254,6 +256,14 @@ class TestChosenSettings:
         cubic = MODEL.with_friction(third="cubic")
         settings, _ = chosen(a_recording(cubic, np.append(truth(), [0.5, 0.3])), {"friction"})
         assert settings.model.friction.laws[0].third == "cubic"
+
+    def test_a_stated_stribeck_speed_is_a_candidate(self):
+        stated = MODEL.with_friction(stribeck=0.3)
+        slow = np.array([[0.3, 0.5], [0.7, 0.4], [1.1, 0.9]])
+        motion = sine_motion(np.arange(0.0, 30.0, 0.005), 0.4, slow, slow)
+        recording = a_recording(stated, np.append(truth(), [5.0, 4.0]), motion=motion)
+        settings, _ = chosen(recording, {"friction"}, model=stated)
+        assert settings.model.friction.laws[0].stribeck == 0.3
 
     def test_no_friction_term_is_added_without_cause(self):
         settings, _ = chosen(a_recording(), {"friction"})
