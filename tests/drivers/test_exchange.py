@@ -271,6 +271,30 @@ class TestBacklog:
         assert source.advances <= advances + 1
         assert State.CLOSED in self.states(rig)
 
+    def test_overtaken_packet_of_a_backlog_is_dropped(self):
+        rig, source = moving()
+        on_time, second, third = self.on_time(rig), rig.packet(), rig.packet()
+        advances = source.advances
+        sent = self.serve(rig, on_time, [third, second])
+        assert [reply[:4] for reply in sent][1:] == [self.number_after(rig)]
+        assert source.advances == advances + 2
+        counters = rig.session.counters
+        assert (counters.discarded, counters.missed, counters.stale) == ({"late": 1}, 1, 0)
+
+    def test_packet_after_an_init_packet_is_not_one_before_it(self):
+        """Its number, which is low, would make it look overtaken."""
+        rig, _ = moving()
+        on_time, late, init = self.on_time(rig), rig.packet(), rig.init.encode()
+        rig.number = 10
+        sent = self.serve(rig, on_time, [late, init, rig.packet()])
+        assert len(sent) == 4
+        assert sent[-1][:4] == self.number_after(rig)
+
+    def test_each_packet_gets_a_reply_while_any_peer_may_start(self):
+        """They may be of several peers."""
+        sync = [number.to_bytes(4, "little") + bytes(728) for number in (1, 2, 3)]
+        assert len(self.serve(Rig(), sync[0], sync[1:])) == 3
+
     @pytest.mark.parametrize("place", [None, *range(4)])
     @pytest.mark.parametrize("garbled", [0x10, 0x20, 0x40])
     def test_dropped_packets_are_a_gap_also_with_a_corrupt_number(self, place, garbled):

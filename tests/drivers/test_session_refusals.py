@@ -368,6 +368,24 @@ def test_request_is_refused_by_state(text):
 
 
 class TestNumbers:
+    def test_low_number_in_a_session_is_stale(self):
+        """Without a silence before it, it is no restart."""
+        rig = Rig()
+        rig.status = 0
+        rig.start()
+        rig.cycle(20)
+        rig.number = 4
+        assert rig.cycle() is None
+        assert (rig.state, rig.session.counters.stale) == (State.DRIVE_OFF, 1)
+
+    def test_one_sync_packet_is_a_cold_start(self):
+        """After which sync packets follow the init packet."""
+        rig = Rig()
+        rig.sync(1)
+        rig.send(rig.init.encode())
+        assert rig.sync(11) is not None
+        assert rig.state is State.INIT
+
     @pytest.mark.parametrize(
         ("numbers", "after"),
         [
