@@ -236,15 +236,19 @@ class TestBacklog:
         assert rig.session.counters.discarded == {"late": waiting - 1}
         assert waiting < 4 or source.stops == 1 or rig.session.state is State.FAULTED
 
-    def test_bunched_packets_do_not_advance_the_motion(self):
+    @pytest.mark.parametrize("after", [0.0, 0.2])
+    def test_bunched_packets_do_not_advance_the_motion(self, after):
+        """Seven of them at once with the first, or soon after it."""
         rig, source = moving()
         packets = [rig.packet() for _ in range(9)]
         # One on time, eight together that were held up on their way.
-        times = [rig.now + PERIOD, *(rig.now + (9.0 + 0.01 * k) * PERIOD for k in range(8))]
+        bunch = [9.0, *(9.0 + after + 0.01 * k for k in range(1, 8))]
+        times = rig.now + PERIOD * np.array([1.0, *bunch])
         link = Bunched(zip(times, packets, strict=True))
         advances = source.advances
         exchange(link, rig.session, until=lambda: False)
         assert source.advances <= advances + 3
+        assert len(link.sent) == (3 if after else 2)
         assert link.sent[-1][:4] == self.number_after(rig)
 
     def test_axes_that_open_within_a_backlog_do_not_run_ahead(self):

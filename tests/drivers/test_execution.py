@@ -146,6 +146,35 @@ class TestEnd:
         assert execution.reason == f"it did not come to rest in {STOP} cycles of a hold"
 
 
+class Careless(Motion):
+    """Returns one array again and again, and changes those it is given."""
+
+    def begin(self, position):
+        super().begin(position.copy())
+        position += 1.0
+
+    def advance(self):
+        position, velocity = super().advance()
+        self.returned = getattr(self, "returned", np.zeros(N))
+        self.returned[:] = position
+        return self.returned, velocity
+
+    def resume_from(self, position, velocity, cycles):
+        position += 1.0
+        velocity += 1.0
+
+
+def test_arrays_of_the_session_are_not_those_of_the_source():
+    execution = requested(Careless())
+    here, speed = HERE.copy(), np.zeros(N)
+    execution.begin(here, 0)
+    first, _, _ = execution.advance(1)
+    before = first.copy()
+    execution.advance(2)
+    execution.resume_from(here, speed, 1, 3)
+    np.testing.assert_array_equal([first, here, speed], [before, HERE, np.zeros(N)])
+
+
 class TestHold:
     @pytest.mark.parametrize("what", ["step", "speed"])
     def test_rest_has_neither_step_nor_velocity_and_no_limit(self, what):
