@@ -43,7 +43,7 @@ def require_finite(values: Array, where: Joints, cycle: int) -> None:
     require(where, np.abs(finite), np.zeros_like(values), Check.FINITE, cycle)
 
 
-def report(
+def raise_first(
     found: Array, allowed: Array, checks: tuple[Check, ...], cycle: int, middle: Array | None = None
 ) -> NoReturn:
     """Raise for the first row and joint outside its bound; not finite values come first.
@@ -332,7 +332,7 @@ class Guard:
         if where is not None:
             found[:, ~where] = 0.0
         if not (found <= self._feedback_bounds).all():
-            report(found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
+            raise_first(found, self._feedback_bounds, _FEEDBACK_CHECKS, cycle)
 
     def check_after_gap(
         self,
@@ -378,7 +378,7 @@ class Guard:
         """Check the position (n,) rad that a correction leads to."""
         found, allowed = (q - self._middle)[None], self._sets[0][:1]
         if not (np.abs(found) <= allowed).all():
-            report(found, allowed, _SET_POINT_CHECKS[:1], cycle, self._middle)
+            raise_first(found, allowed, _SET_POINT_CHECKS[:1], cycle, self._middle)
 
     def check_set_point(self, q: Array, qd: Array, bounds: BoundsName, cycle: int) -> None:
         """Check the next set-point q (n,) rad, qd (n,) rad/s, which then counts as sent.
@@ -395,7 +395,7 @@ class Guard:
         found[0] -= self._middle
         allowed = self._sets[self._active.update(bounds)]
         if not (np.abs(found) <= allowed).all():
-            report(found, allowed, _SET_POINT_CHECKS, cycle, self._middle)
+            raise_first(found, allowed, _SET_POINT_CHECKS, cycle, self._middle)
 
 
 _RATE_CHECKS: Final = (Check.VELOCITY, Check.ACCELERATION, Check.JERK)
@@ -465,7 +465,7 @@ class CorrectionGuard:
         np.matmul(self._differences, history, out=found)
         allowed = self._sets[self._active.update(bounds)]
         if not (np.abs(found) <= allowed).all():
-            report(found, allowed, self._checks, cycle)
+            raise_first(found, allowed, self._checks, cycle)
 
     @property
     def resting(self) -> bool:

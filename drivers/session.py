@@ -356,6 +356,7 @@ class Session(StateMachine):
         return self._finish(packet, echo(packet), now)
 
     def _cyclic(self, packet: bytes, number: int, now: float, ages: Ages | None) -> bytes | None:
+        """Run one cycle: decode, record, change state, reply; an error becomes drive-off or 508."""
         policy, ring = self._policy, self._ring
         assert policy is not None
         decoded = CyclicPacket.decode(packet, policy.init.n_axes)

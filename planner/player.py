@@ -109,6 +109,8 @@ class _SetPoints(NamedTuple):
 class TrajectoryPlayer:
     """Returns the set-points of a trajectory, one period per call of `advance`.
 
+    It has the methods of a `drivers.MotionSource`, and a session takes it as one.
+
     Motion time advances only in `advance`, so a late or missing call delays the motion and never
     makes it jump. At full rate the set-points come from a table; after a change of rate the path
     is evaluated. After the end, `advance` returns the last position with zero velocity.

@@ -145,6 +145,8 @@ class Recorded:
 class Recorder:
     """Fills one archive from records and events, and closes it with the true outcome.
 
+    It adds the joint torque that the drive train makes of the target current.
+
     It contains cycles of one session with the controller; those of a later one are left out.
 
     Attributes:

@@ -28,7 +28,7 @@ LITERAL = {
     "doubts": "key of files that earlier versions wrote",
 }
 INDEX = re.compile(r"\bpypi\b|\bconda\b|\bnpm\b|https?://\S*/simple\b", re.IGNORECASE)
-MOST_TERMS = 60
+MOST_TERMS = 72
 
 
 def docstrings(tree: ast.AST) -> set[int]:
