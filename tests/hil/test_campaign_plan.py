@@ -20,11 +20,14 @@ from hil.cell import Cell
 from hil.cli import app
 from hil.cli import demo as demo_module
 from hil.demo_link import SimulatorProcess
+from hil.design import load_design, preset
+from hil.design.run import DesignFolder, run_design
 from hil.errors import InputError
 from hil.identify import identify_campaign
 from hil.motion_checks import PLANNED_CURRENT, MotionChecks
 from hil.outcome import FILES
 from hil.progress import Silent
+from hil.results import Results
 from identification.excitation import Constraints, Criteria, Excitation, sampled
 from planner import FourierSeries, PiecewiseCubic
 from sim_fixtures.ns16 import CELL_PATH
@@ -93,6 +96,34 @@ def test_a_design_that_cannot_be_read_is_named_first(tmp_path: Path) -> None:
     assert isinstance(result.exception, InputError)
     assert "cell.toml" in str(result.exception)
     assert not (tmp_path / "demo").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "changes"), [("a", {"sines": {"length": 8.0, "ramp": 2.0}}), ("b", {})]
+)
+def test_the_demo_runs_a_design_and_identifies_from_its_archives(
+    tmp_path: Path, method: str, changes: dict[str, Any]
+) -> None:
+    folder, made = tmp_path / "demo", tmp_path / "design"
+    small = {"population": 12, "generations": 2, "polish": 0}
+    settings = preset(method).replaced(search=small, **changes)
+    run_design(DesignFolder(made), Cell.load(CELL_PATH), settings, Silent())
+    words = ["demo", "--output", str(folder), "--excitation", str(made / "excitation.toml")]
+    words += ["--repetitions", "2", "--validation", "1", "--quiet"]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code in (0, 5), result.output  # a poor motion may not make a good model
+    wanted = load_design(made)
+    paths = Campaign.open(folder).folder.completed("excitation")
+    assert len(paths) == 2
+    for path in paths:
+        stored = json.loads(open_archive(path).attachments["plan.json"])["excitation"]
+        assert stored["trajectory"] == wanted.trajectory.to_dict()
+        assert stored["method"] == method
+    found = Results.load(folder / "results.json").excitation
+    assert (found.method, found.n_sines, found.n_via) == (
+        (method, 3, None) if method == "a" else (method, None, 6)
+    )
 
 
 Run = Callable[..., Campaign]

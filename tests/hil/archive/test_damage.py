@@ -262,6 +262,11 @@ def flips(rng: random.Random, data: bytes, _: float) -> bytes:
     return flipped(data, rng.randrange(len(data)), 1 << rng.randrange(8))
 
 
+def bursts(rng: random.Random, data: bytes, _: float) -> bytes:
+    at, length = rng.randrange(len(data)), rng.randrange(1, 600)
+    return data[:at] + rng.randbytes(min(length, len(data) - at)) + data[at + length :]
+
+
 def cuts(_: random.Random, data: bytes, share: float) -> bytes:
     return data[: int(len(data) * share)]
 
@@ -273,6 +278,7 @@ class TestAnyDamage:
         ("kind", "count", "whole", "lost"),
         [
             (flips, 200, 20, 20),
+            (bursts, 60, 0, 10),
             (cuts, 80, 1, 5),
             pytest.param(flips, 10_000, 1000, 1000, marks=pytest.mark.slow),
             pytest.param(cuts, 14_000, 1, 5, marks=pytest.mark.slow),
