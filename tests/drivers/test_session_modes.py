@@ -113,6 +113,14 @@ class TestEveryMode:
         reported = [mode] * 3 + [508] + [mode] * 2 if begun else [505] * N
         assert answer.axes["mode"].tolist() == reported
 
+    @pytest.mark.parametrize("mode", sorted(CORRECTION_MODES | POSITION_MODES))
+    def test_axis_that_opens_is_at_its_target(self, mode):
+        rig = closed(mode=mode)
+        rig.modes[3] = mode
+        rig.axes["d"][3, 2] += 2.01
+        assert rig.cycle().axes["mode"].tolist() == [0, 0, 0, 508, 0, 0]
+        assert (kind_of(rig.refusal), rig.refusal.joint) == (Check.FOLLOWING_ERROR, 3)
+
     @pytest.mark.parametrize("mode", [3, 6, 11, 12, 14, 15, 17])
     def test_modes_not_served_are_not_moved(self, mode):
         rig = Rig()
