@@ -629,6 +629,20 @@ class TestSentAgain:
     def test_number_of_lost_replies(self, step, ahead, missed, lost):
         assert Sent(step).check(ahead, missed) == lost
 
+    def test_extrapolated_target_is_no_loss(self):
+        sent = Sent(SLOW)
+        for step in (1.0, 2.1, -1.0):
+            sent.add(step)  # one more of the last is a tenth of a step from two set-points ago
+        assert sent.set_points.check(sent.last - sent.step, 1, 7) == 0
+
+    def test_joint_furthest_behind_counts(self):
+        sent = Sent(SLOW)
+        sent.step = SLOW * np.array([0.0, 1.0, 0.0, 0.0, 1.0, 0.0])
+        for _ in range(4):
+            sent.add(1.0)
+        target = sent.last - sent.step * np.array([0, 1, 0, 0, 2, 0])
+        assert sent.set_points.check(target, 0, 1) == 2
+
     @pytest.mark.parametrize("way", [-1.0, 1.0])
     @pytest.mark.parametrize(
         ("steps", "behind", "counts"),

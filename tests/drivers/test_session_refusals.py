@@ -522,6 +522,16 @@ class TestLongGap:
         assert rig.state is State.EXITING
         assert not rig.seen(Refused)
 
+    def test_axis_that_opens_again_is_not_compared(self):
+        rig = leaving(axis=2)
+        rig.axes["d"][2, [0, 2]] += 0.5
+        rig.modes[2] = rig.mode
+        rig.cycle()
+        rig.miss(10)
+        rig.cycle()
+        assert rig.state is State.EXITING
+        assert not rig.seen(Refused)
+
     def test_axes_that_open_are_not_compared(self):
         rig = opened(20)
         rig.cycle(mode=Mode.CLOSED)
