@@ -606,6 +606,15 @@ class TestTargets:
         sent.add(1.0)
         sent.refuse(24.0, missed=1)
 
+    def test_begin_resets_the_history(self):
+        sent = Sent(SLOW)
+        assert sent.check(-1.0) == 1
+        sent.set_points.begin(TURNS)
+        sent.last = TURNS
+        sent.add(1.0)
+        assert sent.check(-1.0) == 1
+        sent.refuse(25.0)
+
     def test_selected_joints(self):
         sent, others = Sent(0.24), np.arange(N) != 1
         assert sent.check(9.0, where=others) == 0

@@ -810,6 +810,15 @@ class TestOtherAxes:
         rig.lose_target(value)
         assert rig.session.counters.refused == 2
 
+    def test_no_motion_begins(self, arm, value):
+        rig = OtherAxis(arm)
+        rig.close()
+        rig.axes["mode"][6] = Mode.POSITION
+        rig.lose_target(value)
+        rig.session.request(source := Cruise())
+        assert all_drive_off(rig.cycle(mode=Mode.POSITION))
+        assert (source.begun_at, rig.ended.outcome) == (None, "refused")
+
     def test_echo_with_its_drive_off(self, arm, value):
         rig = OtherAxis(arm)
         rig.close()
