@@ -189,6 +189,11 @@ class TestHold:
         setattr(source, what, 1.1e-9)
         run(execution, 2 * STOP, 9)
         assert (execution.outcome, execution.held) == ("completed", True)
+        execution = begun(source := Motion(step=0.0, speed=0.0))
+        execution.hold(0)
+        setattr(source, what, 1.1e-9)
+        run(execution, STOP + 1)
+        assert execution.outcome == "stopped", "it did not rest"
 
     def test_hold_before_the_begin(self):
         execution = requested(source := Motion())
