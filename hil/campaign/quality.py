@@ -314,8 +314,9 @@ class ArchiveReview:
         problem, good = self._check.problem(executed), self._folder.completed("excitation")
         if problem is None or not problem.differs or len(good) != 1:
             return problem
-        alike = self._alike(executed)
-        if len(alike) + 1 < max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions):
+        alike, with_accepted = self._alike(executed)
+        enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)
+        if len(alike) + 1 < max(enough, with_accepted + 2):
             return problem
         name = good[0].name
         reason = f"{', '.join(alike)} and the next repetition agree with each other, not with this"
@@ -333,19 +334,27 @@ class ArchiveReview:
         self._folder.add(name, REJECTED, reason)
         self.rejected.append(Rejected(name, reason))
 
-    def _alike(self, executed: Executed) -> list[str]:
-        """Return the rejected, valid attempts that agree with this one and with each other."""
-        check, alike = RepetitionCheck(self._cell, self._motion), list[str]()
-        check.accept(executed)
+    def _alike(self, executed: Executed) -> tuple[list[str], int]:
+        """Return attempts that agree with this one and each other, and how many with the accepted.
+
+        Only valid attempts that were rejected since the last accepted one are compared; where
+        attempts scatter, they agree with either.
+        """
+        rejected = list[str]()
         for entry in self._folder.manifest():
-            if (entry.kind, entry.outcome) != ("excitation", REJECTED):
-                continue
+            if entry.kind == "excitation":
+                rejected = [*rejected, entry.name] if entry.outcome == REJECTED else []
+        check, alike, with_accepted = RepetitionCheck(self._cell, self._motion), list[str](), 0
+        check.accept(executed)
+        for one in rejected:
             with suppress(ArchiveError):
-                other = self._executed(entry.name)
-                if check.problem(other) is None:
-                    check.accept(other)
-                    alike.append(entry.name)
-        return alike
+                other = self._executed(one)
+                if problem_of(other, self._motion, self._cell) is None:
+                    with_accepted += self._check.problem(other) is None
+                    if check.problem(other) is None:
+                        check.accept(other)
+                        alike.append(one)
+        return alike, with_accepted
 
     def _executed(self, name: str) -> Executed:
         return Executed.of(open_archive(self._folder.archives / name, fields=FIELDS))
