@@ -499,8 +499,8 @@ class TestPosterior:
         np.testing.assert_array_equal(found.estimate.values[unknown], 0.0)
 
     def test_few_rows_require_weights(self):
-        kept = np.arange(len(noisy().torque)) % 200 == 7
-        few = Factor.of(MODEL, replace(noisy(), usable=noisy().usable & kept[:, None]))
+        chosen = np.arange(len(noisy().torque)) % 200 == 7
+        few = Factor.of(MODEL, replace(noisy(), usable=noisy().usable & chosen[:, None]))
         prior = nominal_prior(MODEL, known=KNOWN)
         with pytest.raises(IdentificationError, match="too few"):
             with_prior(MODEL, few, prior)
