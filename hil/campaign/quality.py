@@ -309,10 +309,10 @@ class ArchiveReview:
         """Return the problem of a repetition, None for none.
 
         Where enough later attempts agree with each other and not with the only accepted one, that
-        one is rejected instead.
+        one is rejected instead: once in a run, since a second time shows that they scatter.
         """
         problem, good = self._check.problem(executed), self._folder.completed("excitation")
-        if problem is None or not problem.differs or len(good) != 1:
+        if problem is None or not problem.differs or len(good) != 1 or self.notes:
             return problem
         alike, with_accepted = self._alike(executed)
         enough = max(_FEWEST_ALIKE, self._cell.campaign.bad_repetitions)

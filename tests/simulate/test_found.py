@@ -160,10 +160,17 @@ def short_way(
 HELD_OR_EXTRAPOLATED = (1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 22400, 24885)
 CLOSED_BY_THE_CONTROLLER = (20738, 22032)
 SHUT_DOWN_AT_A_SAVE = (21048, 21634, 22291)
+SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
 
 
 @pytest.mark.parametrize(
-    "seed", [*HELD_OR_EXTRAPOLATED, *CLOSED_BY_THE_CONTROLLER, *SHUT_DOWN_AT_A_SAVE]
+    "seed",
+    [
+        *HELD_OR_EXTRAPOLATED,
+        *CLOSED_BY_THE_CONTROLLER,
+        *SHUT_DOWN_AT_A_SAVE,
+        *SCATTERED_REPETITIONS,
+    ],
 )
 def test_seed_breaks_no_law(seed: int, tmp_path: Path) -> None:
     """In 5326 a motion that had just begun continued as if it had not been held."""
