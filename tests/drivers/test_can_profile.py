@@ -200,7 +200,7 @@ class TestClassicNumbers:
         got = decoded(wire.up(packet(11, d=d))).axes["d"]
         np.testing.assert_array_equal(got[:, [0, 2, 4]], d[:, [0, 2, 4]].astype(np.float32))
 
-    def test_velocity_and_the_step_of_replies_are_differences_of_positions(self, wire):
+    def test_velocity_and_step_are_differences_of_positions(self, wire):
         """Over missed cycles a mean; the age of a velocity is the number of those."""
         velocity, ages, steps = [], [], []
         for number, position in ((11, 1.0), (12, 1.25), (13, 1.75), (16, 2.5)):

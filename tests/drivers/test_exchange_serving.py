@@ -151,7 +151,7 @@ def test_control_block():
 
 
 class TestMotionTransfer:
-    def test_copy_equals_the_original_and_its_large_arrays_are_read_only(self):
+    def test_a_copy_equals_the_original_with_read_only_arrays(self):
         here = still(5000)
         there = motion_transfer.unpack(motion_transfer.pack(here))
         assert not there.positions.flags.writeable

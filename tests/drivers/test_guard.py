@@ -395,7 +395,7 @@ class TestAfterGap:
             assert error.bound == pytest.approx(gain)
             guard.check_after_pause(other, 5, np.arange(N) != joint)
 
-    def test_extrapolated_steps_have_a_bounded_acceleration_and_later_jerk(self, joint, sign):
+    def test_extrapolated_steps_have_bounded_acceleration_and_jerk(self, joint, sign):
         guard, q, step = Guard(limits(), PERIOD), START, at(joint, sign * 1.5 * PERIOD)
         bound = 2.0 * 8.0 * PERIOD**2  # of a stop, per cycle
         guard.resume_from(q, step / PERIOD, 2)
@@ -537,9 +537,7 @@ class TestTarget:
     @joints
     @signs
     @pytest.mark.parametrize(("before", "after"), [(0.6, 0.6), (-0.3, 0.3)])
-    def test_an_offset_counts_as_a_step_in_each_cycle_and_as_its_change(
-        self, joint, sign, before, after
-    ):
+    def test_an_offset_counts_as_a_step_and_as_its_change(self, joint, sign, before, after):
         """Four tenths of the way of a cycle at full speed are left; the other way is free."""
         unit = at(joint, sign * V * T)
         for share, allowed in ((0.399, True), (0.401, False), (-1.0, True)):

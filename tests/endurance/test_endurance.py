@@ -86,7 +86,7 @@ def test_each_fault_is_found(change: Change | None, campaign: Line, words: str) 
     assert any(words in text for text in judge([one]).faults)
 
 
-def test_hours_without_a_fault_are_good_and_short_runs_are_warned_of() -> None:
+def test_hours_without_a_fault_pass_and_short_runs_warn() -> None:
     sound = piece()
     found = judge([sound, sound])
     assert (found.faults, found.warnings) == ([], [])

@@ -194,7 +194,7 @@ class TestDigests:
 
 
 class TestWorkers:
-    def test_tasks_that_kill_or_hang_their_process_do_not_affect_others(self, tmp_path):
+    def test_tasks_that_kill_their_process_do_not_affect_others(self, tmp_path):
         """A task whose process ends is run once more."""
         tasks, failing = work.tasks_with_failures(12, hang=5)
         tasks[9] = work.task(work.once, str(tmp_path / "ran"))

@@ -168,7 +168,7 @@ def test_the_conduct_has_what_was_left_out(ran: Campaign) -> None:
     assert (steps["repetitions"].words, steps["repetitions"].details) == ("2 complete", [])
 
 
-def test_the_conduct_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignFolder) -> None:
+def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
     DryRun(
         folder.plan_hash, 0.2, ("dryrun_000_a1.mcap",), 9.0, True, ("shoulder", "elbow"),

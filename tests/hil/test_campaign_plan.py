@@ -41,9 +41,7 @@ def test_the_quick_search_tries_no_more_than_it_may(cell: Cell, candidates: int)
     assert search.population * search.generations > 0.75 * candidates
 
 
-def test_the_quick_search_keeps_the_cell_and_begins_and_ends_at_home(
-    cell: Cell, plan: CampaignPlan
-) -> None:
+def test_the_quick_search_begins_and_ends_at_home(cell: Cell, plan: CampaignPlan) -> None:
     excitation = plan.excitation
     assert excitation.tried <= cell.campaign.candidates
     assert isinstance(excitation.trajectory, PiecewiseCubic)

@@ -172,7 +172,7 @@ def test_settings_of_earlier_versions_are_ignored(folder: Path) -> None:
     assert cell.joint_names == Cell.load(CELL_PATH).joint_names
 
 
-def test_a_transmission_that_names_a_joint_again_does_not_widen_its_limits(folder: Path) -> None:
+def test_a_second_transmission_does_not_widen_the_limits(folder: Path) -> None:
     urdf = folder / "ns16.urdf"
     again = '<transmission name="t"><joint name="joint_2"/></transmission></robot>'
     urdf.write_text(urdf.read_text("utf-8").replace("</robot>", again), "utf-8")
@@ -246,7 +246,7 @@ def test_the_third_nominal_coefficient_may_be_left_out(folder: Path, ns16: Cell)
     np.testing.assert_array_equal(cell.nominal_values(), ns16.nominal_values())
 
 
-def test_limits_without_a_drive_train_are_held_against_the_urdf_too(ns16: Cell) -> None:
+def test_limits_without_a_drive_train_are_checked_by_the_urdf(ns16: Cell) -> None:
     limits = ns16.text[ns16.text.index("[limits]") : ns16.text.index("[drive_train]")]
     for old, new in (('"controller"', '"urdf"'), ("upper_deg = [180.0", "upper_deg = [999")):
         limits = limits.replace(old, new)
@@ -254,7 +254,7 @@ def test_limits_without_a_drive_train_are_held_against_the_urdf_too(ns16: Cell) 
         Cell.from_texts(f'[cell]\nname = "x"\nurdf = "u"\n{limits}', ns16.urdf, Path("cell.toml"))
 
 
-def test_a_sliding_joint_is_refused_by_name_where_degrees_are_given(folder: Path) -> None:
+def test_a_sliding_joint_in_degrees_is_refused_by_name(folder: Path) -> None:
     text = (folder / "ns16.urdf").read_text("utf-8")
     sliding = re.sub(r'(name="joint_3"\s+type=)"revolute"', r'\1"prismatic"', text)
     (folder / "ns16.urdf").write_text(sliding, "utf-8")
@@ -365,7 +365,7 @@ def documented() -> dict[str, dict[str, str]]:
     return found
 
 
-def test_the_document_and_the_schema_name_the_same_fields_and_defaults() -> None:
+def test_document_and_schema_have_the_same_fields_and_defaults() -> None:
     schema: dict[str, Any] = {
         name: {field: default_text(info) for field, info in model.model_fields.items()}
         for name, model in tables(CellFile)

@@ -48,7 +48,7 @@ def via(tmp_path):
     return path
 
 
-def test_each_via_point_is_reported_in_the_angles_of_the_controller(via, tmp_path):
+def test_via_points_are_reported_in_controller_angles(via, tmp_path):
     out = run("--via", via, "--fly", 50)
     lines = out.splitlines()
     assert lines[0].split()[:3] == ["target", "joint_1", "joint_2"]

@@ -165,9 +165,7 @@ class StopsAfter(Silent):
         yield Task(lambda *_: setattr(self.stop, "requested", True))
 
 
-def test_a_stopped_rehearsal_has_no_result_and_a_passed_one_stays(
-    tmp_path: Path, designed: Campaign
-) -> None:
+def test_a_stopped_rehearsal_replaces_no_passed_one(tmp_path: Path, designed: Campaign) -> None:
     campaign, stop = Campaign.create(tmp_path / "campaign", designed.cell, designed.plan), Stop()
     with pytest.raises(OperatorStopError, match="rehearse again"):
         campaign.rehearse(stop=stop, reporter=StopsAfter(stop))

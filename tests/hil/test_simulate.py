@@ -251,7 +251,7 @@ def test_own_postures_are_within_limits_and_clear_on_the_way():
     assert postures[-1] == pytest.approx(cell.home)
 
 
-def test_a_cell_of_real_hardware_is_simulated_only_where_asked_for():
+def test_real_hardware_is_simulated_only_where_asked_for():
     real = Cell.load(CELL_PATH).with_link(transport="udp")
     with pytest.raises(CellError, match="real hardware"):
         simulated_link(real)
@@ -313,7 +313,7 @@ def test_the_first_signal_asks_for_the_end_the_second_aborts():
     assert not buttons.interrupted
 
 
-def test_a_reader_that_has_stopped_reading_costs_lines_not_cycles():
+def test_a_reader_that_stopped_costs_lines_not_cycles():
     reader, writer = os.pipe()
     try:
         for _ in range(3000):

@@ -196,7 +196,7 @@ class TestBlocks:
         assert 4 <= block_length(slow) <= 20
         assert block_length(white[:25]) == 1  # enough blocks remain
 
-    def test_the_interval_factor_is_students_t_of_the_number_of_blocks(self):
+    def test_the_interval_factor_is_students_t_of_the_blocks(self):
         motion = a_motion()
         noise = coloured(np.random.default_rng(0), len(motion.time), 5e-3, 0.0)
         result = estimate_repetitions(MODEL, [recording(noise, motion)]).pooled
@@ -571,7 +571,7 @@ class TestNominalPrior:
         assert np.abs((np.cov(base.T) - covariance) / scale).max() < 0.04
         np.testing.assert_allclose(prior.std[rank:], [2.0, 1.0, 1.0, 0.5])
 
-    def test_rotors_and_friction_have_none_and_flatten_only_their_groups(self):
+    def test_rotors_and_friction_flatten_only_their_groups(self):
         model = RobotModel.from_urdf(urdf_text())
         std = dict(zip(model.parameter_names, nominal_prior(model).std, strict=True))
         rotors = model.base.grouping[:, model.layout.rotors].any(axis=1)
@@ -736,7 +736,7 @@ class TestConsistentEstimate:
     @pytest.mark.parametrize(
         "path", ["ur_description/urdf/ur10_robot.urdf", "panda_description/urdf/panda.urdf"]
     )
-    def test_other_robots_with_partly_inconsistent_nominal_parameters(self, path):
+    def test_other_robots_with_inconsistent_nominal_parameters(self, path):
         model = RobotModel.from_urdf(robot_text(path))
         values = values_of(model, np.repeat([2.0, 1.0, 0.0], model.n_joints), 0.5)
         found = fit_of(values, 0.1, 1, model=model)

@@ -752,7 +752,7 @@ class TestPublishedRecordings:
         return found, error
 
     @pytest.mark.slow
-    def test_a_coupled_wrist_is_explained_with_the_published_parameters(self):
+    def test_a_coupled_wrist_follows_the_published_parameters(self):
         """Comparators: 10.9 % with, 14.3 % without; joint 5 19 and 53 %; Iam6, fsm6, fvm6."""
         _, without = self.fitted(None)
         found, coupled = self.fitted(Coupling(self.TURNS))

@@ -116,7 +116,7 @@ def test_a_stop_stays_on_the_path_and_within_its_bounds(motions, which, share, p
     np.testing.assert_allclose(positions[1 + played :], q[1 + played :], rtol=0, atol=1e-12)
 
 
-def test_a_start_that_moves_the_motion_out_of_its_range_is_refused():
+def test_a_start_that_moves_the_motion_out_of_range_is_refused():
     upper = SIX_AXES.upper
     points = np.array([np.zeros(6), upper, np.zeros(6)])
     motion = plan(points, SIX_AXES, fly=0.0)

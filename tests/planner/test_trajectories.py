@@ -205,7 +205,7 @@ def test_it_is_equation_8_without_and_between_ramps():
 
 @given(series())
 @settings(max_examples=40, deadline=None)
-def test_velocity_and_acceleration_are_the_derivatives_of_position(motion):
+def test_velocity_and_acceleration_are_derivatives_of_position(motion):
     h = 1e-5 * motion.duration
     t = np.linspace(0.0, motion.duration, 203)[1:-1]
     before, here, after = (motion.sample(x) for x in (t - h, t, t + h))
@@ -546,7 +546,7 @@ def test_a_corner_slower_than_a_stop_is_not_used(monkeypatch):
 
 
 @pytest.mark.parametrize("missed", [1.2, np.inf], ids=["too slow", "unknown"])
-def test_a_join_that_the_solver_misses_is_replaced_by_its_neighbour(monkeypatch, missed):
+def test_a_join_without_solution_is_replaced_by_its_neighbour(monkeypatch, missed):
     def misses_the_first(*asked):
         found = solve_many(*asked)
         # Observed: a join much longer than necessary, still shorter than a stop.

@@ -104,7 +104,7 @@ def test_plans_of_a_child_are_the_same_and_read_only():
     assert not motion.coefficients[0].flags.writeable
 
 
-def test_errors_have_their_attributes_and_the_traceback_of_the_child():
+def test_errors_have_attributes_and_traceback_of_the_child():
     with pytest.raises(InvalidSetting, match="fly = 2") as caught:
         plan_in_child(random_points(3), SIX_AXES, fly=2.0)
     assert (caught.value.name, caught.value.value) == ("fly", 2.0)

@@ -179,7 +179,7 @@ class TestOpenMode:
     @pytest.mark.parametrize(
         ("modes", "status"), [([505] * 6, 0), ([4, 4, 508, 4, 4, 4], 5)], ids=["505", "508"]
     )
-    def test_505_and_508_close_all_axes_and_their_targets_are_ignored(
+    def test_505_and_508_close_all_axes_and_ignore_targets(
         self, modes: list[int], status: int
     ) -> None:
         controller = make(Phase.OPEN)
@@ -534,7 +534,7 @@ class TestWithoutAnAnswer:
         # 0.2 s after the ramp the integral parts still unwind
         assert np.abs(controller.plant.velocity).max() < 1e-3 * small_cell.SPEED[0]
 
-    def test_drive_off_takes_the_drive_away_with_the_last_missing_answer(self) -> None:
+    def test_the_last_missing_reply_switches_the_drive_off(self) -> None:
         controller = opened(missed_replies=3, while_silent="drive_off")
         for answered in (False, False, True, False, False, False):
             received = receive(controller)
@@ -557,7 +557,7 @@ class TestLeaving:
         modes = [tuple(step(controller).axes["mode"].tolist()) for _ in range(7)]
         assert modes == [(4, 4)] * 2 + [(0, 4)] * 3 + [(0, 0)] * 2
 
-    def test_an_axis_that_leaves_by_itself_stays_closed_until_all_open_again(self) -> None:
+    def test_an_axis_that_leaves_stays_closed_until_all_open_again(self) -> None:
         controller = opened()
         controller.program.axis_leaves(1)
         for status in (0, 0, 0, STATUS_EXIT):
@@ -635,7 +635,7 @@ class TestProgram:
         assert loop.phase is Phase.ENDED
         assert "init" in loop.reason
 
-    def test_phases_last_as_long_as_set_and_the_end_waits_until_the_arm_is_at_rest(self) -> None:
+    def test_phases_last_as_set_and_the_end_waits_for_rest(self) -> None:
         loop = self.program(Phase.DRIVE_OFF)
         closed = [Phase.DRIVE_OFF] * 2 + [Phase.DRIVING_ON] * 3 + [Phase.CLOSED] * 2
         assert self.phases_to(loop, Phase.OPENING) == closed

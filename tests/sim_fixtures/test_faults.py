@@ -149,7 +149,7 @@ def test_the_drive_goes_off_in_the_packet_of_that_cycle(fault: str, reason: str)
     assert opens_again(pc)
 
 
-def test_a_cold_restart_is_silence_then_the_whole_start_and_waits_for_the_drive() -> None:
+def test_a_cold_restart_is_silence_then_the_whole_start() -> None:
     pc = run(300, "restart@100", boot_time=0.05)
     assert pc.packets[100:150] == [b""] * 50
     numbers = [packet_number(packet) for packet in pc.packets[150:163]]

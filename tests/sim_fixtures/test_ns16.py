@@ -101,7 +101,7 @@ def test_the_planted_base_vector_is_column_c_of_all_forty_rows() -> None:
     np.testing.assert_allclose(base, printed, rtol=0.0, atol=1e-6)
 
 
-def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> None:
+def test_the_friction_is_column_c_without_the_interleaving() -> None:
     column = {row.parameter: row.pi_c for row in ns16.TABLE2}
     truth = ns16.load_truth()
     assert truth.coulomb == tuple(column[f"f0_{i}"] for i in range(1, 7))
@@ -111,7 +111,7 @@ def test_the_planted_friction_is_column_c_read_without_the_interleaving() -> Non
     assert truth.coulomb[0] > truth.coulomb[2] > truth.coulomb[3] > truth.coulomb[5]
 
 
-def test_base_torques_are_the_torques_of_the_rigid_bodies_and_rotors(model: pin.Model) -> None:
+def test_base_torques_are_those_of_rigid_bodies_and_rotors(model: pin.Model) -> None:
     rng = np.random.default_rng(2)
     base = ns16.base_from_standard(ns16.standard_parameters())
     rotors = np.array(ns16.load_truth().rotor_inertia)

@@ -151,7 +151,7 @@ def test_the_cell_file_has_the_default_sizes_of_effects() -> None:
         np.testing.assert_array_equal(CELL["simulation"][name], size, err_msg=name)
 
 
-def test_ripple_repeats_twice_per_motor_turn_with_the_stated_amplitude() -> None:
+def test_ripple_has_two_periods_per_motor_turn() -> None:
     ripple = TorqueRipple(np.array([5.0, 2.0]), np.random.default_rng(1))
     turns = np.linspace(0.0, 1.0, 401)
     torque = np.array([ripple.torque([t, t]) for t in turns])
@@ -240,7 +240,7 @@ def test_friction_holds_what_it_can_and_opposes_what_slides(seed: int, n: int, p
     np.testing.assert_allclose(balance, 0.0, atol=STEP * np.abs(inverse).sum() * slack)
 
 
-def test_a_joint_slides_on_when_its_coulomb_torque_grows_a_little() -> None:
+def test_a_joint_slides_on_when_coulomb_torque_grows_a_little() -> None:
     """A guess just short of the bound must not pass for a torque that holds."""
     result = resolve_dry_friction([1.0], np.eye(1), [10.0 * (1.0 + 1e-9)], STEP, [10.0])
     assert result.velocity[0] > 0.9
@@ -263,7 +263,7 @@ def servo() -> Servo:
     return servo
 
 
-def test_current_is_that_of_the_model_at_rest_limited_and_without_wind_up(servo: Servo) -> None:
+def test_current_at_rest_is_limited_and_without_wind_up(servo: Servo) -> None:
     assert servo.advance(servo.target, [0.0] * 6) == servo.model_current
     assert servo.model_current[1] != 0.0  # gravity
     home = list(servo.measured)
@@ -292,7 +292,7 @@ def test_the_model_is_wrong_by_five_to_ten_per_cent() -> None:
 
 
 @pytest.mark.parametrize("substeps", [1, 2, 5])
-def test_the_current_follows_with_the_stated_lag_whatever_the_substeps(substeps: int) -> None:
+def test_the_current_follows_with_the_stated_lag(substeps: int) -> None:
     """Area above a step response is the time constant."""
     lag, period = 0.0007, 0.001
     loop = CurrentLoop(1, lag=lag, substep=period / substeps, delay_substeps=0)

@@ -212,7 +212,7 @@ def test_a_stall_of_the_server_is_not_counted_as_the_pcs(stall: float):
     assert min(gaps(cabinet)[1:]) > (0.5 * T if stall == 30.0 else 0.0)
 
 
-def test_a_stretched_cycle_waits_for_its_answer_and_the_next_begins_after_it():
+def test_a_stretched_cycle_waits_for_its_reply():
     summary, cabinet, _ = served(slow({20: 30.0}), stretch=0.5)
     assert (summary.replies, summary.missed, summary.late) == (50, 0, 0)
     assert (summary.stretched, summary.own_late) == (1, 0)

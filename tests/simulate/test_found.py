@@ -54,7 +54,7 @@ class TestControllerWithoutInitPacket:
             second.connect(Stop(), timeout=0.5)
         assert "switch the drive on" not in str(raised.value)
 
-    def test_the_error_of_a_session_that_ended_at_once_has_no_timeout(
+    def test_a_session_that_ended_at_once_states_no_timeout(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
         controller.finish()
@@ -64,7 +64,7 @@ class TestControllerWithoutInitPacket:
         assert "60 s" not in str(raised.value)
 
 
-def test_a_motion_does_not_wait_forever_for_a_drive_that_went_off(
+def test_a_motion_does_not_wait_for_a_drive_that_went_off(
     cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
     """Seed 455: the drive was lost between two motions, and virtual time did not end."""

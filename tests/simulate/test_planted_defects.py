@@ -106,9 +106,7 @@ def test_it_is_found(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -
     assert law in {one.law for one in judged(stage.observed(SEED, wanted))}
 
 
-def test_a_defect_without_faults_is_reported_and_not_a_reason_for_another_arm(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_defect_without_faults_is_reported(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(self: Runner, *arguments: Any) -> str:
         raise TypeError("planted")
 

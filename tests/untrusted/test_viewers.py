@@ -43,7 +43,7 @@ def still_served(publisher: live.LivePublisher) -> None:
     raise AssertionError("no message arrives")
 
 
-def test_invalid_frames_and_idle_connections_do_not_end_the_service(
+def test_invalid_frames_do_not_end_the_service(
     publisher: live.LivePublisher,
 ) -> None:
     address = ("127.0.0.1", publisher.port)
