@@ -160,6 +160,7 @@ def short_way(
 HELD_OR_EXTRAPOLATED = (1555, 1799, 3704, 4160, 5326, 6080, 7154, 8192, 22400, 24885)
 CLOSED_BY_THE_CONTROLLER = (20738, 22032)
 SHUT_DOWN_AT_A_SAVE = (21048, 21634, 22291)
+MALFORMED_BESIDE_A_GAP = (100543,)  # a packet that is none counts once
 SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
 
 
@@ -169,6 +170,7 @@ SCATTERED_REPETITIONS = (100232,)  # they rejected one another in turn
         *HELD_OR_EXTRAPOLATED,
         *CLOSED_BY_THE_CONTROLLER,
         *SHUT_DOWN_AT_A_SAVE,
+        *MALFORMED_BESIDE_A_GAP,
         *SCATTERED_REPETITIONS,
     ],
 )

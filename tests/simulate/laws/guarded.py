@@ -11,7 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from drivers.events import MotionEnded
+from drivers.packets import LAST_NUMBER
 from tests.drivers.judge import Conduct
+from tests.drivers.oracle import number_of
 from tests.simulate.observed import Observed
 
 from .conversation import Talk, heard
@@ -71,12 +73,17 @@ def _judged(talk: Talk, conduct: Conduct) -> Iterator[int]:
             conduct.interrupted()
         record, one = talk.records[row], talk.life.exchanged[index]
         # Superseded packets count as missing. The session counts those with a corrupted number
-        # twice: as stale, and as missing.
+        # twice, as stale and as missing, unless they are no packets at all.
         gap, between = int(record["gap"]), talk.life.exchanged[last + 1 : index]
         missed = max(gap, len(between))
         last = index
-        at_most = gap + sum(packet.given for packet in between)
+        stale = [other for other in between if other.given and _well_formed(other.packet)]
+        at_most = gap + len(stale)
         conduct.judge(one.packet, one.replies[0], record, missed, at_most)
+
+
+def _well_formed(packet: bytes) -> bool:
+    return 1 <= number_of(packet) <= LAST_NUMBER
 
 
 def _note(conduct: Conduct, what: str) -> None:
