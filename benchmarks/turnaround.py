@@ -188,8 +188,8 @@ def summary(times: dict[str, Any]) -> dict[str, Any]:
     result |= {
         "cycles": len(trip(times, "ours")),
         "controller_late": int((times["ours_woke_late"] > PERIOD).sum()),
-        "left_out": status.late - status.answered_late,
-        "answered_late": status.answered_late,
+        "left_out": status.late - status.replied_late,
+        "answered_late": status.replied_late,
         "worst_turnaround_us": round(status.worst_turnaround_us, 1),
         "pickup_us": round(status.pickup_us, 1),
         "records_lost": int(times["exchange_overflow"]),

@@ -18,7 +18,6 @@ from drivers.errors import (
     TransportClosed,
 )
 from drivers.events import (
-    AnswersLost,
     Counters,
     Event,
     GapSeen,
@@ -31,6 +30,7 @@ from drivers.events import (
     OverrideChanged,
     PacketRejected,
     Refused,
+    RepliesLost,
     StateChanged,
 )
 from drivers.exchange.loop import exchange
@@ -55,7 +55,7 @@ from drivers.transports.simulated import (
 from drivers.transports.udp import UdpSpec, UdpTransport
 
 __all__ = [
-    "AnswersLost",
+    "RepliesLost",
     "BoundsName",
     "CorrectionSource",
     "Corrupt",

@@ -20,10 +20,10 @@ class Counters:
     """Packets since the session was created.
 
     `missed` never arrived; `discarded` were dropped by the link, by kind ("foreign", "torn", ...);
-    `not_accepted` are replies that the controller did not accept, see `AnswersLost`.
+    `not_accepted` are replies that the controller did not accept, see `RepliesLost`.
     """
 
-    answered: int = 0
+    replied: int = 0
     duplicates: int = 0
     malformed: int = 0
     stale: int = 0
@@ -65,7 +65,7 @@ class GapSeen:
 
 
 @dataclass(frozen=True)
-class AnswersLost:
+class RepliesLost:
     """The target received in `cycle` is that of an earlier set-point; `count` were not accepted.
 
     Detected only in modes 1, 4 and 5, while a joint moves by more than the standstill threshold per
@@ -154,7 +154,7 @@ Event = (
     InitReceived
     | StateChanged
     | GapSeen
-    | AnswersLost
+    | RepliesLost
     | MotionStarted
     | OverrideChanged
     | HoldChanged

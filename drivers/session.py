@@ -408,7 +408,7 @@ class Session(StateMachine):
         return self._finish(packet, policy.frame.finish(number, status), now)
 
     def _finish(self, packet: bytes, reply: bytes, now: float) -> bytes:
-        self.counters.answered += 1
+        self.counters.replied += 1
         self._last_packet = packet
         self._last_reply = reply
         self._arrived_at = now

@@ -9,7 +9,6 @@ import numpy as np
 
 from drivers.errors import AxisNotInMode, RequestError
 from drivers.events import (
-    AnswersLost,
     Counters,
     Event,
     GapSeen,
@@ -18,6 +17,7 @@ from drivers.events import (
     MotionStarted,
     Outcome,
     OverrideChanged,
+    RepliesLost,
     StateChanged,
 )
 from drivers.execution import Execution
@@ -167,13 +167,13 @@ class StateMachine:
         if not lost:
             return
         self.counters.not_accepted += lost
-        self._events.append(AnswersLost(lost, self.cycle))
+        self._events.append(RepliesLost(lost, self.cycle))
         self._losses.append((self.cycle, lost))
         while self._losses[0][0] <= self.cycle - LOSS_WINDOW:
             self._losses.popleft()
         count = sum(number for _, number in self._losses)
         if count > self._max_gap and self.state is State.OPEN and self.execution:
-            self.stop(f"{count} answers were lost in {LOSS_WINDOW} cycles")
+            self.stop(f"{count} replies were lost in {LOSS_WINDOW} cycles")
 
     def record_gap(self, missed: int, without_reply: int) -> None:
         """Count `missed` packets; too many `without_reply` ones in a row stop a motion."""

@@ -9,8 +9,8 @@ from os import PathLike
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.events import AnswersLost
 from hil.archive import Archive, open_archive
+from hil.archive.header import REPLIES_LOST
 from hil.errors import ArchiveError
 from identification.signals.recording import Recording
 
@@ -112,7 +112,7 @@ def _gaps(archive: Archive) -> NDArray[np.bool_] | None:
     skipped = np.diff(archive.columns["cycle"], prepend=archive.columns["cycle"][0] - 1) > 1
     gaps = np.asarray(skipped | (archive.columns["gap"] > 0))
     if archive.period is not None:
-        unaccepted = [event.time for event in archive.events if event.name == AnswersLost.__name__]
+        unaccepted = [event.time for event in archive.events if event.name == REPLIES_LOST]
         cycles = np.rint(np.array(unaccepted) / archive.period)
         gaps |= np.isin(archive.columns["cycle"], cycles)
     return gaps

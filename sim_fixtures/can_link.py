@@ -1,6 +1,6 @@
 """The controller's end of the CAN profile, as a gateway at the controller.
 
-Start packets consist of many frames and take longer than a cycle on a real bus, so answers to them
+Start packets consist of many frames and take longer than a cycle on a real bus, so replies to them
 are waited for; cyclic packets are timed by the controller.
 """
 
@@ -16,7 +16,7 @@ from drivers.transports.can.profile import BusRates, ControllerEnd
 from drivers.transports.can.transport import CanLink, CanSpec, open_bus
 
 START_PATIENCE: Final = 0.25
-"""Least timeout for the answer to a packet sent as segments [s]."""
+"""Least timeout for the reply to a packet sent as segments [s]."""
 
 
 class CanControllerLink(CanLink):
@@ -58,7 +58,7 @@ class CanControllerLink(CanLink):
             TransportClosed: closed, or the bus failed.
         """
         patience = max(timeout, self._start_patience) if self._awaited else timeout
-        self._awaited = False  # a lost answer is waited for once
+        self._awaited = False  # a lost reply is waited for once
         return super().receive(patience)
 
     @property

@@ -94,7 +94,7 @@ def _cycles(count: int) -> str:
     return "1 cycle" if count == 1 else f"{count} cycles"
 
 
-class Answer(NamedTuple):
+class Requests(NamedTuple):
     """Requests in one reply of the PC.
 
     A `valid` reply has the right number and length; `exit` requests the end of open mode (status
@@ -107,7 +107,7 @@ class Answer(NamedTuple):
     following_error: bool = False
 
 
-MISSING = Answer()
+MISSING = Requests()
 
 
 class LoopProgram:
@@ -199,17 +199,17 @@ class LoopProgram:
         program.reason = "the controller was restarted"
         return program
 
-    def advance(self, answer: Answer, at_rest: bool, own_motion_done: bool = False) -> None:
+    def advance(self, requests: Requests, at_rest: bool, own_motion_done: bool = False) -> None:
         """End the cycle; `at_rest` means that the targets of all axes are at rest."""
         self._age += 1
-        self._missed = 0 if answer.valid else self._missed + 1
+        self._missed = 0 if requests.valid else self._missed + 1
         if self._missed >= self._settings.silence_limit and self.phase < Phase.SHUTDOWN:
             self.reason = f"no valid reply in {self._missed} cycles"
             self._enter(Phase.SHUTDOWN)
         elif self.phase is Phase.START:
-            self._advance_start(answer)
+            self._advance_start(requests)
         elif self.listening:
-            self._advance_open(answer, at_rest)
+            self._advance_open(requests, at_rest)
         elif self.phase is Phase.MOVING:
             if own_motion_done:
                 self._own_motion_over = True
@@ -246,28 +246,28 @@ class LoopProgram:
             for i, is_open in enumerate(self.open_axes)
         ]
 
-    def _advance_start(self, answer: Answer) -> None:
-        """Advance through the packets of the start; an init packet without answer ends it."""
-        if self._start[self._age - 1] and not answer.valid:
-            self.reason = "the init packet was not answered"
+    def _advance_start(self, requests: Requests) -> None:
+        """Advance through the packets of the start; an init packet without reply ends it."""
+        if self._start[self._age - 1] and not requests.valid:
+            self.reason = "the init packet got no reply"
             self._enter(Phase.ENDED)
         elif self._age == len(self._start):
             self._enter(Phase.DRIVE_OFF)
 
-    def _advance_open(self, answer: Answer, at_rest: bool) -> None:
+    def _advance_open(self, requests: Requests, at_rest: bool) -> None:
         """Process a reply while axes are open or opening."""
         settings = self._settings
-        self._missed_open = 0 if answer.valid else self._missed_open + 1
-        if answer.drive_off:
+        self._missed_open = 0 if requests.valid else self._missed_open + 1
+        if requests.drive_off:
             self.openings_lost = 0
             self.reason = "the PC asked for drive off (505)"
             self._stays_off = True
             self._enter(Phase.DRIVE_OFF)
-        elif answer.following_error:
+        elif requests.following_error:
             self._lose_opening("the PC reported a following error (508)")
         elif self._missed >= settings.missed_replies:
             self._miss_replies()
-        elif answer.exit or (self._finishing and at_rest):
+        elif requests.exit or (self._finishing and at_rest):
             self.openings_lost = 0
             self._enter(Phase.CLOSING)
         elif self.phase is Phase.OPENING:
@@ -395,14 +395,14 @@ class Layout:
             packet += self._tail.bytes(MAX_CYCLIC_LENGTH - len(packet))
         return packet
 
-    def move_foreign(self, answer: CyclicPacket) -> None:
+    def move_foreign(self, reply: CyclicPacket) -> None:
         """Move open axes of other arms to the targets of the PC."""
         mode = self._settings.open_mode
         if mode not in _PC_TARGETS:
             return
         for slot in self._foreign.tolist():
-            if self.axes["mode"][slot] == mode == answer.axes["mode"][slot]:
-                target, delta = answer.axes["d"][slot, :2].tolist()
+            if self.axes["mode"][slot] == mode == reply.axes["mode"][slot]:
+                target, delta = reply.axes["d"][slot, :2].tolist()
                 self.axes["d"][slot, :4] = (target, delta, target, delta)
 
     def init(self, drive: SimulatedDrive, period: float) -> bytes:
@@ -829,7 +829,7 @@ class SimulatedController:
     def next_packet(self) -> bytes | None:
         """Return the packet of the cycle that begins; None after the end of the session.
 
-        It is empty while the controller boots. A packet without `accept` counts as not answered.
+        It is empty while the controller boots. A packet without `accept` counts as without reply.
         """
         if self._awaiting:
             self.accept(None)
@@ -857,12 +857,12 @@ class SimulatedController:
             self._silent -= 1
             self._run(Demand([], [], [], []))
             return
-        answer, wanted = self._read(reply) if reply is not None else (MISSING, self._nothing)
+        requests, wanted = self._read(reply) if reply is not None else (MISSING, self._nothing)
         demand = self._targets.advance(self.servo, self.program, wanted)
         if not all(map(isfinite, chain(*demand))):
             self.program.trip("the PC sent a number that is not finite")
         done = self._targets.own_motion_done
-        self.program.advance(answer, not any(demand.delta), done)
+        self.program.advance(requests, not any(demand.delta), done)
         self._run(demand)
         self._number = next_number(self._number)
 
@@ -894,33 +894,33 @@ class SimulatedController:
                     f"threshold {threshold:g}"
                 )
 
-    def _read(self, reply: bytes) -> tuple[Answer, Wanted]:
+    def _read(self, reply: bytes) -> tuple[Requests, Wanted]:
         """Decode a reply: its requests, and the fields of each open axis."""
         program, layout = self.program, self._layout
         try:
             if packet_number(reply) != next_number(self._number):
                 raise PacketError("number", packet_number(reply), "that of this cycle")
             if program.phase is Phase.START:
-                return Answer(valid=True), self._nothing
+                return Requests(valid=True), self._nothing
             packet = CyclicPacket.decode(reply, layout.n_slots)
         except PacketError:
             self.rejected_replies += 1
             return MISSING, self._nothing
         modes: list[int] = packet.axes["mode"].tolist()
-        answer = Answer(
+        requests = Requests(
             valid=True,
             exit=packet.status[self.settings.arm - 1] == EXIT_FROM_OPEN,
             drive_off=Mode.DRIVE_OFF_REQUEST in modes,
             following_error=Mode.FOLLOWING_ERROR in modes,
         )
-        if answer.drive_off or answer.following_error or not program.listening:
-            return answer, self._nothing
+        if requests.drive_off or requests.following_error or not program.listening:
+            return requests, self._nothing
         layout.move_foreign(packet)
-        answered = packet.axes["d"][layout.own].tolist()
+        replied = packet.axes["d"][layout.own].tolist()
         open_mode = self.settings.open_mode
-        return answer, [
+        return requests, [
             fields if is_open and modes[slot] == open_mode else None
-            for is_open, slot, fields in zip(program.open_axes, layout.slots, answered, strict=True)
+            for is_open, slot, fields in zip(program.open_axes, layout.slots, replied, strict=True)
         ]
 
     def _cyclic_packet(self, phase: Phase) -> bytes:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 GRAMMAR: Final = """\
 KIND@CYCLE[xCOUNT][:OPTION]...   cycles count the controller's packets from 0; both up to 1e9
 
-lose@1200x3                      packets to the PC are lost; :to_controller the PC's answers
+lose@1200x3                      packets to the PC are lost; :to_controller the PC's replies
 delay@1200:5ms                   they arrive later, by ms, us, s or cycles (:1.5cycles)
 duplicate@1200                   they arrive twice
 reorder@1200                     the packet is overtaken by the next one

@@ -1,11 +1,11 @@
 """Server of a simulated controller on a real link, in real time.
 
-Cycles begin one period after another. The packet is sent; the first answer with the right number
+Cycles begin one period after another. The packet is sent; the first reply with the right number
 within a period is the reply; other packets are counted and dropped; then controller and arm are
 simulated for a cycle.
 
-Delays of the server are not counted as the PC's: the period for an answer begins when the packet
-was sent, and the link is polled once more before an answer counts as missing. If the server is late
+Delays of the server are not counted as the PC's: the period for a reply begins when the packet
+was sent, and the link is polled once more before a reply counts as missing. If the server is late
 by a period or more, later cycles are shifted; packets are not sent in a burst. `ServeCounts` has
 counts and times, in memory of fixed size.
 """
@@ -127,26 +127,26 @@ class Latencies:
 class ServeCounts:
     """Counts and times of a served session.
 
-    `own_late` are cycles that began late by a tenth of the period or more although the answer
+    `own_late` are cycles that began late by a tenth of the period or more although the reply
     before was in time, `slips` those of them that were late by a period or more.
     """
 
     cycles: int = 0  # packets of the controller, the repeated first one counted once
     knocks: int = 0  # transmissions of the first packet
-    replies: int = 0  # accepted answers, at most one per cycle
-    missed: int = 0  # cycles without a valid answer
-    late: int = 0  # answers after their cycle, not accepted
-    surplus: int = 0  # further answers in an answered cycle
-    rejected: int = 0  # answers of wrong length, number or content
-    stretched: int = 0  # cycles extended to wait for their answer
+    replies: int = 0  # accepted replies, at most one per cycle
+    missed: int = 0  # cycles without a valid reply
+    late: int = 0  # replies after their cycle, not accepted
+    surplus: int = 0  # further replies in a cycle that had one
+    rejected: int = 0  # replies of wrong length, number or content
+    stretched: int = 0  # cycles extended to wait for their reply
     own_late: int = 0
     slips: int = 0
     ended: bool = False  # whether the controller has ended its session (504)
     stretch_max: float = 0.0  # longest extension of a cycle, s
-    answer: Latencies = field(default_factory=Latencies)  # times from the packet to its answer
+    reply: Latencies = field(default_factory=Latencies)  # times from the packet to its reply
     cost: Latencies = field(default_factory=Latencies)  # computing times of a cycle
-    _unanswered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    _answered: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _without_reply: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _replied: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
     def count_reply(self, number: int, *, valid: bool) -> None:
         """Count a reply with the right number, valid for the controller or not."""
@@ -155,20 +155,20 @@ class ServeCounts:
         else:
             self.rejected += 1
             self.missed += 1
-        self._answered.append(number)
+        self._replied.append(number)
 
     def count_missing(self, number: int) -> None:
-        """Count a cycle without the answer `number`."""
+        """Count a cycle without the reply `number`."""
         self.missed += 1
-        self._unanswered.append(number)
+        self._without_reply.append(number)
 
     def count_discarded(self, number: int | None) -> None:
-        """Count an answer that is not that of the present cycle; None if it has no number."""
-        if number is not None and number in self._unanswered:
+        """Count a reply that is not that of the present cycle; None if it has no number."""
+        if number is not None and number in self._without_reply:
             self.late += 1
-            self._unanswered.remove(number)
-            self._answered.append(number)
-        elif number is not None and number in self._answered:
+            self._without_reply.remove(number)
+            self._replied.append(number)
+        elif number is not None and number in self._replied:
             self.surplus += 1
         else:
             self.rejected += 1
@@ -185,7 +185,7 @@ class Clock(Protocol):
 
 
 KNOCK_INTERVAL: Final = 1.0
-"""Seconds between two first packets while no PC answers."""
+"""Seconds between two first packets while no PC replies."""
 PATIENCE: Final = 3.0
 """Time for the arm to stop when the session is to end [s]."""
 _MOST_STRAY: Final = 100
@@ -224,16 +224,16 @@ def serve(
 ) -> ServeCounts:
     """Run a controller on a real link until its session has ended; the link stays open.
 
-    The first packet is repeated once a second until a PC answers, so that either program may be
+    The first packet is repeated once a second until a PC replies, so that either program may be
     started first.
 
     `request` is called every cycle. At `END` the controller ends its session; if the arm does not
     stop within `patience` s, its drive is switched off. At `ABORT` it stops at once. `watch` is
     called once per cycle with the counts so far.
 
-    A cycle without an answer is extended by up to `stretch` s. Real controllers do not extend
-    cycles; this is for PCs with occasional delays. After `END`, a PC that did not answer within an
-    extension is not waited for until it answers again.
+    A cycle without a reply is extended by up to `stretch` s. Real controllers do not extend
+    cycles; this is for PCs with occasional delays. After `END`, a PC that did not reply within an
+    extension is not waited for until it replies again.
     """
     server = _Server(peer, link, request, watch, clock, patience, stretch)
     if server.await_pc():
@@ -255,10 +255,10 @@ class _Server:
     counts: ServeCounts = field(default_factory=ServeCounts)
     due: float = 0.0
     finish_by: float | None = None
-    unanswered: bool = False
+    without_reply: bool = False
 
     def await_pc(self) -> bool:
-        """Repeat the first packet until it is answered; False if the end is requested before."""
+        """Repeat the first packet until it gets a reply; False if the end is requested before."""
         packet = self.peer.next_packet()
         if packet is None:
             self.counts.ended = True
@@ -276,7 +276,7 @@ class _Server:
         return False
 
     def _first_reply(self, packet: bytes, until: float) -> bytes | None:
-        """Return the answer to the first packet, checking for requests every 0.1 s."""
+        """Return the reply to the first packet, checking for requests every 0.1 s."""
         while self.request() is Request.CONTINUE and (now := self.clock.monotonic()) < until:
             reply = self._reply(packet, min(until, now + 0.1))
             self.watch(self.counts)
@@ -297,27 +297,27 @@ class _Server:
                 self.counts.ended = True
                 return
             stretched = self.counts.stretched
-            answered = self._exchange(packet) if packet else self._stay_silent()
-            late_by_missing = not answered or self.counts.stretched > stretched
+            replied = self._exchange(packet) if packet else self._stay_silent()
+            late_by_missing = not replied or self.counts.stretched > stretched
             self.due += self.peer.period
             self.watch(self.counts)
 
     def _exchange(self, packet: bytes) -> bool:
-        """Run one cycle with a packet; return whether it was answered."""
+        """Run one cycle with a packet; return whether it got a reply."""
         sent = self.clock.monotonic()
         self.counts.cycles += 1
         self.link.send(packet)
         reply = self._reply(packet, sent + self.peer.period)
         ending = self.finish_by is not None
-        if reply is None and self.stretch and not (self.unanswered and ending):
+        if reply is None and self.stretch and not (self.without_reply and ending):
             until = sent + self.peer.period
             reply = self._reply(packet, until + self.stretch)
             self.counts.stretched += 1
             extended = self.clock.monotonic() - until
             self.counts.stretch_max = max(self.counts.stretch_max, extended)
-        self.unanswered = reply is None
+        self.without_reply = reply is None
         if reply is not None:
-            self.counts.answer.add(self.clock.monotonic() - sent)
+            self.counts.reply.add(self.clock.monotonic() - sent)
         self._hand_over(packet, reply)
         return reply is not None
 
@@ -353,16 +353,16 @@ class _Server:
             self.due += late
 
     def _reply(self, packet: bytes, until: float) -> bytes | None:
-        """Return the first answer with the next number; count others."""
+        """Return the first reply with the next number; count others."""
         wanted = next_number(packet_number(packet))
         stray = 0
         while stray < _MOST_STRAY:
-            answer = self.link.receive(max(0.0, until - self.clock.monotonic()))
-            if answer is None:
+            reply = self.link.receive(max(0.0, until - self.clock.monotonic()))
+            if reply is None:
                 return None
-            number = _number(answer)
+            number = _number(reply)
             if number == wanted:
-                return answer
+                return reply
             self.counts.count_discarded(number)
             if self.clock.monotonic() > until:
                 stray += 1
@@ -383,7 +383,7 @@ class _Server:
 
 
 def _ends_the_session(packet: bytes) -> bool:
-    """Whether a packet has mode 504, which needs no answer."""
+    """Whether a packet has mode 504, which needs no reply."""
     if len(packet) < HEADER_LENGTH + AXIS_LENGTH or is_init(packet):
         return False
     mode = packet[HEADER_LENGTH : HEADER_LENGTH + 4]

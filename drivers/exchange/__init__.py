@@ -1,1 +1,1 @@
-"""The exchange: answering a controller's packets, in this process or in one of its own."""
+"""The exchange: replying to a controller's packets, in this process or in one of its own."""

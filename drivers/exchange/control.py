@@ -107,7 +107,7 @@ class ControlBlock(ctypes.Structure):
         ended_interval: of its records, -1 if open mode was not reached.
         overflow: records overwritten before they were archived.
         late: packets without a reply within a cycle of their arrival: dropped for a newer one, or
-            answered late; `answered_late` of them were answered.
+            replied to late; `replied_late` of them got a reply.
         not_accepted: replies not accepted by the controller.
         worst_turnaround_us: longest time from arrival (in the kernel, if the link has time stamps)
             to the departure of the reply, µs.
@@ -142,14 +142,14 @@ class ControlBlock(ctypes.Structure):
     ended_outcome: int
     ended_interval: int
     overflow: int
-    answered: int
+    replied: int
     missed: int
     duplicates: int
     stale: int
     malformed: int
     foreign: int
     late: int
-    answered_late: int
+    replied_late: int
     not_accepted: int
     refused: int
     worst_turnaround_us: float

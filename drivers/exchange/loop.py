@@ -28,7 +28,7 @@ PEER_TIMEOUT: Final = 1.0
 MAX_LATE: Final = 2
 """Consecutive late replies that do not stop a motion in open mode."""
 MAX_KINDS: Final = 64
-"""Most packets of one backlog that are answered."""
+"""Most packets of one backlog that get a reply."""
 _MAX_BACKLOG: Final = 100_000
 """Most packets read in search of the newest, more than any kernel queue holds."""
 _COUNT_EVERY: Final = 100
@@ -102,8 +102,8 @@ class ReceiveQueue:
     """Receives packets; of a backlog that formed while this process did not run, the newest.
 
     A reply to any other comes too late, and a motion would run ahead of the arm by one step for
-    each. Of each kind (length, status, modes) only the newest packet is answered, so that the
-    session sees axes open and close; packets before and after an init packet are of different
+    each. Of each kind (length, status, modes) only the newest packet gets a reply, so that
+    the session sees axes open and close; packets before and after an init packet are of different
     kinds. The others are counted as "late".
 
     A full queue contains the oldest packets. If the newest packet found is so old that later ones
@@ -119,7 +119,7 @@ class ReceiveQueue:
         self._earliest_next = -math.inf
 
     def receive(self) -> tuple[Arrival, ...]:
-        """Return the packets to be answered, in order; none if none came before the deadline.
+        """Return the packets to reply to, in order; none if none came before the deadline.
 
         Raises:
             TransportClosed: the link is closed.
@@ -244,7 +244,7 @@ def _ahead(later: int, earlier: int) -> int:
 
 
 class _LatenessMonitor:
-    """Counts replies that leave more than a cycle after their packet arrived, as "answered late".
+    """Counts replies that leave more than a cycle after their packet arrived, as "replied to late".
 
     More than `max_late` in a row, each overtaken by the controller's next packet, stop a motion on
     its path: the controller has accepted none of them, or each in a later cycle than intended. A
@@ -270,7 +270,7 @@ class _LatenessMonitor:
     def after_reply(self, arrived: float, sent: float) -> None:
         """Record the time at which its reply left."""
         if sent - arrived > self._session.period:
-            self._session.discarded("answered late", 1)
+            self._session.discarded("replied to late", 1)
             self._late_reply_at = sent
         else:
             self._late_reply_at = -math.inf
@@ -283,18 +283,18 @@ def exchange(
     until: Callable[[], bool],
     max_late: int = MAX_LATE,
 ) -> None:
-    """Answer packets until `until()` is true, the controller ends the session or the link closes.
+    """Reply to packets until `until()` is true, the controller ends the session or the link closes.
 
     `until` is called after the replies to what was received at once, and at least every 0.1 s; it
-    is the place for work that can wait. Of a backlog only the newest packets are answered
-    (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More than
-    `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
+    is the place for work that can wait. Of a backlog only the newest packets get a
+    reply (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More
+    than `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
     """
     queue = ReceiveQueue(transport, session)
     peers = _PeerSelection(transport, session)
     lateness = _LatenessMonitor(session, max_late)
     handled = 0
-    send, reply = transport.send, session.reply
+    send, reply_to = transport.send, session.reply
     while session.state is not State.ENDED and not until():
         try:
             arrivals = queue.receive()
@@ -306,16 +306,16 @@ def exchange(
             for packet, arrived, ages, stamped in arrivals:
                 lateness.before_reply(arrived if stamped else math.inf)
                 deadline = session.deadline
-                answer = reply(packet, arrived, ages)
-                if answer is not None:
+                reply = reply_to(packet, arrived, ages)
+                if reply is not None:
                     now = transport.now
                     # Silence is counted from the reply: the packet may have been queued for long.
                     if session.deadline != deadline:
                         session.sent(now)
                     # Before it leaves: the controller's next packet may come at once.
                     lateness.after_reply(arrived, now)
-                    send(answer)
-                peers.after_packet(answer is not None)
+                    send(reply)
+                peers.after_packet(reply is not None)
             handled += 1
             if handled % _COUNT_EVERY == 0:
                 _count_rejected(transport, session)

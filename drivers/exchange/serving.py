@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import DriverError, RequestError
-from drivers.events import AnswersLost, Event, GapSeen, LinkLost, MotionEnded, PacketRejected
+from drivers.events import Event, GapSeen, LinkLost, MotionEnded, PacketRejected, RepliesLost
 from drivers.exchange.control import (
     HEARTBEAT_TIMEOUT,
     IDLE_HEARTBEAT_TIMEOUT,
@@ -44,7 +44,7 @@ from drivers.transports.base import Transport
 EVENT_PERIOD: Final = 0.1
 """Shortest time between two reports of events that are counted, s."""
 DETACHED_LINGER: Final = 2.0
-"""Time that packets are answered after the axes closed, without a supervisor, s."""
+"""Time that packets get replies after the axes closed, without a supervisor, s."""
 FINISH_LINGER: Final = 1.0
 """The same when the supervisor requested the end, s; without packets for so long, open axes are
 assumed to have closed."""
@@ -61,10 +61,10 @@ _POSITION: Final = MEASURED.index("position")
 _MAY_BE_OPEN: Final = frozenset(
     {State.OPENING, State.OPEN, State.EXITING, State.FREEZING, State.FAULTED}
 )
-_COUNTERS: Final = ("answered", "missed", "duplicates", "stale", "not_accepted", "refused")
+_COUNTERS: Final = ("replied", "missed", "duplicates", "stale", "not_accepted", "refused")
 """Counters of a session with their own field in the control block."""
 STOPPED: Final = "a stop was requested"
-_Countable = PacketRejected | GapSeen | AnswersLost
+_Countable = PacketRejected | GapSeen | RepliesLost
 
 
 class EventLimiter:
@@ -82,7 +82,7 @@ class EventLimiter:
         """Return the events to be reported at this moment, in order."""
         released: list[Event] = []
         for event in events:
-            if isinstance(event, PacketRejected | GapSeen | AnswersLost):
+            if isinstance(event, PacketRejected | GapSeen | RepliesLost):
                 sort = type(event), getattr(event, "kind", "")
                 pending = self._pending.get(sort)
                 self._pending[sort] = event if pending is None else _sum(pending, event)
@@ -148,8 +148,8 @@ class ControlServer:
         self._stops = control.stop_count
         self._linger = DETACHED_LINGER
         self._calls = 0
-        self._answered = 0
-        self._answered_at = began = time.monotonic()
+        self._replied = 0
+        self._replied_at = began = time.monotonic()
         # Time in which the whole computer stood still must not count as silence.
         self._supervisor = HeartbeatMonitor(
             lambda: control.supervisor_heartbeat or began, max_interval=POLL
@@ -180,7 +180,7 @@ class ControlServer:
         self._events.write(event)
 
     def _measure_latency(self) -> None:
-        """Count the time from the arrival of the packet just answered to this moment."""
+        """Count the time from the arrival of the packet just replied to to this moment."""
         rows = self._ring.written
         if rows == self._rows:
             return
@@ -329,13 +329,13 @@ class ControlServer:
         control.state = session.state
         control.cycle = int(self._ring.cycle[(self._rows - 1) % self._ring.capacity])
         control.interval = session.interval
-        if self._calls % _SLOW_EVERY == 0 or session.counters.answered == self._answered:
+        if self._calls % _SLOW_EVERY == 0 or session.counters.replied == self._replied:
             self._publish_counters()
             self._watch_arm(now)
-        if session.counters.answered != self._answered:
-            self._answered = session.counters.answered
-            self._answered_at = now
-        self._open = session.state in _MAY_BE_OPEN and now - self._answered_at < FINISH_LINGER
+        if session.counters.replied != self._replied:
+            self._replied = session.counters.replied
+            self._replied_at = now
+        self._open = session.state in _MAY_BE_OPEN and now - self._replied_at < FINISH_LINGER
         if self._open:
             self._closed_since = math.inf
         else:
@@ -366,15 +366,15 @@ class ControlServer:
         control.overflow = self._ring.overflow
         control.malformed = counters.malformed + discarded.get("malformed", 0)
         control.foreign = discarded.get("foreign", 0)
-        control.answered_late = discarded.get("answered late", 0)
-        control.late = discarded.get("late", 0) + control.answered_late
+        control.replied_late = discarded.get("replied to late", 0)
+        control.late = discarded.get("late", 0) + control.replied_late
         control.worst_turnaround_us = 1e6 * self._worst
         control.motion_time, control.rate = progress_of(self._source)
 
     def _may_end(self, now: float) -> bool:
         """Whether replies are no longer needed, once there is a reason to end.
 
-        Without a supervisor packets are answered as long as the arm moves, without limit: there is
+        Without a supervisor packets get replies as long as the arm moves, without limit: there is
         nothing to react to what the controller does without replies.
         """
         if self._open or (self._detached and now - self._arm_moved_at < ARM_RESTS):

@@ -48,6 +48,7 @@ CHUNKS = "chunks"  # Entry of the outcome: checksums of all chunks in order. Old
 SEALS = (DESCRIPTION, CHUNKS)  # Entries of the outcome that only serve to verify the file
 CONTROLLER_PROGRAM = "controller"
 """Entry ``motion`` of an archive whose motion was made by a program of the controller."""
+REPLIES_LOST = "AnswersLost"  # Name of the event `drivers.events.RepliesLost`
 REJECTED = "rejected"  # Outcome of a motion that completed and failed its quality check
 MOST_JOINTS: Final = 256
 

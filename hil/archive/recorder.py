@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from drivers.drive_train import DriveTrain
 from drivers.errors import GuardError
 from drivers.events import (
-    AnswersLost,
     GapSeen,
     HoldChanged,
     InitReceived,
@@ -24,6 +23,7 @@ from drivers.events import (
     OverrideChanged,
     PacketRejected,
     Refused,
+    RepliesLost,
     StateChanged,
 )
 from drivers.exchange.event_log import (
@@ -35,6 +35,7 @@ from drivers.exchange.event_log import (
     ExchangeStarted,
     Leaving,
 )
+from hil.archive.header import REPLIES_LOST
 from hil.archive.schema import Level
 from hil.archive.writer import ArchiveWriter
 
@@ -42,7 +43,7 @@ _TEXTS: Final[Mapping[type, tuple[Level, str]]] = {
     InitReceived: (Level.INFO, "the controller started a session{details}"),
     StateChanged: (Level.INFO, "{0.before.name} -> {0.after.name} in cycle {0.cycle}"),
     GapSeen: (Level.WARN, "packets missed before cycle {0.cycle}: {0.missed}"),
-    AnswersLost: (
+    RepliesLost: (
         Level.WARN,
         "replies not accepted by the controller until cycle {0.cycle}: {0.count}",
     ),
@@ -92,8 +93,8 @@ def level_of(event: ExchangeEvent) -> Level:
 
 Records = NDArray[np.void]
 
-LATE_KINDS = frozenset({"late", "answered late"})
-"""Kinds of `PacketRejected`: dropped for a newer packet, or answered after its cycle."""
+LATE_KINDS = frozenset({"late", "replied to late"})
+"""Kinds of `PacketRejected`: dropped for a newer packet, or replied to after its cycle."""
 AFTERMATH = 0.5  # Time recorded after a motion was refused or lost, s
 
 
@@ -184,7 +185,7 @@ class Recorder:
         for event in own:
             if isinstance(event, EventsLost):
                 self._events_lost += event.count
-            elif isinstance(event, AnswersLost):
+            elif isinstance(event, RepliesLost):
                 self._not_accepted += event.count
             elif isinstance(event, PacketRejected) and event.kind in LATE_KINDS:
                 self._late += event.count
@@ -253,6 +254,7 @@ class Recorder:
         if isinstance(event, Refused) and isinstance(event.error, GuardError):
             data = {name: getattr(event.error, name) for name in _REFUSAL_DATA}
         cycle, name = getattr(event, "cycle", None), type(event).__name__
+        name = REPLIES_LOST if isinstance(event, RepliesLost) else name
         self.writer.event(cycle, name, describe(event), level=level_of(event), data=data)
 
     @property
@@ -276,7 +278,7 @@ class Recorder:
 
 
 _DATA: Final[Mapping[type, Sequence[str]]] = {
-    AnswersLost: ("count",),
+    RepliesLost: ("count",),
     OverrideChanged: ("fraction",),
     HoldChanged: ("held",),
 }

@@ -72,8 +72,8 @@ REQUEST_PERIOD: Final = 0.02  # Period of reading the operator's request during 
 SHOW_PERIOD: Final = 0.1  # Period of showing the motion, s
 
 Counts = tuple[int, int, int, int]
-"""Packets of a session that were answered, missed, answered late, and whose reply was not accepted;
-see `drivers.events.Counters`."""
+"""Packets of a session that got a reply, were missed, got it late, and whose reply was not
+accepted; see `drivers.events.Counters`."""
 
 
 class Steering:
@@ -165,7 +165,7 @@ class Steering:
         Shares are of the active limits of `drives` and `guard`.
         """
         self._due = time.monotonic() + SHOW_PERIOD
-        answered, missed, late, not_accepted = np.subtract(self._counts(), self._before).tolist()
+        replied, missed, late, not_accepted = np.subtract(self._counts(), self._before).tolist()
         arrays: dict[str, Array] = {}
         if self._last is not None:
             last = self._last[0]
@@ -182,7 +182,7 @@ class Steering:
             MotionProgress(
                 motion_time=None if math.isnan(motion_time) else motion_time,
                 duration=self._duration,
-                cycles=answered,
+                cycles=replied,
                 missed=missed,
                 late=late,
                 not_accepted=not_accepted,
@@ -303,7 +303,7 @@ class MotionLink(ABC):
             ready = target is not None and self._state() in self._READY
             return ready or stop.requested or self._now() - began > timeout
 
-        self._exchange_until(finished, "the controller gets no answers")
+        self._exchange_until(finished, "the controller gets no replies")
         self._poll()
         self.connection.require_usable()
         if stop.requested:
@@ -758,8 +758,8 @@ class Link(MotionLink):
 
     def _counts(self) -> Counts:
         counters = self.session.counters
-        late = counters.discarded.get("late", 0) + counters.discarded.get("answered late", 0)
-        return counters.answered, counters.missed, late, counters.not_accepted
+        late = counters.discarded.get("late", 0) + counters.discarded.get("replied to late", 0)
+        return counters.replied, counters.missed, late, counters.not_accepted
 
 
 class _Archiving:

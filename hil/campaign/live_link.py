@@ -193,7 +193,7 @@ class ExchangeView:
                 case PacketRejected() if event.reason:
                     self._rejected += event.count
                     packets = plural(self._rejected, "packet")
-                    self.not_understood = f"{packets} came and got no answer: {event.reason}"
+                    self.not_understood = f"{packets} came and got no reply: {event.reason}"
                 case MotionStarted() | EventsLost():
                     self.started = True
                 case ExchangeFailed():
@@ -504,7 +504,7 @@ class LiveLink(MotionLink):
 
     def _counts(self) -> Counts:
         status = self.view.status
-        return status.answered, status.missed, status.late, status.not_accepted
+        return status.replied, status.missed, status.late, status.not_accepted
 
     def _shut(self) -> str | None:
         """End both processes; return what was wrong with them, None if nothing was."""
@@ -618,7 +618,7 @@ class LiveLink(MotionLink):
         if ended is None:
             failure = view.failure() or recorded.reason
             raise ControllerFault(
-                f"{failure}; the controller gets no answers and acts by its own watchdog; "
+                f"{failure}; the controller gets no replies and acts by its own watchdog; "
                 f"the archive ({recorded.outcome}) is complete up to then"
             )
         if ended.reason == NO_ARCHIVE and recorded.disk_waited > SLOW_DISK:
@@ -733,7 +733,7 @@ class LiveLink(MotionLink):
                 self._position,
                 late=status.late,
                 not_accepted=status.not_accepted,
-                waiting="" if status.answered else self._waiting(),
+                waiting="" if status.replied else self._waiting(),
                 over=over,
             )
         )

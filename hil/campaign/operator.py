@@ -80,8 +80,8 @@ class MotionProgress:
 
     Attributes:
         motion_time, duration: s of the planned motion, done and in total; None if unknown.
-        cycles, missed, late, not_accepted: packets of this motion that were answered, never
-            arrived, were answered late or left out, and whose reply was not accepted.
+        cycles, missed, late, not_accepted: packets of this motion that got a reply, never arrived,
+            got it late or not at all, and whose reply was not accepted.
         position: rad, measured.
         following_error: rad, the controller's target minus position.
         current: A at the motors, the controller's target; no current is measured.

@@ -24,7 +24,7 @@ def doctor(
     quick: bool = False,
     json: JsonOption = False,
 ) -> None:
-    """Measure whether this PC can answer a controller every 1 or 2 ms, and list what to change.
+    """Measure whether this PC can reply to a controller every 1 or 2 ms, and list what to change.
 
     Checks permissions, processor, load, route, port or CAN bus, and disk; then measures wake-up and
     turnaround latency in processes with the real-time settings of an exchange. Sends nothing to the

@@ -213,7 +213,7 @@ def _figures(served: Served) -> dict[str, object]:
     """Return the content of `--json`; times in µs."""
     summary = served.summary
     times = {"stretch_max_us": summary.stretch_max}
-    for name, each in (("answer", summary.answer), ("cost", summary.cost)):
+    for name, each in (("answer", summary.reply), ("cost", summary.cost)):
         parts = (f"{name}_{part}_us" for part in ("p50", "p99", "max"))
         times |= zip(parts, _parts(each), strict=True)
     return {

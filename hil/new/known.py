@@ -248,7 +248,7 @@ def _waited_for(view: ExchangeView, wait: float, stop: Stop) -> InitPacket:
             )
         if time.monotonic() > deadline:
             status, text = view.status, f"no init packet within {wait:g} s"
-            if status.answered or status.malformed or status.stale:
+            if status.replied or status.malformed or status.stale:
                 text += ", but other packets: a session was already running"
             text += f"; {view.not_understood}" if view.not_understood else ""
             text += "; start this command first, then the controller's Open program"

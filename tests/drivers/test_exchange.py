@@ -452,14 +452,14 @@ class TestLateness:
     @pytest.mark.parametrize("cost", [0.1, 0.9, 0.99])
     def test_replies_within_their_cycle_are_not_late(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
-        assert session.discards.get("answered late", 0) == 0
+        assert session.discards.get("replied to late", 0) == 0
         assert link.answered == list(range(1, 51))
         assert session.stops == []
 
     @pytest.mark.parametrize("cost", [1.05, 1.1, 1.3, 1.49, 1.6, 3.5])
     def test_slight_overload_stops_the_motion(self, cost, stamped):
         link, session = self.run([cost] * 50, stamped=stamped)
-        assert session.discards["answered late"] >= 49
+        assert session.discards["replied to late"] >= 49
         if stamped:
             assert session.stops[0] == "3 consecutive replies left too late"
         else:
@@ -470,12 +470,12 @@ class TestLateness:
     @pytest.mark.parametrize("state", [State.CLOSED, State.DRIVING_ON, State.EXITING])
     def test_late_replies_are_counted_in_every_state(self, state, stamped):
         _, session = self.run([1.2] * 50, state=state, stamped=stamped)
-        assert session.discards["answered late"] >= 49
+        assert session.discards["replied to late"] >= 49
         assert session.stops == []
 
     def test_controller_that_waits_for_replies_is_not_stopped(self, stamped):
         _, session = self.run([1.2, 1.2, 0.1, 0.1] * 10, stamped=stamped)
-        assert session.discards["answered late"] >= 20
+        assert session.discards["replied to late"] >= 20
         assert session.stops == []  # at most two late replies are consecutive
         _, session = self.run([1.5] * 50, patient=True, stamped=stamped)
         assert session.stops == []
@@ -488,7 +488,7 @@ def test_estimated_arrivals_count_no_reply_as_late(slower):
     arrivals = []
     session.reply = lambda packet, now, ages: arrivals.append(now) or link.reply(packet, now, ages)
     exchange(link, session, until=lambda: False)
-    assert session.discards.get("answered late", 0) == 0
+    assert session.discards.get("replied to late", 0) == 0
     assert session.stops == []
     assert np.diff(arrivals).min() > 0.9 * PERIOD, "they are recorded as they were received"
 

@@ -247,7 +247,7 @@ def test_motion_is_run_and_recorded():
         status = exchange.status()
         assert status.state == State.CLOSED
         assert (status.missed, status.refused, status.overflow) == (0, 0, 0)
-        assert status.late == status.answered_late, "none was left out"
+        assert status.late == status.replied_late, "none was left out"
         assert (status.outcome, status.ended_interval) == ("completed", started.interval)
         assert time.monotonic() - status.exchange_heartbeat < 0.5
         assert exchange.realtime == RealTimeReport("ordinary", False, False)
@@ -434,7 +434,7 @@ def test_backlog_after_a_stall_is_dropped():
         assert controller.moved - before == pytest.approx(PERIOD * Cruise.SPEED, rel=0.01)
         controller.cycle(200)
         status = exchange.status()
-        assert status.late - status.answered_late == 90
+        assert status.late - status.replied_late == 90
         assert status.missed == 90
 
 

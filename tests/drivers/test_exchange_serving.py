@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from drivers import CyclicPacket, GapSeen, Mode, MotionEnded, State, StateChanged
 from drivers.errors import RequestError
-from drivers.events import AnswersLost, Counters, Outcome, PacketRejected
+from drivers.events import Counters, Outcome, PacketRejected, RepliesLost
 from drivers.exchange import control, event_log, motion_transfer
 from drivers.exchange.__main__ import warm_up
 from drivers.exchange.control import (
@@ -131,10 +131,10 @@ class TestEventLimiter:
     def test_first_passes_at_once_and_the_sums_after_the_period(self):
         limiter = EventLimiter()
         assert limiter.filter([GapSeen(1, 7)], 0.0) == [GapSeen(1, 7)]
-        assert limiter.filter([GapSeen(2, 9), AnswersLost(1, 9)], 0.01) == []
-        assert limiter.filter([GapSeen(1, 12), AnswersLost(2, 12)], 0.05) == []
+        assert limiter.filter([GapSeen(2, 9), RepliesLost(1, 9)], 0.01) == []
+        assert limiter.filter([GapSeen(1, 12), RepliesLost(2, 12)], 0.05) == []
         assert limiter.filter([], 0.099) == []
-        assert limiter.filter([], 0.1) == [GapSeen(3, 12), AnswersLost(3, 12)]
+        assert limiter.filter([], 0.1) == [GapSeen(3, 12), RepliesLost(3, 12)]
         assert limiter.filter([], 1.0) == limiter.flush() == []
 
     def test_sums_precede_the_end_of_a_motion(self):
@@ -318,7 +318,7 @@ class Bench:
     def step(self) -> bool:
         """One packet and heartbeat later; whether that is the end."""
         self.control.supervisor_heartbeat = self.clock.time + STEP
-        self.session.counters.answered += self.session.receives_packets
+        self.session.counters.replied += self.session.receives_packets
         return self.later()
 
     def time_to_the_end(self, states) -> float:
@@ -499,9 +499,9 @@ class TestPublished:
         assert (block.ended_count, block.outcome, block.ended_interval) == (1, "refused", 3)
 
     def test_late_replies_are_counted_sent_or_not(self, bench):
-        bench.session.counters.discarded = {"late": 4, "answered late": 3}
+        bench.session.counters.discarded = {"late": 4, "replied to late": 3}
         bench.serving.conclude()
-        assert (bench.control.late, bench.control.answered_late) == (7, 3)
+        assert (bench.control.late, bench.control.replied_late) == (7, 3)
 
 
 @pytest.mark.parametrize("period", [0.001, 0.002])

@@ -7,7 +7,7 @@ import pytest
 
 from drivers import GapSeen, Guard, InitReceived, Mode, MotionEnded, MotionStarted, State
 from drivers.errors import AxisNotInMode, Check
-from drivers.events import AnswersLost
+from drivers.events import RepliesLost
 from drivers.guard import LAG
 from drivers.open_mode import REPETITIONS, SentSetPoints
 from drivers.packets import LAST_NUMBER
@@ -179,7 +179,7 @@ class TestLostReplies:
             assert -1e-5 <= step <= 1.001 * share * STEP
             assert last == 0.0 or abs(step - last) <= PULL
             last = step
-        events = rig.seen(AnswersLost)
+        events = rig.seen(RepliesLost)
         assert sum(event.count for event in events) == rig.session.counters.not_accepted == lost
         assert events[0].cycle == before + 2
         rig.session.stop()
@@ -205,7 +205,7 @@ class TestLostReplies:
         rig = at_speed()
         report_late(rig)
         rig.run_to("stopped")
-        assert rig.ended.reason == "3 answers were lost in 100 cycles"
+        assert rig.ended.reason == "3 replies were lost in 100 cycles"
         sent = rig.records["commanded_position"]
         waits = (np.diff(sent[600:, 0]) == 0.0) & (rig.records["commanded_velocity"][601:, 0] != 0)
         assert waits.sum() == 3
@@ -229,7 +229,7 @@ class TestLostReplies:
             lose(rig, 1)
             rig.cycle(1 if lost > max_gap else pattern - 1)
         rig.run_to("stopped")
-        assert rig.ended.reason == f"{max_gap + 1} answers were lost in 100 cycles"
+        assert rig.ended.reason == f"{max_gap + 1} replies were lost in 100 cycles"
 
     def test_earlier_losses_do_not_count(self):
         rig = at_speed()

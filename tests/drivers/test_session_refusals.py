@@ -17,7 +17,7 @@ from drivers import (
     reply_policy,
 )
 from drivers.errors import Check, ExitTimeout, ModeRefused, RefusalError
-from drivers.events import AnswersLost
+from drivers.events import RepliesLost
 from drivers.packets import DRIVE_ON, LAST_NUMBER
 from drivers.reply_policy import EXIT_RETRY_CYCLES, EXIT_TIMEOUT
 from drivers.session import FLIGHT_RECORDER, STOP_TIMEOUT
@@ -446,7 +446,7 @@ def test_lost_reply_is_counted_in_its_interval_only():
     rig.cycle(5)
     assert rig.state is State.EXITING
     assert rig.session.counters.not_accepted == 1
-    assert len(rig.seen(AnswersLost)) == 1
+    assert len(rig.seen(RepliesLost)) == 1
 
 
 class TestExit:

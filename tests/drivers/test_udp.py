@@ -113,7 +113,7 @@ class TestPeer:
         """Of sync packets nothing is known but that they are shorter than the init packet."""
         rig = Rig()
         controller.send(struct.pack("<i", 3) + bytes(length - 4))
-        exchange(transport, rig.session, until=lambda: rig.session.counters.answered > 0)
+        exchange(transport, rig.session, until=lambda: rig.session.counters.replied > 0)
         controller.wait()
         assert controller.replies == [struct.pack("<i", 4) + bytes(length - 4)]
 
@@ -320,7 +320,7 @@ class TestSession:
 
             def handled(count=count):
                 lost = counters.stale + counters.malformed
-                return counters.answered + counters.duplicates + lost == count
+                return counters.replied + counters.duplicates + lost == count
 
             exchange(transport, session, until=handled)
         for _ in range(5):
@@ -340,7 +340,7 @@ class TestSession:
 
         controller.send(init_packet().encode())
         controller.send(CyclicPacket.zeros(11, N).encode())
-        serve(lambda: session.counters.answered == 2)
+        serve(lambda: session.counters.replied == 2)
         another.send(init_packet().encode())
         assert transport.receive(0.02) is None
         serve(lambda: session.state is State.FAULTED)

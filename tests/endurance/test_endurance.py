@@ -35,7 +35,7 @@ def piece(change: Change = lambda _: None, **campaign: Any) -> Piece:
                 name: {"memory": int(40 * MIB + 4096 * rng.integers(0, 64)), "threads": 1}
                 for name in PROCESSES
             },
-            "counters": {"answered": 100 * second, "missed": 0, "late": 0},
+            "counters": {"replied": 100 * second, "missed": 0, "late": 0},
         }
         change(sample)
         took = 150e-6 * sample["slower"] * np.exp(0.3 * rng.standard_normal(500))
@@ -64,7 +64,7 @@ def slower(sample: Line) -> None:
 
 
 def missing(sample: Line) -> None:
-    sample["counters"]["missed"] = sample["counters"]["answered"] // 50
+    sample["counters"]["missed"] = sample["counters"]["replied"] // 50
 
 
 @pytest.mark.parametrize(
@@ -133,4 +133,4 @@ def test_some_seconds_of_it_leave_archives_and_a_journal(tmp_path: Path) -> None
     last = found.samples[-1]
     assert set(last["processes"]) == set(PROCESSES)
     # Every packet with a reply is in the histogram, but for those under way.
-    assert abs(sum(last["latencies"]) - last["counters"]["answered"]) <= 50
+    assert abs(sum(last["latencies"]) - last["counters"]["replied"]) <= 50

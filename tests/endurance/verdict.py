@@ -117,8 +117,8 @@ def _faults(piece: Piece) -> Iterator[str]:
     if piece.samples:
         counters = piece.samples[-1]["counters"]
         for name in ("missed", "late"):
-            if counters[name] > NOT_IN_TIME * max(1, counters["answered"]):
-                yield f"{counters[name]} of {counters['answered']} replies were {name}"
+            if counters[name] > NOT_IN_TIME * max(1, counters["replied"]):
+                yield f"{counters[name]} of {counters['replied']} replies were {name}"
 
 
 def _growth(piece: Piece) -> Iterator[str]:

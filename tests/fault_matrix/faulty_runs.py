@@ -48,7 +48,7 @@ LIMITS: Final = JointLimits(
     jerk=np.full(N, 3000.0),
 )
 TOLERATED: Final = 4
-"""Answers missing in a row that the controller puts up with; the next one ends open mode."""
+"""Replies missing in a row that the controller puts up with; the next one ends open mode."""
 MAX_GAP: Final = 2  # Of the session, by default
 SESSION_THRESHOLD: Final = 0.6 * small_cell.FOLLOWING_ERROR
 """Narrower than the controller's own, so that the session is the first to notice."""
@@ -64,27 +64,27 @@ FAULTS: Final[Mapping[str, str]] = {
     "3 packets lost": "lose@{c}x3",
     "5 packets lost": "lose@{c}x5",
     "link dead for 0.2 s": "lose@{c}x200",
-    "answer lost": "lose@{c}:to_controller",
-    "3 answers lost": "lose@{c}x3:to_controller",
-    "5 answers lost": "lose@{c}x5:to_controller",
+    "reply lost": "lose@{c}:to_controller",
+    "3 replies lost": "lose@{c}x3:to_controller",
+    "5 replies lost": "lose@{c}x5:to_controller",
     "packet late": "delay@{c}:0.5cycles",
     "packet past its cycle": "delay@{c}:1.5cycles",
-    "answer late": "delay@{c}:0.5cycles:to_controller",
-    "answer past its cycle": "delay@{c}:1.5cycles:to_controller",
+    "reply late": "delay@{c}:0.5cycles:to_controller",
+    "reply past its cycle": "delay@{c}:1.5cycles:to_controller",
     "packet doubled": "duplicate@{c}",
-    "answer doubled": "duplicate@{c}:to_controller",
+    "reply doubled": "duplicate@{c}:to_controller",
     "packets swapped": "reorder@{c}",
-    "answers swapped": "reorder@{c}:to_controller",
+    "replies swapped": "reorder@{c}:to_controller",
     "number a little ahead": "corrupt@{c}:offset=0:mask={ahead}",
     "number far ahead": "corrupt@{c}:offset=1:mask=0x10",
     "status corrupted": "corrupt@{c}:offset=4",
     "mode corrupted": "corrupt@{c}:offset=12",
     "target corrupted": "corrupt@{c}:offset=19:mask=0x40",
     "position corrupted": "corrupt@{c}:offset=27:mask=0x40",
-    "answer's number corrupted": "corrupt@{c}:offset=0:mask=0x40:to_controller",
-    "answer's status corrupted": "corrupt@{c}:offset=4:mask=0x01:to_controller",
-    "answer's mode corrupted": "corrupt@{c}:offset=12:to_controller",
-    "answer's target corrupted": "corrupt@{c}:offset=19:mask=0x40:to_controller",
+    "reply's number corrupted": "corrupt@{c}:offset=0:mask=0x40:to_controller",
+    "reply's status corrupted": "corrupt@{c}:offset=4:mask=0x01:to_controller",
+    "reply's mode corrupted": "corrupt@{c}:offset=12:to_controller",
+    "reply's target corrupted": "corrupt@{c}:offset=19:mask=0x40:to_controller",
     "cold restart": "restart@{c}:cold",
     "warm restart": "restart@{c}:warm",
     "drive drop": "drive-drop@{c}",
@@ -103,10 +103,10 @@ SITUATIONS: Final = (
 )
 ANSWER_MISSING: Final = frozenset(
     name for name in FAULTS if "lost" in name or "past" in name or "swap" in name or "dead" in name
-) | {"number a little ahead", "answer's number corrupted"}
-"""Faults after which the controller is without an answer, so that what it does then matters."""
+) | {"number a little ahead", "reply's number corrupted"}
+"""Faults after which the controller is without a reply, so that what it does then matters."""
 BEHAVIOURS: Final = ("hold", "continue", "drive_off")
-"""What the controller may do while it is without an answer."""
+"""What the controller may do while it is without a reply."""
 HAS_OPEN_AXES: Final = ("opening", "open at rest", "moving", "exiting")
 
 
@@ -425,13 +425,13 @@ def cases() -> Iterator[tuple[str, str, str]]:
 
 
 SPEEDS: Final = (0.25, 0.5, 0.8, 1.0)
-"""Shares of full speed at which packets and answers are lost in a row."""
-FAULTS_AT_SPEED: Final = ("3 packets lost", "5 packets lost", "3 answers lost", "5 answers lost")
-PATIENT: Final = 12  # Answers missing in a row that the controller puts up with in these runs
+"""Shares of full speed at which packets and replies are lost in a row."""
+FAULTS_AT_SPEED: Final = ("3 packets lost", "5 packets lost", "3 replies lost", "5 replies lost")
+PATIENT: Final = 12  # Replies missing in a row that the controller puts up with in these runs
 
 
 def play_at(fault: str, speed: float, while_silent: str) -> Run:
-    """Let packets or answers be lost where the motion has reached a share of full speed."""
+    """Let packets or replies be lost where the motion has reached a share of full speed."""
 
     def run(of_link: tuple[Any, ...], cycle: int) -> Run:
         moving = controller(while_silent, PATIENT)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from drivers.drive_train import DriveTrain
-from drivers.events import AnswersLost, MotionEnded, MotionStarted, PacketRejected
+from drivers.events import MotionEnded, MotionStarted, PacketRejected, RepliesLost
 from drivers.exchange import control as control_memory
 from drivers.exchange import event_log
 from drivers.exchange.control import OUTCOMES, ArchiveState, ControlBlock
@@ -162,8 +162,8 @@ class TestArchiveProcess:
     def test_events_are_counted_in_the_outcome(self, rig: Rig) -> None:
         path, memory = rig.open(1, until_ended=False), rig.memory
         memory.cycles(50)
-        memory.events.write(AnswersLost(2, 10))
-        memory.events.write(PacketRejected("answered late", 3))
+        memory.events.write(RepliesLost(2, 10))
+        memory.events.write(PacketRejected("replied to late", 3))
         memory.events.write(PacketRejected("late", 4))
         wait(lambda: open_archive(path).n_samples > 0)
         for number in range(5000):  # far more than the log holds, faster than it is read

@@ -83,7 +83,7 @@ def test_only_the_newest_archive_may_be_truncated(
 @pytest.mark.parametrize(
     ("victim", "text", "true"),
     [
-        ("exchange", "the exchange process ended; the controller gets no answers", True),
+        ("exchange", "the exchange process ended; the controller gets no replies", True),
         ("exchange", "the exchange process is gone: no such process", True),
         ("exchange", "repetition 1 was lost: nothing was received from the controller", False),
         ("exchange", "the controller did not answer the exchange process", False),

@@ -29,7 +29,7 @@ from sim_fixtures import (
     UnmodelledEffects,
     ns16,
 )
-from sim_fixtures.controller import MISSING, RUN_UP, Answer, LoopProgram, OwnMotion
+from sim_fixtures.controller import MISSING, RUN_UP, LoopProgram, OwnMotion, Requests
 from tests.fault_matrix import small_cell
 from tests.sim_fixtures.bench import DRIVE, SMOOTH_Q, TRUTH, make_drive, motor_matrix, play
 
@@ -567,7 +567,7 @@ class TestLeaving:
         assert seen[-1] == (4, 4)
 
 
-FINE = Answer(valid=True)
+FINE = Requests(valid=True)
 
 
 class TestProgram:
@@ -601,11 +601,11 @@ class TestProgram:
         ("lost_by", "reason"),
         [
             (MISSING, "no valid reply in 1 cycle of open mode"),
-            (Answer(True, following_error=True), "the PC reported a following error (508)"),
+            (Requests(True, following_error=True), "the PC reported a following error (508)"),
         ],
     )
     def test_the_session_ends_after_some_lost_openings_in_a_row(
-        self, lost_by: Answer, reason: str
+        self, lost_by: Requests, reason: str
     ) -> None:
         """Each is followed by a pause."""
         loop = self.program(lost_openings=3, reopening_time=0.05)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from drivers.events import AnswersLost, MotionEnded
+from drivers.events import MotionEnded, RepliesLost
 from hil.campaign.errors import MotionFailedError
 from hil.errors import ControllerFault
 from tests.drivers import oracle
@@ -415,7 +415,7 @@ def test_bounds_of_a_stop_without_lost_answers_are_found(observed: Observed) -> 
     wide = leapt(observed, float(np.min(0.6 * revolutions_of_jerk(observed))))
     cycle = int(observed.runs[0].records["cycle"][moving(observed)[0]])
     events = observed.runs[0].events
-    lost = with_life(wide, 0, events=(*events, (events[-1][0], AnswersLost(3, cycle))))
+    lost = with_life(wide, 0, events=(*events, (events[-1][0], RepliesLost(3, cycle))))
     assert "jerk" in found(wide, "guard")
     assert "jerk" in found(lost, "guard")
 

@@ -13,7 +13,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from drivers.events import AnswersLost, Event, GapSeen, InitReceived, LinkLost, MotionEnded
+from drivers.events import Event, GapSeen, InitReceived, LinkLost, MotionEnded, RepliesLost
 from tests.drivers import oracle
 from tests.simulate.laws import LAWS as OTHERS
 from tests.simulate.laws.conversation import heard
@@ -139,7 +139,7 @@ MET: Final[dict[str, Callable[[Life, Observed], Any]]] = {
     "more were missed than allowed": lambda life, seen: any(
         gap.missed > seen.cell.controller.max_gap for gap in _events(life, GapSeen)
     ),
-    "answers were not taken": lambda life, _: _events(life, AnswersLost),
+    "replies were not accepted": lambda life, _: _events(life, RepliesLost),
     "a set-point was refused": lambda life, _: life.counters.refused,
     "the link fell silent": lambda life, _: _events(life, LinkLost),
     "the controller began anew in mid-run": lambda life, _: _events(life, InitReceived)[1:],

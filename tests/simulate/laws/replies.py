@@ -52,7 +52,7 @@ def _counters(life: Life, one: Heard) -> Iterator[str]:
     late, left_out = found.discarded.get("late", 0), len(one.left_out)
     refused = found.stale + found.malformed + found.ended
     for name, number, least, most in (
-        ("answered", found.answered, answered, answered + slack),
+        ("replied", found.replied, answered, answered + slack),
         ("duplicates", found.duplicates, fates["again"], fates["again"] + slack),
         ("missed", found.missed, one.missed, one.missed + slack * LAST),
         # Duplicates among waiting packets are not counted.
