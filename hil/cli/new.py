@@ -101,17 +101,18 @@ def new(
         # Limits belong together, with their frame.
         known = (known.without("limits") if "limits.frame" in stated.values else known) | stated
     made = replace(made, known=known)
-    text, unknown = (made.for_design() if design_only else made).text(output)
+    made = made.for_design() if design_only else made
+    text, unknown = made.text(output)
     with convert_write_errors(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         if made.urdf is not None:
             write_atomically(made.urdf_beside(output), made.urdf)
         write_atomically(output, text)
     if json:
-        found = {"joints": made.joint_names, "unknown": unknown, "notes": known.notes}
+        found = {"joints": made.joint_names, "unknown": unknown, "notes": made.known.notes}
         print_json({"cell": str(output), **found})
         return
-    for note in known.notes:
+    for note in made.known.notes:
         say(f"note: {note}")
     say(f"{output}: {len(made.joint_names)} joints ({', '.join(made.joint_names)})")
     if unknown:

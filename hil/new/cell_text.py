@@ -24,12 +24,13 @@ from hil.cell.schema import CellFile
 from hil.cell.text import urdf_limits
 from hil.errors import InputError
 from hil.importers import Convention, urdf_of_dh
-from hil.reading import read_input
+from hil.reading import read_input, read_text
 from identification.errors import ModelError
 from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
 
+from .clearance import clear_home
 from .known import ASSUMED, Known, assumed_for_design, from_urdf
 
 Array = NDArray[np.float64]
@@ -165,7 +166,8 @@ class NewCell:
             sources=f"Its values are {origins}." if origins else "",
             joints=", ".join(f"{k} {name}" for k, name in enumerate(self.joint_names, 1)),
         )
-        lines, unknown = [head], list[str]()
+        notes = [line for note in self.known.notes for line in _comment(f"Note: {note}", "# ")]
+        lines, unknown = [head, *notes], list[str]()
         without = ("drive_train", "controller") if self.design_only else ()
         tables = [*CellFile.model_fields, *(name.partition(".")[0] for name in values)]
         for table in (one for one in dict.fromkeys(tables) if one not in without):
@@ -212,9 +214,12 @@ class NewCell:
         return list(found)
 
     def for_design(self) -> NewCell:
-        """Return the cell for design only, with assumed values."""
+        """Return the cell for design only, with assumed values and a clear home posture."""
         known = self.known | assumed_for_design(self.known, len(self.joint_names))
-        return replace(self, known=known, design_only=True)
+        urdf = self.urdf if self.urdf is not None else read_text(self.urdf_path)
+        beside = self.urdf_path.resolve().parent
+        meshes = [str(beside / folder) for folder in self._mesh_folders(beside) or []]
+        return replace(self, known=known | clear_home(urdf, known, meshes), design_only=True)
 
     def urdf_beside(self, path: Path) -> Path:
         """Return the path of a changed URDF: next to the cell file, different from the original."""

@@ -47,7 +47,7 @@ def draw_front(axes: Axes, design: Design) -> None:
     axes.plot(
         front.measure("coupling_index"), front.measure("log10_det"), drawstyle="steps-post",
         color=style.POSITION, linewidth=1.0, marker="o", markersize=3.4,
-        label=f"front, {len(front)} motions",
+        label=f"front, {len(front)} motion{'s' * (len(front) > 1)}",
     )  # fmt: skip
 
     def mark(name: str, measures: Sequence[float], **look: Any) -> None:
@@ -91,8 +91,8 @@ def draw_correlation(axes: Axes, trajectory: Trajectory, model: RobotModel) -> N
     axes.grid(False)
     axes.set_xlabel("parameters by joint, without friction")
     axes.set_title(
-        f"|correlation| from this motion alone, 0 white, 1 black\nall {p} parameters: I_c "
-        f"{coupling_index(gram):.1f} of {coupling_index_max(p):.0f}",
+        f"|correlation| from this motion alone,\n0 white, 1 black; all {p} parameters:\n"
+        f"I_c {coupling_index(gram):.1f} of {coupling_index_max(p):.0f}",
         loc="left",
         color=style.MUTED,
         pad=5.0,

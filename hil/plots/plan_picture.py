@@ -66,8 +66,8 @@ def draw_motion(
 
 
 def wrapped(name: str) -> str:
-    """Return a joint's name in lines that fit the height of a row."""
-    return textwrap.fill(label(name), _LETTERS)
+    """Return a joint's name in lines that fit the height of a row, broken after underscores."""
+    return textwrap.fill(label(name).replace("_", "_ "), _LETTERS).replace("_ ", "_")
 
 
 def _against_limits(axes: Axes, low: float, high: float, values: Array) -> None:

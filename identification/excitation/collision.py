@@ -462,7 +462,8 @@ _MOST_DISTANCES: Final = 30_000
 _NEAR: Final = 0.05
 # Largest variation [m] of the distance of a rotating foot from its obstacle.
 _CONSTANT: Final = 0.002
-# A link that never has the margin must have the largest sampled distance less this [m].
+# A pair that never or hardly has the margin must have the largest sampled distance less this [m],
+# or less half the margin if that is smaller.
 _SLACK: Final = 0.005
 _N_POSTURES = 200
 _SEED = 20140901
@@ -478,10 +479,11 @@ class Contact(NamedTuple):
     time: float | None  #: [s], of a motion
     posture: tuple[float, ...]  #: joint positions there [rad]
     distance: float  #: [m], negative if they overlap
+    required: float  #: least distance of the two [m]
 
 
 class ClosePair(NamedTuple):
-    """Two shapes that are closer than the margin in all sampled postures.
+    """Two shapes that never, or hardly, have the margin in the sampled postures.
 
     Shapes of links have pinocchio's names, the link's with a number.
     """
@@ -508,15 +510,16 @@ class CollisionChecker:
     Links that share a joint are not checked against each other, nor is the base against obstacles.
     Not checked either, if closer than the margin and 5 cm in each of 200 random postures: two
     shapes of the arm at most two joints apart (a wrist), and a shape of the first link at a
-    constant distance from an obstacle (a rotating foot in the floor). One of the first two links
-    that never has the margin from a floor or wall, but does not always touch it, is checked with
-    the largest distance that it can have. `exceptions` reports all of these.
+    constant distance from an obstacle (a rotating foot in the floor). Two shapes at most two joints
+    apart whose largest distance there is about the margin, or less and not excluded as above, but
+    not a touch, are checked with that distance less 5 mm. `exceptions` reports all of these.
 
     Meshes of the robot description, in `mesh_folders` of `package://` paths, are replaced by their
     convex hulls. Random postures are within limits, if given, else ± half a turn.
 
     Attributes:
         separation: distance bounds of the p pairs.
+        required: least distance of each pair (p,) [m].
         unchecked, reduced: pairs that are not checked, or with less than the margin.
         arm_length: length along the arm from the base to its last joint [m]; 1 if it is zero.
 
@@ -549,7 +552,7 @@ class CollisionChecker:
         self.separation = Separation(self._bodies, pairs)
         self._postures = random_postures(chain.n_joints, limits)
         self._tried = self.path(self._postures)
-        self.unchecked, self.reduced = self._find_close_pairs()
+        self.required, self.unchecked, self.reduced = self._find_close_pairs()
         still = np.zeros(chain.n_joints)
         self._turning_reaches = reaches(chain, self._bodies, self.separation, still)
         self.arm_length = _length(chain)
@@ -567,9 +570,7 @@ class CollisionChecker:
         """Message about pairs checked not at all or with less than the margin, None if none."""
         messages = {
             "not checked for collisions, always closer than the margin": self.unchecked,
-            "checked with the largest distance that the mounting allows instead of the margin": (
-                self.reduced
-            ),
+            "checked with less than the margin, which they never or hardly have": self.reduced,
         }
         parts = [
             f"{text}: {'; '.join(map(str, pairs))}" for text, pairs in messages.items() if pairs
@@ -619,39 +620,36 @@ class CollisionChecker:
         a, b = self.indices(pair)
         return self._bodies[a].name, self._bodies[b].name
 
-    def _find_close_pairs(self) -> tuple[tuple[ClosePair, ...], tuple[ClosePair, ...]]:
-        """Remove pairs that are always too close, and move planes back for others."""
+    def _find_close_pairs(self) -> tuple[Array, tuple[ClosePair, ...], tuple[ClosePair, ...]]:
+        """Remove pairs that are always too close; return the least distances of the others."""
         # Removed: two links at most two joints apart that are too close in all postures, and an
-        # obstacle and a shape of the first link at a constant distance below the margin. A plane
-        # is moved back for one of the first two links that never has the margin from it, but does
-        # not touch it in all postures.
+        # obstacle and a shape of the first link at a constant distance below the margin.
         near, samples = min(self.margin, _NEAR), np.arange(_N_POSTURES)
+        slack = min(_SLACK, near / 2.0)
         checked: list[tuple[int, int]] = []
+        required: list[float] = []
         unchecked, reduced = list[ClosePair](), list[ClosePair]()
         for pair in range(len(self.separation.first)):
             a, b = self.indices(pair)
-            obstacle, plane = b >= self._n_links, self._bodies[b].normal is not None
             joints = self._joints_apart(a, b)
             least, most = -np.inf, np.inf
             if joints <= 2:
                 repeated = np.full(_N_POSTURES, pair)
                 bound = self.separation.bound(self._tried.bodies, repeated, samples)
-                if np.all(bound < near):
+                if np.all(bound < near + slack):
                     distances = self._distances(pair)
                     least, most = float(distances.min()), float(distances.max())
-            names = self._bodies[a].shape_name, self._bodies[b].shape_name
-            fixed = joints <= 1 and most - least <= _CONSTANT if obstacle else True
+            close = ClosePair(self._bodies[a].shape_name, self._bodies[b].shape_name, least, most)
+            fixed = joints <= 1 and most - least <= _CONSTANT if b >= self._n_links else True
             if most < near and fixed:
-                unchecked.append(ClosePair(*names, least, most))
+                unchecked.append(close)
                 continue
-            if plane and _SLACK < most < near:
-                reduced.append(ClosePair(*names, least, most))
-                height = float(self._bodies[b].hull.centre[2]) - (self.margin - most + _SLACK)
-                self._bodies.append(floor_at(height))
-                b = len(self._bodies) - 1
+            close_to_margin = slack < most < near + slack
+            reduced += [close] if close_to_margin else []
+            required.append(most - slack if close_to_margin else self.margin)
             checked.append((a, b))
         self.separation = Separation(self._bodies, checked)
-        return tuple(unchecked), tuple(reduced)
+        return np.array(required), tuple(unchecked), tuple(reduced)
 
     def spread(self, first: str, second: str) -> tuple[float, float]:
         """Return the least and largest distance [m] of one of `pairs` in random postures.
@@ -660,7 +658,6 @@ class CollisionChecker:
             ValueError: it is not one of `pairs`.
         """
         pairs = [k for k in range(len(self.separation.first)) if self.names(k) == (first, second)]
-        self._tried = self.path(self._postures)  # with the planes that were moved back
         distances = np.min([self._distances(pair) for pair in pairs], axis=0)
         return float(distances.min()), float(distances.max())
 
@@ -724,7 +721,10 @@ class CollisionChecker:
             gaps = gaps.take(~((gaps.before + gaps.after - change) / 2.0 >= nearest.limit))
         if nearest.contact is None and len(gaps.pair) > 0:
             nearest.touch(
-                int(gaps.pair[0]), float(np.nextafter(self.margin, -1.0)), gaps.start[0], gaps.q0[0]
+                int(gaps.pair[0]),
+                float(np.nextafter(self.required[gaps.pair[0]], -1.0)),
+                gaps.start[0],
+                gaps.q0[0],
             )
         return nearest.contact
 
@@ -734,11 +734,11 @@ class CollisionChecker:
         pairs, samples = np.indices((len(self.separation.first), len(q))).reshape(2, -1)
         lower = self.separation.bound(path.bodies, pairs, samples)
         blocked = np.zeros(len(q), dtype=np.bool_)
-        near = np.flatnonzero(~(lower >= self.margin))
+        near = np.flatnonzero(~(lower >= self.required[pairs]))
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
             pair, sample = int(pairs[k]), int(samples[k])
             if not blocked[sample]:
-                blocked[sample] = not self.distance(pair, path, sample) >= self.margin
+                blocked[sample] = not self.distance(pair, path, sample) >= self.required[pair]
         return np.asarray(~blocked)
 
 
@@ -779,38 +779,45 @@ class _Nearest:
     def __init__(self, checker: CollisionChecker, resolution: float) -> None:
         self._checker, self._resolution = checker, resolution
         self.contact: Contact | None = None
+        self._deepest = 0.0  # its distance beyond the required one [m]
         self.distances = 0
 
     @property
     def limit(self) -> float:
-        """Distance [m] below which a contact would be the deepest one."""
+        """Distance beyond the required one [m] below which a contact would be the deepest."""
         if self.contact is None:
-            return self._checker.margin
-        return self.contact.distance - self._resolution
+            return 0.0
+        return self._deepest - self._resolution
 
     def visit(self, q: Array, time: Array, pair: Indices, sample: Indices) -> Array:
-        """Return bounds of the distances of pairs (k,), in rising order, at samples (k,) of q."""
+        """Return bounds of the distances beyond the required ones, at samples (k,) of q.
+
+        Pairs (k,) are in rising order.
+        """
         checker = self._checker
         path = checker.path(q)
-        lower = checker.separation.bound(path.bodies, pair, sample)
+        required = checker.required[pair]
+        lower = checker.separation.bound(path.bodies, pair, sample) - required
         near = np.flatnonzero(~(lower >= self.limit))
         exact = checker.separation.exact[pair]
         for k in near[np.argsort(lower[near], kind="stable")].tolist():
             if lower[k] >= self.limit:
                 break
             if not exact[k]:
-                lower[k] = checker.distance(int(pair[k]), path, int(sample[k]))
+                lower[k] = checker.distance(int(pair[k]), path, int(sample[k])) - required[k]
                 self.distances += 1
-            if lower[k] < checker.margin and (
-                self.contact is None or lower[k] < self.contact.distance
-            ):
-                self.touch(int(pair[k]), float(lower[k]), time[sample[k]], q[sample[k]])
+            if lower[k] < self._deepest:
+                distance = float(lower[k] + required[k])
+                self.touch(int(pair[k]), distance, time[sample[k]], q[sample[k]])
         return lower
 
     def touch(self, pair: int, distance: float, time: float, posture: Array) -> None:
         """Set the deepest contact."""
         first, second = self._checker.names(pair)
-        self.contact = Contact(first, second, None, float(time), tuple(posture.tolist()), distance)
+        required = float(self._checker.required[pair])
+        at = float(time), tuple(posture.tolist())
+        self.contact = Contact(first, second, None, *at, distance, required)
+        self._deepest = distance - required
 
 
 def _steps(duration: float, step: float) -> int:

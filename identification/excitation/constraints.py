@@ -248,7 +248,7 @@ def _collision(checker: CollisionChecker, contact: Contact) -> Violation:
         "collision",
         f"{contact.first} and {contact.second}",
         contact.distance,
-        checker.workspace.margin,
+        contact.required,
         contact.time,
         contact.posture,
         scale=checker.arm_length,

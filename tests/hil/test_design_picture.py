@@ -127,3 +127,18 @@ class TestPage:
             for name in ("a.png", "b.png"):
                 save(draw_design(design_of(two_link, motion), two_link), tmp_path / name)
             assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+    def test_no_text_of_a_small_arm_leaves_the_page(self, two_link):
+        """With long names, which are broken after underscores, and a front of one motion."""
+        urdf = two_link.urdf.replace('"shoulder"', '"shoulder_pan_joint"')
+        cell = Cell.from_texts(two_link.text, urdf, two_link.path)
+        design = design_of(cell, wandering(cell))
+        front = Front(np.zeros((1, 1)), design.front.measures[:1], np.ones(1))
+        figure = draw_design(replace(design, front=front, origin=0), cell)
+        assert {"front, 1 motion", "shoulder_\npan_joint"} <= set(texts(figure))
+        figure.draw_without_rendering()
+        page = figure.bbox
+        for text in figure.findobj(lambda one: isinstance(one, Text) and len(one.get_text()) > 9):
+            box = text.get_window_extent()
+            assert page.x0 <= box.x0 and box.x1 <= page.x1, text.get_text()
+            assert page.y0 <= box.y0 and box.y1 <= page.y1, text.get_text()

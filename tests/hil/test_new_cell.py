@@ -27,6 +27,7 @@ from hil.cli import app
 from hil.demo_link import SIMULATE, free_port
 from hil.errors import ArchiveError, ControllerFault, InputError
 from hil.importers import Robot
+from hil.motion_checks import collision_checker
 from hil.new import cell_of_urdf, from_archive
 from hil.new.cell_text import with_fixed
 from hil.new.known import _nothing_moves
@@ -38,6 +39,7 @@ from tests.hil.new_cells import TWO_JOINTS, described_robot, filled_in
 
 UR10 = "ur_description/urdf/ur10_robot.urdf"
 PANDA = "panda_description/urdf/panda.urdf"
+TALOS_ARM = "talos_data/robots/talos_left_arm.urdf"
 ON_THE_WIRE = (
     "gear_ratio", "calibration", "k54", "k64", "k65", "current_limit", "following_error"
 )  # fmt: skip
@@ -119,6 +121,28 @@ def test_a_filled_in_cell_runs_a_campaign(
     campaign = Campaign.create(tmp_path / "campaign", cell, plan)
     campaign.run(simulated_link(cell), Stop(), Silent(), durable=False, unrehearsed=True)
     assert len(campaign.folder.completed("excitation")) == 2
+
+
+@pytest.mark.parametrize(
+    ("robot", "home", "floor"),
+    [
+        (UR10, [0.0, -90.0, 0.0, 0.0, 0.0, 0.0], 0.0),
+        (PANDA, [0.0, 0.0, 0.0, -90.0, 0.0, 90.0, 0.0], 0.0),
+        (TALOS_ARM, [82.5, 0.0, -67.5, 0.0, 0.0, 0.0, -30.0], "none"),
+    ],
+)
+def test_a_design_begins_where_the_arm_is_clear(
+    robot: str, home: list[float], floor: float | str, tmp_path: Path
+) -> None:
+    """Joints are turned by 90° where zero is a contact; an arm that hangs has no floor at zero."""
+    summary = new(described_robot(robot), tmp_path / "cell.toml", "--design-only")
+    cell = Cell.load(tmp_path / "cell.toml")
+    assert (cell.campaign.home_deg, cell.file.workspace.floor) == (home, floor)
+    checker = collision_checker(cell)
+    assert checker.clear(cell.home[None]).tolist() == [True]
+    assert checker.exceptions in summary["notes"]
+    comments = " ".join(line.lstrip("# ") for line in cell.text.splitlines())
+    assert all(f"Note: {note}" in comments for note in summary["notes"])
 
 
 @pytest.mark.parametrize("joint", ["panda_finger_joint1", "panda_joint4"])

@@ -345,6 +345,22 @@ class TestPairs:
         assert (contact.first, contact.second, contact.sample) == ("link_0", "link_3", 0)
         assert contact.distance < 0.0
 
+    def test_a_pair_that_hardly_has_the_margin_must_have_less(self):
+        """Its largest distance less 5 mm, as no motion could keep the margin."""
+        urdf = ball_chain(0.08, 0.0, 0.1)
+        _, most = CollisionChecker(urdf, NOWHERE).spread("link_0", "link_2")
+        checker = CollisionChecker(urdf, Workspace(floor=None, margin=most - 0.001))
+        assert (len(checker.reduced), checker.unchecked) == (1, ())
+        assert "link_0_0 and link_2_0" in str(checker.exceptions)
+        q = np.random.default_rng(5).uniform(-np.pi, np.pi, (100, 3))
+        distances = [checker.distance(0, checker.path(q), k) for k in range(len(q))]
+        clear = np.array(distances) >= most - 0.005
+        assert 10 < np.sum(clear) < 90
+        assert checker.clear(q).tolist() == clear.tolist()
+        contact = checker.deepest_contact(q)
+        assert contact.required == pytest.approx(most - 0.005)
+        assert contact.distance == pytest.approx(min(distances), abs=0.005)
+
     def test_missing_limits_leave_no_pair_unchecked(self):
         # Two arms of 0.6 m beyond a turntable; the first swings to and from a box in its way.
         rod = '<cylinder radius="0.05" length="0.5"/>'
