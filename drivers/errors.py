@@ -191,8 +191,7 @@ class GuardError(RefusalError):
     """A quantity outside its bound.
 
     Attributes:
-        kind: the check that failed.
-        check: its quantity.
+        check: the one that failed.
         unit: of value and bound; that of the check if it is None.
         joint: index from 0.
         value: what was found.
@@ -201,24 +200,23 @@ class GuardError(RefusalError):
 
     def __init__(
         self,
-        kind: Check,
+        check: Check,
         joint: int,
         value: float,
         bound: float,
         cycle: int,
         unit: str | None = None,
     ) -> None:
-        self.unit = unit = kind.unit if unit is None else unit
+        self.unit = unit = check.unit if unit is None else unit
         message = (
-            f"{kind.quantity} of joint {joint + 1} is {value:.9g} {unit}; "
+            f"{check.quantity} of joint {joint + 1} is {value:.9g} {unit}; "
             f"allowed is {bound:.9g} {unit}"
         )
         if not math.isfinite(value):
-            kind, message = Check.FINITE, f"joint {joint + 1} has {value} where a number must be"
+            check, message = Check.FINITE, f"joint {joint + 1} has {value} where a number must be"
         super().__init__(message, cycle)
-        self.kind = kind
-        self.check = kind.quantity
-        self.remedy = kind.remedy
+        self.check = check
+        self.remedy = check.remedy
         self.joint = joint
         self.value = value
         self.bound = bound

@@ -268,11 +268,11 @@ class Guard:
         self._feedback_bounds[2] = self.current
         self._feedback_bounds *= 1.0 + RELATIVE_TOLERANCE
 
-    def check_hold(self, target: Array, actual: Array, held: Joints, cycle: int) -> None:
-        """Check that axes `held` (n,) can hold their target (n,) D1 while others are closed."""
-        require_finite(target, held, cycle)
+    def check_hold(self, target: Array, actual: Array, opened: Joints, cycle: int) -> None:
+        """Check that axes `opened` (n,) can hold their target (n,) D1 while others are closed."""
+        require_finite(target, opened, cycle)
         bound = self.following_error * (1.0 + RELATIVE_TOLERANCE)
-        require(held, np.abs(actual - target), bound, Check.FOLLOWING_ERROR, cycle)
+        require(opened, np.abs(actual - target), bound, Check.FOLLOWING_ERROR, cycle)
 
     def begin(self, q: Array, cycle: int) -> None:
         """Check the first set-point q (n,) rad, at rest, which then counts as sent."""

@@ -159,7 +159,7 @@ class OpenMode(ABC):
     Methods that check or send something raise `GuardError` or `SourceFailed`.
 
     Attributes:
-        held: (n,) rad, the set-point sent last.
+        set_point: (n,) rad, the one sent last.
         lost: replies that were not accepted according to the last packet.
     """
 
@@ -172,7 +172,7 @@ class OpenMode(ABC):
         self._mode = mode
         self._still = np.zeros(n)
         self._every = np.ones(n, dtype=np.bool_)
-        self.held = self._still
+        self.set_point = self._still
         self.lost = 0
 
     def receive(
@@ -193,18 +193,18 @@ class OpenMode(ABC):
     def opening(self) -> None:
         """Hold the axes that are open already, by the safe reply."""
         self.lost = 0  # set-points of an earlier interval do not matter
-        held = self._reading.held
-        self.require_holdable(held, held | self._reading.ready)
-        self._record_held(held)
+        returned = self._reading.returned
+        self.require_holdable(returned, returned | self._reading.ready)
+        self._record_returned(returned)
 
-    def _record_held(self, held: Joints) -> None:
-        """Record the targets of `held` joints as commanded, at rest."""
-        self._commanded[0] = np.where(held, self._measured[0], np.nan)
-        self._commanded[1] = np.where(held, 0.0, np.nan)
+    def _record_returned(self, returned: Joints) -> None:
+        """Record the targets of `returned` joints as commanded, at rest."""
+        self._commanded[0] = np.where(returned, self._measured[0], np.nan)
+        self._commanded[1] = np.where(returned, 0.0, np.nan)
 
-    def require_holdable(self, held: Joints, where: Joints) -> None:
-        """Require new targets for joints `held` (n,), and all of `where` near their targets."""
-        self._require_fresh((TARGET,), Check.FIRST_AGE, held)
+    def require_holdable(self, returned: Joints, where: Joints) -> None:
+        """Require new targets for joints `returned` (n,), and all of `where` near their targets."""
+        self._require_fresh((TARGET,), Check.FIRST_AGE, returned)
         self._guard.check_hold(self._raw[TARGET], self._raw[ACTUAL], where, self._cycle)
 
     def require_start(self) -> None:
@@ -274,7 +274,7 @@ class PositionMode(OpenMode):
         self._check_feedback(target)
         if self._feed_forward is not None:
             self._feed_forward.begin()
-        self.held = position
+        self.set_point = position
         self._sent = target
         self._history.begin(target)
         self.lost = 0
@@ -282,7 +282,7 @@ class PositionMode(OpenMode):
         self._rest()
 
     def require_start(self) -> None:
-        """Require the arm at rest at the set-point that was held, too."""
+        """Require the arm at rest at the set-point sent last, too."""
         super().require_start()
         self._check_start(self._sent)
 
@@ -292,7 +292,7 @@ class PositionMode(OpenMode):
         self._check_feedback(self._sent)
         self._check_accepted(stopping=execution is not None and execution.outcome == "stopped")
         if execution is None:
-            self._guard.check_set_point(self.held, self._still, "plan", cycle)
+            self._guard.check_set_point(self.set_point, self._still, "plan", cycle)
             self._rest()
             return
         frame = self._frame.floats
@@ -300,7 +300,7 @@ class PositionMode(OpenMode):
             # The controller holds the target before the last one: send that once more.
             frame[self._slots] = self._last_reply
             self._history.repeat()
-            commanded[0] = self.held
+            commanded[0] = self.set_point
             commanded[1] = self._velocity
             return
         position, velocity, bounds = execution.advance(cycle)
@@ -308,12 +308,12 @@ class PositionMode(OpenMode):
         motor = self._wire.motor(position)
         self._require_closed_still(motor)
         self._step = step = motor - self._sent
-        self._velocity = (position - self.held) / self._guard.period
+        self._velocity = (position - self.set_point) / self._guard.period
         commanded[0], commanded[1] = position, self._velocity
         self._wire.write(frame, motor, step)
         if self._feed_forward is not None:
             self._write_feed_forward(self._feed_forward, execution, step)
-        self.held = position
+        self.set_point = position
         self._sent = motor
         self._history.add(motor)
         self._last_reply = frame[self._slots]
@@ -370,17 +370,17 @@ class PositionMode(OpenMode):
         ahead = self._sent + np.arange(self._missed + 1)[:, None] * step
         steps = int(np.abs(target - ahead).max(axis=1).argmin())
         moved, moves = np.abs((step, velocity[0])).max(axis=1) > self._guard.limits.standstill
-        # For a motion slower than standstill, the target shows whether it was held.
+        # For a motion slower than standstill, the target shows whether the controller held it.
         step = self._still if not moves and (moved or steps == 0) else step
         self._guard.check_after_gap(target, velocity, ahead[steps], step, cycle, where)
         step = velocity[0] if moves else step
-        position = self.held + self._wire.joint_difference(target - self._sent)
+        position = self.set_point + self._wire.joint_difference(target - self._sent)
         speed = self._wire.joint_difference(step) / self._guard.period
         spread = min(SPREAD * steps, round(RETURN / self._guard.period))
         execution.resume_from(position, speed, spread, cycle)
         self._guard.resume_from(position, speed, spread)
         self._history.resume_from(target, step)
-        self.held, self._sent = position, target
+        self.set_point, self._sent = position, target
 
     def check_after_pause(self) -> None:
         """Require after a late packet that the arm moves as the set-points sent last."""
@@ -391,27 +391,27 @@ class PositionMode(OpenMode):
 
     def leaving(self) -> None:
         """Hold axes that were always open at the last set-point, reopened ones at their target."""
-        ready, continuing, held = self._reading.ready, self._continuing, self._reading.held
+        ready, continuing, returned = self._reading.ready, self._continuing, self._reading.returned
         continuing &= ready
-        self.require_holdable(held & ~continuing, held | ready)
-        self._record_held(held)
+        self.require_holdable(returned & ~continuing, returned | ready)
+        self._record_returned(returned)
         self._check_feedback(self._sent, continuing)
         self._check_accepted(continuing)
         if np.array_equal(continuing, self._wire.opened):
             # A source that ends while moving would cause a jump to rest.
-            self._guard.check_set_point(self.held, self._still, "plan", self._cycle)
+            self._guard.check_set_point(self.set_point, self._still, "plan", self._cycle)
         self._history.add(self._sent)
         self._step = self._still
         slots = self._wire.joint_slots[continuing]
         self._frame.floats[slots, D1] = self._sent[continuing]
         self._frame.floats[slots, D2] = 0.0
-        self._commanded[0, continuing] = self.held[continuing]
+        self._commanded[0, continuing] = self.set_point[continuing]
 
     def _rest(self) -> None:
         self._step = self._still
         self._history.add(self._sent)
         self._wire.write(self._frame.floats, self._sent, self._still)
-        self._commanded[0] = self.held
+        self._commanded[0] = self.set_point
         self._commanded[1] = 0.0
 
 
@@ -451,9 +451,9 @@ class CorrectionMode(OpenMode):
 
     def _send_zero(self) -> None:
         self._check_feedback(self._raw[TARGET])
-        self.held = self._measured[0].copy()
-        self._guard.check_position(self.held, self._cycle)
-        self._corrections.set_target(self.held, self._still, self._sent_in())
+        self.set_point = self._measured[0].copy()
+        self._guard.check_position(self.set_point, self._cycle)
+        self._corrections.set_target(self.set_point, self._still, self._sent_in())
         self._record(self._still)
 
     def next(self, execution: Execution | None) -> None:
@@ -463,16 +463,17 @@ class CorrectionMode(OpenMode):
             return
         cycle, guard, target = self._cycle, self._corrections, self._raw[TARGET]
         self._check_feedback(target)
-        self.held = self._measured[0].copy()
+        self.set_point = self._measured[0].copy()
         motion, current, bounds = execution.advance(cycle)
         self._require_fields(motion, current)
         guard.check_motion(motion, bounds, cycle)
         if bounds == "stop" and guard.resting:
             execution.mark_at_rest()
-        self._guard.check_position(self.held + motion if self._offset else self.held, cycle)
+        corrected = self.set_point + motion if self._offset else self.set_point
+        self._guard.check_position(corrected, cycle)
         if self._offset:
             rounding = self._wire.joint_rounding(target)
-            guard.check_target(self.held, motion, self._sent_in(), rounding, cycle)
+            guard.check_target(self.set_point, motion, self._sent_in(), rounding, cycle)
         servo = self._raw[CURRENT] if self._added_to_servo else None
         guard.check_current(current, servo, cycle)
         if execution.finished:
@@ -489,10 +490,10 @@ class CorrectionMode(OpenMode):
 
     def leaving(self) -> None:
         """Send zeros, by the safe reply; the target to an axis in a position mode."""
-        held = self._reading.held
-        if held.any():
-            self.require_holdable(held, held)
-            self._record_held(held)
+        returned = self._reading.returned
+        if returned.any():
+            self.require_holdable(returned, returned)
+            self._record_returned(returned)
         self._check_feedback(self._raw[TARGET], self._reading.ready)
 
     def _sent_in(self) -> Array:

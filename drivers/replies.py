@@ -64,13 +64,13 @@ class SafeReply:
         status: 4 bytes.
         modes: (n,) modes of the reply.
         mask: (n, 9) all bits set in the words that are returned as received, none elsewhere.
-        held: slots in an open mode with their drive on whose target is returned.
+        returned: slots in an open mode with their drive on whose target is returned.
     """
 
     status: bytes
     modes: Words
     mask: Words
-    held: tuple[int, ...]
+    returned: tuple[int, ...]
 
 
 def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeReply:
@@ -85,7 +85,7 @@ def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeR
         on = [any(on)] * N_ARMS
     replied = np.zeros(n, np.int32)
     mask = np.zeros((n, WORDS_PER_AXIS), np.int32)
-    held = []
+    returned = []
     for slot in range(n):
         mode = int(modes[slot])
         if not on[arms[slot] - 1] and mode not in INCREMENTAL:
@@ -95,11 +95,11 @@ def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeR
             replied[slot] = mode
             mask[slot, list(_RETURNED_WORDS[mode])] = _ALL_BITS
             if mode in HOLDABLE:
-                held.append(slot)
-    returned = bytes(
+                returned.append(slot)
+    drives = bytes(
         status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
     )
-    return SafeReply(returned, replied, mask, tuple(held))
+    return SafeReply(drives, replied, mask, tuple(returned))
 
 
 def words_of(packet: CyclicPacket) -> Words:
@@ -158,11 +158,11 @@ class Reading:
         status: status byte of the arm.
         modes: (n,) mode of each joint.
         ready: (n,) joints in the wanted mode; closed ones where they are to stay closed.
-        held: (n,) joints in an open mode whose safe reply is the target received.
+        returned: (n,) joints in an open mode whose safe reply is the target received.
         powered: some wanted axis is in an open mode and the drive is on.
         any_open: some wanted axis is in an open mode.
         unwanted: first joint in an open mode other than the wanted one, or None.
-        other_slots: slots in `reply.held` that are not joints of the arm.
+        other_slots: slots in `reply.returned` that are not joints of the arm.
     """
 
     input: Input
@@ -170,7 +170,7 @@ class Reading:
     status: int
     modes: NDArray[np.int32]
     ready: NDArray[np.bool_]
-    held: NDArray[np.bool_]
+    returned: NDArray[np.bool_]
     powered: bool
     any_open: bool
     unwanted: int | None
@@ -235,9 +235,9 @@ class Reader:
             status=status[self._arm - 1],
             modes=wanted,
             ready=ready,
-            held=np.isin(wanted, list(HOLDABLE)),
+            returned=np.isin(wanted, list(HOLDABLE)),
             powered=drive_on and bool(is_open.any()),
             any_open=bool(is_open.any()),
             unwanted=int(unwanted[0]) if unwanted.size else None,
-            other_slots=tuple(slot for slot in reply.held if slot not in joints),
+            other_slots=tuple(slot for slot in reply.returned if slot not in joints),
         )

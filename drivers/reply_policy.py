@@ -169,7 +169,7 @@ class ReplyPolicy:
                 open_mode.leaving()
             else:
                 open_mode.opening()
-            self._require_targets(reading.reply.held, cycle)
+            self._require_targets(reading.reply.returned, cycle)
             if leaving:
                 machine.record_lost(open_mode.lost)
                 return self._request_exit(status) if self._exit_due(machine) else status
@@ -186,9 +186,9 @@ class ReplyPolicy:
         Raises RefusalError in the first cycle of these.
         """
         try:
-            self._require_targets(reading.reply.held, machine.cycle)
+            self._require_targets(reading.reply.returned, machine.cycle)
             if machine.state is State.FREEZING and self._open_mode is not None:
-                self._open_mode.require_holdable(reading.held, reading.held)
+                self._open_mode.require_holdable(reading.returned, reading.returned)
         except RefusalError as error:
             if not self._reported:
                 self._reported = True
@@ -214,7 +214,7 @@ class ReplyPolicy:
         if machine.execution is not None:
             if machine.cycle - machine.entered_at < self._exit_cycles:
                 return False
-            axes = np.flatnonzero(reading.held) + 1
+            axes = np.flatnonzero(reading.returned) + 1
             hint = (
                 f": if axis {axes[0]} alone is to open, use --only-axis" if len(axes) == 1 else ""
             )
@@ -250,7 +250,7 @@ class ReplyPolicy:
         if execution is None:
             return machine.stop_reason is not None
         if not moving:
-            machine.begin_motion(open_mode.held)
+            machine.begin_motion(open_mode.set_point)
         execution.leaving = execution.settled
         return execution.leaving
 
@@ -285,8 +285,8 @@ class ReplyPolicy:
 
         With a 508 open axes get their target back, so each must be finite.
         """
-        held = list(reading.reply.held)
-        finite = np.isfinite(words.view(np.float32)[held, D1]).all()
+        returned = list(reading.reply.returned)
+        finite = np.isfinite(words.view(np.float32)[returned, D1]).all()
         if offending is None or self._wire is None or not finite:
             self.frame.drive_off(reading.reply, words)
         else:
@@ -301,6 +301,6 @@ class ReplyPolicy:
 
 
 def _offending(error: RefusalError) -> int | None:
-    if isinstance(error, GuardError) and error.kind is Check.FOLLOWING_ERROR:
+    if isinstance(error, GuardError) and error.check is Check.FOLLOWING_ERROR:
         return error.joint
     return None

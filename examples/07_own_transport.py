@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 
 from drivers import CycleRing, Guard, Session, TransportClosed
 from hil import Cell
-from hil.campaign import Link, stop_on_interrupt
+from hil.campaign import VirtualLink, stop_on_interrupt
 from hil.move import plan_move, send
 from hil.plots import save
 from hil.plots.archive_view import draw_archive, view_of
@@ -81,7 +81,7 @@ def main() -> None:
     ring = CycleRing(len(cell.joint_names), capacity=1000)
     guard = Guard(cell.guard_limits, cell.period)
     session = Session(cell.drive_train, guard, ring, **cell.session_settings())
-    link = Link(PipeTransport(pc_end, cell.period), session, ring, guard, cell)
+    link = VirtualLink(PipeTransport(pc_end, cell.period), session, ring, guard, cell)
     with TemporaryDirectory() as folder, stop_on_interrupt() as stop:
         archive = Path(folder) / "move_000_a1.mcap"
         move = plan_move(cell, link.connect(stop), cell.home)

@@ -20,7 +20,7 @@ from drivers.transports.udp import UdpSpec
 from hil.archive.live import LiveView
 from hil.campaign.live_link import LiveLink
 from hil.cell import Cell
-from hil.errors import ControllerFault
+from hil.errors import ControllerFault, ExecutionError
 
 LOOPBACK = "127.0.0.1"
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
@@ -111,7 +111,7 @@ def loopback_link(
     try:
         with LiveLink.open(cell, transport=spec, finish=simulator.finish, live=live) as link:
             yield link
-    except ControllerFault as fault:
+    except ExecutionError as fault:
         if (failure := simulator.failure()) is not None:
             raise ControllerFault(f"the simulated controller failed: {failure}") from fault
         raise

@@ -7,8 +7,9 @@ HilError                   exit status 1
 │   ├── NoExcitationError       every motion of a design would be refused
 │   ├── NotRehearsedError       the plan did not pass its rehearsal
 │   └── DryRunError             the slow dry run of the plan was not accepted
-├── ControllerFault        4: the controller, the link or the guard ended a motion
-│   └── MotionFailedError       with the archive of what was recorded
+├── ExecutionError         4: a motion did not begin, or ended otherwise than planned
+│   ├── ControllerFault         the controller or the link was not ready, or failed
+│   └── MotionFailedError       stopped, refused by this PC, or lost; with its archive
 ├── RepetitionsRejectedError   5: a motion failed its quality check repeatedly
 ├── OperatorStopError         130: stopped by the operator
 ├── OutputError            1: results cannot be written: disk full, no permission
@@ -120,7 +121,11 @@ class OperatorStopError(HilError):
     exit_code: ClassVar[int] = 130
 
 
-class ControllerFault(HilError):  # noqa: N818 - the controller's own word
-    """The controller, the link or the guard ended a motion."""
+class ExecutionError(HilError):
+    """A motion did not begin, or ended otherwise than planned, whoever ended it."""
 
     exit_code: ClassVar[int] = 4
+
+
+class ControllerFault(ExecutionError):  # noqa: N818 - the controller's own word
+    """The controller, or the link to it, was not ready or failed."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.campaign.link import Link
+from hil.campaign.link import VirtualLink
 from hil.cell import Cell, CellError
 from hil.motion_checks import collision_checker
 from sim_fixtures import (
@@ -39,7 +39,7 @@ def simulated_link(
     truth: PlantTruth | None = None,
     instead_of_hardware: bool = False,
     only_axis: int | None = None,
-) -> Link:
+) -> VirtualLink:
     """Return a link in virtual time to a simulated controller; runs are reproducible by seed.
 
     Args:
@@ -66,7 +66,7 @@ def simulated_link(
         cell, effects=effects, drive=drive, truth=truth, settings=settings
     )
     transport = SimulatedTransport(controller)
-    return Link.over(transport, cell, finish=controller.finish, only_axis=only_axis)
+    return VirtualLink.over(transport, cell, finish=controller.finish, only_axis=only_axis)
 
 
 def simulated_controller(

@@ -66,7 +66,7 @@ def run(
     )
     session.request(source)
     link = SimulatedTransport(controller)
-    exchange(link, session, until=lambda: link.cycle > 20_000)
+    exchange(link, session, ends_when=lambda: link.cycle > 20_000)
     events = session.events()
     refusals = [event.error for event in events if isinstance(event, Refused)]
     ends = [event for event in events if isinstance(event, MotionEnded)]

@@ -14,7 +14,7 @@ import pytest
 
 from drivers import SimulatedTransport
 from hil.archive import Archive, ArchiveSpec, open_archive
-from hil.campaign import Link, Stop
+from hil.campaign import Stop, VirtualLink
 from hil.campaign.intervals import START_TOLERANCE, player_of
 from hil.cell import Cell
 from hil.cell.text import replaced_value
@@ -87,7 +87,7 @@ def on_ns16(
     settings = replace(controller_settings(cell), missed_replies=13, while_silent=silent)
     controller = simulated_controller(cell, settings=settings)
     faults = split_faults([parse_fault(fault)])[0] if fault else ()
-    link = Link.over(SimulatedTransport(controller, faults), cell, finish=controller.finish)
+    link = VirtualLink.over(SimulatedTransport(controller, faults), cell, finish=controller.finish)
     link.connect(Stop())
     spec = ArchiveSpec(file, cell.joint_names, cell.period, {"kind": "move"}, durable=False)
     ended = link.run(player_of(cell, path), spec, Stop())

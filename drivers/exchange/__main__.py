@@ -145,7 +145,7 @@ def main(arguments: Sequence[str]) -> int:
 
 def _serve(transport: Transport, session: Session, server: ControlServer, max_late: int) -> int:
     try:
-        exchange(transport, session, until=server, max_late=max_late)
+        exchange(transport, session, ends_when=server, max_late=max_late)
         server.conclude()
     except Exception:
         traceback.print_exc()

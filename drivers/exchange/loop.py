@@ -280,22 +280,22 @@ def exchange(
     transport: Transport,
     session: Session,
     *,
-    until: Callable[[], bool],
+    ends_when: Callable[[], bool],
     max_late: int = MAX_LATE,
 ) -> None:
-    """Reply to packets until `until()` is true, the controller ends the session or the link closes.
+    """Reply to packets until the session ends, the link closes, or `ends_when()` is true.
 
-    `until` is called after the replies to what was received at once, and at least every 0.1 s; it
-    is the place for work that can wait. Of a backlog only the newest packets get a
-    reply (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More
-    than `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
+    `ends_when` is called after the replies to what was received at once, and at least every 0.1 s;
+    it is the place for work that can wait. Of a backlog only the newest packets get a reply
+    (`ReceiveQueue`). A closed link counts as permanent silence, which ends a motion. More than
+    `max_late` consecutive late replies, each overtaken by the next packet, stop a motion.
     """
     queue = ReceiveQueue(transport, session)
     peers = _PeerSelection(transport, session)
     lateness = _LatenessMonitor(session, max_late)
     handled = 0
     send, reply_to = transport.send, session.reply
-    while session.state is not State.ENDED and not until():
+    while session.state is not State.ENDED and not ends_when():
         try:
             arrivals = queue.receive()
             if not arrivals:

@@ -253,6 +253,7 @@ class Recorder:
         data = {name: getattr(event, name) for name in _DATA.get(type(event), ())}
         if isinstance(event, Refused) and isinstance(event.error, GuardError):
             data = {name: getattr(event.error, name) for name in _REFUSAL_DATA}
+            data["check"] = event.error.check.quantity
         cycle, name = getattr(event, "cycle", None), type(event).__name__
         name = REPLIES_LOST if isinstance(event, RepliesLost) else name
         self.writer.event(cycle, name, describe(event), level=level_of(event), data=data)
@@ -283,7 +284,7 @@ _DATA: Final[Mapping[type, Sequence[str]]] = {
     HoldChanged: ("held",),
 }
 """Data of an event beside its cycle."""
-_REFUSAL_DATA: Final = ("check", "joint", "value", "bound", "unit")
+_REFUSAL_DATA: Final = ("joint", "value", "bound", "unit")
 
 
 def _at_rest(ended: MotionEnded) -> bool:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
         NotRehearsedError,
     )
     from .folder import CampaignFolder
-    from .link import Link, MotionLink, Progress
+    from .link import MotionLink, Progress, VirtualLink
     from .operator import Stop, stop_on_interrupt
     from .plan import CampaignPlan, PlannedMotion, design, plan_around
 
@@ -21,7 +21,7 @@ __all__ = [
     "CampaignFolder",
     "CampaignFolderError",
     "CampaignPlan",
-    "Link",
+    "VirtualLink",
     "MotionFailedError",
     "MotionLink",
     "MotionRefusedError",
@@ -36,7 +36,7 @@ __all__ = [
 _HOME = {
     "Campaign": "campaign",
     "CampaignFolder": "folder",
-    **dict.fromkeys(("Link", "MotionLink", "Progress"), "link"),
+    **dict.fromkeys(("VirtualLink", "MotionLink", "Progress"), "link"),
     **dict.fromkeys(("Stop", "stop_on_interrupt"), "operator"),
     **dict.fromkeys(("CampaignPlan", "PlannedMotion", "design", "plan_around"), "plan"),
 }

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from drivers.events import Refused
-from hil.errors import ControllerFault, HilError, InputError, UnsafeError
+from hil.errors import ExecutionError, HilError, InputError, UnsafeError
 from hil.terminal_text import plural
 
 
@@ -25,11 +25,11 @@ class MotionRefusedError(UnsafeError):
         super().__init__(f"{motion} was not sent: {problem}; {remedy}.")
 
 
-class MotionFailedError(ControllerFault):
+class MotionFailedError(ExecutionError):
     """A motion ended otherwise than planned; what was recorded is archived.
 
     Attributes:
-        outcome: "stopped", "refused" or "lost".
+        outcome: "stopped", "refused" by this PC, or "lost".
         sentence: motion, archive, outcome and reason.
         refused: the refusal, with its error and the last records before it; else None.
     """

@@ -100,7 +100,7 @@ def planned_intervals(cell: Cell, plan: CampaignPlan) -> list[Interval]:
     """Return all motions of a plan, without the moves between them."""
     repetitions, excitation = cell.campaign.repetitions, plan.excitation.trajectory
     return [
-        Interval("standstill", 0, hold(cell.home, cell.campaign.standstill_s)),
+        Interval("standstill", 0, rest(cell.home, cell.campaign.standstill_s)),
         *(Interval("excitation", k, excitation, plan.moves) for k in range(repetitions)),
         *(Interval("validation", k, m.trajectory, m.moves) for k, m in enumerate(plan.validation)),
     ]
@@ -186,7 +186,7 @@ def player_of(cell: Cell, trajectory: PiecewiseCubic | FourierSeries) -> Traject
     )
 
 
-def hold(position: Array, duration: float) -> PiecewiseCubic:
+def rest(position: Array, duration: float) -> PiecewiseCubic:
     """Return a rest at `position` (n,) [rad] of `duration` s."""
     return PiecewiseCubic(
         knots=tuple(np.array([0.0, duration]) for _ in position),

@@ -1,6 +1,6 @@
 """Connections to a controller: run motions on it, or record those of its own program.
 
-`Link` is a `MotionLink` in virtual time, where exchange and archive share one thread;
+`VirtualLink` is a `MotionLink` in virtual time, where exchange and archive share one thread;
 `hil.campaign.live_link` is that in real time.
 """
 
@@ -565,7 +565,7 @@ AFTERMATH_CYCLES: Final = 1000
 
 
 @dataclass(eq=False, repr=False)
-class Link(MotionLink):
+class VirtualLink(MotionLink):
     """Session, transport and recorder of one connection in virtual time.
 
     Attributes:
@@ -593,7 +593,7 @@ class Link(MotionLink):
         finish: Callable[[], None] = lambda: None,
         *,
         only_axis: int | None = None,
-    ) -> Link:
+    ) -> VirtualLink:
         """Return a link to the simulated controller of `cell` (TypeError for a real transport)."""
         if not isinstance(transport, SimulatedTransport):
             raise TypeError(
@@ -621,7 +621,7 @@ class Link(MotionLink):
             self.ring.drain()
             return self.transport.now > deadline
 
-        exchange(self.transport, self.session, until=finished)
+        exchange(self.transport, self.session, ends_when=finished)
         if self.session.state in HAS_SET_POINTS:
             raise ControllerFault(
                 f"an axis is still open {END_TIMEOUT:g} s after the controller was asked to end"
@@ -675,7 +675,7 @@ class Link(MotionLink):
             complete = recorder.complete and self.session.state not in HAS_SET_POINTS
             return complete or patience < 0 or no_start is not None
 
-        exchange(self.transport, self.session, until=finished)
+        exchange(self.transport, self.session, ends_when=finished)
         if no_start is not None:
             self.session.stop(no_start)
         archiving.finish()
@@ -722,7 +722,7 @@ class Link(MotionLink):
             full = recorder.records + DRAIN_CYCLES - until_drain >= limit
             return full or stop.requested or recorder.restarted or recorder.link_lost
 
-        exchange(self.transport, self.session, until=finished)
+        exchange(self.transport, self.session, ends_when=finished)
         archiving.finish()
         end = recording_end(
             restarted=recorder.restarted,
@@ -754,7 +754,7 @@ class Link(MotionLink):
         return self.ring.drain()
 
     def _exchange_until(self, finished: Callable[[], bool], _consequence: str, /) -> None:
-        exchange(self.transport, self.session, until=finished)
+        exchange(self.transport, self.session, ends_when=finished)
 
     def _counts(self) -> Counts:
         counters = self.session.counters
@@ -765,7 +765,7 @@ class Link(MotionLink):
 class _Archiving:
     """Moves records and events from the session into an archive, and to `steering`."""
 
-    def __init__(self, link: Link, writer: ArchiveWriter) -> None:
+    def __init__(self, link: VirtualLink, writer: ArchiveWriter) -> None:
         self.recorder = Recorder(writer, link.session.drive_train)
         self.started = False
         self.steering: Steering | None = None

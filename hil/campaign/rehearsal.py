@@ -21,7 +21,7 @@ from pydantic import StrictBool, model_validator
 from drivers.transports.simulated import Delay, Duplicate, Fault, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.cell import Cell
-from hil.errors import ControllerFault, HilError, InputError, OperatorStopError
+from hil.errors import ExecutionError, HilError, InputError, OperatorStopError
 from hil.files import make_folder, write_output
 from hil.motion_checks import PLANNED_CURRENT
 from hil.progress import Reporter
@@ -42,7 +42,7 @@ from sim_fixtures import ServoSettings, SimulationError, UnmodelledEffects
 from .errors import CampaignFolderError, MotionFailedError, RepetitionsRejectedError
 from .folder import CampaignFolder, load_record
 from .intervals import planned_intervals, require_runnable
-from .link import Link
+from .link import VirtualLink
 from .operator import Stop
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ class Twin:
         )
         return cls(twin, planted_values(twin), tuple(assumed), seed)
 
-    def link(self, seconds: float, *, effects: bool) -> Link:
+    def link(self, seconds: float, *, effects: bool) -> VirtualLink:
         """Return a link in virtual time to the arm, with random faults."""
         table = self.cell.controller
         # The current loop has the delay of `[controller] current_delay_cycles`.
@@ -199,7 +199,7 @@ class Twin:
             self.cell, settings=settings, effects=effects, seed=self.seed
         )
         faults = link_faults(self.cell, _HORIZON * seconds, self.seed)
-        return Link.over(
+        return VirtualLink.over(
             SimulatedTransport(controller, faults), self.cell, finish=controller.finish
         )
 
@@ -493,13 +493,15 @@ def _rehearsed(
     )
 
 
-def _failure(rehearsal: Campaign, link: Link, twin: Twin, reporter: Reporter, stop: Stop) -> str:
+def _failure(
+    rehearsal: Campaign, link: VirtualLink, twin: Twin, reporter: Reporter, stop: Stop
+) -> str:
     """Run what is missing; return the failure in a sentence, "" for none."""
     try:
         rehearsal.run(
             link, stop, reporter, provenance=twin.provenance, durable=False, unrehearsed=True
         )
-    except (ControllerFault, RepetitionsRejectedError, SimulationError) as error:
+    except (ExecutionError, RepetitionsRejectedError, SimulationError) as error:
         if stop.requested:
             raise OperatorStopError("the rehearsal was stopped; rehearse again") from error
         if isinstance(error, MotionFailedError):

@@ -40,7 +40,7 @@ from .intervals import (
     player_of,
     require_allowed,
 )
-from .link import NOT_STARTED, Link, MotionLink, active_checks, narrower_limits
+from .link import NOT_STARTED, MotionLink, VirtualLink, active_checks, narrower_limits
 from .live_link import LiveLink
 from .operator import Operator, RunWatch, Stop
 from .plan import CampaignPlan, moves_to_dict
@@ -126,7 +126,7 @@ class Run:
         self.watch = RunWatch(self.operator, self.stop)
         self.wanted = planned_intervals(self.cell, self.plan)
         self.simulated: bool = (self.cell if self.link is None else self.link).only_simulated
-        self.virtual = isinstance(self.link, Link) or (
+        self.virtual = isinstance(self.link, VirtualLink) or (
             self.link is None and self.cell.controller.transport == "simulated"
         )
 

@@ -22,7 +22,7 @@ from hil.cell import Cell
 from hil.cli.arguments import JsonOption, QuietOption
 from hil.cli.verdict import finish
 from hil.design import load_design
-from hil.errors import ControllerFault, InputError, OperatorStopError
+from hil.errors import ExecutionError, InputError, OperatorStopError
 from hil.outcome import FILES, REPORT, RESULTS, SERIES
 from hil.progress import Reporter
 from hil.progress import reporter as make_reporter
@@ -97,7 +97,7 @@ def _run(campaign: Campaign, reporter: Reporter, *, effects: bool) -> None:
                 provenance=simulated_provenance(cell, effects),
                 unrehearsed=True,  # the arm is simulated
             )
-        except ControllerFault as fault:
+        except ExecutionError as fault:
             if stop.requested:
                 raise OperatorStopError(f"{fault} Resume with --resume.") from fault
             raise

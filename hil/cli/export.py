@@ -17,7 +17,7 @@ from hil.cli.arguments import (
 from hil.cli.identify_options import FEW, EstimatorOption, Identifying
 from hil.cli.verdict import NOT_GOOD
 from hil.exporting import FormatName, default_output, export_model
-from hil.identify import identify_sources
+from hil.identify import identify_paths
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 
@@ -48,7 +48,7 @@ def export(
             working directory.
     """
     reporter = make_reporter(quiet=quiet or json)
-    found = identify_sources(archives, reporter, how.options(estimator=estimator))
+    found = identify_paths(archives, reporter, how.options(estimator=estimator))
     target = output or default_output(archives, to)
     exported = export_model(found, target, to)
     if json:

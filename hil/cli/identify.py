@@ -11,7 +11,7 @@ from hil.cli.arguments import ArchivesArgument, JsonOption, QuietOption, with_op
 from hil.cli.identify_options import EstimatorOption, Identifying
 from hil.cli.verdict import finish
 from hil.files import make_folder
-from hil.identify import identify_sources
+from hil.identify import identify_paths
 from hil.outcome import write_outcome
 from hil.progress import reporter as make_reporter
 
@@ -53,7 +53,7 @@ def identify(
         output = output or (archives[0] / "paper" if paper else archives[0])
     if output is not None:
         make_folder(output)
-    found = identify_sources(archives, reporter, options, predict=predict or ())
+    found = identify_paths(archives, reporter, options, predict=predict or ())
     results = found.results
     if output is not None:
         results = write_outcome(output, found, reporter)

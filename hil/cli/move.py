@@ -19,7 +19,7 @@ from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.cell import AngleFrame, Cell
 from hil.cell_link import cell_link
 from hil.cli.arguments import JsonOption
-from hil.errors import ControllerFault, InputError, OperatorStopError, UnsafeError
+from hil.errors import ControllerFault, ExecutionError, InputError, OperatorStopError, UnsafeError
 from hil.files import make_folder
 from hil.move import THERE, CheckedMove, axis_alone, plan_move, posture, send, turned
 from hil.progress import Task, say
@@ -145,7 +145,7 @@ def move(
         raise OperatorStopError(how).beside(figures)
     if ended.outcome != "completed":
         why = f"the motion ended {ended.outcome}: {ended.reason}; {path} is complete."
-        raise ControllerFault(why).beside(figures)
+        raise ExecutionError(why).beside(figures)
 
 
 class _Shown:

@@ -15,7 +15,7 @@ from hil.campaign.run import RunResult
 from hil.cell_link import require_real_time
 from hil.cli.arguments import CampaignArgument, JsonOption, QuietOption, print_json
 from hil.cli.verdict import NOT_GOOD, as_json, finish
-from hil.errors import ControllerFault, InputError, OperatorStopError
+from hil.errors import ExecutionError, InputError, OperatorStopError
 from hil.progress import reporter as make_reporter
 from hil.progress import say
 from hil.screen import Screen
@@ -91,7 +91,7 @@ def _run(
             return campaign.run(
                 stop=stop, reporter=operator, operator=operator, live=view, **choices
             )
-        except (ControllerFault, OSError) as fault:
+        except (ExecutionError, OSError) as fault:
             failed = isinstance(fault, MotionFailedError) and fault.outcome != "stopped"
             if stop.requested and not failed:  # an OSError: of a terminal that was closed
                 again = f"Resume with `hil run {campaign.folder.root}`."

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 from .options import Options
 
 if TYPE_CHECKING:
-    from .run import Identification, identify_archives, identify_campaign, identify_sources
+    from .run import Identification, identify_archives, identify_campaign, identify_paths
 
 __all__ = [
     "Identification",
     "Options",
     "identify_archives",
     "identify_campaign",
-    "identify_sources",
+    "identify_paths",
 ]
 
 

@@ -102,7 +102,7 @@ def consistency_of(model: RobotModel, training: Factor, held_out: Factor) -> Con
         return str(error)
 
 
-def identify_sources(
+def identify_paths(
     paths: Sequence[Path],
     reporter: Reporter,
     options: Options = Options(),

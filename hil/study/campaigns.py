@@ -16,7 +16,7 @@ from hil.cell import Cell
 from hil.design import DesignResult, DesignSettings, preset
 from hil.design.advice import NoExcitationError
 from hil.design.run import DesignFolder, run_design
-from hil.errors import ControllerFault, HilError
+from hil.errors import ExecutionError, HilError
 from hil.motion_checks import MotionChecks
 from hil.progress import Reporter, Silent
 from hil.simulation import simulated_link, simulated_provenance
@@ -198,7 +198,7 @@ def execute(execution: Execution) -> None:
             durable=False,
             unrehearsed=True,
         )
-    except (ControllerFault, RepetitionsRejectedError) as error:
+    except (ExecutionError, RepetitionsRejectedError) as error:
         raise StudyError(
             f"the controller ended the excitation: {error}; search another one with --seed, in"
             " another folder"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.transports.simulated import SimulatedTransport
-from hil.campaign import Campaign, Link, design
+from hil.campaign import Campaign, VirtualLink, design
 from hil.cell import Cell
 from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.progress import Silent
@@ -62,14 +62,16 @@ def faulty_controller(cell: Cell, *lines: str) -> SimulatedController:
     return simulated_controller(cell, faults=own)
 
 
-def faulty_link(cell: Cell, *lines: str, controller: SimulatedController | None = None) -> Link:
+def faulty_link(
+    cell: Cell, *lines: str, controller: SimulatedController | None = None
+) -> VirtualLink:
     """Return a link in virtual time to a simulated controller, not yet connected.
 
     `controller` is by default `faulty_controller` of the same lines (FaultScriptError).
     """
     controller = controller or faulty_controller(cell, *lines)
     of_link, _ = split_faults(map(parse_fault, lines))
-    return Link.over(SimulatedTransport(controller, of_link), cell, controller.finish)
+    return VirtualLink.over(SimulatedTransport(controller, of_link), cell, controller.finish)
 
 
 PATIENCE: Final = 0.5

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from hil.campaign import Campaign, Link
+    from hil.campaign import Campaign, VirtualLink
     from hil.cell import Cell
     from hil.testing.faulty import UdpController
     from sim_fixtures import SimulatedController
@@ -64,7 +64,7 @@ def simulated_link(
     simulated_cell: Cell,
     simulated_controller: SimulatedController,
     controller_faults: tuple[str, ...],
-) -> Link:
+) -> VirtualLink:
     """A link to `simulated_controller` for `Campaign.run`, not yet connected."""
     from hil.testing.faulty import faulty_link
 

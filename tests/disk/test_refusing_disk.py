@@ -21,7 +21,7 @@ from typer.testing import CliRunner, Result
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignPlan
-from hil.campaign.link import Link
+from hil.campaign.link import VirtualLink
 from hil.cell import Cell
 from hil.cli import app
 from hil.errors import ArchiveError, HilError, NotAnArchiveError, OutputError
@@ -302,7 +302,7 @@ def test_removed_folder_is_reported_with_the_arm_at_rest(
 ) -> None:
     root = small.folder.root
     controller = simulated_controller(small.cell, settings=controller_settings(small.cell))
-    link = Link.over(SimulatedTransport(controller), small.cell, finish=controller.finish)
+    link = VirtualLink.over(SimulatedTransport(controller), small.cell, finish=controller.finish)
     remove_at(monkeypatch, small, "excitation_000_a1.mcap", parts)
     with pytest.raises(HilError) as raised:
         small.run(link, None, Silent(), accept_dry_run=True, durable=True)

@@ -200,7 +200,7 @@ def session_on(profile, *, until, clock=None, ends=None, controller=None, sessio
     link = PacedByPackets(near, far, controller, lost=lost, clock=clock)
     guard = Guard(wide_limits(), controller.period)
     session = session or Session(NS16.drive_train, guard, CycleRing(N, 64))
-    exchange(link, session, until=lambda: until(link))
+    exchange(link, session, ends_when=lambda: until(link))
     return link, session
 
 

@@ -433,7 +433,7 @@ def all_drive_off(answer: CyclicPacket) -> bool:
 
 def kind_of(error: Exception) -> object:
     """Return the check of a guard's error, the class of any other."""
-    return error.kind if isinstance(error, GuardError) else type(error)
+    return error.check if isinstance(error, GuardError) else type(error)
 
 
 def assert_refused(rig: Rig, answer: CyclicPacket, kind: object) -> Exception:
@@ -474,5 +474,5 @@ def refused(kind: Check, check: Callable[..., object], *args: Any, **named: Any)
     """Return the error that a check raises, which must be of this kind."""
     with pytest.raises(GuardError) as caught:
         check(*args, **named)
-    assert caught.value.kind is kind
+    assert caught.value.check is kind
     return caught.value

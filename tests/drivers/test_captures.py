@@ -280,7 +280,7 @@ def test_replies_are_the_documented_ones(shared_data: Path, name: str):
     (ended,) = replay.seen(MotionEnded)
     # In the others the drive went off, or open mode was closed, with the last set-point.
     assert ended.outcome == {"a_508": "refused", "a_exit": "completed"}.get(name, "lost")
-    refused = [(event.error.kind, event.error.joint) for event in replay.seen(Refused)]
+    refused = [(event.error.check, event.error.joint) for event in replay.seen(Refused)]
     assert refused == ([(Check.VELOCITY, 0)] if name == "a_508" else [])
 
 

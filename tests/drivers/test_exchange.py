@@ -76,7 +76,7 @@ def run(faults=(), *, stays=2000, source=None):
     controller = Controller(rig, stays)
     transport = SimulatedTransport(controller, faults)
     rig.session.request(source or smooth_move(MOVE, 300))
-    exchange(transport, rig.session, until=lambda: False)
+    exchange(transport, rig.session, ends_when=lambda: False)
     rig.events += rig.session.events()
     return rig, controller, transport
 
@@ -129,7 +129,7 @@ class TestExchange:
         rig = Rig()
         controller = Controller(rig)
         transport = SimulatedTransport(controller)
-        exchange(transport, rig.session, until=lambda: rig.session.state is State.CLOSED)
+        exchange(transport, rig.session, ends_when=lambda: rig.session.state is State.CLOSED)
         assert controller.cycle == 21
         assert len(controller.replies) == 21, "the last packet was answered too"
 
@@ -210,7 +210,7 @@ class TestBacklog:
     def serve(self, rig, on_time, late):
         """Deliver one packet in time, then a batch."""
         link = Backlogged([[on_time], late], rig.now)
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         return link.sent
 
     @staticmethod
@@ -246,7 +246,7 @@ class TestBacklog:
         times = rig.now + PERIOD * np.array([1.0, *bunch])
         link = Bunched(zip(times, packets, strict=True))
         advances = source.advances
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         assert source.advances <= advances + 3
         assert len(link.sent) == (3 if after else 2)
         assert link.sent[-1][:4] == self.number_after(rig)
@@ -328,7 +328,7 @@ class TestBacklog:
         ]
         session = EchoSession()
         link = Backlogged([packets])
-        exchange(link, session, until=lambda: False)
+        exchange(link, session, ends_when=lambda: False)
         # The first one came alone.
         newest = sorted({status: number for number, status in enumerate(statuses[1:], 1)}.values())
         expected = [*packets[:1], *(packets[number] for number in newest[-MAX_KINDS:])]
@@ -355,7 +355,7 @@ class TestBacklog:
 
         link.receive = aging
         rig.session.reply = lambda packet, now, age: ages.append(age[0, 0]) or reply(packet, now)
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         assert ages == [1, 2, 3, 4]
 
     def test_packet_and_duplicate_get_one_reply(self):
@@ -435,7 +435,7 @@ def test_last_rejections_of_the_link_are_counted(end):
     link, session = Paced([0.1] * 7), EchoSession()
     link.rejected = lambda: {"foreign": 1}
     session.reply = link.reply
-    exchange(link, session, until=lambda: end == "asked for" and not link.costs)
+    exchange(link, session, ends_when=lambda: end == "asked for" and not link.costs)
     assert len(link.answered) == 7
     assert session.discards["foreign"] == 1  # at the end: fewer packets than between two readings
 
@@ -446,7 +446,7 @@ class TestLateness:
         link, session = Paced(costs, patient=patient, stamped=stamped), EchoSession()
         session.state = state
         session.reply = link.reply
-        exchange(link, session, until=lambda: False, max_late=max_late)
+        exchange(link, session, ends_when=lambda: False, max_late=max_late)
         return link, session
 
     @pytest.mark.parametrize("cost", [0.1, 0.9, 0.99])
@@ -487,7 +487,7 @@ def test_estimated_arrivals_count_no_reply_as_late(slower):
     link, session = Paced([0.95] * 20_000, stamped=False, slower=slower), EchoSession()
     arrivals = []
     session.reply = lambda packet, now, ages: arrivals.append(now) or link.reply(packet, now, ages)
-    exchange(link, session, until=lambda: False)
+    exchange(link, session, ends_when=lambda: False)
     assert session.discards.get("replied to late", 0) == 0
     assert session.stops == []
     assert np.diff(arrivals).min() > 0.9 * PERIOD, "they are recorded as they were received"
@@ -498,7 +498,7 @@ class TestFullQueue:
         """The queue had no room for what came in the last `since` cycles."""
         times = rig.now + PERIOD * np.arange(1, len(packets) + 1)
         link = Bunched(zip(times, packets, strict=True), times[-1] + since * PERIOD)
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         return link
 
     @pytest.mark.parametrize(
@@ -533,7 +533,7 @@ class TestDeadline:
     def test_silence_is_counted_from_the_reply(self):
         rig = closed(silence_timeout=1.0)
         link = Bunched([(rig.now + PERIOD, rig.packet())], rig.now + PERIOD + 0.9)
-        exchange(link, rig.session, until=lambda: bool(link.sent))
+        exchange(link, rig.session, ends_when=lambda: bool(link.sent))
         assert len(link.sent) == 1
         assert rig.session.deadline == pytest.approx(link.now + 1.0)
         assert rig.session._ring.last(1)["arrival"][0] == pytest.approx(rig.now + PERIOD)
@@ -542,7 +542,7 @@ class TestDeadline:
         rig = closed()
         packet = rig.packet()
         link = Bunched([(rig.now + PERIOD, packet), (rig.now + 0.5, packet)], rig.now)
-        exchange(link, rig.session, until=lambda: len(link.sent) == 2)
+        exchange(link, rig.session, ends_when=lambda: len(link.sent) == 2)
         assert rig.session.deadline == pytest.approx(rig.now + PERIOD + 1.0)
 
 
@@ -553,7 +553,7 @@ class TestPeerSelection:
         rig = Rig()
         rig.number = 12
         link = Backlogged([[b"\xff" * 60], [self.SYNC], [rig.init.encode()], [rig.packet()]])
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         assert link.forgotten == [0], "not the one whose sync packet was answered"
         assert len(link.sent) == 3
 
@@ -568,13 +568,13 @@ class TestPeerSelection:
     )
     def test_peer_is_forgotten_without_reply_or_after_a_silence(self, batches, silence, forgotten):
         link = Backlogged(batches, silence=silence)
-        exchange(link, Rig().session, until=lambda: False)
+        exchange(link, Rig().session, ends_when=lambda: False)
         assert link.forgotten[:1] == forgotten
 
     def test_lost_session_accepts_the_peer_that_gets_a_reply(self):
         rig = closed()
         rig.session.tick(rig.now + 2.0)
         link = Backlogged([[b"\xff" * 60], [rig.packet()], [rig.packet()]], rig.now + 2.0)
-        exchange(link, rig.session, until=lambda: False)
+        exchange(link, rig.session, ends_when=lambda: False)
         assert link.forgotten == [0]
         assert len(link.sent) == 2

@@ -130,7 +130,7 @@ def test_values_that_are_not_finite_are_refused(joint, value):
     ):
         with np.errstate(invalid="ignore"):
             error = refused(Check.FINITE, check, *arguments, 5)
-        assert (error.joint, error.cycle, error.check) == (joint, 5, "finiteness")
+        assert (error.joint, error.cycle, error.check) == (joint, 5, Check.FINITE)
         assert "where a number must be" in str(error)
     others = np.arange(N) != joint
     guard.check_hold(np.where(others, 0.0, value), REST, others, 5)
@@ -207,8 +207,8 @@ class TestRates:
         passes.check_set_point(*below, bounds, 1)
         error = refused(kind, fails.check_set_point, *above, bounds, 1)
         assert (error.joint, error.cycle) == (joint, 1)
-        text = f"{error.check} of joint {joint + 1} is {error.value:.9g} {error.unit}; allowed is"
-        assert str(error) == f"{text} {error.bound:.9g} {error.unit} (cycle 1)"
+        text = f"of joint {joint + 1} is {error.value:.9g} {error.unit}; allowed is"
+        assert str(error) == f"{kind.quantity} {text} {error.bound:.9g} {error.unit} (cycle 1)"
         assert error.value == pytest.approx(sign * limit, rel=1e-5)
         assert error.bound == pytest.approx(limit, rel=1e-5)
 
@@ -518,7 +518,7 @@ class TestTarget:
         try:
             checks.check_target(START + target, offset, sent, rounded, 5)
         except GuardError as error:
-            assert (error.kind, error.cycle) == (Check.VELOCITY, 5)
+            assert (error.check, error.cycle) == (Check.VELOCITY, 5)
             assert error.joint == np.argmax(np.abs(target))
             return False
         return True

@@ -190,10 +190,10 @@ def test_errors_pickle(kind):
 def test_guard_error_states_check_joint_value_bound_and_cycle(check):
     error = GuardError(check, 3, -1.25, 0.5, 1234)
     assert (error.joint, error.value, error.bound, error.cycle) == (3, -1.25, 0.5, 1234)
-    assert (error.check, error.unit, error.remedy) == (check.quantity, check.unit, check.remedy)
+    assert (error.check, error.unit, error.remedy) == (check, check.unit, check.remedy)
     for part in (check.quantity, "joint 4", "-1.25", "0.5", "cycle 1234"):
         assert part in str(error)
-    assert through_pickle(error).kind is check
+    assert through_pickle(error).check is check
 
 
 def _nothing(self, *_):

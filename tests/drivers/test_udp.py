@@ -113,7 +113,7 @@ class TestPeer:
         """Of sync packets nothing is known but that they are shorter than the init packet."""
         rig = Rig()
         controller.send(struct.pack("<i", 3) + bytes(length - 4))
-        exchange(transport, rig.session, until=lambda: rig.session.counters.replied > 0)
+        exchange(transport, rig.session, ends_when=lambda: rig.session.counters.replied > 0)
         controller.wait()
         assert controller.replies == [struct.pack("<i", 4) + bytes(length - 4)]
 
@@ -304,7 +304,7 @@ class TestSession:
                 controller.send(init_packet().encode())
             return session.state is State.INIT or loops > 20
 
-        exchange(transport, session, until=until)
+        exchange(transport, session, ends_when=until)
         for _ in range(4):
             controller.wait()
         assert another.received_nothing()
@@ -322,7 +322,7 @@ class TestSession:
                 lost = counters.stale + counters.malformed
                 return counters.replied + counters.duplicates + lost == count
 
-            exchange(transport, session, until=handled)
+            exchange(transport, session, ends_when=handled)
         for _ in range(5):
             controller.wait()
         assert controller.received_nothing()
@@ -336,7 +336,7 @@ class TestSession:
         self, transport, controller, another, session
     ):
         def serve(until):
-            exchange(transport, session, until=until)
+            exchange(transport, session, ends_when=until)
 
         controller.send(init_packet().encode())
         controller.send(CyclicPacket.zeros(11, N).encode())

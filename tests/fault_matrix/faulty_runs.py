@@ -266,7 +266,7 @@ class Run:
                 self._note_situation()
             return until() or self.transport.cycle >= end
 
-        exchange(self.transport, cast(Session, self.session), until=done)
+        exchange(self.transport, cast(Session, self.session), ends_when=done)
         self._note_events()
 
     def _note_events(self) -> None:
@@ -300,7 +300,7 @@ class Run:
         for event in self.events:
             if isinstance(event, Refused):
                 error = event.error
-                kind = error.kind.name if isinstance(error, GuardError) else type(error).__name__
+                kind = error.check.name if isinstance(error, GuardError) else type(error).__name__
                 return f"{self._asked_for()} {kind}"
             if isinstance(event, MotionEnded):
                 lost = event.outcome == "lost"

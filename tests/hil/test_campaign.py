@@ -20,21 +20,21 @@ from hil.campaign import (
     Campaign,
     CampaignFolderError,
     CampaignPlan,
-    Link,
     MotionFailedError,
     MotionRefusedError,
     NotRehearsedError,
     PlannedMotion,
     Stop,
+    VirtualLink,
 )
 from hil.campaign import campaign as campaign_module
 from hil.campaign.intervals import (
     Interval,
     StraightMoves,
-    hold,
     planned_intervals,
     player_of,
     require_allowed,
+    rest,
 )
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, InputError
@@ -55,7 +55,7 @@ from tests.hil.fast_cell import set_points
 Run = Callable[..., Campaign]
 
 
-def execute(campaign: Campaign, link: Link | None = None, **how: Any) -> None:
+def execute(campaign: Campaign, link: VirtualLink | None = None, **how: Any) -> None:
     link = link or simulated_link(campaign.cell)
     campaign.run(link, durable=False, unrehearsed=True, **how)
 
@@ -66,14 +66,16 @@ class Arm:
 
     campaign: Campaign
     controller: SimulatedController
-    link: Link
+    link: VirtualLink
 
     @classmethod
     def made(cls, folder: Path, cell: Cell, plan: CampaignPlan, *faults: Lose) -> Arm:
         campaign = Campaign.create(folder / "one", *one_repetition(cell, plan))
         controller = simulated_controller(campaign.cell)
         return cls(
-            campaign, controller, Link.over(SimulatedTransport(controller, faults), campaign.cell)
+            campaign,
+            controller,
+            VirtualLink.over(SimulatedTransport(controller, faults), campaign.cell),
         )
 
     @property
@@ -212,7 +214,7 @@ def test_a_controller_of_another_drive_train_is_refused(
 ) -> None:
     wrong = written(cell, old, new)
     campaign = Campaign.create(tmp_path / "init", wrong, plan)
-    link = Link.over(SimulatedTransport(simulated_controller(cell)), wrong)
+    link = VirtualLink.over(SimulatedTransport(simulated_controller(cell)), wrong)
     with pytest.raises(ControllerFault, match=f"cannot be used: .*{named}"):
         execute(campaign, link)
     assert not list(campaign.folder.archives.iterdir())
@@ -223,7 +225,7 @@ def test_a_real_link_is_not_driven_from_the_archives_thread(cell: Cell) -> None:
         now = 0.0
 
     with pytest.raises(TypeError, match="Wire is not virtual time"):
-        Link.over(Wire(), cell)  # type: ignore[arg-type]
+        VirtualLink.over(Wire(), cell)  # type: ignore[arg-type]
 
 
 def test_what_the_arm_does_after_a_refusal_is_recorded(
@@ -333,7 +335,7 @@ def test_only_a_move_from_the_arm_asks_for_jogging(cell: Cell, plan: CampaignPla
     buried = MotionChecks.of(written(cell, "floor = 0.0", "floor = 0.3"))
     with pytest.raises(MotionRefusedError, match=r"move 1 .*jog the arm"):
         StraightMoves(cell, buried).joining(intervals, low)
-    wild = Interval("excitation", 0, hold(cell.home + 10.0, 1.0))
+    wild = Interval("excitation", 0, rest(cell.home + 10.0, 1.0))
     with pytest.raises(MotionRefusedError, match=r"repetition 1 .*; design another motion\."):
         require_allowed([wild], buried)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from hil.campaign.intervals import hold
+from hil.campaign.intervals import rest
 from hil.cell import AngleFrame, Cell, CellError
 from hil.cell.text import replaced_value
 from hil.design import preset, problem_of
@@ -170,7 +170,7 @@ def test_gravity_beyond_a_torque_limit_is_refused(cell: Cell) -> None:
     torque = [1e4] * 6
     for share in (1.02, 0.98):
         torque[HELD] = share * held_torque(cell)
-        refusal = MotionChecks.of(limited(cell, torque)).refusal(hold(cell.home, 1.0))
+        refusal = MotionChecks.of(limited(cell, torque)).refusal(rest(cell.home, 1.0))
         assert (refusal is None) == (share > 1.0)
     assert refusal is not None and refusal.startswith("torque of joint_3: ")
     assert f"N·m, must be at most {torque[HELD]:.4g} N·m" in refusal

@@ -15,7 +15,7 @@ from hil.archive import open_archive
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.cell import Cell
 from hil.cli import app
-from hil.errors import ControllerFault, InputError, UnsafeError
+from hil.errors import ExecutionError, InputError, UnsafeError
 from hil.move import plan_move, posture, turned
 from hil.testing import UdpController
 from sim_fixtures.ns16 import CELL_PATH
@@ -90,7 +90,7 @@ def test_one_axis_alone_is_refused_where_others_open_or_turn(ns16: Cell, tmp_pat
 
     with UdpController.started(ns16, tmp_path) as controller:
         error = refused(controller.cell_path, "3")
-    assert isinstance(error, ControllerFault)
+    assert isinstance(error, ExecutionError)
     assert "joint 1 is in mode 4; the motion needs 0" in str(error)
     error = refused(CELL_PATH, "4")
     assert isinstance(error, InputError)

@@ -24,7 +24,7 @@ from drivers.states import State
 from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import open_archive
 from hil.archive.recorder import Recorded
-from hil.campaign import Link, Progress, Stop
+from hil.campaign import Progress, Stop, VirtualLink
 from hil.cell import Cell
 from hil.cli.record import record as record_command
 from hil.demo_link import SIMULATE, free_port
@@ -38,7 +38,7 @@ from sim_fixtures.ns16 import CELL_PATH
 NAME = "excitation_000_a1.mcap"
 
 
-def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = None) -> Link:
+def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = None) -> VirtualLink:
     """A link in virtual time to a controller whose own program moves the arm.
 
     `stated` is the cell that the PC has, by default the controller's.
@@ -46,7 +46,7 @@ def own_motion_link(cell: Cell, *faults: Lose | Corrupt, stated: Cell | None = N
     settings = replace(controller_settings(cell), own_motion=own_postures(cell))
     controller = simulated_controller(cell, settings=settings)
     transport = SimulatedTransport(controller, faults)
-    return Link.over(transport, stated or cell, controller.finish)
+    return VirtualLink.over(transport, stated or cell, controller.finish)
 
 
 def recording_of(

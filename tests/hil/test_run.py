@@ -28,9 +28,9 @@ from hil.batch.discovery import discover
 from hil.campaign import (
     Campaign,
     CampaignFolderError,
-    Link,
     MotionRefusedError,
     NotRehearsedError,
+    VirtualLink,
     quality,
 )
 from hil.campaign import link as link_module
@@ -162,7 +162,7 @@ class Push:
 def run_pushed(campaign: Campaign, fault: Push) -> RunResult:
     """Run a campaign with a load on the arm."""
     controller = simulated_controller(campaign.cell, faults=[fault])  # type: ignore[list-item]
-    link = Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+    link = VirtualLink.over(SimulatedTransport(controller), campaign.cell, controller.finish)
     return campaign.run(link, unrehearsed=True, durable=False)
 
 
@@ -480,11 +480,11 @@ def test_an_unwatched_move_is_no_faster_than_a_dry_run(copied: Campaign) -> None
         assert peak_speed(copied, name).max() <= OVERRIDE * 1.001
 
 
-def link_to_controller_with(campaign: Campaign, **figures: Any) -> Link:
+def link_to_controller_with(campaign: Campaign, **figures: Any) -> VirtualLink:
     """A link to a simulated controller whose own cell file differs in some figures."""
     other = campaign.cell.with_values({k.replace("__", "."): v for k, v in figures.items()})
     controller = simulated_controller(other)
-    return Link.over(SimulatedTransport(controller), campaign.cell, controller.finish)
+    return VirtualLink.over(SimulatedTransport(controller), campaign.cell, controller.finish)
 
 
 @pytest.mark.parametrize(
@@ -659,7 +659,7 @@ def test_a_repetition_with_lost_replies_is_as_planned(
     settings = replace(controller_settings(cell), missed_replies=5)
     controller = simulated_controller(cell, settings=settings)
     lost, _ = split_faults([parse_fault(f"lose@{middle}x2:to_controller")])
-    link = Link.over(SimulatedTransport(controller, lost), cell, controller.finish)
+    link = VirtualLink.over(SimulatedTransport(controller, lost), cell, controller.finish)
     campaign = Campaign.create(tmp_path / "campaign", cell, designed.plan)
     campaign.run(link, unrehearsed=True, durable=False)
     sent, intended = (one.folder.archives / name for one in (campaign, undisturbed))

@@ -23,7 +23,7 @@ from drivers.states import State
 from hil.archive import Archive, ArchiveSpec, ArchiveWriter, open_archive
 from hil.campaign import Stop, live_link
 from hil.campaign.intervals import player_of
-from hil.campaign.link import Link
+from hil.campaign.link import VirtualLink
 from hil.campaign.live_link import STALL, ExchangeView, Heartbeat, Standstill
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, RunWatch
 from hil.cell import Cell
@@ -57,7 +57,7 @@ class WatchedArm:
     """A connected arm and a motion from where it stands and back, some seconds long."""
 
     cell: Cell
-    link: Link
+    link: VirtualLink
     motion: PiecewiseCubic
     path: Path
 

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveName, open_archive
-from hil.campaign import Campaign, CampaignPlan, Link, Stop
+from hil.campaign import Campaign, CampaignPlan, Stop, VirtualLink
 from hil.campaign.plan import design
 from hil.cell import Cell
 from hil.identify import identify_campaign
@@ -110,7 +110,7 @@ def finish_in_virtual_time(campaign: Campaign, seed: int) -> None:
     at_home = cell.with_values({"simulation.initial_deg": cell.campaign.home_deg})
     controller = simulated_controller(at_home, seed=seed)
     Campaign.open(campaign.folder.root).run(
-        Link.over(SimulatedTransport(controller), cell, finish=controller.finish),
+        VirtualLink.over(SimulatedTransport(controller), cell, finish=controller.finish),
         Stop(),
         Silent(),
         durable=False,

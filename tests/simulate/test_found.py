@@ -13,7 +13,7 @@ from drivers import State
 from drivers.exchange.loop import exchange
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveOutcome, ArchiveSpec, open_archive
-from hil.campaign import Link
+from hil.campaign import VirtualLink
 from hil.campaign import link as link_module
 from hil.campaign.intervals import START_TOLERANCE
 from hil.campaign.operator import Stop
@@ -46,10 +46,10 @@ class TestControllerWithoutInitPacket:
     def test_the_operator_is_asked_to_restart_its_program(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
-        first = Link.over(SimulatedTransport(controller), cell)
+        first = VirtualLink.over(SimulatedTransport(controller), cell)
         first.connect(Stop())
         controller.lose_drive("emergency stop")
-        second = Link.over(SimulatedTransport(controller), cell)
+        second = VirtualLink.over(SimulatedTransport(controller), cell)
         with pytest.raises(ControllerFault, match=r"did not begin a session.*restart") as raised:
             second.connect(Stop(), timeout=0.5)
         assert "switch the drive on" not in str(raised.value)
@@ -58,7 +58,7 @@ class TestControllerWithoutInitPacket:
         self, cell: Cell, controller: SimulatedController
     ) -> None:
         controller.finish()
-        link = Link.over(SimulatedTransport(controller), cell)
+        link = VirtualLink.over(SimulatedTransport(controller), cell)
         with pytest.raises(ControllerFault, match="ended the session within 0") as raised:
             link.connect(Stop())
         assert "60 s" not in str(raised.value)
@@ -68,11 +68,11 @@ def test_a_motion_does_not_wait_for_a_drive_that_went_off(
     cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
     """Seed 455: the drive was lost between two motions, and virtual time did not end."""
-    link = Link.over(SimulatedTransport(controller), cell)
+    link = VirtualLink.over(SimulatedTransport(controller), cell)
     where = link.connect(Stop())
     controller.lose_drive("emergency stop")
     packets = iter(range(10))
-    exchange(link.transport, link.session, until=lambda: next(packets, None) is None)
+    exchange(link.transport, link.session, ends_when=lambda: next(packets, None) is None)
     motion, spec = short_way(cell, where, tmp_path)
     with pytest.raises(ControllerFault, match="went off before the motion began; nothing was sent"):
         link.run(motion, spec, Stop())
@@ -83,7 +83,7 @@ def test_a_motion_stopped_while_axes_open_leaves_them_closed(
     cell: Cell, controller: SimulatedController, tmp_path: Path
 ) -> None:
     """Seed 2088 with `stop@30`: the link was left with some of the axes in open mode."""
-    link = Link.over(SimulatedTransport(controller), cell)
+    link = VirtualLink.over(SimulatedTransport(controller), cell)
     motion, spec = short_way(cell, link.connect(Stop()), tmp_path)
     stop, phases = Stop(), []
 
@@ -128,7 +128,7 @@ class TestClosedLink:
     def test_it_does_not_wait_forever_for_a_restarted_controller(
         self, cell: Cell, controller: SimulatedController
     ) -> None:
-        link = Link.over(
+        link = VirtualLink.over(
             SimulatedTransport(controller), cell, lambda: controller.restart(warm=True)
         )
         link.connect(Stop())
@@ -138,9 +138,9 @@ class TestClosedLink:
         assert link.session.state is State.DRIVE_OFF
 
     def test_it_reports_open_axes(self, cell: Cell, controller: SimulatedController) -> None:
-        link = Link.over(SimulatedTransport(controller), cell)
+        link = VirtualLink.over(SimulatedTransport(controller), cell)
         link.connect(Stop())
-        exchange(link.transport, link.session, until=lambda: link.session.state is State.OPEN)
+        exchange(link.transport, link.session, ends_when=lambda: link.session.state is State.OPEN)
         with pytest.raises(ControllerFault, match=r"an axis is still open 0\.5 s after"):
             link.close()
 

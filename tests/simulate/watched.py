@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from drivers import CycleRing, Session
 from drivers.transports.simulated import Fault as LinkFault
 from drivers.transports.simulated import SimulatedTransport
-from hil.campaign import Link
+from hil.campaign import VirtualLink
 from sim_fixtures import Phase, SimulatedController
 from sim_fixtures.faults import ControllerFault
 from tests.simulate.observed import Act, ArmHistory, Exchanged
@@ -190,7 +190,7 @@ class StampedWatchedTransport(WatchedTransport):
 class SessionLog:
     """Recorder of the calls, events and records of a session."""
 
-    def __init__(self, link: Link, transport: WatchedTransport) -> None:
+    def __init__(self, link: VirtualLink, transport: WatchedTransport) -> None:
         self._transport, self._seen = transport, transport.seen
         self.acts: list[Act] = []
         self.events: list[tuple[int, Any]] = []

@@ -22,7 +22,7 @@ from drivers import State
 from drivers.errors import Check
 from drivers.events import MotionEnded
 from hil.archive import writer
-from hil.campaign import Campaign, Link, link
+from hil.campaign import Campaign, VirtualLink, link
 from hil.campaign import folder as campaign_folder
 from hil.campaign.dry_run import DryRun
 from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
@@ -336,7 +336,7 @@ class World:
         self.disk.begin()
         first, before, names = self.controller.cycle, self._digests, _names(self.folder)
         transport = self._kind(self.controller, self.script, self._clock, self._on_cycle)
-        connection = Link.over(
+        connection = VirtualLink.over(
             transport, self._scene.cell, finish=self.controller.controller.finish
         )
         log = SessionLog(connection, transport)
@@ -364,7 +364,7 @@ class World:
             after=after,
         )
 
-    def _run(self, connection: Link) -> tuple[RunResult | None, BaseException | None]:
+    def _run(self, connection: VirtualLink) -> tuple[RunResult | None, BaseException | None]:
         lurches = lurching(self.script, lambda: self.controller.cycle, self._struck)
         with installed(self.disk), _no_waiting(), lurches:
             try:
