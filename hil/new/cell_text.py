@@ -30,8 +30,7 @@ from identification.model.kinematics import Chain, chain_from_urdf
 from identification.model.urdf_text import urdf_tree
 from planner.toml_text import toml_key, toml_value
 
-from .clearance import clear_home
-from .known import ASSUMED, Known, assumed_for_design, from_urdf
+from .known import ASSUMED, Known, assumed_for_design, clear_home, from_urdf
 
 Array = NDArray[np.float64]
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations, product
 from os import PathLike
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from drivers.drive_train import WRIST_AXES, DriveTrain
 from drivers.errors import DriverError, PacketError
@@ -26,7 +27,13 @@ from hil.cell.errors import UNKNOWN
 from hil.cell.text import urdf_limits
 from hil.errors import ArchiveError, ControllerFault, OperatorStopError
 from hil.reading import parse_toml
+from identification.excitation import CollisionChecker, CollisionModelError, Workspace
+from planner import JointLimits
 
+Array = NDArray[np.float64]
+
+_MOST_TURNED: Final = 3
+"""Joints turned to find a clear home posture."""
 _DECIMALS: Final = 3
 """Decimals of degrees; rounding is below the tolerance of URDF limits."""
 _CYCLES: Final = (1, 2)
@@ -121,6 +128,43 @@ def assumed_for_design(known: Known, n_joints: int) -> Known:
     if high != upper:
         values["limits.upper_deg"] = high
     return Known.of_origin(ASSUMED, values)
+
+
+def clear_home(urdf: str, known: Known, mesh_folders: Sequence[str]) -> Known:
+    """Return the first clear posture with up to three joints turned by 90° from the home posture.
+
+    Where none is clear of the floor, no floor is assumed. Notes report this, and pairs that are not
+    checked or with less than the margin. Nothing is returned if shapes are missing or unreadable.
+    """
+    lower, upper = (np.radians(known.values[f"limits.{end}_deg"]) for end in ("lower", "upper"))
+    limits = JointLimits(lower, upper, *np.ones((3, len(lower))))  # rates do not matter
+    postures = np.array([*_turned(np.radians(known.values["campaign.home_deg"]), limits)])
+    for floor in (known.values["workspace.floor"], None):
+        workspace = Workspace(floor, margin=known.values["workspace.margin"])
+        try:
+            checker = CollisionChecker(urdf, workspace, limits, mesh_folders)
+        except CollisionModelError:
+            return Known()
+        clear = np.flatnonzero(checker.clear(postures))
+        if len(clear) > 0:
+            values: dict[str, Any] = {"campaign.home_deg": _degrees(postures[clear[0]])}
+            notes = [] if checker.exceptions is None else [checker.exceptions]
+            if floor is None:
+                values["workspace.floor"] = "none"
+                notes.append("no posture tried is clear of a floor at 0 m: no floor is assumed")
+            return Known.of_origin(ASSUMED, values, notes)
+    return Known(notes=("every posture tried is a contact: correct campaign.home_deg",))
+
+
+def _turned(home: Array, limits: JointLimits) -> Iterator[Array]:
+    """Yield the home posture, and those with joints turned by 90° within the limits."""
+    for n in range(_MOST_TURNED + 1):
+        for joints in combinations(range(len(home)), n):
+            for turns in product((-0.5 * np.pi, 0.5 * np.pi), repeat=n):
+                posture = home.copy()
+                posture[[*joints]] += turns
+                if np.all((posture > limits.lower) & (posture < limits.upper)):
+                    yield posture
 
 
 def from_init(init: InitPacket, n_joints: int, arm: int) -> Known:

@@ -170,7 +170,12 @@ def _convex(shape: coal.CollisionGeometry, link: str) -> coal.CollisionGeometry:
 
 def obstacles(workspace: Workspace) -> list[Body]:
     """Return floor and boxes as bodies."""
-    bodies = [] if workspace.floor is None else [floor_at(workspace.floor)]
+    bodies = []
+    if workspace.floor is not None:
+        normal = np.array([0.0, 0.0, 1.0])
+        hull = Hull(normal * workspace.floor, normal, 0.0, 0.0, 0.0, exact=True)
+        shape, pose = coal.Halfspace(normal, workspace.floor), coal.Transform3s.Identity()
+        bodies.append(Body("floor", "floor", -1, shape, pose, hull, normal=normal))
     for i, box in enumerate(workspace.boxes):
         lower, upper = np.array(box.lower, dtype=float), np.array(box.upper, dtype=float)
         middle, half = (lower + upper) / 2.0, (upper - lower) / 2.0
@@ -180,14 +185,6 @@ def obstacles(workspace: Workspace) -> list[Body]:
         pose = coal.Transform3s(np.eye(3), middle)
         bodies.append(Body(f"box {i}", f"box {i}", -1, shape, pose, hull, half_sides=half))
     return bodies
-
-
-def floor_at(height: float) -> Body:
-    """Return a floor [m], solid below."""
-    normal = np.array([0.0, 0.0, 1.0])
-    hull = Hull(normal * height, normal, 0.0, 0.0, 0.0, exact=True)
-    pose = coal.Transform3s(np.eye(3), np.zeros(3))
-    return Body("floor", "floor", -1, coal.Halfspace(normal, height), pose, hull, normal=normal)
 
 
 def _hull(shape: coal.CollisionGeometry, rotation: Array, translation: Array) -> Hull:
