@@ -212,5 +212,6 @@ class ColumnMap(_Table):
             problem, field, remedy = wrong.problem, wrong.field, wrong.remedy
             raise SourceError(path, problem, field=field, remedy=remedy) from error
         except (OSError, ValueError) as error:
-            problem = f"cannot be read ({error})"
+            reason = error.strerror if isinstance(error, OSError) else error
+            problem = f"cannot be read ({reason})"
             raise SourceError(path, problem, remedy="name a TOML file") from error
