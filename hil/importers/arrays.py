@@ -100,14 +100,14 @@ class ArrayFile:
         """Return an array as a matrix; without a name the only one there is, else SourceError."""
         return self._matrix(name, field).astype(np.float64)
 
-    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int]:
-        """Return times as whole nanoseconds.
+    def times(self, column: Column, decimals: int, array: str | None = None) -> list[int | None]:
+        """Return times as whole nanoseconds, None where one is missing.
 
         There are `decimals` decimal places between the unit and the second; dates in numpy's types
         need none. An index without `array` is of the only array there is.
 
         Raises:
-            SourceError: no such array or column, or a time that is not finite.
+            SourceError: no such array or column.
         """
         if isinstance(column, int) and array is None:
             times = self._array(None, "time").ravel()
@@ -116,18 +116,18 @@ class ArrayFile:
         factor = 10 ** (9 - decimals)
         if times.dtype.kind in "mM":
             kind = "datetime64[ns]" if times.dtype.kind == "M" else "timedelta64[ns]"
-            return [int(one) for one in times.astype(kind).astype(np.int64)]
+            stamps = times.astype(kind).astype(np.int64)
+            missing = np.isnat(times)
+            return [None if no else int(one) for one, no in zip(stamps, missing, strict=True)]
         if times.dtype.kind in "iu":
             return [int(one) * factor for one in times.tolist()]
         values = times.astype(np.float64)
-        if not np.isfinite(values).all():
-            sample = int(np.argmin(np.isfinite(values)))
-            problem = f"is {values[sample]} in sample {sample}"
-            raise SourceError(self.path, problem, field="time")
+        known = np.isfinite(values)
         # Separately, since an epoch in nanoseconds has more digits than a float.
-        whole = np.floor(values)
-        part = np.rint((values - whole) * float(factor))
-        return [int(w) * factor + int(p) for w, p in zip(whole, part, strict=True)]
+        whole = np.floor(np.where(known, values, 0.0))
+        part = np.rint((np.where(known, values, 0.0) - whole) * float(factor))
+        found = zip(known, whole, part, strict=True)
+        return [int(w) * factor + int(p) if there else None for there, w, p in found]
 
     def _column(
         self, column: Column, field: str, array: str | None, *, rows: bool = False

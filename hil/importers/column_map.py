@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
@@ -123,6 +123,10 @@ class Drive(_Table):
     def geared(self) -> bool:
         """Whether gears are given."""
         return bool(self.gear_ratio or self.motor_from_joint)
+
+
+HOLE: Final = 'correct it, or leave such rows out: [format] missing = "drop"'
+"""Remedy for a number that is missing."""
 
 
 class Format(_Table):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hil.archive import Samples
 from hil.errors import SourceError
 from hil.importers.arrays import READERS, ArrayFile
-from hil.importers.column_map import TIMES, UNITS, ColumnMap, Quantity
+from hil.importers.column_map import HOLE, TIMES, UNITS, ColumnMap, Quantity
 from hil.importers.robot import NOT_RECORDED, Robot, Use, write_imported
 from hil.importers.table import Table
 
@@ -50,11 +50,12 @@ def import_log(
     log = _Log(Path(source), columns, robot)
     with np.errstate(over="ignore", invalid="ignore"):  # such numbers are refused later
         values = {name: log.read(name) for name in columns.quantities()}
-    stamp, origin, clock = log.stamps(len(values["position"]))
+    stamp, timed, origin, clock = log.stamps(len(values["position"]))
     _check_lengths({**values, "time": stamp}, log.path, "quantities")
     metadata = {"importer": "log", "clock_origin_ns": str(origin)}
     if columns.format.missing == "drop":
-        complete = np.all([np.isfinite(array).all(axis=1) for array in values.values()], axis=0)
+        known = [timed, *(np.isfinite(array).all(axis=1) for array in values.values())]
+        complete = np.all(known, axis=0)
         metadata["dropped_rows"] = str(np.count_nonzero(~complete))
         stamp, values = stamp[complete], {name: array[complete] for name, array in values.items()}
     if columns.drive.geared:
@@ -107,12 +108,13 @@ class _Log:
                 self._check_count(value, f"{name}.{key}")
         return np.asarray((values + quantity.offset) * np.multiply(factor, quantity.scale))
 
-    def stamps(self, count: int) -> tuple[NDArray[np.int64], int, Path]:
-        """Return stamps [ns], the origin that was subtracted to store them, and their file."""
+    def stamps(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.bool_], int, Path]:
+        """Return stamps [ns], which are known, the origin that was subtracted, and their file."""
         time, rate, position = self._map.time, self._map.sample_rate, self._map.position
         if time is None:
             assert rate is not None
-            return np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64), 0, self.path
+            stamps = np.rint(np.arange(count) * (1e9 / rate)).astype(np.int64)
+            return stamps, np.ones(count, np.bool_), 0, self.path
         if time.file is None and position.files is not None:
             first, *others = self._file_per_joint(position.files, "position.files")
         else:
@@ -123,12 +125,17 @@ class _Log:
                 problem = f"has other times than {first.path.name}"
                 remedy = "name one file of times for all joints: [time] file"
                 raise SourceError(other.path, problem, field="time", remedy=remedy)
-        origin = 0 if min(times) >= 0 and max(times) < _LATEST else min(times)
-        if max(times) - origin >= _LATEST:
-            problem = f"spans {Decimal(max(times) - min(times)).scaleb(-9):.3g} s"
+        known = [one for one in times if one is not None]
+        if not known or (len(known) < len(times) and self._map.format.missing == "refuse"):
+            problem = f"has no time in sample {times.index(None)}"
+            raise SourceError(first.path, problem, field="time", remedy=HOLE)
+        origin = 0 if min(known) >= 0 and max(known) < _LATEST else min(known)
+        if max(known) - origin >= _LATEST:
+            problem = f"spans {Decimal(max(known) - min(known)).scaleb(-9):.3g} s"
             remedy = "give the unit of its time: s, ms, us or ns"
             raise SourceError(first.path, problem, field="time", remedy=remedy)
-        return np.array([one - origin for one in times], np.int64), origin, first.path
+        stamps = np.array([0 if one is None else one - origin for one in times], np.int64)
+        return stamps, np.array([one is not None for one in times]), origin, first.path
 
     def _numbers(self, name: str, quantity: Quantity) -> Array:
         """Return the numbers of a quantity as in the file, (m, k)."""

@@ -261,4 +261,6 @@ def _check(samples: Samples, source: Path, joints: Sequence[str]) -> None:
                 f"({elapsed:.6g} s; {rows.size} such values)"
             )
             remedy = f"cut the recording there, or leave out the quantity (largest: {_MOST:g})"
+            if not np.isfinite(values[row, column]):
+                remedy += ', or of a log such rows: [format] missing = "drop"'
             raise SourceError(source, problem, remedy=remedy)

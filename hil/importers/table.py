@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.errors import SourceError
-from hil.importers.column_map import Column, Format
+from hil.importers.arrays import READERS
+from hil.importers.column_map import HOLE, Column, Format
 from hil.reading import read_text
 
 Array = NDArray[np.float64]
@@ -56,7 +57,7 @@ class Table:
         except (OSError, UnicodeDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             problem = f"cannot be read ({reason})"
-            remedy = "name a text file, or one that ends in .npz, .npy, .mat or .m"
+            remedy = f"name a text file, or one that ends in {', '.join(READERS)}"
             raise SourceError(path, problem, remedy=remedy) from error
         numbered = [
             (number, line)
@@ -118,10 +119,11 @@ class Table:
         """Return all columns; see `numbers`."""
         return self.numbers(range(self.width), field)
 
-    def times(self, column: Column, decimals: int, _array: str | None = None) -> list[int]:
+    def times(self, column: Column, decimals: int, _array: str | None = None) -> list[int | None]:
         """Return a column of times as whole nanoseconds, exactly; of a single line, that line.
 
-        There are `decimals` decimal places between the column's unit and the second.
+        There are `decimals` decimal places between the column's unit and the second. Missing times
+        are None where they are allowed.
 
         Raises:
             SourceError: no such column, or a time that is not a number.
@@ -134,14 +136,17 @@ class Table:
                 (number, (line.split(self.delimiter)[index : index + 1] or [""])[0])
                 for number, line in zip(self.numbered, self.lines, strict=True)
             ]
-        found = []
+        found = list[int | None]()
         for number, text in texts:
+            if self.gaps and text.strip().lower() in (*_MISSING, "nan"):
+                found.append(None)
+                continue
             try:
                 found.append(_nanoseconds(text, decimals))
             except (ArithmeticError, ValueError) as error:
                 shown = repr(text.strip()) if text.strip() else "nothing"
                 problem = f"line {number} has {shown} for the time"
-                raise SourceError(self.path, problem, field="time") from error
+                raise SourceError(self.path, problem, field="time", remedy=HOLE) from error
         return found
 
     def _index(self, column: Column, field: str) -> int:
@@ -173,7 +178,7 @@ class Table:
                         self.path,
                         f"line {self.numbered[row]} has {shown} in column {name}, not a number",
                         field=field,
-                        remedy='correct it, or leave such rows out: [format] missing = "drop"',
+                        remedy=HOLE,
                     )
         return values
 

@@ -574,6 +574,28 @@ class TestTextMatrices:
         assert np.array_equal(found["position"], np.delete(Q, 7, axis=0))
         assert 70_000_000 not in found["stamp"]
 
+    @pytest.mark.parametrize("suffix", [".csv", ".npz"])
+    @pytest.mark.parametrize(("column", "named"), [(0, "time"), (2, "position|q2")])
+    def test_holes_of_time_and_quantities_name_the_remedy(
+        self, tmp_path, robot, suffix, column, named
+    ):
+        """A missing time, in a file of any kind, is a hole like a missing number."""
+        rows, path = np.column_stack([TIME, Q]), tmp_path / f"a{suffix}"
+        rows[7, column] = np.nan
+        if suffix == ".npz":
+            np.savez(path, t=rows[:, 0], q=rows[:, 1:])
+            entries = {"time": {"column": "t"}, "position": {"columns": "q"}}
+        else:
+            lines = [",".join(map(repr, row)) for row in rows.tolist()]
+            path.write_text("\n".join(["t,q1,q2,q3", *lines]))
+            entries = {"time": {"column": "t"}}
+        with pytest.raises(SourceError, match=named) as refused:
+            read(path, robot, **entries)
+        assert 'missing = "drop"' in str(refused.value)
+        found = read(path, robot, format={"missing": "drop"}, **entries)
+        assert np.array_equal(found["position"], np.delete(Q, 7, axis=0))
+        assert len(found["stamp"]) == len(Q) - 1
+
 
 def test_joints_are_those_of_the_robot_or_locked(tmp_path, robot):
     columns = np.column_stack([Q[:, 2], np.full(20, 9.0), Q[:, :2]])
