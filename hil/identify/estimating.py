@@ -20,6 +20,7 @@ from identification.estimators.consistent import (
     SolverError,
     consistent_estimate,
     fit_shrunk,
+    fitted_values,
 )
 from identification.estimators.delay import rate_products, with_uncertain_delay
 from identification.estimators.instrumental import (
@@ -41,6 +42,7 @@ from identification.estimators.prior import (
     PosteriorEstimate,
     fit_with_prior,
     nominal_prior,
+    with_prior,
 )
 from identification.estimators.robust import RobustEstimate, robust_estimate
 from identification.factor.columns import instrument_factor
@@ -52,6 +54,7 @@ from identification.factor.factor import (
     total_factor,
 )
 from identification.signals.samples import Samples
+from identification.validation.calibration import Refit
 from identification.validation.finding import joined
 
 from .options import Estimator, Options
@@ -84,6 +87,7 @@ class Estimation:
     held_out: tuple[Factor, ...]  #: one per held-out recording
     #: estimate with the prior from CAD, or the reason why there is none
     posterior: PosteriorEstimate | str
+    refit: Refit  #: parameters by the estimator from a factor, to predict parts of the fitted rows
     warnings: tuple[str, ...]
 
 
@@ -136,7 +140,8 @@ def estimate_with(prepared: Prepared, options: Options, reporter: Reporter) -> E
             f"the scaled condition number is {pooled.condition:.2g}: the motion separates some"
             " parameters poorly (solved by QR)"
         )
-    return Estimation(name, result, held_out, posterior, tuple(warnings))
+    refit = refit_of(model, name, prepared.settings.shrinkage, prior, posterior)
+    return Estimation(name, result, held_out, posterior, refit, tuple(warnings))
 
 
 def cad_prior(cell: Cell) -> GaussianPrior | str:
@@ -203,6 +208,29 @@ def fit_of(
         return found
 
     return fit
+
+
+def refit_of(
+    model: RobotModel,
+    name: Estimator,
+    shrinkage: Shrinkage,
+    prior: GaussianPrior | str,
+    posterior: PosteriorEstimate | str,
+) -> Refit:
+    """Return the parameters (p,) by an estimator as a function of a factor.
+
+    Robust losses and instruments need samples; weighted least squares represents them.
+    """
+    if name == "ols":
+        return lambda factor: factor.solve(np.ones(model.n_joints)).values
+    if name == "prior" and not isinstance(prior, str) and not isinstance(posterior, str):
+        effect = posterior.design_effect
+        return lambda factor: with_prior(model, factor, prior, design_effect=effect).estimate.values
+    if name == "consistent":
+        shrinkage = Shrinkage(strength=math.inf)
+    elif name != "auto":
+        shrinkage = Shrinkage()
+    return lambda factor: fitted_values(model, factor, shrinkage)
 
 
 def centre_of(

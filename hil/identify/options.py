@@ -76,30 +76,36 @@ def friction_from(text: str) -> Mapping[str, Any]:
     """Return entries of `[robot.friction]` for a law such as ``coulomb,viscous,presliding=1e-4``.
 
     Raises:
-        InputError: a term is unknown or excludes another, or its value is not positive.
+        InputError: a term is unknown, repeats or excludes another, or has an invalid value.
     """
     known = {kind.label.lower(): kind for kind in TERMS}
     absent = {kind.option: ABSENT.get(kind.option, False) for kind in TERMS} | {"presliding": 0.0}
     entries: dict[str, Any] = dict(absent)
     for term in text.split(","):
-        name, _, figure = term.strip().partition("=")
+        name, equals, figure = term.strip().partition("=")
         kind = known.get(name)
-        if name == "presliding" or (kind is not None and kind.speed_symbol):
+        option = kind.option if kind else "presliding"
+        unknown = kind is None and name != "presliding"
+        if unknown or entries[option] != absent[option]:
+            problem = "is not a friction term" if unknown else "repeats a term or excludes it"
+            remedy = f"use auto, or a comma-separated list of {FRICTION_TERMS}"
+            raise InputError(None, f"{term.strip()!r} {problem}", field="--friction", remedy=remedy)
+        value: Any = True
+        if kind is None or kind.speed_symbol:
             try:
                 value = float(figure)
             except ValueError:
                 value = math.nan
             if not 0.0 < value < math.inf:
                 problem = f"{term.strip()!r} needs a value above zero"
-                remedy = "for example presliding=1e-4"
+                remedy = f"for example {name}=1e-4"
                 raise InputError(None, problem, field="--friction", remedy=remedy)
-            entries[kind.option if kind else name] = value
-        elif kind is not None and not figure and entries[kind.option] == absent[kind.option]:
-            entries[kind.option] = kind.label if kind.option in ABSENT else True
-        else:
-            problem = f"{term.strip()!r} is not a friction term, or excludes another term"
-            remedy = f"use auto, or a comma-separated list of {FRICTION_TERMS}"
+        elif equals:
+            problem, remedy = f"{name!r} takes no value", f"write {name}"
             raise InputError(None, problem, field="--friction", remedy=remedy)
+        elif option in ABSENT:
+            value = kind.label
+        entries[option] = value
     return entries
 
 

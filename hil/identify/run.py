@@ -23,7 +23,6 @@ from hil.report import ReportSeries
 from hil.simulation import planted_values
 from hil.version import software
 from identification import Factor, IdentificationError, RobotModel, estimate
-from identification.estimators.consistent import Shrinkage, fitted_values
 from identification.estimators.covariance import with_block_covariance
 from identification.estimators.least_squares import RepeatedEstimate
 from identification.excitation import (
@@ -368,17 +367,13 @@ def _calibration(prepared: Prepared, estimation: Estimation) -> results.Calibrat
     if prepared.sources.in_sample:
         return None
     model, result = prepared.sources.cell.model, estimation.result
-    shrinkage = prepared.settings.shrinkage if estimation.estimator == "auto" else Shrinkage()
-    if estimation.estimator == "consistent":
-        shrinkage = Shrinkage(strength=math.inf)
-
     try:
         found = calibrate(
             result.pooled,
             result.factor,
             TorqueMeans.of(model, prepared.training),
             TorqueMeans.of(model, prepared.held_out),
-            lambda factor: fitted_values(model, factor, shrinkage),
+            estimation.refit,
         )
     except IdentificationError:
         return None

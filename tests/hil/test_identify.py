@@ -19,7 +19,7 @@ from hil.cli.verdict import NOT_GOOD, as_json, finish, sentences, table
 from hil.errors import ArchiveError, InputError, OutputError
 from hil.identify import Options, identify_archives, identify_campaign
 from hil.identify.estimating import estimate_with
-from hil.identify.options import ESTIMATORS, FIXED
+from hil.identify.options import ESTIMATORS, FIXED, friction_from
 from hil.identify.prepared import prepare_sources
 from hil.identify.sources import gather_sources
 from hil.importers import Robot
@@ -298,6 +298,13 @@ def prepared(campaign):
     return prepare_sources(sources, Options(standstill="slow"), Silent())
 
 
+def torque_share(difference, factor):
+    """Return the largest torque of a difference of parameters (p,), relative to the measured."""
+    gram = factor.gram
+    squares = np.einsum("i,jik,k->j", difference, gram[:, :-1, :-1], difference)
+    return np.sqrt(squares / gram[:, -1, -1]).max()
+
+
 @pytest.fixture(scope="module")
 def estimations(prepared):
     return {name: estimate_with(prepared, Options(estimator=name), Silent()) for name in ESTIMATORS}
@@ -312,13 +319,19 @@ class TestEstimators:
         found = estimations[name]
         pooled = found.result.pooled
         error = pooled.values - planted_values(prepared.sources.cell)
-        gram = found.result.factor.gram
-        squares = np.einsum("i,jik,k->j", error, gram[:, :-1, :-1], error)
-        assert np.sqrt(squares / gram[:, -1, -1]).max() < 0.005
+        assert torque_share(error, found.result.factor) < 0.005
         # Expected by chance: 0.03 of 58, and three of a single motion.
         assert np.count_nonzero(np.abs(error) / pooled.std > 3.5) <= 3
         assert found.estimator == name
         assert len(found.result.repetitions) == len(prepared.fitted)
+
+    @pytest.mark.parametrize("name", ["auto", "wls", "ols", "prior", "consistent"])
+    def test_refit_of_all_rows_is_the_estimate(self, name, estimations):
+        """So that the calibration is that of the estimator; others need the samples."""
+        found = estimations[name]
+        values = found.posterior.estimate.values if name == "prior" else found.result.pooled.values
+        difference = found.refit(found.result.factor) - values
+        assert torque_share(difference, found.result.factor) < 1e-4
 
     def test_need_commands_as_instruments(self, prepared):
         sources = prepared.sources
@@ -341,6 +354,21 @@ class TestEstimators:
         expected = estimations["wls"].result.pooled.values
         np.testing.assert_array_equal(found.result.pooled.values, expected)
         assert any("least squares is reported" in one for one in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("coulomb,tanh=", "'tanh=' needs a value above zero"),
+        ("coulomb=2", "'coulomb' takes no value"),
+        ("stribeck=0.1,stribeck=0.2", "'stribeck=0.2' repeats a term"),
+        ("quadratic,cubic", "'cubic' repeats a term or excludes it"),
+        ("coulomb,third", "'third' is not a friction term"),
+    ],
+)
+def test_a_friction_law_is_refused_by_its_term(text, problem):
+    with pytest.raises(InputError, match=problem):
+        friction_from(text)
 
 
 def test_the_command_writes_results_of_the_estimator(campaign, tmp_path):
