@@ -29,7 +29,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from hil.campaign.dry_run import DryRun
+from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
 from hil.progress import Silent, Task, put
@@ -241,7 +241,7 @@ _POLL: Final = 0.1
 """Period of polling keys and stop requests, s."""
 
 
-def ask(console: Console, title: str, found: DryRun, stop: Stop) -> bool:
+def ask(console: Console, title: str, found: DryRunRecord, stop: Stop) -> bool:
     """Show a dry run and ask for its acceptance: "yes", or the joints that contradict the model."""
     table = Table(title=Text(printable(f"Dry run of {title}, {clock(found.duration)} long")))
     for column in ("joint", "largest following error", "largest current", "torque and gravity"):
@@ -374,7 +374,7 @@ class Screen:
         """Whether the operator can be asked at the terminal."""
         return self._full and can_read(sys.stdin)
 
-    def accept_dry_run(self, found: DryRun) -> bool:
+    def accept_dry_run(self, found: DryRunRecord) -> bool:
         """Ask on the terminal's main page; False without a terminal."""
         if not self.can_answer:
             return False

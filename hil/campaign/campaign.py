@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,12 +23,12 @@ from identification.excitation import Excitation
 
 from .errors import CampaignFolderError
 from .folder import LOCK, CampaignFolder
-from .intervals import require_runnable
+from .intervals import Interval, planned_intervals, require_runnable
 from .link import MotionLink
-from .operator import Operator, Stop, Unattended
+from .operator import Operator, RunWatch, Stop, Unattended
 from .plan import CampaignPlan, plan_around
 from .rehearsal import SEED, Rehearsal, rehearse
-from .run import Run, RunResult
+from .run import Choices, Run, RunResult, execute
 from .status import CampaignStatus, status_of
 
 if TYPE_CHECKING:
@@ -126,6 +127,23 @@ class Campaign:
                 self.folder.root, f"holds a campaign with another {what}", "name a new folder"
             )
         return self
+
+    @cached_property
+    def motions(self) -> Sequence[Interval]:
+        """All motions of its plan in order, without the moves between them."""
+        return planned_intervals(self.cell, self.plan)
+
+    def missing(self, *kinds: str) -> list[Interval]:
+        """Return what is still to be run at full speed, of these kinds or of all."""
+        return [
+            one
+            for one in self.motions
+            if one.kind in (kinds or (one.kind,)) and self.folder.whole(one.kind, one.index) is None
+        ]
+
+    def progress(self, kind: str) -> tuple[int, int]:
+        """Return how many motions of a kind are complete, and how many there are to be."""
+        return len(self.folder.completed(kind)), sum(one.kind == kind for one in self.motions)
 
     def status(self) -> CampaignStatus:
         """Return which steps are done, and the command for the next one."""
@@ -226,7 +244,7 @@ class Campaign:
             accept_dry_run: accept the dry run of an earlier run; on a simulated link also that of
                 this run.
             accept_torque: joints to accept whose torque had the opposite sign of gravity in the
-                dry run of an earlier run (`DryRun.against_gravity`).
+                dry run of an earlier run (`DryRunRecord.against_gravity`).
             live: where viewers may connect, on the cell's own link.
 
         Raises:
@@ -240,20 +258,19 @@ class Campaign:
             CampaignFolderError: the folder was changed, or is in use by another run.
             OutputError: a result cannot be written.
         """
-        return Run(
-            self,
-            link,
-            stop or Stop(),
-            reporter or Silent(),
-            operator or Unattended(),
-            given_provenance=provenance,
+        watch = RunWatch(operator or Unattended(), stop or Stop())
+        choices = Choices(
+            provenance=provenance,
             durable=durable,
             unrehearsed=unrehearsed,
             dry_run_only=dry_run_only,
             accept_dry_run=accept_dry_run,
             accept_torque=tuple(accept_torque),
             live=live,
-        ).execute()
+        )
+        with self.folder.locked():
+            self.folder.require_unchanged()
+            return execute(Run(self, link, watch, reporter or Silent(), choices))
 
 
 _FILES = ("manifest.json", "cell.toml", "robot.urdf", "plan.json", "rehearsal.json", LOCK)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.archive import open_archive
-from hil.cell import Cell
 from hil.errors import ArchiveError, OperatorStopError
 
 from .errors import AgainstGravityError, DryRunError
@@ -21,6 +20,7 @@ from .folder import CampaignFolder, load_record, save_record
 from .intervals import Interval
 
 if TYPE_CHECKING:
+    from .campaign import Campaign
     from .run import Run, Runner
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ class Acceptance:
 
 
 @dataclass(frozen=True)
-class DryRun:
+class DryRunRecord:
     """A completed dry run; `dry_run.json`.
 
     Attributes:
@@ -161,15 +161,10 @@ class DryRun:
 
     @classmethod
     def of(
-        cls,
-        folder: CampaignFolder,
-        cell: Cell,
-        names: Sequence[str],
-        *,
-        plan_hash: str,
-        simulated: bool,
+        cls, campaign: Campaign, names: Sequence[str], *, plan_hash: str, simulated: bool
     ) -> Self:
         """Return the dry run from its archives."""
+        folder, cell = campaign.folder, campaign.cell
         limit, step = cell.drive_train.current_limit, max(1, round(_STEP / cell.period))
         current, following = np.zeros(len(limit)), np.zeros(len(limit))
         missed = late = cycles = 0
@@ -221,7 +216,7 @@ class DryRun:
         """Write the file (OutputError if the disk refuses)."""
         save_record(path, self, FORMAT_VERSION)
 
-    def accepted_now(self) -> DryRun:
+    def accepted_now(self) -> DryRunRecord:
         """Return this dry run, accepted by the user of this program."""
         try:
             user = getpass.getuser()
@@ -238,31 +233,29 @@ class DryRunStage:
     """
 
     def __init__(self, run: Run) -> None:
-        self._run = run
-        self.state: DryRunState = "left out" if run.unrehearsed else "to be accepted"
+        self._run, self._folder, self._choices = run, run.campaign.folder, run.choices
+        self.state: DryRunState = "left out" if run.choices.unrehearsed else "to be accepted"
         motions = [
-            one for one in run.wanted
+            one for one in run.campaign.motions
             if one.kind == "validation" or (one.kind, one.index) == ("excitation", 0)
         ]  # fmt: skip
         self.intervals = [replace(one, kind="dryrun", index=k) for k, one in enumerate(motions)]
         # Only what an earlier run measured can be accepted, not what this one is going to.
-        self._known = run.accept_torque if run.accept_torque and self.found() else ()
+        named = run.choices.accept_torque
+        self._known = named if named and self.found() else ()
 
-    def found(self) -> DryRun | None:
+    def found(self) -> DryRunRecord | None:
         """Return the dry run of this plan and kind of arm; None without a valid one."""
-        run = self._run
-        if run.unrehearsed:
+        run, motions = self._run, len(self.intervals)
+        if self._choices.unrehearsed:
             return None
-        return DryRun.that_counts(
-            run.folder,
-            plan_hash=run.plan_hash,
-            motions=len(self.intervals),
-            simulated=run.simulated,
+        return DryRunRecord.that_counts(
+            self._folder, plan_hash=run.plan_hash, motions=motions, simulated=run.simulated
         )
 
     def missing(self) -> list[Interval]:
         """Return the motions that were not run slowly yet."""
-        intervals = [] if self._run.unrehearsed else self.intervals
+        intervals = [] if self._choices.unrehearsed else self.intervals
         return [one for one in intervals if self._complete(one) is None]
 
     def run(self, runner: Runner) -> None:
@@ -270,7 +263,7 @@ class DryRunStage:
         missing = self.missing()
         for slow in missing:
             name = runner.run_motion(slow, slow.index + 1, len(self.intervals), OVERRIDE)
-            self._run.review.enter(slow, name)
+            self._run.archives.review.enter(slow, name)
         if missing:
             self.accept()
 
@@ -282,42 +275,42 @@ class DryRunStage:
             OperatorStopError: the operator stopped instead of answering.
         """
         run, found = self._run, self.found()
-        if run.unrehearsed:
+        if self._choices.unrehearsed:
             return
         if found is None:
             names = [name for slow in self.intervals if (name := self._complete(slow)) is not None]
             if len(names) < len(self.intervals):
                 return
-            found = DryRun.of(
-                run.folder, run.cell, names, plan_hash=run.plan_hash, simulated=run.simulated
+            found = DryRunRecord.of(
+                run.campaign, names, plan_hash=run.plan_hash, simulated=run.simulated
             )
-            found.save(run.folder.dry_run)
+            found.save(self._folder.dry_run)
         if found.accepted is None:
             unknown = [joint for joint in found.against_gravity if joint not in self._known]
             if not self._agreed(found, unknown):
-                if not run.dry_run_only:
-                    raise not_accepted(run.folder, unknown)
+                if not self._choices.dry_run_only:
+                    raise not_accepted(self._folder, unknown)
                 return
-            found.accepted_now().save(run.folder.dry_run)
+            found.accepted_now().save(self._folder.dry_run)
         self.state = "accepted"
 
-    def _agreed(self, found: DryRun, unknown: Sequence[str]) -> bool:
+    def _agreed(self, found: DryRunRecord, unknown: Sequence[str]) -> bool:
         """Return whether caller or operator accepts it; unknown joints only the operator can."""
-        run = self._run
-        if run.accept_dry_run and not unknown:
+        operator, stop = self._run.watch.operator, self._run.watch.stop
+        if self._choices.accept_dry_run and not unknown:
             return True
-        agreed = run.operator.can_answer and run.operator.accept_dry_run(found)
-        if run.operator.can_answer and not agreed and run.stop.requested:
+        agreed = operator.can_answer and operator.accept_dry_run(found)
+        if operator.can_answer and not agreed and stop.requested:
             raise OperatorStopError(
-                f"{run.folder.root}: stopped by the operator; its dry run was done, and is not "
+                f"{self._folder.root}: stopped by the operator; its dry run was done, and is not "
                 "accepted."
             )
         return agreed
 
     def _complete(self, slow: Interval) -> str | None:
         """Return the name of its complete archive, if it is of this kind of arm."""
-        name = self._run.folder.whole(slow.kind, slow.index)
-        made = name is not None and made_by(self._run.folder.archives / name, self._run.simulated)
+        name = self._folder.whole(slow.kind, slow.index)
+        made = name is not None and made_by(self._folder.archives / name, self._run.simulated)
         return name if made else None
 
 

@@ -31,8 +31,8 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
     """
     _require_one_kind_of_arm(run)
     _require_own_link(run)
-    root = run.folder.root
-    if run.unrehearsed:
+    root = run.campaign.folder.root
+    if run.choices.unrehearsed:
         if not run.simulated:
             raise NotRehearsedError(
                 root,
@@ -41,19 +41,19 @@ def require_gates(run: Run, dry_run: DryRunStage) -> None:
                 f"rehearsal: run `hil rehearse {root}`",
             )
         return
-    require_rehearsed(run.folder, run.plan_hash)
+    require_rehearsed(run.campaign.folder, run.plan_hash)
     # Refused before anything moves if the dry run could not be accepted afterwards.
     found, first = dry_run.found(), f"run `hil run {root} --dry-run`"
-    if found is None and run.accept_dry_run and not run.simulated:
+    if found is None and run.choices.accept_dry_run and not run.simulated:
         remedy = f"{first}, watch the arm, and accept it then"
         raise DryRunError(root, "cannot be accepted before it was done", remedy)
-    if run.operator.can_answer or run.dry_run_only or run.accept_dry_run:
+    if run.watch.operator.can_answer or run.choices.dry_run_only or run.choices.accept_dry_run:
         return
     if found is None:
         remedy = f"{first} and watch the arm"
         raise DryRunError(root, "was not done, and there is no operator to accept it", remedy)
     if found.accepted is None:
-        raise not_accepted(run.folder, found.against_gravity)
+        raise not_accepted(run.campaign.folder, found.against_gravity)
 
 
 def require_rehearsed(folder: CampaignFolder, plan_hash: str | None = None) -> Rehearsal:
@@ -84,8 +84,8 @@ def _require_one_kind_of_arm(run: Run) -> None:
     must not be pooled.
     """
     own = yes_or_no(run.simulated)
-    for entry in run.folder.manifest():
-        path, made_by = run.folder.archives / entry.name, own
+    for entry in run.campaign.folder.manifest():
+        path, made_by = run.campaign.folder.archives / entry.name, own
         with suppress(ArchiveError):
             if path.is_file():
                 made_by = open_archive(path, fields=()).header.simulated or ""
@@ -94,7 +94,7 @@ def _require_one_kind_of_arm(run: Run) -> None:
             whose = kinds.get(made_by, "an unknown kind of arm")
             link = "a simulated one" if run.simulated else "a real one"
             raise CampaignFolderError(
-                run.folder.root,
+                run.campaign.folder.root,
                 f"holds archives of {whose}, and its link leads to {link}",
                 "begin a new campaign folder (`hil design`), or restore the cell's [controller]",
             )
@@ -103,12 +103,12 @@ def _require_one_kind_of_arm(run: Run) -> None:
 def _require_own_link(run: Run) -> None:
     """Refuse a link opened for another arm; the address and the simulated arm may differ."""
     other = getattr(run.link, "cell", None)
-    if not isinstance(other, Cell) or other is run.cell:
+    if not isinstance(other, Cell) or other is run.campaign.cell:
         return
-    wanted, found = _sent_by(run.cell), _sent_by(other)
+    wanted, found = _sent_by(run.campaign.cell), _sent_by(other)
     if differ := [name for name in wanted if wanted[name] != found[name]]:
         raise CampaignFolderError(
-            run.folder.root,
+            run.campaign.folder.root,
             f"its link was opened with another cell ({', '.join(differ)} differ)",
             "open the link with the campaign's own cell (`campaign.cell`)",
         )
@@ -133,11 +133,11 @@ def require_as_rehearsed(run: Run, connection: Connection) -> None:
         NotRehearsedError: names joints with a narrower following-error threshold in the
             controller, and both thresholds.
     """
-    below = narrower_limits(run.cell, connection, "following_error")
+    below = narrower_limits(run.campaign.cell, connection, "following_error")
     if not below:
         return
     raise NotRehearsedError(
-        run.folder.root,
+        run.campaign.folder.root,
         "was planned and rehearsed with wider following-error thresholds than those of the "
         f"controller ({'; '.join(below)})",
         "write the controller's into [drive_train] following_error of the cell file and rehearse, "

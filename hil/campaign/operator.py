@@ -17,7 +17,7 @@ from drivers.states import State
 from hil.archive.header import KIND_NAMES
 
 if TYPE_CHECKING:
-    from .dry_run import DryRun
+    from .dry_run import DryRunRecord
 
 Array = NDArray[np.float64]
 
@@ -159,7 +159,7 @@ class Operator(Protocol):
         """Return the present request."""
         ...
 
-    def accept_dry_run(self, found: DryRun) -> bool:
+    def accept_dry_run(self, found: DryRunRecord) -> bool:
         """Ask whether the slow motion was right; False where he cannot be asked."""
         ...
 

@@ -13,11 +13,10 @@ from hil.reading import path_exists
 from hil.results import ConductResult, Results, StepResult
 from hil.terminal_text import plural
 
-from .dry_run import DryRun
+from .dry_run import DryRunRecord
 from .folder import CampaignFolder
-from .intervals import planned_intervals
 from .rehearsal import Rehearsal
-from .warmup import WarmUp, drift_wanted
+from .warmup import WarmUpRecord, drift_wanted
 
 if TYPE_CHECKING:
     from .campaign import Campaign
@@ -139,7 +138,7 @@ def _rehearsal(folder: CampaignFolder) -> Step:
 
 def _dry_run(campaign: Campaign) -> Step:
     folder = campaign.folder
-    found = DryRun.that_counts(
+    found = DryRunRecord.that_counts(
         folder,
         plan_hash=folder.plan_hash,
         motions=1 + len(campaign.plan.validation),
@@ -151,7 +150,7 @@ def _dry_run(campaign: Campaign) -> Step:
     return _accepted(found)
 
 
-def _accepted(found: DryRun | None) -> Step:
+def _accepted(found: DryRunRecord | None) -> Step:
     if found is None:
         return Step("next", "not done: every motion at 20 % of its speed", "run {} --dry-run")
     if found.accepted is None:
@@ -185,14 +184,14 @@ def _gate(campaign: Campaign, found: Step, record: Path) -> Step:
 def _warmed(campaign: Campaign) -> Step:
     if not drift_wanted(campaign.cell):
         return Step("done", "none wanted (warmup_drift)")
-    warm = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+    warm = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     if warm is None and _motions(campaign, "excitation", "repetitions").done:
         return Step("done", "left out")
     over = warm is not None and warm.outcome != "going on"
     return replace(_warm_up(warm), state="done" if over else "next")
 
 
-def _warm_up(found: WarmUp | None) -> Step:
+def _warm_up(found: WarmUpRecord | None) -> Step:
     """Return the step for the report: done if the arm was warm."""
     if found is None:
         return Step("next", "not done", "run {}")
@@ -203,8 +202,7 @@ def _warm_up(found: WarmUp | None) -> Step:
 
 
 def _motions(campaign: Campaign, kind: str, words: str) -> Step:
-    total = sum(one.kind == kind for one in planned_intervals(campaign.cell, campaign.plan))
-    whole = len(campaign.folder.completed(kind))
+    whole, total = campaign.progress(kind)
     state: State = "done" if whole >= total else "next"
     return Step(state, f"{whole} of {total} {words} complete", "run {}")
 
@@ -239,8 +237,8 @@ def conduct_of(folder: CampaignFolder) -> ConductResult:
     """
     steps = {
         "rehearsal": _step(lambda: _rehearsal(folder)),
-        "dry run": _step(lambda: _accepted(DryRun.load(folder))),
-        "warm-up": _step(lambda: _warm_up(WarmUp.load(folder.warmup, folder.plan_hash))),
+        "dry run": _step(lambda: _accepted(DryRunRecord.load(folder))),
+        "warm-up": _step(lambda: _warm_up(WarmUpRecord.load(folder.warmup, folder.plan_hash))),
         "repetitions": _recorded(folder, "excitation"),
         "validation": _recorded(folder, "validation"),
     }

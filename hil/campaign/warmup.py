@@ -67,7 +67,7 @@ class WarmMotion:
 
 
 @dataclass(frozen=True)
-class WarmUp:
+class WarmUpRecord:
     """Warm-up of a campaign; `warmup.json`.
 
     Attributes:
@@ -119,7 +119,7 @@ class WarmUp:
         friction = friction.reshape(len(self.motions), len(self.joint_names))
         return [change_per_motion(friction[: k + 1]) for k in range(len(friction))]
 
-    def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUp:
+    def with_motion(self, archive: str, friction: Array, least: int, most: int) -> WarmUpRecord:
         """Return this warm-up after another motion of friction (n,) [N·m], with its new outcome."""
         known = tuple(float(f) if np.isfinite(f) else None for f in friction)
         longer = replace(self, motions=(*self.motions, WarmMotion(archive, known)))
@@ -129,7 +129,7 @@ class WarmUp:
         unknown = done >= least and np.isnan(change)  # and would be after more motions
         return replace(longer, outcome="not warm") if unknown or done >= most else longer
 
-    def cooled(self) -> WarmUp:
+    def cooled(self) -> WarmUpRecord:
         """Return a new warm-up after the arm cooled down."""
         earlier = (*self.earlier, *self.motions)
         return replace(self, motions=(), outcome="going on", earlier=earlier)
@@ -197,9 +197,9 @@ class WarmUpStage:
     """Repeats the excitation until friction hardly changes any more."""
 
     def __init__(self, run: Run) -> None:
-        self._run = run
+        self._run, self._cell, self._path = run, run.campaign.cell, run.campaign.folder.warmup
         self._pauses: list[str] = []
-        self._threshold = drift_wanted(run.cell, only_simulated=run.simulated)
+        self._threshold = drift_wanted(run.campaign.cell, only_simulated=run.simulated)
 
     @property
     def outcome(self) -> str:
@@ -225,24 +225,24 @@ class WarmUpStage:
         state, motions = self._state(), self.next_motion()
         if state.outcome != "going on":
             return []
-        missing = self._run.cell.campaign.warmup_least - len(state.motions)
+        missing = self._cell.campaign.warmup_least - len(state.motions)
         return [motion.trajectory.duration for motion in motions] * max(missing, 0)
 
     def run(self, runner: Runner) -> None:
-        """Run motions until the arm is warm (RepetitionsRejectedError: each attempt was slowed)."""
-        if not self._threshold:
+        """Run motions until the arm is warm, if any are missing (RepetitionsRejectedError)."""
+        if not self._threshold or not self._run.campaign.missing("excitation", "validation"):
             return
-        run, state, settings = self._run, self._present(), self._run.cell.campaign
-        meter = FrictionMeter(run.cell, run.plan.excitation.trajectory)
+        run, state, settings = self._run, self._present(), self._cell.campaign
+        meter = FrictionMeter(run.campaign.cell, run.campaign.plan.excitation.trajectory)
         while state.outcome == "going on":
             interval, done = self._interval(state), len(state.motions)
             if done >= settings.warmup_least:
                 run.watch.expect([interval.trajectory.duration])
             name = runner.run_until_accepted(interval, done + 1, settings.warmup_most)
-            friction = meter.measure(run.folder.archives / name)
+            friction = meter.measure(run.campaign.folder.archives / name)
             state = state.with_motion(name, friction, settings.warmup_least, settings.warmup_most)
             state = replace(state, moved_at=time.time())
-            state.save(run.folder.warmup)
+            state.save(self._path)
             run.reporter.say(state.sentence)
 
     def rewarm(self, runner: Runner) -> None:
@@ -261,26 +261,26 @@ class WarmUpStage:
         """Record that a motion that warms the joints has ended."""
         found = self._found()
         if found is not None:
-            replace(found, moved_at=time.time()).save(self._run.folder.warmup)
+            replace(found, moved_at=time.time()).save(self._path)
 
-    def _found(self) -> WarmUp | None:
-        return WarmUp.load(self._run.folder.warmup, self._run.plan_hash)
+    def _found(self) -> WarmUpRecord | None:
+        return WarmUpRecord.load(self._path, self._run.plan_hash)
 
-    def _state(self) -> WarmUp:
+    def _state(self) -> WarmUpRecord:
         """Return the warm-up from its file, or a new one."""
-        new = WarmUp(self._run.plan_hash, self._run.cell.joint_names, self._threshold)
+        new = WarmUpRecord(self._run.plan_hash, self._cell.joint_names, self._threshold)
         return replace(self._found() or new, threshold=self._threshold)
 
-    def _cold(self, when: float) -> WarmUp | None:
+    def _cold(self, when: float) -> WarmUpRecord | None:
         """Return a warm-up after which the arm has cooled down by `when` [s since 1970]."""
         found = self._found() if self._threshold else None
         return found if found is not None and found.motions and found.cold(when) else None
 
-    def _interval(self, state: WarmUp) -> Interval:
-        plan = self._run.plan
+    def _interval(self, state: WarmUpRecord) -> Interval:
+        plan = self._run.campaign.plan
         return Interval("warmup", state.next_index, plan.excitation.trajectory, plan.moves)
 
-    def _present(self) -> WarmUp:
+    def _present(self) -> WarmUpRecord:
         """Return the warm-up to continue; a new one if the joints have cooled down."""
         state = self._state()
         if state.motions and state.cold(time.time()):

@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.states import State
 from hil.campaign import stop_on_interrupt
-from hil.campaign.dry_run import DryRun
+from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus
 from hil.screen import Screen
 
@@ -124,7 +124,7 @@ def main() -> int:
             last: OperatorRequest | None = None
             until = time.monotonic() + LONGEST
             if ending in ("question", "contradiction"):
-                found = DryRun(
+                found = DryRunRecord(
                     "0" * 64, 0.2, ("dryrun_000_a1.mcap",), 12.0, True, NAMES,
                     (0.2, 0.4), (0.001, 0.002), 0, 0,
                     against_gravity=NAMES[1:] if ending == "contradiction" else (),

@@ -20,11 +20,11 @@ from typer.testing import CliRunner
 import hil
 from hil.campaign import Campaign, CampaignFolderError, MotionRefusedError
 from hil.campaign.campaign import campaign_of_design
-from hil.campaign.dry_run import Acceptance, DryRun
+from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.intervals import at_limit, straight_move
 from hil.campaign.status import conduct_of
-from hil.campaign.warmup import WarmMotion, WarmUp
+from hil.campaign.warmup import WarmMotion, WarmUpRecord
 from hil.cell import Cell
 from hil.cli import app
 from hil.design import DesignResult
@@ -170,12 +170,12 @@ def test_the_conduct_has_what_was_left_out(ran: Campaign) -> None:
 
 def test_the_page_has_rehearsal_dry_run_warm_up_and_rejections(folder: CampaignFolder) -> None:
     pass_rehearsal(folder)
-    DryRun(
+    DryRunRecord(
         folder.plan_hash, 0.2, ("dryrun_000_a1.mcap",), 9.0, True, ("shoulder", "elbow"),
         (0.3, 0.12), (0.01, 0.02), 1, 2, Acceptance("ada", "2026-03-01"),
     ).save(folder.dry_run)  # fmt: skip
     motions = tuple(WarmMotion(f"w{k}", (10.0 - k, None)) for k in range(3))
-    warm = WarmUp(folder.plan_hash, ("shoulder", "elbow"), 0.002, motions, "not warm")
+    warm = WarmUpRecord(folder.plan_hash, ("shoulder", "elbow"), 0.002, motions, "not warm")
     assert np.isnan(warm.changes[0]) and warm.changes[1] == pytest.approx(1.0 / 9.5)
     warm.save(folder.warmup)
     name = "excitation_001_a9.mcap"

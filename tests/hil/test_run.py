@@ -34,7 +34,7 @@ from hil.campaign import (
     quality,
 )
 from hil.campaign import link as link_module
-from hil.campaign.dry_run import OVERRIDE, DryRun, agreement
+from hil.campaign.dry_run import OVERRIDE, DryRunRecord, agreement
 from hil.campaign.errors import (
     AgainstGravityError,
     DryRunError,
@@ -48,7 +48,13 @@ from hil.campaign.operator import OperatorRequest, RunStatus, Stop
 from hil.campaign.quality import FIELDS, Executed, RepetitionCheck
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.run import RunResult
-from hil.campaign.warmup import COLD_AFTER, FrictionMeter, WarmUp, WarmUpStage, change_per_motion
+from hil.campaign.warmup import (
+    COLD_AFTER,
+    FrictionMeter,
+    WarmUpRecord,
+    WarmUpStage,
+    change_per_motion,
+)
 from hil.cli import app
 from hil.errors import ControllerFault, HilError, OperatorStopError, OutputError
 from hil.identify.sources import gather_sources
@@ -82,7 +88,7 @@ class Operator:
     ) -> None:
         self.accepts, self.requests = accepts, requests
         self.seen: list[RunStatus] = []
-        self.asked: list[DryRun] = []
+        self.asked: list[DryRunRecord] = []
 
     def show(self, status: RunStatus) -> None:
         self.seen.append(status)
@@ -90,7 +96,7 @@ class Operator:
     def request(self) -> OperatorRequest:
         return self.requests(self.seen[-1]) if self.seen else OperatorRequest()
 
-    def accept_dry_run(self, summary: DryRun) -> bool:
+    def accept_dry_run(self, summary: DryRunRecord) -> bool:
         self.asked.append(summary)
         return self.accepts
 
@@ -244,7 +250,7 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
         campaign.plan.excitation.trajectory,
         *(one.trajectory for one in campaign.plan.validation),
     ]
-    found = DryRun.load(campaign.folder)
+    found = DryRunRecord.load(campaign.folder)
     assert (found.warnings, found.gravity_not_seen) == ((), ()), "torques of a right cell"
     for name, motion in zip(sorted(found.archives), motions, strict=True):
         planned = np.abs(motion.sample(np.arange(0, motion.duration, campaign.cell.period))[1])
@@ -257,7 +263,7 @@ def test_the_dry_run_is_every_motion_slowly(make: Make) -> None:
         campaign.run()
     rest = campaign.run(accept_dry_run=True)
     assert kinds(rest) == ["move", "standstill", "excitation", "validation", "move"]
-    assert DryRun.load(campaign.folder).accepted.by
+    assert DryRunRecord.load(campaign.folder).accepted.by
     assert rest.complete
     assert campaign.run().archives == (), "accepted once, and nothing is missing"
 
@@ -426,7 +432,7 @@ def test_a_simulated_dry_run_opens_no_gate_to_a_real_arm(make: Make) -> None:
     did = make("did", real=True)
     simulated = simulated_link(did.cell, instead_of_hardware=True)
     did.run(simulated, dry_run_only=True, operator=Operator())
-    found = DryRun.load(did.folder)
+    found = DryRunRecord.load(did.folder)
     for name, claimed in (("copied", found), ("edited", replace(found, simulated=False))):
         mine = make(name, real=True)
         claimed.accepted_now().save(mine.folder.dry_run)
@@ -445,7 +451,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     campaign = make(real=True)
     twin = simulated_link(campaign.cell, instead_of_hardware=True)
     if provenance is None:  # as of a version that left it to the caller
-        monkeypatch.setattr("hil.campaign.run.Run.provenance", {})
+        monkeypatch.setattr("hil.campaign.run.with_present_date", lambda _: {})
     campaign.run(twin, provenance=provenance, dry_run_only=True)
     monkeypatch.undo()
     first = next(campaign.folder.archives.iterdir())
@@ -454,7 +460,7 @@ def test_the_link_decides_whether_the_arm_is_simulated(
     with pytest.raises(CampaignFolderError, match=r"holds archives of .*leads to a real one"):
         campaign.run(Real(campaign), dry_run_only=True)  # type: ignore[arg-type]
     hash_ = campaign.folder.plan_hash
-    counts = DryRun.that_counts(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
+    counts = DryRunRecord.that_counts(campaign.folder, plan_hash=hash_, motions=2, simulated=False)
     assert counts is None
 
 
@@ -808,8 +814,8 @@ def test_friction_is_measured_without_knowing_the_arm_exactly(
     assert found[1] / found[0] == pytest.approx(np.full(2, 1.1), abs=0.01)
 
 
-def warm_up_of(campaign: Campaign) -> WarmUp:
-    found = WarmUp.load(campaign.folder.warmup, campaign.folder.plan_hash)
+def warm_up_of(campaign: Campaign) -> WarmUpRecord:
+    found = WarmUpRecord.load(campaign.folder.warmup, campaign.folder.plan_hash)
     assert found is not None
     return found
 
@@ -918,11 +924,11 @@ def test_a_full_disk_is_named(make: Make, monkeypatch: pytest.MonkeyPatch, name:
 
 
 def test_a_stop_while_a_dry_run_is_asked_for(copied: Campaign) -> None:
-    replace(DryRun.load(copied.folder), accepted=None).save(copied.folder.dry_run)
+    replace(DryRunRecord.load(copied.folder), accepted=None).save(copied.folder.dry_run)
     stop = Stop()
 
     class Leaves(Operator):
-        def accept_dry_run(self, summary: DryRun) -> bool:
+        def accept_dry_run(self, summary: DryRunRecord) -> bool:
             stop.requested = True
             return False
 

@@ -24,7 +24,7 @@ from drivers.events import MotionEnded
 from hil.archive import writer
 from hil.campaign import Campaign, VirtualLink, link
 from hil.campaign import folder as campaign_folder
-from hil.campaign.dry_run import DryRun
+from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import MotionFailedError, RepetitionsRejectedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.operator import OperatorRequest, RunStatus, Stop
@@ -205,7 +205,7 @@ class ScriptedOperator:
                 self._asked = 0
         return OperatorRequest(self._speed, held)
 
-    def accept_dry_run(self, found: DryRun) -> bool:
+    def accept_dry_run(self, found: DryRunRecord) -> bool:
         del found
         if self._declines:
             self.struck.append(self._declines.pop())

@@ -27,12 +27,12 @@ from hil.archive import ArchiveHeader, Samples, open_archive, write_samples
 from hil.archive.check import check_archive
 from hil.archive.container import MAGIC
 from hil.campaign import Campaign, CampaignFolderError
-from hil.campaign.dry_run import Acceptance, DryRun
+from hil.campaign.dry_run import Acceptance, DryRunRecord
 from hil.campaign.folder import LOCK, CampaignFolder
 from hil.campaign.quality import Executed
 from hil.campaign.rehearsal import Rehearsal
 from hil.campaign.status import conduct_of
-from hil.campaign.warmup import FrictionMeter, WarmUp
+from hil.campaign.warmup import FrictionMeter, WarmUpRecord
 from hil.cell import AngleFrame, Cell
 from hil.cli import app
 from hil.cli.plan import read_via_points
@@ -119,8 +119,8 @@ FILES: dict[str, Callable[[Path], object]] = {
     "cell.toml": lambda root: Campaign.open(root).status(),
     "robot.urdf": lambda root: Campaign.open(root).status(),
     "rehearsal.json": lambda root: Rehearsal.load(CampaignFolder(root)),
-    "dry_run.json": lambda root: DryRun.load(CampaignFolder(root)),
-    "warmup.json": lambda root: WarmUp.load(
+    "dry_run.json": lambda root: DryRunRecord.load(CampaignFolder(root)),
+    "warmup.json": lambda root: WarmUpRecord.load(
         CampaignFolder(root).warmup, CampaignFolder(root).plan_hash
     ),
     "results.json": lambda root: Results.load(root / "results.json"),
@@ -437,7 +437,7 @@ def test_imported_archive_instead_of_a_recorded_one(imported: Path, folder: Path
     shutil.copy(imported, folder / "archives" / "dryrun_000_a1.mcap")
     names = ["dryrun_000_a1.mcap"]
     for use in (
-        lambda: DryRun.of(campaign.folder, cell, names, plan_hash="", simulated=True),
+        lambda: DryRunRecord.of(campaign, names, plan_hash="", simulated=True),
         lambda: Executed.of(open_archive(imported)),
         lambda: FrictionMeter(cell, motion).measure(imported),
     ):
@@ -445,17 +445,17 @@ def test_imported_archive_instead_of_a_recorded_one(imported: Path, folder: Path
             use()
 
 
-def dry_run(folder: Path) -> DryRun:
-    return DryRun(
+def dry_run(folder: Path) -> DryRunRecord:
+    return DryRunRecord(
         plan_hash=CampaignFolder(folder).plan_hash, override=0.2, archives=(), duration=10.0,
         simulated=True, joint_names=("a", "b"), current_share=(0.1, 0.2),
         following_error=(0.1, float("nan")), missed=0, late=0, accepted=Acceptance("me", "now"),
     )  # fmt: skip
 
 
-def warm_up(folder: Path) -> WarmUp:
+def warm_up(folder: Path) -> WarmUpRecord:
     return (
-        WarmUp(CampaignFolder(folder).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
+        WarmUpRecord(CampaignFolder(folder).plan_hash, ("a", "b"), 0.01, moved_at=1e9)
         .with_motion("one.mcap", [1.0, float("nan")], 1, 9)
         .cooled()
         .with_motion("two.mcap", [1.0, 2.0], 1, 9)

@@ -8,12 +8,12 @@ from contextlib import suppress
 from functools import lru_cache, partial
 from pathlib import Path
 
-from hil.campaign.dry_run import DryRun
+from hil.campaign.dry_run import DryRunRecord
 from hil.campaign.errors import CampaignFolderError, NotRehearsedError
 from hil.campaign.folder import CampaignFolder
 from hil.campaign.plan import CampaignPlan
 from hil.campaign.rehearsal import Rehearsal
-from hil.campaign.warmup import WarmUp
+from hil.campaign.warmup import WarmUpRecord
 from hil.design.result import DesignResult, _seal
 from hil.design.settings import load_settings, preset_text
 from hil.errors import InputError
@@ -92,8 +92,8 @@ READERS: dict[str, Callable[[Path], object]] = {
     "plan.json": plan, "settings.toml": load_settings, "results.json": results,
     "manifest.json": manifest,
     "rehearsal.json": lambda path: Rehearsal.load(CampaignFolder(path.parent)),
-    "dry_run.json": lambda path: DryRun.load(CampaignFolder(path.parent), "0"),
-    "warmup.json": lambda path: WarmUp.load(path, "0"),
+    "dry_run.json": lambda path: DryRunRecord.load(CampaignFolder(path.parent), "0"),
+    "warmup.json": lambda path: WarmUpRecord.load(path, "0"),
     "moves.toml": load_settings, "moves.json": plan,  # inputs of a former reader
     "excitation.toml": DesignResult.load,
 }  # fmt: skip
