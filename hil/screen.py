@@ -30,7 +30,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.campaign.dry_run import DryRunRecord
-from hil.campaign.operator import MotionProgress, OperatorRequest, RunStatus, Stop
+from hil.campaign.operator import REFUSED, MotionProgress, OperatorRequest, RunStatus, Stop
 from hil.cell import Cell
 from hil.progress import Silent, Task, put
 from hil.terminal_text import plural, printable
@@ -446,7 +446,10 @@ class Screen:
         rows: list[RenderableType] = [top, state]
         rows += [] if motion is None else _motion_rows(self._names, motion)
         newest = tuple(self._messages)[-NEWEST:]
-        rows += [Text(), *(Text(printable(one, keep=""), style="dim") for one in newest)]
+        rows.append(Text())
+        for line in newest:
+            style = "bold red" if line.startswith(REFUSED) else "dim"
+            rows.append(Text(printable(line, keep=""), style=style))
         keys = self._keyboard is not None and self._keyboard.attached
         help_line = Text(HELP if keys else "Ctrl-C stops on the path", style="reverse")
         page = Layout()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Final
 
+from drivers.errors import Check, GuardError, RefusalError
 from drivers.events import Refused
+from hil.cell import AngleFrame, Cell
 from hil.errors import ExecutionError, HilError, InputError, UnsafeError
 from hil.terminal_text import plural
 
@@ -48,6 +51,40 @@ class MotionFailedError(ExecutionError):
         self.sentence = f"{which} was {how}"
         remedy = "run the campaign again to continue" if refused is None else refused.error.remedy
         super().__init__(f"{self.sentence}; everything recorded is archived; {remedy}.")
+
+
+_SET_BY: Final[Mapping[Check, str]] = {
+    Check.POSITION: "[limits] lower_deg and upper_deg",
+    Check.VELOCITY: "[limits] velocity_deg",
+    Check.ACCELERATION: "[limits] acceleration_deg and its factor in [bounds]",
+    Check.JERK: "[limits] jerk_deg and its factor in [bounds]",
+    Check.STATED_VELOCITY: "[limits] acceleration_deg and its factor in [bounds], times a cycle",
+    Check.FOLLOWING_ERROR: "[drive_train] following_error, or the controller where it is narrower",
+    Check.CURRENT: "[drive_train] current_limit, or the controller where it is narrower",
+    Check.COMMANDED_CURRENT: "[drive_train] current_limit, or the controller where it is narrower",
+}
+"""What in the cell file sets the bound of a check."""
+
+
+def refusal_text(cell: Cell, error: RefusalError) -> str:
+    """Return a refusal with the joint's name, degrees, and what in the cell file sets the bound."""
+    if not isinstance(error, GuardError):
+        return str(error)
+    joint, check, unit = error.joint, error.check, error.unit
+    name, cycle = cell.joint_names[joint], f"(cycle {error.cycle})"
+    if check is Check.FINITE:
+        return f"{name} has {error.value} where a number must be {cycle}"
+    value, bound = error.value, error.bound
+    if unit.startswith("rad"):
+        value, bound, unit = math.degrees(value), math.degrees(bound), unit.replace("rad", "°")
+    if check is Check.POSITION:
+        frame = AngleFrame.of(cell)
+        sign, offset = frame.sign[joint], math.degrees(frame.offset[joint])
+        value, bound = sign * value + offset, sign * bound + offset
+    source = f", set by {_SET_BY[check]}" if check in _SET_BY else ""
+    # The guard allows a millionth more than the cell file, for rounding.
+    allowed = f"allowed is {bound:.6g} {unit}{source}"
+    return f"{check.quantity} of {name} is {value:.9g} {unit}; {allowed} {cycle}"
 
 
 class NotRehearsedError(UnsafeError):

@@ -33,12 +33,13 @@ from drivers.states import HAS_SET_POINTS, State
 from drivers.transports.base import Transport
 from drivers.transports.simulated import SimulatedTransport
 from hil.archive import ArchiveSpec, ArchiveWriter, Recorder
-from hil.archive.recorder import Recorded, describe
+from hil.archive.recorder import Recorded
 from hil.cell import Cell
 from hil.errors import ArchiveWriteError, ControllerFault, OperatorStopError
 from hil.motion_checks import MotionChecks
 
-from .operator import MotionProgress, MotionWatch, Stop, unwatched_motion
+from .errors import refusal_text
+from .operator import REFUSED, MotionProgress, MotionWatch, Stop, unwatched_motion
 
 Array = NDArray[np.float64]
 
@@ -229,6 +230,7 @@ class Connection:
         differences: figures in which it differs from the cell.
         refused: the last refusal of the session.
         report: receives a line for each refusal at once.
+        cell: of the link, for these lines.
     """
 
     init: InitPacket | None = None
@@ -236,6 +238,7 @@ class Connection:
     differences: tuple[str, ...] = ()
     refused: Refused | None = None
     report: Callable[[str], object] = str
+    cell: Cell | None = None
 
     def update(self, event: ExchangeEvent) -> None:
         """Update the state with an event."""
@@ -244,7 +247,8 @@ class Connection:
             self.differences = event.differences
         elif isinstance(event, Refused):
             self.refused = event
-            self.report(f"REFUSED: {describe(event)}")
+            text = str(event.error) if self.cell is None else refusal_text(self.cell, event.error)
+            self.report(f"{REFUSED}: {text}; {event.error.remedy}")
 
     def require_usable(self) -> None:
         """Raise ControllerFault if the controller is not the cell's."""
@@ -351,7 +355,10 @@ class MotionLink(ABC):
                 except RequestError as error:
                     self.complete("refused", str(error))
                     raise ControllerFault(f"{error}; see the outcome of {spec.path}") from error
-                return self._supervise(spec, steering, stop)
+                ended, refused = self._supervise(spec, steering, stop), self.connection.refused
+                if refused is not None and ended.reason == str(refused.error):
+                    return replace(ended, reason=refusal_text(self.cell, refused.error))
+                return ended
             self.complete("stopped", NOT_STARTED)
             return MotionEnded("stopped", NOT_STARTED, -1, -1)
 
@@ -584,6 +591,9 @@ class VirtualLink(MotionLink):
     only_simulated: bool = True
     _archiving: _Archiving | None = None
     _READY: ClassVar[frozenset[State]] = frozenset((State.CLOSED,))
+
+    def __post_init__(self) -> None:
+        self.connection.cell = self.cell
 
     @classmethod
     def over(

@@ -281,6 +281,7 @@ class LiveLink(MotionLink):
     def __post_init__(self) -> None:
         self.view = ExchangeView(self.exchange)
         self.connection = self.view.connection
+        self.connection.cell = self.cell
         self._restart_reader()
 
     @classmethod

@@ -25,6 +25,9 @@ REQUESTS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Ctrl-C, the usual request to end, and the end of the terminal."""
 
 
+REFUSED: Final = "REFUSED"  # Begins the line of a refusal
+
+
 @dataclass
 class Stop:
     """Request to stop; the link then brings the arm to rest on its path.

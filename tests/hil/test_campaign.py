@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.errors import Check, GuardError
 from drivers.states import State
-from drivers.transports.simulated import Lose, SimulatedTransport
+from drivers.transports.simulated import Corrupt, Lose, SimulatedTransport
 from hil.archive import ArchiveName, ArchiveWriter, open_archive
 from hil.campaign import (
     Campaign,
@@ -28,6 +29,7 @@ from hil.campaign import (
     VirtualLink,
 )
 from hil.campaign import campaign as campaign_module
+from hil.campaign.errors import refusal_text
 from hil.campaign.intervals import (
     Interval,
     StraightMoves,
@@ -36,7 +38,7 @@ from hil.campaign.intervals import (
     require_allowed,
     rest,
 )
-from hil.cell import Cell
+from hil.cell import AngleFrame, Cell
 from hil.errors import ArchiveWriteError, ControllerFault, InputError
 from hil.motion_checks import MotionChecks
 from hil.progress import Silent, Task
@@ -240,6 +242,37 @@ def test_what_the_arm_does_after_a_refusal_is_recorded(
     last = archive.columns["cycle"][-1] * arm.campaign.cell.period
     assert last - ended.time == pytest.approx(0.5, abs=0.002)
     assert np.abs(archive.columns["velocity"][-1]).max() < 0.01
+
+
+def test_a_refusal_has_names_and_fields_of_the_cell_file(
+    tmp_path: Path, cell: Cell, plan: CampaignPlan
+) -> None:
+    """A wrong position is received: both the line at once and the error name joint and field."""
+    arm, lines = Arm.made(tmp_path, cell, plan, Corrupt(600, offset=27, mask=0x40)), list[str]()
+    reporter = Silent()
+    reporter.say = lines.append  # type: ignore[method-assign]
+    with pytest.raises(MotionFailedError, match="was refused: following error of") as failed:
+        arm.campaign.run(arm.link, Stop(), reporter, unrehearsed=True)
+    text = failed.value.reason
+    assert text.startswith(f"following error of {cell.joint_names[0]} is ")
+    assert ", set by [drive_train] following_error, or the controller" in text
+    error = failed.value.refused.error
+    assert f"REFUSED: {text}; {error.remedy}" in lines
+
+
+def test_a_refusal_shows_degrees_in_the_frame_of_the_limits(cell: Cell) -> None:
+    """Those of the teach pendant here, where joint 3 has another sense and zero position."""
+    pendant = AngleFrame.of(cell)
+    value, bound = np.radians(100.0), np.radians(90.0) * (1.0 + 1e-7)
+    shown = [pendant.shown(np.full(6, angle))[2] for angle in (value, bound)]
+    for check, text in (
+        (Check.VELOCITY, "100 °/s; allowed is 90 °/s, set by [limits] velocity_deg"),
+        (Check.POSITION, f"{shown[0]:.9g} °; allowed is {shown[1]:.6g} °, set by [limits] lower"),
+    ):
+        error = GuardError(check, 2, value, bound, 7)
+        named = f"{check.quantity} of {cell.joint_names[2]} is {text}"
+        assert refusal_text(cell, error).startswith(named)
+    assert pendant.name == "controller" and shown[0] != pytest.approx(100.0)
 
 
 @pytest.mark.parametrize(

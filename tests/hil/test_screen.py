@@ -106,6 +106,15 @@ class TestPicture:
             assert max(map(len, rows)) <= width
             assert rows[-1].startswith("Ctrl-C")
 
+    def test_a_refusal_stands_out_of_the_messages(self) -> None:
+        screen = screen_of(status())
+        screen._messages += ["REFUSED: velocity of joint_1", "another line"]
+        console = Console(width=80, height=24, file=StringIO())
+        rows = console.render_lines(screen.picture(), console.options)
+        styles = {part.text.strip(): str(part.style) for row in rows for part in row}
+        assert styles["REFUSED: velocity of joint_1"] == "bold red"
+        assert styles["another line"] == "dim"
+
     def test_shows_stop_hold_and_silence(self) -> None:
         held, stopping, silent = (screen_of(status()) for _ in range(3))
         held.press("h")
