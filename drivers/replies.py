@@ -96,10 +96,10 @@ def safe_reply(status: bytes, modes: Words, arms: Sequence[int] | None) -> SafeR
             mask[slot, list(_RETURNED_WORDS[mode])] = _ALL_BITS
             if mode in HOLDABLE:
                 returned.append(slot)
-    drives = bytes(
+    reply_status = bytes(
         status[arm - 1] if arm in arms and not on[arm - 1] else 0 for arm in range(1, N_ARMS + 1)
     )
-    return SafeReply(drives, replied, mask, tuple(returned))
+    return SafeReply(reply_status, replied, mask, tuple(returned))
 
 
 def words_of(packet: CyclicPacket) -> Words:
