@@ -8,19 +8,10 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 from typing import IO, Any
-
-from drivers.transports.base import TransportSpec
-from drivers.transports.udp import UdpSpec
-from hil.archive.live import LiveView
-from hil.campaign.live_link import LiveLink
-from hil.cell import Cell
-from hil.errors import ControllerFault, ExecutionError
 
 LOOPBACK = "127.0.0.1"
 SIMULATE = (sys.executable, "-m", "hil", "simulate")
@@ -83,41 +74,6 @@ class SimulatorProcess:
 def _lines(file: IO[bytes]) -> list[str]:
     file.seek(0)
     return [line.strip() for line in file.read().decode(errors="replace").splitlines()]
-
-
-@contextmanager
-def loopback_link(
-    cell: Cell,
-    *,
-    simulated_by: Path | None = None,
-    options: tuple[str, ...] = (),
-    live: LiveView | None = None,
-) -> Iterator[LiveLink]:
-    """Start a simulated controller in another process and connect a `LiveLink` to it.
-
-    UDP uses a free port of the loopback device, CAN the bus of the cell. `simulated_by` is the cell
-    file of the controller (default: that of `cell`); `options` are further ones of `hil simulate`.
-    """
-    spec: TransportSpec
-    if cell.controller.can is not None and cell.controller.transport == "can":
-        table = cell.controller.can
-        spec = cell.transport_spec()
-        address = ("--can", f"{table.interface}:{table.channel}:{table.profile}")
-    else:
-        port = free_port()
-        spec = UdpSpec(peer_host=LOOPBACK, port=port, bind=LOOPBACK)
-        address = ("--udp", f"{LOOPBACK}:{port}")
-    simulator = SimulatorProcess.start(simulated_by or cell.path, *address, *options)
-    try:
-        with LiveLink.open(cell, transport=spec, finish=simulator.finish, live=live) as link:
-            yield link
-    except ExecutionError as fault:
-        if (failure := simulator.failure()) is not None:
-            raise ControllerFault(f"the simulated controller failed: {failure}") from fault
-        raise
-    finally:
-        simulator.finish()
-        simulator.end()
 
 
 def free_port() -> int:

@@ -339,10 +339,8 @@ class Screen:
     @classmethod
     def of(cls, cell: Cell, stop: Stop, *, title: str = "", quiet: bool = False) -> Screen:
         """Return the screen of a run on a cell's own link; `title` is by default its name."""
-        table = cell.controller
-        on_bus = table.can if table.transport == "can" else None
-        address = table.host if on_bus is None else f"{on_bus.interface}:{on_bus.channel}"
-        link = SIMULATED if cell.only_simulated else address
+        spec = cell.link_spec
+        link = SIMULATED if spec is None or spec.is_local else spec.description
         name = title or cell.name
         return cls(cell.joint_names, stop, title=name, controller=link, quiet=quiet)
 

@@ -10,13 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from types import FrameType
-from typing import Final, Literal
+from typing import Final
 
 from drivers.errors import DriverError
 from drivers.transports.base import TransportError
+from hil.cell.schema import LINKS, ControllerTable
 from hil.errors import ControllerFault, InputError
-from hil.reading import parse_port
 from sim_fixtures import ControllerSettings, Phase, SimulatedController, serve
 from sim_fixtures.settings import PlantDiverged
 
@@ -24,44 +25,49 @@ _PR_SET_TIMERSLACK: Final = 29
 
 
 def open_controller_link(
-    udp: str | None, can: str | None, settings: ControllerSettings, n_axes: int
+    udp: str | None,
+    can: str | None,
+    settings: ControllerSettings,
+    n_axes: int,
+    *,
+    link: str | None = None,
 ) -> serve.ControllerLink:
-    """Open the controller's end: UDP ("HOST:PORT") or CAN ("INTERFACE:CHANNEL[:fd|classic]").
+    """Open the controller's end at the address of exactly one option; `link` is "NAME:ADDRESS".
 
     Raises:
-        InputError: neither or both links, or an invalid one, that cannot be opened or cannot carry
-            the session.
+        InputError: not one link, or an invalid one, that cannot be opened or cannot carry the
+            session.
     """
-    if (udp is None) == (can is None):
+    name, _, address = (link or "").partition(":")
+    options = (
+        ("--udp", "udp", udp),
+        ("--can", "can", can),
+        ("--link", name, None if link is None else address),
+    )
+    given = [(option, name, text) for option, name, text in options if text is not None]
+    if len(given) != 1:
         remedy = "give --udp or --can, not both"
         raise InputError(None, "one link is needed", remedy=remedy)
+    option, name, text = given[0]
+    kind = LINKS.get(name)
+    if kind is None:
+        remedy = f"write NAME:ADDRESS; names are {', '.join(LINKS)}"
+        raise InputError(None, f"--link {link!r} names no transport", remedy=remedy)
+    if (fields := kind.parse(text)) is None:
+        noun, form = kind.form
+        raise InputError(None, f"{option} {text!r} is not {noun}", remedy=f"write {form}")
+    cycle_ms = round(1e3 * settings.period)
+    table = ControllerTable.model_validate({"transport": name, "cycle_ms": cycle_ms, **fields})
+    spec = kind.spec(table, n_axes)
+    moved_by_pc = settings.corrected or not settings.own_motion
+    ends = import_module(kind.controller)
     try:
-        return _bus(can, settings, n_axes) if can is not None else _udp(udp or "")
+        end: serve.ControllerLink = ends.open_controller_link(
+            spec, settings.open_mode if moved_by_pc else None
+        )
     except TransportError as error:
         raise InputError(None, str(error)) from error
-
-
-def _udp(text: str) -> serve.UdpControllerLink:
-    host, _, port_text = text.rpartition(":")
-    port = parse_port(port_text)
-    if not host or port is None:
-        remedy = "write HOST:PORT, for instance 127.0.0.1:2001"
-        raise InputError(None, f"--udp {text!r} is not an address", remedy=remedy)
-    return serve.UdpControllerLink(host, port)
-
-
-def _bus(text: str, settings: ControllerSettings, n_axes: int) -> serve.ControllerLink:
-    interface, _, rest = text.partition(":")
-    channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
-    if not (interface and channel) or profile not in ("fd", "classic"):
-        remedy = "write INTERFACE:CHANNEL:fd or :classic, for instance socketcan:can0:fd"
-        raise InputError(None, f"--can {text!r} is not a bus", remedy=remedy)
-    from sim_fixtures import can_link  # python-can is slow to load
-
-    moved_by_pc = settings.corrected or not settings.own_motion
-    kind: Literal["fd", "classic"] = "classic" if profile == "classic" else "fd"
-    spec = can_link.CanSpec(interface, channel, kind, period=settings.period, n_axes=n_axes)
-    return can_link.open_controller_link(spec, settings.open_mode if moved_by_pc else None)
+    return end
 
 
 class Buttons:

@@ -78,6 +78,3 @@ def open_controller_link(
     spec.check(mode)
     bus = open_bus(spec.interface, spec.channel, spec.rates, spec.options)
     return CanControllerLink(bus, spec.rates, start_patience=start_patience)
-
-
-__all__ = ["START_PATIENCE", "CanControllerLink", "CanSpec", "open_controller_link"]

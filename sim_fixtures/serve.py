@@ -35,6 +35,7 @@ from drivers.packets import (
 )
 from drivers.transports.base import TransportError
 from drivers.transports.simulated import Peer
+from drivers.transports.udp import UdpSpec
 
 LARGEST_DATAGRAM: Final = 65536
 
@@ -101,6 +102,12 @@ class UdpControllerLink:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
+
+
+def open_controller_link(spec: UdpSpec, mode: int | None = None) -> UdpControllerLink:
+    """Open the controller's end of UDP to a PC program at the host and port of `spec`."""
+    del mode
+    return UdpControllerLink(spec.peer_host, spec.port)
 
 
 REMEMBERED: Final = 1000

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +74,58 @@ class Transport(Protocol):
         """Close the link; may be called again."""
 
 
-class TransportSpec(Protocol):
-    """Settings of a link; pickles, so that another process can open it."""
+@dataclass(frozen=True)
+class DirectRoute:
+    """A host that is reached without a router."""
 
+    host: str
+
+
+@dataclass(frozen=True)
+class FreePort:
+    """A port that can be bound on a local address."""
+
+    bind: str
+    port: int
+    protocol: Literal["UDP", "TCP"]
+
+
+@dataclass(frozen=True)
+class CanBus:
+    """A CAN interface at these bit rates, bit/s; None for those of the profile."""
+
+    interface: str
+    channel: str
+    profile: str
+    bitrate: int | None = None
+    data_bitrate: int | None = None
+
+
+class TransportSpec(ABC):
+    """Settings of a link; pickles, so that another process can open it.
+
+    What is not overridden describes a real controller.
+    """
+
+    @abstractmethod
     def open(self) -> Transport:
         """Open the link; raises TransportError."""
+
+    @property
+    def description(self) -> str:
+        """Where the controller is, as shown to a person."""
+        return "the controller"
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only a simulated controller on this computer can be at the other end."""
+        return False
+
+    @property
+    def needs(self) -> tuple[DirectRoute | FreePort | CanBus, ...]:
+        """What this computer must offer, for checks that do not open the link."""
+        return ()
+
+    def check(self, mode: int | None = None) -> None:
+        """Raise DriverError if the link cannot carry the session, or motions in this open mode."""
+        del mode

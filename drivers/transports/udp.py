@@ -7,6 +7,7 @@ the kernel attaches the time of arrival to each datagram.
 from __future__ import annotations
 
 import errno
+import ipaddress
 import math
 import socket
 import struct
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
 from drivers.packets import HEADER_LENGTH
-from drivers.transports.base import TransportError
+from drivers.transports.base import DirectRoute, FreePort, TransportError, TransportSpec
 
 LONGEST: Final = 1500
 """Bytes of the longest datagram accepted (the buffer of the manufacturer's library)."""
@@ -44,7 +45,7 @@ MAX_FOREIGN: Final = 1000
 
 
 @dataclass(frozen=True)
-class UdpSpec:
+class UdpSpec(TransportSpec):
     """Settings of a UDP link.
 
     Attributes:
@@ -60,6 +61,24 @@ class UdpSpec:
     def open(self) -> UdpTransport:
         """Bind the port; raises TransportError."""
         return UdpTransport(self.peer_host, self.port, self.bind)
+
+    @property
+    def description(self) -> str:
+        """Address of the controller."""
+        return self.peer_host
+
+    @property
+    def is_local(self) -> bool:
+        """Whether the controller's address, not a name, is one of the loopback device."""
+        try:
+            return ipaddress.ip_address(self.peer_host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def needs(self) -> tuple[DirectRoute, FreePort]:
+        """A route to the controller and the port."""
+        return DirectRoute(self.peer_host), FreePort(self.bind, self.port, "UDP")
 
 
 class UdpTransport:

@@ -59,7 +59,6 @@ from hil.archive.supervised import (
     Serving,
 )
 from hil.cell import Cell
-from hil.cell.cell import is_local
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.terminal_text import plural
 
@@ -341,7 +340,7 @@ class LiveLink(MotionLink):
             if isinstance(error, OSError):
                 raise ControllerFault(f"the archive process cannot be started: {error}") from error
             raise
-        link = cls(cell, exchange, archive, heart, finish, only_simulated=is_local(spec))
+        link = cls(cell, exchange, archive, heart, finish, only_simulated=spec.is_local)
         if live is not None:
             try:
                 link._serve(live)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from pydantic import ValidationError
 from drivers.drive_train import DriveTrain
 from drivers.errors import DriverError
 from drivers.guard import GuardLimits
+from drivers.transports.base import TransportSpec
 from hil.reading import parse_toml, read_text
 from identification.excitation import Box, Workspace
 from identification.model.robot import RobotModel
@@ -25,6 +25,7 @@ from planner import JointLimits
 from .errors import CellError, first_error, require_known
 from .robot import robot_model
 from .schema import (
+    LINKS,
     CampaignTable,
     CanTable,
     CellFile,
@@ -36,14 +37,8 @@ from .schema import (
 )
 from .text import urdf_limits, with_values
 
-if TYPE_CHECKING:
-    from drivers.transports.base import TransportSpec
-
 Array = NDArray[np.float64]
 T = TypeVar("T")
-
-_WITHIN_THIS_COMPUTER: Final = frozenset(("virtual", "udp_multicast"))
-"""Interfaces of python-can without an adapter."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -203,40 +198,37 @@ class Cell:
             stop_jerk=bounds.stop.jerk,
         )
 
+    @property
+    def link_spec(self) -> TransportSpec | None:
+        """Settings of the link, not checked; None with transport "simulated"."""
+        table = self.controller
+        if table.transport == "simulated":
+            return None
+        return LINKS[table.transport].spec(table, len(self.joint_names))
+
     def transport_spec(self) -> TransportSpec:
         """Return the settings that open the link.
 
         Raises:
-            CellError: the cell is simulated, or its CAN bus has too little capacity.
+            CellError: the cell is simulated, or its link cannot carry the session.
         """
-        table = self.controller
-        if table.transport == "udp":
-            from drivers.transports.udp import UdpSpec
-
-            return UdpSpec(peer_host=table.host, port=table.port, bind=table.bind)
-        if table.transport == "can" and table.can is not None:
-            from drivers.transports.can.transport import CanSpec
-
-            axes = len(self.joint_names)
-            spec = CanSpec(**table.can.model_dump(), period=self.period, n_axes=axes)
-            try:
-                spec.check(table.mode)
-            except (DriverError, ValueError) as error:
-                remedy = "choose values within the capacity of the bus"
-                raise self.error("controller.can", None, str(error), remedy) from error
-            return spec
-        problem = "a simulated controller has no link"
-        raise self.error("controller.transport", table.transport, problem, 'write "udp" or "can"')
+        table, spec = self.controller, self.link_spec
+        if spec is None:
+            problem = "a simulated controller has no link"
+            remedy = "write " + " or ".join(f'"{name}"' for name in LINKS)
+            raise self.error("controller.transport", table.transport, problem, remedy)
+        try:
+            spec.check(table.mode)
+        except (DriverError, ValueError) as error:
+            remedy = "choose values within the capacity of the bus"
+            raise self.error(f"controller.{table.transport}", None, str(error), remedy) from error
+        return spec
 
     @property
     def only_simulated(self) -> bool:
         """Whether the link can reach only a simulated controller on this computer."""
-        table = self.controller
-        if table.transport == "udp":
-            return _is_loopback(table.host)
-        if table.transport == "can":
-            return table.can is not None and table.can.interface in _WITHIN_THIS_COMPUTER
-        return table.transport == "simulated"
+        spec = self.link_spec
+        return spec is None or spec.is_local
 
     def session_settings(self, *, only_axis: int | None = None) -> dict[str, Any]:
         """Keyword arguments of `drivers.Session`."""
@@ -390,23 +382,6 @@ def _required(cell: Cell, table: T | None, name: str) -> T:
     if table is None:
         raise CellError(cell.path, name, None, "is missing", f"add a table [{name}]")
     return table
-
-
-def is_local(spec: TransportSpec) -> bool:
-    """Return whether a link ends on this computer; False for unknown transports."""
-    from drivers.transports.can.transport import CanSpec
-    from drivers.transports.udp import UdpSpec
-
-    if isinstance(spec, UdpSpec):
-        return _is_loopback(spec.peer_host)
-    return isinstance(spec, CanSpec) and spec.interface in _WITHIN_THIS_COMPUTER
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 @dataclass(frozen=True, eq=False)

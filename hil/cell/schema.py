@@ -6,9 +6,15 @@ other than SI are in the name of the field.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+from drivers.transports.base import TransportSpec
+from drivers.transports.udp import UdpSpec
+from hil.reading import parse_port
 
 # Strict: TOML has types, so "yes" and "3" are errors.
 Number = Annotated[FiniteFloat, Field(strict=True)]
@@ -377,6 +383,59 @@ class ControllerTable(Table):
                 'transport = "can" needs a table [controller.can]; add it, or write "udp"'
             )
         return self
+
+
+@dataclass(frozen=True)
+class LinkType:
+    """A transport that cell files and `hil simulate` can name.
+
+    Attributes:
+        spec: settings of the link from `[controller]` and the number of axes.
+        parse: fields of `[controller]` from an address of `hil simulate`; None if it is none.
+        form: what such an address is, and how it is written with an example.
+        controller: module whose `open_controller_link(spec, mode)` opens the controller's end; a
+            name, because `sim_fixtures` is slow to load.
+    """
+
+    spec: Callable[[ControllerTable, int], TransportSpec]
+    parse: Callable[[str], dict[str, Any] | None]
+    form: tuple[str, str]
+    controller: str
+
+
+def _udp(table: ControllerTable, n_axes: int) -> TransportSpec:
+    del n_axes
+    return UdpSpec(peer_host=table.host, port=table.port, bind=table.bind)
+
+
+def _udp_address(text: str) -> dict[str, Any] | None:
+    host, _, port_text = text.rpartition(":")
+    port = parse_port(port_text)
+    return {"host": host, "port": port} if host and port is not None else None
+
+
+def _can(table: ControllerTable, n_axes: int) -> TransportSpec:
+    from drivers.transports.can.transport import CanSpec  # python-can is slow to load
+
+    assert table.can is not None, "the table is checked"
+    return CanSpec(**table.can.model_dump(), period=table.cycle_ms / 1000, n_axes=n_axes)
+
+
+def _can_address(text: str) -> dict[str, Any] | None:
+    interface, _, rest = text.partition(":")
+    channel, _, profile = rest.rpartition(":") if ":" in rest else (rest, "", "fd")
+    if not (interface and channel) or profile not in ("fd", "classic"):
+        return None
+    return {"can": {"interface": interface, "channel": channel, "profile": profile}}
+
+
+HOST_PORT: Final = ("an address", "HOST:PORT, for instance 127.0.0.1:2001")
+BUS: Final = ("a bus", "INTERFACE:CHANNEL:fd or :classic, for instance socketcan:can0:fd")
+LINKS: Final[Mapping[str, LinkType]] = {
+    "udp": LinkType(_udp, _udp_address, HOST_PORT, "sim_fixtures.serve"),
+    "can": LinkType(_can, _can_address, BUS, "sim_fixtures.can_link"),
+}
+"""Every value of `controller.transport` but "simulated"."""
 
 
 class BoxTable(Table):

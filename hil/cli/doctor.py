@@ -40,10 +40,10 @@ def doctor(
         output: Folder for archives, on the disk to test.
         quick: Measure for 5 s each; the result is provisional (exit status 5).
     """
-    controller = None if cell is None else Cell.load(cell).controller
+    loaded = None if cell is None else Cell.load(cell)
     diagnosis = examine(
-        controller,
-        cycle_ms=1 if controller is None else controller.cycle_ms,
+        None if loaded is None else loaded.link_spec,
+        cycle_ms=1 if loaded is None else loaded.controller.cycle_ms,
         seconds=QUICK_SECONDS if quick else duration,
         place=output,
         reporter=reporter(quiet=json),

@@ -78,6 +78,7 @@ def simulate(
     cell: Path,
     udp: Annotated[str | None, typer.Option(metavar="HOST:PORT")] = None,
     can: Annotated[str | None, typer.Option(metavar="INTERFACE:CHANNEL[:fd|classic]")] = None,
+    link: Annotated[str | None, typer.Option(metavar="NAME:ADDRESS")] = None,
     cycle: Annotated[int | None, typer.Option(min=1, max=2)] = None,
     mode: int | None = None,
     stagger: Annotated[int, typer.Option(min=0)] = 3,
@@ -122,6 +123,7 @@ def simulate(
         cell: Cell file with a [simulation] table.
         udp: Address of the PC program.
         can: CAN bus in place of UDP, in python-can names, such as socketcan:can0.
+        link: Either of them, or another transport of cell files, such as udp:127.0.0.1:2001.
         cycle: Cycle, ms. Default: that of the cell.
         mode: Open mode: 1, 2, 4, 5, 7, 8 or 9. Default: that of the cell.
         stagger: Cycles between two axes entering open mode.
@@ -169,10 +171,10 @@ def simulate(
             loaded, effects=effects, settings=settings, seed=seed, faults=in_controller
         )
 
-    link = open_controller_link(udp, can, settings, len(loaded.joint_names))
+    end = open_controller_link(udp, can, settings, len(loaded.joint_names), link=link)
     status = Status(settings, quiet=json)
     status.say(
-        f"{loaded.name}: a SIMULATED controller for {udp or can}; nothing moves.\n"
+        f"{loaded.name}: a SIMULATED controller for {udp or can or link}; nothing moves.\n"
         f"cycle {1e3 * settings.period:g} ms, mode {settings.open_mode}, process {os.getpid()}"
     )
     if patience:
@@ -181,7 +183,7 @@ def simulate(
         with buttons(duration) as pressed, realtime_process(priority):
             served = serve_session(
                 build,
-                link,
+                end,
                 pressed,
                 # The controller's own program stops at the next posture only.
                 patience=OWN_MOVE if own_motion else PATIENCE,
@@ -189,7 +191,7 @@ def simulate(
                 watch=status.watch,
             )
     finally:
-        link.close()
+        end.close()
     if json:
         print_json(_figures(served))
     else:

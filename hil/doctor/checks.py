@@ -12,13 +12,11 @@ import subprocess
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from drivers.exchange.realtime import LIMITS_FILE, RealTimeReport, RealTimeSettings
+from drivers.transports.base import CanBus, DirectRoute, FreePort, TransportSpec
 from hil.archive.process import STALL_LIMIT
-
-if TYPE_CHECKING:
-    from hil.cell.schema import CanTable, ControllerTable
 
 
 class Status(StrEnum):
@@ -210,7 +208,7 @@ def disk_checks(place: Path, trial: DiskTrial | None) -> list[Check]:
 _ARPHRD_CAN = "280"
 
 
-def can_check(bus: CanTable, system: System) -> Check:
+def can_check(bus: CanBus, system: System) -> Check:
     """Check that a CAN interface is up at the bit rate of the cell; another one corrupts frames."""
     # An adapter is not opened here: on the bus it would acknowledge frames.
     name, fd = f"CAN {bus.interface} {bus.channel}", bus.profile == "fd"
@@ -244,26 +242,28 @@ def can_check(bus: CanTable, system: System) -> Check:
     return Check(name, Status.BAD, f"{found}; the cell needs {rates}", (down, bring_up))
 
 
-def try_port(bind: str, port: int) -> int:
+def try_port(wanted: FreePort) -> int:
     """Bind the address, release it, and return the error number, 0 without one."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as trial:
+    kind = socket.SOCK_DGRAM if wanted.protocol == "UDP" else socket.SOCK_STREAM
+    with socket.socket(socket.AF_INET, kind) as trial:
         try:
-            trial.bind((bind, port))
+            trial.bind((wanted.bind, wanted.port))
         except OSError as error:
             return error.errno or -1
     return 0
 
 
-def port_check(bind: str, port: int, error: int) -> Check:
+def port_check(wanted: FreePort, error: int) -> Check:
     """Judge the error number of `try_port`."""
-    name = f"UDP port {port}"
+    bind, port = wanted.bind, wanted.port
+    name = f"{wanted.protocol} port {port}"
     if error == 0:
         return Check(name, Status.OK, f"can be bound on {bind}")
     found = f"cannot be bound ({errno.errorcode.get(error, f'error {error}')})"
     remedy: tuple[str, ...] = ()
     if error == errno.EADDRINUSE:
         found = "in use by another program"
-        remedy = (f"sudo ss -lunp sport = :{port}   # names it",)
+        remedy = (f"sudo ss -l{wanted.protocol[0].lower()}np sport = :{port}   # names it",)
     elif error == errno.EADDRNOTAVAIL:
         found = f"{bind} is not an address of this PC"
         remedy = ("ip -brief addr   # then set controller.bind in the cell file, or 0.0.0.0",)
@@ -317,11 +317,20 @@ def route_check(host: str, system: System) -> Check:
     return Check(name, Status.OK, f"{address} directly on {device}")
 
 
-def link_checks(table: ControllerTable | None, system: System) -> list[Check]:
-    """Check the link of a cell; None without a cell."""
-    if table is None or table.transport == "simulated":
+def link_checks(link: TransportSpec | None, system: System) -> list[Check]:
+    """Check what a link needs of this PC; None without a cell, or with a simulated one."""
+    if link is None:
         return [Check("controller link", Status.OK, "none: no cell, or a simulated one")]
-    if table.can is not None and table.transport == "can":
-        return [can_check(table.can, system)]
-    error = try_port(table.bind, table.port)
-    return [route_check(table.host, system), port_check(table.bind, table.port, error)]
+    if not link.needs:
+        return [Check("controller link", Status.UNKNOWN, f"not checked: {link.description}")]
+    return [_check_of(need, system) for need in link.needs]
+
+
+def _check_of(need: DirectRoute | FreePort | CanBus, system: System) -> Check:
+    match need:
+        case DirectRoute():
+            return route_check(need.host, system)
+        case FreePort():
+            return port_check(need, try_port(need))
+        case CanBus():
+            return can_check(need, system)

@@ -27,7 +27,7 @@ from hil.terminal_text import printable
 from .checks import Check, DiskTrial, Status, System, computer_checks, disk_checks, link_checks
 
 if TYPE_CHECKING:
-    from hil.cell.schema import ControllerTable
+    from drivers.transports.base import TransportSpec
 
 RESERVE: Final = 100e-6
 """Part of a cycle for session and guard (20 µs, at most 40), transmission both ways (25 µs each at
@@ -219,7 +219,7 @@ class Diagnosis:
 
 
 def examine(
-    controller: ControllerTable | None,
+    link: TransportSpec | None,
     cycle_ms: int,
     seconds: float,
     place: Path,
@@ -230,7 +230,7 @@ def examine(
     reporter.say("checking this PC; no packet is sent to the controller")
     checks = [
         *computer_checks(realtime_permissions(), system),
-        *link_checks(controller, system),
+        *link_checks(link, system),
         *disk_checks(place, disk_trial(place)),
     ]
     periods = {"wake-up": cycle_ms / 1000, "turnaround": TURNAROUND_PERIOD}

@@ -16,11 +16,12 @@ import pytest
 from hil.archive import ArchiveOutcome, open_archive
 from hil.campaign import Campaign
 from hil.cell import Cell
-from hil.demo_link import LOOPBACK, SimulatorProcess, free_port, loopback_link
+from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
 from hil.errors import ControllerFault
 from hil.progress import Silent
 from tests.disk.disks import CREATE, SYNC, WRITE, Disk, Rule, processes_disk
 from tests.hil.fast_cell import fast_campaign, fast_cell, pass_rehearsal
+from tests.hil.loopback import loopback_link
 
 PATIENCE = 120.0  # s for a process on a loaded computer
 RUN = (sys.executable, "-m", "hil", "run")

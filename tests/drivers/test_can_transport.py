@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import os
 import queue
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -277,6 +279,16 @@ class TestRefusals:
             assert caught.value.__cause__ is not None
         with pytest.raises(TransportError, match="vcan77"):
             open_controller_link(CanSpec("socketcan", "vcan77", period=0.002))
+
+    def test_python_can_prints_nothing_of_its_own(self):
+        """A program without logging shows only our error."""
+        opening = (
+            "from drivers.transports.can.transport import CanSpec\n"
+            "CanSpec('udp_multicast', '1.2.3.4', period=0.001).open()\n"
+        )
+        command = [sys.executable, "-c", opening]
+        shown = subprocess.run(command, capture_output=True, text=True).stderr
+        assert "not properly shut down" not in shown and "route for multicast" in shown
 
 
 class Failing(can.BusABC):

@@ -22,7 +22,8 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from drivers.exchange.realtime import RealTimeReport
-from hil.cell.schema import CanTable, ControllerTable
+from drivers.transports.base import CanBus, FreePort
+from drivers.transports.udp import UdpSpec
 from hil.cli import app
 from hil.doctor import checks as system_checks
 from hil.doctor import probe
@@ -242,8 +243,7 @@ def test_the_command_sends_the_controller_nothing(tmp_path: Path) -> None:
 
 
 def test_every_remedy_is_valid_shell(tmp_path: Path) -> None:
-    far = ControllerTable(transport="udp", cycle_ms=1, host="10.99.99.99", port=999)
-    found = examine(far, 1, 0.1, tmp_path, Silent())
+    found = examine(UdpSpec("10.99.99.99", 999), 1, 0.1, tmp_path, Silent())
     for check in found.checks:
         for command in check.remedy:
             checked = subprocess.run(["bash", "-n", "-c", command], capture_output=True, text=True)
@@ -270,7 +270,7 @@ PARTLY = RealTimeReport("SCHED_FIFO 50", False, True, ("only memory in use now i
 NOTHING = RealTimeReport("ordinary", False, False)
 CPU = "/sys/devices/system/cpu"
 C4G = "10.2.12.150"
-FD = CanTable(interface="socketcan", channel="can0", bitrate=1_000_000, data_bitrate=5_000_000)
+FD = CanBus("socketcan", "can0", "fd", bitrate=1_000_000, data_bitrate=5_000_000)
 BUS = {"/sys/class/net/can0/type": "280", "/sys/class/net/can0/operstate": "up"}
 
 
@@ -304,7 +304,7 @@ def of(judge: Judge, *cases: tuple[Any, ...]) -> list[Case]:
 
 
 def port(error: int) -> Judge:
-    return lambda _: system_checks.port_check("10.1.1.1", 1000, error)
+    return lambda _: system_checks.port_check(FreePort("10.1.1.1", 1000, "UDP"), error)
 
 
 FULL_SPEED = processors(4, cpufreq__scaling_governor="performance")
@@ -340,7 +340,7 @@ JUDGED = [
         (BUS, UNKNOWN, "not stated", ip()),
         (BUS, OK, "virtual bus", ip({"linkinfo": {"info_kind": "vcan"}})),
     ),
-    *of(lambda s: system_checks.can_check(CanTable(interface="slcan", channel="x"), s),
+    *of(lambda s: system_checks.can_check(CanBus("slcan", "x", "fd"), s),
         ({}, UNKNOWN, "not a kernel device")),
     *of(port(errno.EACCES), ({}, BAD, "net.ipv4.ip_unprivileged_port_start=1000")),
     *of(port(errno.EADDRINUSE), ({}, BAD, "sudo ss -lunp")),
@@ -401,5 +401,5 @@ def test_missing_and_hanging_commands_give_none(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_ports_are_tried() -> None:
-    found = [try_port(host, 0) for host in ("127.0.0.1", "192.0.2.77")]
+    found = [try_port(FreePort(host, 0, "UDP")) for host in ("127.0.0.1", "192.0.2.77")]
     assert found == [0, errno.EADDRNOTAVAIL]

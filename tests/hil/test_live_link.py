@@ -31,14 +31,14 @@ from hil.campaign.live_link import LiveLink
 from hil.campaign.operator import MotionProgress, OperatorRequest
 from hil.campaign.plan import design
 from hil.cell import Cell
-from hil.cell.cell import is_local
 from hil.cli.record import record
-from hil.demo_link import free_port, loopback_link
+from hil.demo_link import free_port
 from hil.errors import ArchiveWriteError, ControllerFault
 from hil.progress import Silent
 from planner import Move, plan_moves
 from sim_fixtures.ns16 import CELL_PATH
 from tests.hil.fast_cell import fast_cell, on_path, set_points
+from tests.hil.loopback import loopback_link
 from tests.hil.test_supervision import spec as spec_of
 
 PATIENT = ("--patience", "2")
@@ -313,11 +313,10 @@ def test_a_hold_while_a_motion_is_handed_over_is_applied(
     [
         (UdpSpec("127.0.0.1", 1000), True), (UdpSpec("127.8.0.1", 1000), True),
         (UdpSpec("192.0.2.1", 1000, "127.0.0.1"), False), (UdpSpec("localhost", 1000), False),
-        (object(), False),
     ],
 )  # fmt: skip
 def test_a_link_is_judged_by_the_transport_that_is_opened(spec: TransportSpec, here: bool) -> None:
-    assert is_local(spec) is here
+    assert spec.is_local is here
 
 
 def test_a_real_transport_makes_a_simulated_cell_a_real_one(cell: Cell) -> None:

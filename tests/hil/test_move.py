@@ -166,7 +166,7 @@ def test_a_real_controller_is_not_driven_without_confirmation(
 ) -> None:
     """The link is declared real; the controller is still simulated."""
     with UdpController.started(ns16, tmp_path) as controller:
-        monkeypatch.setattr("hil.campaign.live_link.is_local", lambda _: False)
+        monkeypatch.setattr("drivers.transports.udp.UdpSpec.is_local", False)
         arguments = ["move", str(controller.cell_path), "--to", "home", "-o", str(tmp_path / "m")]
         result = CliRunner().invoke(app, arguments)
         assert isinstance(result.exception, UnsafeError)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
 import re
 import tempfile
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import TransportClosed
 from drivers.packets import Mode
-from drivers.transports.base import TransportError
+from drivers.transports.base import CanBus, TransportError, TransportSpec
 from drivers.transports.can.profile import (
     MAX_AXES,
     SEGMENT_DOWN,
@@ -36,6 +37,10 @@ from drivers.transports.can.profile import (
     ProfileName,
 )
 
+logging.getLogger("can").addHandler(logging.NullHandler())  # our errors have its reasons
+
+_WITHIN_THIS_COMPUTER: Final = frozenset(("virtual", "udp_multicast"))
+"""Interfaces of python-can without an adapter."""
 _REMEDIES = {
     "socketcan": "bring it up: modprobe can_raw && ip link set {channel} up type can {rates}",
     "slcan": "check that the adapter is connected and its port may be opened (group dialout)",
@@ -346,7 +351,7 @@ class CanTransport(CanLink):
 
 
 @dataclass(frozen=True)
-class CanSpec:
+class CanSpec(TransportSpec):
     """Settings of a CAN link.
 
     Attributes:
@@ -376,6 +381,22 @@ class CanSpec:
         standard = BusRates(self.profile)
         data_bitrate = self.data_bitrate or standard.data_bitrate
         return BusRates(self.profile, self.bitrate or standard.bitrate, data_bitrate)
+
+    @property
+    def description(self) -> str:
+        """Interface and channel."""
+        return f"{self.interface}:{self.channel}"
+
+    @property
+    def is_local(self) -> bool:
+        """Whether frames do not leave this computer."""
+        return self.interface in _WITHIN_THIS_COMPUTER
+
+    @property
+    def needs(self) -> tuple[CanBus]:
+        """The interface at its bit rates."""
+        rates = (self.bitrate, self.data_bitrate)
+        return (CanBus(self.interface, self.channel, self.profile, *rates),)
 
     def check(self, mode: int | None = None) -> None:
         """Check that this bus can carry the session, and motions in this open mode.

@@ -1,0 +1,43 @@
+"""A link of a cell to a simulated controller in another process, over the loopback device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from drivers.transports.udp import UdpSpec
+from hil.archive.live import LiveView
+from hil.campaign.live_link import LiveLink
+from hil.cell import Cell
+from hil.demo_link import LOOPBACK, SimulatorProcess, free_port
+from hil.errors import ControllerFault, ExecutionError
+
+
+@contextmanager
+def loopback_link(
+    cell: Cell,
+    *,
+    simulated_by: Path | None = None,
+    options: tuple[str, ...] = (),
+    live: LiveView | None = None,
+) -> Iterator[LiveLink]:
+    """Start a simulated controller in another process and connect a `LiveLink` to it.
+
+    `simulated_by` is the cell file of the controller (default: that of `cell`); `options` are
+    further ones of `hil simulate`.
+    """
+    port = free_port()
+    spec = UdpSpec(peer_host=LOOPBACK, port=port, bind=LOOPBACK)
+    address = ("--udp", f"{LOOPBACK}:{port}")
+    simulator = SimulatorProcess.start(simulated_by or cell.path, *address, *options)
+    try:
+        with LiveLink.open(cell, transport=spec, finish=simulator.finish, live=live) as link:
+            yield link
+    except ExecutionError as fault:
+        if (failure := simulator.failure()) is not None:
+            raise ControllerFault(f"the simulated controller failed: {failure}") from fault
+        raise
+    finally:
+        simulator.finish()
+        simulator.end()

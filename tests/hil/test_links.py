@@ -1,0 +1,73 @@
+"""The table of links: what cell file, doctor, screen and `hil simulate` read of each transport."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass, replace
+from typing import Any, get_args
+
+import pytest
+
+from drivers import Transport
+from drivers.transports.base import TransportSpec
+from hil.cell import Cell
+from hil.cell.schema import LINKS, CanTable, ControllerTable
+from hil.doctor.checks import Check, Status, System, link_checks
+from hil.errors import InputError
+from hil.serving import open_controller_link
+from hil.simulation import controller_settings
+from sim_fixtures.ns16 import CELL_PATH
+
+CELL = Cell.load(CELL_PATH).with_link(cycle_ms=2)
+BUS = CanTable(interface="virtual", channel="links")
+HERE: dict[str, dict[str, Any]] = {"udp": {"host": "127.0.0.1"}, "can": {"can": BUS}}
+AWAY: dict[str, dict[str, Any]] = {
+    "udp": {"host": "192.0.2.1"},
+    "can": {"can": CanTable(interface="socketcan", channel="can0")},
+}
+ADDRESSES = {"udp": "127.0.0.1:2001", "can": "virtual:links:fd"}
+
+
+@dataclass(frozen=True)
+class Unjudged(TransportSpec):
+    """A transport that states nothing but how it is opened."""
+
+    def open(self) -> Transport:
+        raise NotImplementedError
+
+
+def unjudged(*_: object) -> TransportSpec:
+    return Unjudged()
+
+
+class TestLinks:
+    def test_every_transport_has_a_row(self) -> None:
+        names = get_args(ControllerTable.model_fields["transport"].annotation)
+        assert {*names} == {"simulated", *LINKS} == {"simulated", *HERE}
+
+    @pytest.mark.parametrize("name", LINKS)
+    def test_a_row_serves_cell_doctor_and_controller(self, name: str) -> None:
+        """The settings reach the exchange process, and only a link on this computer is local."""
+        here, away = (CELL.with_link(transport=name, **each[name]) for each in (HERE, AWAY))
+        assert here.only_simulated and not away.only_simulated
+        spec = away.transport_spec()
+        assert pickle.loads(pickle.dumps(spec)) == spec
+        assert spec.description in ("192.0.2.1", "socketcan:can0")
+        assert len(link_checks(spec, System())) == len(spec.needs) > 0
+        settings = replace(controller_settings(CELL), period=0.002)
+        for options in ({name: ADDRESSES[name]}, {"link": f"{name}:{ADDRESSES[name]}"}):
+            arguments: dict[str, Any] = {"udp": None, "can": None} | options
+            open_controller_link(settings=settings, n_axes=6, **arguments).close()
+
+    def test_without_a_local_rule_it_is_real(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """A loopback address says nothing of a transport that does not judge it."""
+        monkeypatch.setitem(LINKS, "udp", replace(LINKS["udp"], spec=unjudged))  # type: ignore[arg-type]
+        cell = CELL.with_link(transport="udp", host="127.0.0.1")
+        assert not cell.only_simulated
+        unknown = Check("controller link", Status.UNKNOWN, "not checked: the controller")
+        assert link_checks(cell.link_spec, System()) == [unknown]
+
+    @pytest.mark.parametrize("link", ["tcp:127.0.0.1:1", "", "udp:127.0.0.1", "can:x"])
+    def test_a_wrong_link_is_refused(self, link: str) -> None:
+        with pytest.raises(InputError, match=r"--link .* write"):
+            open_controller_link(None, None, controller_settings(CELL), 6, link=link)
